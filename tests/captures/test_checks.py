@@ -27,10 +27,10 @@ from unmix_plugin.captures.checks import (
     check_views,
     report_text,
 )
-from unmix_plugin.captures.contact_sheet import OUTLINE, Spectra, contact_sheet
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera
-from unmix_plugin.captures.writing.view_files import ViewRecord, detail
+from unmix_plugin.captures.writing.scene_files import _OUTLINE, _contact_sheet, _Spectra
+from unmix_plugin.captures.writing.view_files import ViewRecord, _detail
 
 LAMP = np.array([2.0, 1.0, 5.0])
 
@@ -137,7 +137,7 @@ def test_detail_falls_when_a_picture_is_blurred():
 
     sharp = np.random.default_rng(0).random((80, 80)).astype(np.float32)
     seen = np.ones((80, 80), bool)
-    details = [detail(gaussian_filter(sharp, sigma), seen) for sigma in (0.3, 0.7, 1.2)]
+    details = [_detail(gaussian_filter(sharp, sigma), seen) for sigma in (0.3, 0.7, 1.2)]
     assert details[0] > 1.2 * details[1] > 1.4 * details[2]
 
 
@@ -219,12 +219,12 @@ def ball_points(count: int = 1500) -> np.ndarray:
 def test_every_view_stands_on_the_sheet_with_its_outline(tmp_path: Path):
     views = [view_at(tmp_path, f"view_{i}", place, None) for i, place in enumerate(ring_of(7))]
     nm = np.linspace(400.0, 700.0, 5)
-    spectra = Spectra("", nm, np.ones((7, 5)), np.array([450.0]))
+    spectra = _Spectra("", nm, np.ones((7, 5)), np.array([450.0]))
     points = ball_points(200)
     colours = np.full((200, 3), 128, np.uint8)
-    sheet = contact_sheet(views, [spectra], points, colours, "seven views")
+    sheet = _contact_sheet(views, [spectra], points, colours, "seven views")
     pixels = np.asarray(Image.open(io.BytesIO(sheet)).convert("RGB")).astype(int)
-    outline = np.abs(pixels - np.array(OUTLINE)).max(axis=-1) < 40
+    outline = np.abs(pixels - np.array(_OUTLINE)).max(axis=-1) < 40
     columns = np.flatnonzero(outline.any(axis=0))
     rows = np.flatnonzero(outline.any(axis=1))
     assert (np.diff(columns) > 10).sum() + 1 == 4  # columns of the grid

@@ -1,4 +1,4 @@
-""""""
+"""Where cameras stand in the world of a scene, and how the lenses of a rig share poses."""
 
 import json
 from pathlib import Path
@@ -12,13 +12,12 @@ from tests.captures.poses.alignment import SIMILARITY, elsewhere, in_a_row
 from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
-from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import complete_rigs, place_poses
-from unmix_plugin.captures.spectral_file import SpectralFile
-from unmix_plugin.captures.writing.scene_files import write_points
+from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
+from unmix_plugin.captures.writing.scene_files import _write_points
 from unmix_plugin.scenes import load_scene
 
 FAR = np.array([500_123.0, 5_400_321.0, 300.0])
@@ -83,8 +82,10 @@ def test_cameras_turned_about_a_subject_are_no_flight_whatever_took_them():
 
 def test_sparse_points_are_written_with_their_colours(tmp_path):
     points, colours = np.arange(6.0).reshape(2, 3), np.array([[1, 2, 3], [4, 5, 255]], np.uint8)
-    assert write_points(tmp_path, ring_set()) == {}
-    assert write_points(tmp_path, ring_set(points=points, colours=colours)) == {"ply_file_path": "points.ply"}
+    assert _write_points(tmp_path, ring_set()) == {}
+    assert _write_points(tmp_path, ring_set(points=points, colours=colours)) == {
+        "ply_file_path": "points.ply"
+    }
     vertex = PlyData.read(tmp_path / "points.ply")["vertex"]
     np.testing.assert_array_equal(np.stack([vertex[name] for name in "xyz"], 1), points)
     np.testing.assert_array_equal(np.stack([vertex[name] for name in ("red", "green", "blue")], 1), colours)

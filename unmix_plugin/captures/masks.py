@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float32, UInt8
 
 from unmix_plugin.captures.calibration.calibration import Raster
 from unmix_plugin.captures.calibration.sensor import Sensor, sampled_rows
-from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.poses.pose_set import name_some
+from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
 
 _Background = Literal["white", "black"]

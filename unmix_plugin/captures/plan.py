@@ -13,12 +13,10 @@ import numpy as np
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.calibration import is_srgb
 from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.masks import background_rule, choose_mask, has_opacity, white_background_note
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
-from unmix_plugin.captures.spectral_file import SpectralFile
-from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe
-from unmix_plugin.captures.writing.work_folder import stamps
+from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
+from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe, stamps
 from unmix_plugin.spectral.bands import Bands
 
 

@@ -20,13 +20,12 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.matching import match_poses
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, counted

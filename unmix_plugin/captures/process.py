@@ -8,17 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from unmix_plugin.captures.calibration.sensor import References
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import input_files, make_plan
 from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
+from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.scene_files import write_scene_files
-from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
-from unmix_plugin.captures.writing.work_folder import WorkFolder, hashes, refuse_output
+from unmix_plugin.captures.writing.view_files import ViewRecord, WorkFolder, hashes, refuse_output, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
 
 _Say = Callable[[str], None]

@@ -1,7 +1,8 @@
-"""A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands.
+"""A file of an instrument, opened but not read: what it says of itself, and its numbers by rows and bands; and the
+views of a capture, which are made of such files.
 
-Notation: `H` rows, `W` columns, `B` bands. Axes of stored arrays are letters, the slowest first: `y` rows, `x` columns,
-`b` bands.
+Notation: `H` rows, `W` columns, `B` bands. Axes of stored arrays are letters, the slowest first: `y` rows, `x`
+columns, `b` bands.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float64, Int, Shaped
 
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.errors import CaptureError
 
 Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 """What the axes of an array are, the slowest first: y rows, x columns, b bands."""
 BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 """Some bands: a slice, or their indices in any order."""
-ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
+_ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
 
 _WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
@@ -76,7 +79,7 @@ class SpectralFile:
     """H, W, B."""
     dtype: np.dtype
     """Type of the stored numbers, in any byte order."""
-    read_part: ReadPart = field(repr=False)
+    read_part: _ReadPart = field(repr=False)
     """How `read` gets its numbers."""
     bands: BandTable = BandTable()
     interleave: str | None = None
@@ -291,3 +294,43 @@ def import_extra(package: str) -> ModuleType:
             f"this file needs the package {package.partition('.')[0]}, which isn't installed ({error}): "
             "pip install 'unmix-nerf[captures]'"
         ) from error
+
+
+@dataclass(frozen=True)
+class CaptureView:
+    """One image from one place."""
+
+    name: str
+    """Unique in the capture, fit for file names; poses are found by it or by the stem of one of the files."""
+    cube: SpectralFile
+    """All bands that were taken from this place."""
+    sensor: str = ""
+    """Lens or camera of a rig that took it; views of one sensor share bands and size."""
+    picture: Path | None = None
+    """RGB or RGBA picture with the pixels of the cube."""
+    mask: Path | None = None
+    """Black where pixels are ignored."""
+    labels: Path | None = None
+    """True materials, if known."""
+    alpha: SpectralFile | None = None
+    """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
+    lens: Lens | None = None
+    """Intrinsics that the camera itself writes; poses may bring better ones."""
+    release: str = ""
+    """Name of the shutter release; views of one release were taken at one moment by the lenses of a rig."""
+    split: Literal["train", "eval"] | None = None
+    """What the layout says the view is for."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a folder of an instrument holds."""
+
+    layout: str
+    root: Path
+    views: tuple[CaptureView, ...]
+    """In the order of their names."""
+    poses: PoseSet | None = None
+    """Where the layout has poses of its own."""
+    notes: tuple[str, ...] = ()
+    """What is odd about the folder, one sentence each."""

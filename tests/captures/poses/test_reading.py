@@ -1,11 +1,205 @@
-""""""
+"""Poses of transforms.json and of LLFF."""
+
+import json
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
 
-from tests.captures.poses.pose_factory import assert_same_poses, llff_table, ring
+from tests.captures.poses.pose_factory import (
+    LENS,
+    assert_same_poses,
+    llff_table,
+    ring,
+    transforms,
+    write_json,
+)
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.formats.meshes import write_ply
+
+
+def read(tmp_path, content, **options):
+    return read_poses(write_json(tmp_path / "transforms.json", content), **options)
+
+
+def test_poses_and_lens_are_those_of_the_file(tmp_path):
+    found = read(tmp_path, transforms(ring()))
+    assert_same_poses(found, ring())
+    assert {camera.lens for camera in found.cameras.values()} == {LENS}
+    assert any("6 of 6 frames name files that are not there" in note for note in found.notes)
+    np.testing.assert_array_equal(found.up, [0, 0, 1])
+
+
+def test_scaled_rotations_are_made_rigid_and_the_factor_is_said(tmp_path):
+    scaled = {name: pose * [[0.25, 0.25, 0.25, 1.0]] for name, pose in ring().items()}
+    found = read(tmp_path, transforms(scaled))
+    assert_same_poses(found, ring())
+    assert "the rotations of 6 of 6 cameras were scaled by 0.25; made rigid, positions kept" in found.notes
+
+
+def test_a_bare_list_has_poses_without_lenses(tmp_path):
+    found = read(tmp_path, transforms(ring())["frames"])
+    assert_same_poses(found, ring())
+    assert all(camera.lens is None for camera in found.cameras.values())
+
+
+def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_the_pictures(tmp_path):
+    poses = {
+        f"./{split}/r_{index}": pose
+        for split, index, pose in zip(("train", "val") * 3, range(6), ring().values(), strict=True)
+    }
+    for split in ("train", "val"):
+        own = {name: pose for name, pose in poses.items() if split in name}
+        content = {"camera_angle_x": math.pi / 2, "frames": transforms(own)["frames"]}
+        write_json(tmp_path / f"transforms_{split}.json", content)
+    found = read_poses(tmp_path, {"r_0": (512, 400)})
+    assert sorted(found.cameras) == sorted(name.removeprefix("./") for name in poses)
+    lens = found.cameras["val/r_1"].lens
+    assert lens is not None
+    assert (lens.width, lens.height, lens.center_px) == (512, 400, (256.0, 200.0))
+    assert lens.focal_px == pytest.approx((256.0, 256.0))
+
+
+def test_the_size_is_taken_from_the_picture_where_nothing_else_tells_it(tmp_path):
+    poses = {"view.png": next(iter(ring().values()))}
+    Image.new("RGB", (30, 20)).save(tmp_path / "view.png")
+    found = read(tmp_path, {"fl_x": 40.0, "frames": transforms(poses)["frames"]})
+    lens = found.cameras["view.png"].lens
+    assert lens is not None
+    assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (30, 20, (40.0, 40.0), (15.0, 10.0))
+
+
+def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
+    turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    shift, scale = np.array([1.0, -2.0, 3.0]), 0.5
+    applied = {
+        name: np.column_stack([turn @ pose[:, :3], scale * (turn @ pose[:, 3] + shift)])
+        for name, pose in ring().items()
+    }
+    points = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
+    moved = scale * (points @ turn.T + shift)
+    red = np.array([255, 0], np.uint8)
+    columns = {axis: moved[:, index] for index, axis in enumerate("xyz")}
+    write_ply(tmp_path / "sparse.ply", {**columns, "red": red, "green": red, "blue": red})
+    content = transforms(
+        applied,
+        applied_transform=np.column_stack([turn, shift]).tolist(),
+        applied_scale=scale,
+        ply_file_path="sparse.ply",
+    )
+    found = read(tmp_path, content)
+    assert_same_poses(found, ring())
+    assert found.points is not None
+    np.testing.assert_allclose(found.points, points, atol=1e-12)
+    assert found.colours is not None
+    np.testing.assert_array_equal(found.colours[:, 0], red)
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, [0, 0, -1])
+
+
+def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
+    far = np.array([500_123.4, 5_400_321.6, 300.0])
+    moved = {name: pose + np.column_stack([np.zeros((3, 3)), far]) for name, pose in ring().items()}
+    found = read(tmp_path, transforms(moved))
+    assert_same_poses(found, moved)
+    np.testing.assert_allclose(found.offset, far, atol=3.0)
+    assert max(np.abs(camera.camera_to_world).max() for camera in found.cameras.values()) < 10
+
+
+def test_terms_beyond_k2_are_kept(tmp_path):
+    lens = read(tmp_path, transforms(ring(), k3=0.02, k4=-0.01)).cameras["images/view_0.png"].lens
+    assert lens == replace(LENS, higher_radial=(0.02, -0.01))
+
+
+def zeros(pose):
+    return 0 * pose
+
+
+def not_finite(pose):
+    return np.nan * pose
+
+
+def mirrored(pose):
+    return pose * [[-1.0, 1.0, 1.0, 1.0]]
+
+
+def sheared(pose):
+    return pose * [[1.0, 2.0, 1.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [(zeros, "all zeros"), (not_finite, "not finite"), (mirrored, "mirror image"), (sheared, "sheared")],
+)
+def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, spoil, message):
+    poses = ring()
+    poses["images/view_3.png"] = spoil(poses["images/view_3.png"])
+    with pytest.raises(CaptureError, match=rf"1 of 6 .*images/view_3.png: .*{message}"):
+        read(tmp_path, transforms(poses))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": []}, "'frames' is a list of 0"),
+        ({"frames": [1]}, r"frames\[0\] is 1"),
+        ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
+        ({"fl_x": "long"}, "'fl_x' is \"long\""),
+        ({"fl_x": -5}, "'fl_x' is -5"),
+        ({"w": 0.5}, "'w' is 0.5; expected a whole number"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR.*undistort"),
+        (
+            {"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},
+            "'applied_transform'.*a rotation",
+        ),
+        ({"applied_scale": 0}, "'applied_scale' is 0"),
+        ({"offset": [1, 2]}, "'offset' is a list of 2; expected 3"),
+    ],
+)
+def test_faults_are_told_with_what_was_expected(tmp_path, change, message):
+    with pytest.raises(CaptureError, match=message):
+        read(tmp_path, transforms(ring()) | change)
+
+
+def test_one_name_for_two_poses_is_refused_and_for_one_pose_mentioned(tmp_path):
+    content = transforms(ring())
+    content["frames"].append(content["frames"][0])
+    assert any("listed twice" in note for note in read(tmp_path, content).notes)
+    content["frames"][-1] = {**content["frames"][1], "file_path": content["frames"][0]["file_path"]}
+    with pytest.raises(CaptureError, match=r"two cameras of the name images/view_0\.png"):
+        read(tmp_path, content)
+
+
+def test_cameras_that_all_have_one_pose_are_refused(tmp_path):
+    pose = next(iter(ring().values()))
+    with pytest.raises(CaptureError, match="all 6 cameras have the same pose"):
+        read(tmp_path, transforms(dict.fromkeys(ring(), pose)))
+
+
+VALUES = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.sampled_from(sorted(transforms({}))), VALUES, VALUES)
+def test_json_of_any_content_is_read_or_refused(tmp_path_factory, key, value, matrix):
+    content = transforms(ring(3)) | {key: value}
+    if key != "frames":
+        content["frames"][1]["transform_matrix"] = matrix
+    path = tmp_path_factory.mktemp("fuzz") / "transforms.json"
+    path.write_text(json.dumps(content), encoding="utf-8")
+    try:
+        found = read_poses(path)
+    except CaptureError:
+        return
+    assert all(np.isfinite(camera.camera_to_world).all() for camera in found.cameras.values())
 
 
 def write(tmp_path, **options):

@@ -1,15 +1,18 @@
-"""What holds for every reader, and `unmix-process inspect`."""
+"""What holds for every reader, with ENVI images against SPy and by hand, and `unmix-process inspect`."""
 
 import json
 import sys
+import warnings
 from dataclasses import replace
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+import spectral.io.envi as spy
 import tifffile
 
-from tests.captures.file_factory import header_text, write_envi
+from tests.captures.file_factory import centres_nm, header_text, widths_nm, write_envi
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, stack_bands
 from unmix_plugin.commands.process import process
@@ -202,3 +205,242 @@ def test_the_table_for_people(header, poses, tmp_path, capsys):
 def test_no_file_is_an_error():
     with pytest.raises(ConfigError, match="no file is named"):
         inspect_command([])
+
+
+ENVI_CUBE = np.random.default_rng(0).integers(0, 200, (5, 7, 4))
+AXES = {"bsq": (2, 0, 1), "bil": (0, 2, 1), "bip": (0, 1, 2)}
+
+
+@pytest.mark.parametrize("interleave", AXES)
+@pytest.mark.parametrize(
+    "dtype", ["u1", "<i2", ">i2", "<i4", ">f4", "<f8", "<u2", ">u2", "<u4", "<i8", ">u8"]
+)
+def test_numbers_are_those_that_spy_reads(tmp_path, interleave, dtype):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE.astype(dtype), interleave)
+    file = open_spectral_file(header)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        image: Any = spy.open(str(header))
+        expected = np.asarray(image.load(dtype=np.float64))
+    assert file.shape == (5, 7, 4)
+    assert file.interleave == interleave
+    assert file.dtype == np.dtype(dtype)
+    np.testing.assert_array_equal(file.read(), expected)
+    np.testing.assert_array_equal(file.read(slice(1, 4), np.array([3, 0])), expected[1:4][..., [3, 0]])
+    np.testing.assert_array_equal(file.read(slice(-2, None), slice(1, 3)), expected[-2:, :, 1:3])
+    assert file.read().dtype == np.dtype(dtype).newbyteorder("=")
+
+
+def test_files_of_spy_are_read(tmp_path):
+    cube = np.random.default_rng(1).random((6, 3, 5)).astype(np.float32)
+    entries = {
+        "wavelength": [0.45, 0.5, 0.55, 0.6, 0.7],
+        "wavelength units": "Micrometers",
+        "fwhm": [0.01] * 5,
+    }
+    spy.save_image(str(tmp_path / "cube.hdr"), cube, metadata=entries, interleave="bil")
+    file = open_spectral_file(tmp_path / "cube.img")
+    np.testing.assert_array_equal(file.read(), cube)
+    np.testing.assert_allclose(centres_nm(file), [450, 500, 550, 600, 700])
+    np.testing.assert_allclose(widths_nm(file), [10.0] * 5)
+    assert file.bands.evidence == "header field 'wavelength', Micrometers"
+    assert file.files == (tmp_path / "cube.hdr", tmp_path / "cube.img")
+
+
+def test_a_header_as_headwall_and_plantcv_write_it(tmp_path):
+    text = """ENVI
+; made by hand
+description = {[CAMERA {1}]
+  wavelength = nothing}
+samples = 7
+lines=5 ; rows
+bands = 4
+data type = 12
+interleave = BIL
+file type = ENVI
+wavelength units = nm
+wavelength = {
+400.5
+,410
+;,415
+,420,
+430 }
+bbl = {1,0,1,1}
+reflectance scale factor = 10000
+data ignore value = 65535
+;AOI height = 1008
+"""
+    (tmp_path / "cube.hdr").write_text(text)
+    (tmp_path / "cube").write_bytes(ENVI_CUBE.astype("<u2").transpose(AXES["bil"]).tobytes())
+    file = open_spectral_file(tmp_path / "cube")
+    assert file.path == tmp_path / "cube.hdr"
+    np.testing.assert_array_equal(centres_nm(file), [400.5, 410, 420, 430])
+    np.testing.assert_array_equal(file.bands.bad, [False, True, False, False])
+    assert (file.scale, file.no_data) == (10000, 65535)
+    assert file.notes == ("the header has no byte order; taken as little-endian",)
+    np.testing.assert_array_equal(file.read(), ENVI_CUBE)
+
+
+@pytest.mark.parametrize(
+    ("entries", "nm", "evidence"),
+    [
+        (
+            "wavelength = {0.4, 0.5, 0.6, 2.5}",
+            [400, 500, 600, 2500],
+            "no unit: 0.4 to 2.5 taken as micrometres",
+        ),
+        ("wavelength = {400, 500, 600, 700}", [400, 500, 600, 700], "no unit: 400 to 700 taken as nm"),
+        ("wavelength = {400 500\n600\n700}", [400, 500, 600, 700], "no unit: 400 to 700 taken as nm"),
+        ("wavelength units = Micrometers\nwavelength = {.4,.5,.6,.7}", [400, 500, 600, 700], "Micrometers"),
+        (
+            "band names = {a (450.5 nm), b (460 nm), c (470 nm), d (480 nm)}",
+            [450.5, 460, 470, 480],
+            "a (450.5 nm)",
+        ),
+        ("band names = {0.45 um, 0.46 um, 0.47 um, 0.48 um}", [450, 460, 470, 480], "unit um"),
+        ("band names = {450.2, 460, 470, 480}", [450.2, 460, 470, 480], "increase and are taken as nm"),
+    ],
+)
+def test_wavelengths_come_with_their_evidence(tmp_path, entries, nm, evidence):
+    file = open_spectral_file(write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", entries))
+    np.testing.assert_allclose(centres_nm(file), nm)
+    assert evidence in file.bands.evidence
+
+
+@pytest.mark.parametrize(
+    ("entries", "note"),
+    [
+        ("wavelength = {400, 500, 600}", "wavelengths are left out: 3 for 4 bands"),
+        ("wavelength = {400, nan, 600, 700}", "that of band 1 (from 0) is nan"),
+        ("wavelength = {400, x, 600, 700}", "are not a list of numbers"),
+        (
+            "wavelength units = Index\nwavelength = {1, 2, 3, 4}",
+            "with the unit 'Index' can't be brought to nm",
+        ),
+        ("wavelength units = Micrometers\nwavelength = {400, 500, 600, 700}", "can't be in Micrometers"),
+        ("wavelength units = nm\nwavelength = {0.4, 0.5, 0.6, 0.7}", "can't be in nm"),
+        ("wavelength = {1, 2, 3, 40}", "with no unit can't be brought to nm"),
+    ],
+)
+def test_wavelengths_that_cannot_be_used_are_left_out_with_a_note(tmp_path, entries, note):
+    file = open_spectral_file(write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", entries))
+    assert file.bands.wavelengths_nm is None
+    assert any(note in text for text in file.notes), file.notes
+
+
+@pytest.mark.parametrize(
+    "names", ["Band 201, Band 202, Band 203, Band 204", "a, b, c, d", "450 nm, 460 nm, red, 480 nm"]
+)
+def test_names_without_wavelengths_give_none(tmp_path, names):
+    file = open_spectral_file(
+        write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", f"band names = {{{names}}}")
+    )
+    assert file.bands.wavelengths_nm is None
+    assert file.bands.names == tuple(names.split(", "))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"interleave": "bup"}, "'interleave' is 'bup'; expected bsq, bil or bip"),
+        ({"interleave": None}, "'interleave' is missing"),
+        ({"data type": "6"}, "complex"),
+        ({"data type": "7"}, r"'data type' is 7; expected one of 1 \(uint8\)"),
+        ({"data type": None}, "'data type' is missing; expected a whole number"),
+        ({"samples": "0"}, "'samples' is 0; expected a whole number of at least 1"),
+        ({"lines": "-5"}, "'lines' is -5"),
+        ({"bands": "many"}, "'bands' is many"),
+        ({"bands": "9" * 5000}, "'bands' is 9"),
+        ({"samples": "1e400"}, "'samples' is 1e400; expected a whole number"),
+        ({"header offset": "nan"}, "'header offset' is nan; expected a whole number"),
+        ({"byte order": "2"}, "'byte order' is 2; expected 0"),
+        ({"header offset": "1.5"}, "'header offset' is 1.5"),
+        ({"file compression": "1"}, "compressed"),
+        ({"file type": "ENVI Spectral Library"}, "library of spectra; expected an image"),
+        ({"major frame offsets": "{0, 8}"}, "'major frame offsets' is 0, 8"),
+        ({"lines": "6"}, "cut short: 280 bytes; cube.hdr promises 336"),
+        ({"lines": "1000000000"}, "cut short"),
+        ({"header offset": "4"}, "promises 284"),
+        ({"wavelength": "{1, 2"}, "the list of 'wavelength' is never closed"),
+    ],
+)
+def test_headers_that_cannot_be_followed_are_refused(tmp_path, change, message):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE.astype("<i2"), "bil")
+    header.write_text(header_text(ENVI_CUBE.astype("<i2"), "bil", change))
+    with pytest.raises(CaptureError, match=message):
+        open_spectral_file(header)
+
+
+def test_files_that_are_no_pair_are_refused(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
+    header.with_suffix("").rename(tmp_path / "other.raw")
+    with pytest.raises(
+        CaptureError, match=r"no file of numbers beside this header; expected cube or cube.img"
+    ):
+        open_spectral_file(header)
+    with pytest.raises(CaptureError, match="of no known kind"):
+        open_spectral_file(tmp_path / "other.raw")
+    header.write_text("BYTEORDER I\nNROWS 540\n")
+    with pytest.raises(CaptureError, match="header of an ESRI"):
+        open_spectral_file(header)
+    header.write_bytes(bytes(range(256)))
+    with pytest.raises(CaptureError, match="no ENVI header: its first line is not 'ENVI'"):
+        open_spectral_file(header)
+
+
+def test_compressed_numbers_are_refused(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
+    (tmp_path / "cube").write_bytes(b"\x1f\x8b\x08" + bytes(50))
+    with pytest.raises(CaptureError, match="cube: compressed with gzip; unpack it"):
+        open_spectral_file(header)
+
+
+def test_of_several_files_of_numbers_the_one_that_is_large_enough_is_taken(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
+    (tmp_path / "cube").rename(tmp_path / "cube.RAW")
+    (tmp_path / "cube.dat").write_bytes(b"notes")
+    assert open_spectral_file(header).sources == (tmp_path / "cube.RAW",)
+
+
+def test_a_header_named_after_the_whole_file_is_found(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bip")
+    header.rename(tmp_path / "cube.raw.hdr")
+    (tmp_path / "cube").rename(tmp_path / "cube.raw")
+    for name in ("cube.raw", "cube.raw.hdr"):
+        np.testing.assert_array_equal(open_spectral_file(tmp_path / name).read(), ENVI_CUBE)
+
+
+def test_text_that_is_not_utf8_is_read(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bip")
+    header.write_bytes(
+        b"\xef\xbb\xbf" + header.read_bytes() + "band names = {rouge é, b, c, d}\n".encode("latin-1")
+    )
+    assert open_spectral_file(header).bands.names is not None
+
+
+@pytest.mark.parametrize("interleave", AXES)
+def test_a_file_of_a_terabyte_opens_at_once_and_gives_its_rows(tmp_path, interleave):
+    lines = 10**6
+    header = tmp_path / "cube.hdr"
+    header.write_text(header_text(np.broadcast_to(np.uint16(0), (lines, 1000, 500)), interleave, {}))
+    with (tmp_path / "cube").open("wb") as file:
+        file.truncate(lines * 1000 * 500 * 2)
+    opened = open_spectral_file(header)
+    assert opened.shape == (lines, 1000, 500)
+    assert opened.read(slice(lines - 2, lines), slice(3, 5)).shape == (2, 1000, 2)
+
+
+def test_a_file_that_is_cut_while_open_is_reported(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bip")
+    file = open_spectral_file(header)
+    (tmp_path / "cube").write_bytes(b"")
+    with pytest.raises(CaptureError, match="the file was cut"):
+        file.read()
+
+
+def test_bands_that_are_not_there_are_an_index_error(tmp_path):
+    file = open_spectral_file(write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bip"))
+    with pytest.raises(IndexError):
+        file.read(bands=np.array([4]))
+    assert file.read(slice(2, 2)).shape == (0, 7, 4)
+    np.testing.assert_array_equal(file.read(slice(0, 5, 2), slice(None, None, -1)), ENVI_CUBE[::2, :, ::-1])

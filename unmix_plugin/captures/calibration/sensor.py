@@ -27,9 +27,8 @@ from unmix_plugin.captures.calibration.calibration import (
     white_reference,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.capture import CaptureView
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 

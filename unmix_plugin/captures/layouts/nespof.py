@@ -23,12 +23,18 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import FoundFiles, LayoutOptions, view_names
 from unmix_plugin.captures.layouts.transforms import make_capture, read_frames, with_wavelengths
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, stack_bands
+from unmix_plugin.captures.spectral_file import (
+    BandTable,
+    Capture,
+    CaptureView,
+    ReadOptions,
+    SpectralFile,
+    stack_bands,
+)
 from unmix_plugin.errors import CaptureError
 
 _WAVELENGTH_NAME = re.compile(r"(\d+(?:\.\d+)?)(?:\s*nm)?", re.IGNORECASE)

@@ -15,8 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.capture import Capture
-from unmix_plugin.captures.spectral_file import Axes, ReadOptions
+from unmix_plugin.captures.spectral_file import Axes, Capture, ReadOptions
 from unmix_plugin.errors import CaptureError, counted
 
 

@@ -26,12 +26,11 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import LayoutOptions, view_names
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 
 _TIFF_SUFFIXES = (".tif", ".tiff")

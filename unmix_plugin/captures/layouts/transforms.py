@@ -22,12 +22,11 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from unmix_plugin.captures.capture import Capture, CaptureView
 from unmix_plugin.captures.layouts.registry import FoundFiles, LayoutOptions, view_names
-from unmix_plugin.captures.poses.files import load_json
+from unmix_plugin.captures.poses.pose_set import load_json
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.faults import describe, read_number
 

@@ -1,5 +1,5 @@
-"""Files that hold arrays by name: which is the image, which describe its bands, and how NumPy, torch, NetCDF and MATLAB
-store them.
+"""Files that hold arrays by name: which is the image, which describe its bands, and how NumPy, torch, NetCDF, MATLAB
+and HDF5 store them.
 
 Notation: `H` rows, `W` columns, `B` bands.
 """
@@ -12,7 +12,8 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -26,6 +27,7 @@ from unmix_plugin.captures.spectral_file import (
     SpectralFile,
     choose_axes,
     image_shape,
+    import_extra,
     loaded,
     take_part,
 )
@@ -60,7 +62,7 @@ _LISTED = 12
 
 
 @dataclass(frozen=True)
-class FoundArray:
+class _FoundArray:
     """One array of a file."""
 
     name: str
@@ -87,8 +89,8 @@ class FoundArray:
         return is_list and self.dtype.kind in "iuf"
 
 
-def image_of_arrays(
-    path: Path, reader: str, arrays: Sequence[FoundArray], options: ReadOptions
+def _image_of_arrays(
+    path: Path, reader: str, arrays: Sequence[_FoundArray], options: ReadOptions
 ) -> SpectralFile:
     """The image of a file: the array that is named, otherwise the only one of three axes.
 
@@ -142,7 +144,7 @@ def image_of_arrays(
     )
 
 
-def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
+def _find_image(path: Path, arrays: Sequence[_FoundArray], options: ReadOptions) -> _FoundArray:
     numeric = [array for array in arrays if array.dtype.kind in "iuf" and 0 not in array.shape]
     if [(array.name, len(array.shape)) for array in arrays] == [("", 2)] and options.dataset is None:
         return arrays[0]  # the file is one matrix: one band
@@ -175,7 +177,7 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
 
 
 def _pixel_list_size(
-    array: FoundArray, arrays: Sequence[FoundArray], options: ReadOptions
+    array: _FoundArray, arrays: Sequence[_FoundArray], options: ReadOptions
 ) -> tuple[int, int] | None:
     """Rows and columns of an image that is stored as a matrix of bands and pixels; None if it is not such a matrix.
 
@@ -192,8 +194,8 @@ def _pixel_list_size(
 
 
 def _find_vector(
-    arrays: Sequence[FoundArray], image: FoundArray, names: re.Pattern[str]
-) -> FoundArray | None:
+    arrays: Sequence[_FoundArray], image: _FoundArray, names: re.Pattern[str]
+) -> _FoundArray | None:
     """The list of one number a band with such a name; of several the one in the nearest group."""
 
     def common_groups(name: str) -> int:
@@ -209,10 +211,10 @@ def _find_vector(
     return max(found, key=lambda array: common_groups(array.name), default=None)
 
 
-def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands:
+def _state_bands(arrays: Sequence[_FoundArray], image: _FoundArray) -> StatedBands:
     """What arrays or attributes say of the bands."""
 
-    def numbers(vector: FoundArray | None) -> list[object] | None:
+    def numbers(vector: _FoundArray | None) -> list[object] | None:
         return None if vector is None else vector.whole().reshape(-1).tolist()
 
     centres, widths, good = (_find_vector(arrays, image, names) for names in (_CENTRES, _WIDTHS, _GOOD))
@@ -267,8 +269,8 @@ def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
         header = read_array_header(path)
     except UnreadableArrayError as error:
         raise CaptureError(f"{path}: {error}") from error
-    image = FoundArray("", header.shape, header.dtype, lambda: map_array(path))
-    return image_of_arrays(path, "npy", [image], options)
+    image = _FoundArray("", header.shape, header.dtype, lambda: map_array(path))
+    return _image_of_arrays(path, "npy", [image], options)
 
 
 def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
@@ -279,10 +281,10 @@ def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
     """
     with zipfile.ZipFile(path) as archive:
         arrays = [_npz_member(path, archive, info) for info in archive.infolist()]
-    return image_of_arrays(path, "npy", arrays, options)
+    return _image_of_arrays(path, "npy", arrays, options)
 
 
-def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
+def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> _FoundArray:
     """A member by its header."""
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)
@@ -297,7 +299,7 @@ def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
             f"{path}: {info.filename} holds {info.file_size} bytes; its header promises {needed}"
         )
     name = info.filename.removesuffix(".npy")
-    return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
+    return _FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
 
 
 def _load_npz_member(path: Path, name: str) -> np.ndarray:
@@ -336,7 +338,7 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
         return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
 
     arrays = [
-        FoundArray(
+        _FoundArray(
             name,
             tuple(tensor.shape),
             numbers(tensor[:0] if tensor.ndim else tensor).dtype,
@@ -344,7 +346,7 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
         )
         for name, tensor in tensors().items()
     ]
-    return image_of_arrays(path, "torch", arrays, options)
+    return _image_of_arrays(path, "torch", arrays, options)
 
 
 # NetCDF of the classic kind, mapped by SciPy.
@@ -358,7 +360,7 @@ def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
     """
     from scipy.io import netcdf_file
 
-    def found(name: str, variable: Any) -> FoundArray:
+    def found(name: str, variable: Any) -> _FoundArray:
         """A variable, without holding on to the map of its file."""
 
         def whole() -> np.ndarray:
@@ -371,11 +373,11 @@ def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
 
         attributes = dict(variable._attributes)
         kind = variable.data.dtype
-        return FoundArray(name, variable.shape, kind, whole, take, attributes, variable.dimensions)
+        return _FoundArray(name, variable.shape, kind, whole, take, attributes, variable.dimensions)
 
     with netcdf_file(str(path), "r", mmap=True) as file:
         arrays = [found(name, variable) for name, variable in file.variables.items()]
-    return image_of_arrays(path, "netcdf", arrays, options)
+    return _image_of_arrays(path, "netcdf", arrays, options)
 
 
 # MATLAB's version 5 to 7; files of version 7.3 are HDF5. Numbers that lie open are mapped, compressed ones are unpacked
@@ -413,7 +415,7 @@ def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
         CaptureError: the file is damaged, or no variable, or more than one, can be the image.
     """
 
-    def found(array: _MatlabArray) -> FoundArray:
+    def found(array: _MatlabArray) -> _FoundArray:
         def stored() -> np.ndarray:
             if array.packed is not None:
                 return loaded(_unpack, path, array)
@@ -422,7 +424,7 @@ def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
         def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
             return take_part(stored(), axes, rows, bands).astype(array.dtype)
 
-        return FoundArray(array.name, array.shape, array.dtype, lambda: stored().astype(array.dtype), take)
+        return _FoundArray(array.name, array.shape, array.dtype, lambda: stored().astype(array.dtype), take)
 
     try:
         size = path.stat().st_size
@@ -433,7 +435,7 @@ def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
             arrays = [_matlab_array(file, order, *element) for element in _elements(file, order, size)]
     except (ValueError, zlib.error) as error:
         raise CaptureError(f"{path}: a damaged MATLAB file: {error}; copy it again") from error
-    return image_of_arrays(path, "matlab", [found(array) for array in arrays if array is not None], options)
+    return _image_of_arrays(path, "matlab", [found(array) for array in arrays if array is not None], options)
 
 
 def _elements(file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, int, int]]:
@@ -507,3 +509,72 @@ def _unpack(path: Path, array: _MatlabArray) -> np.ndarray:
             target[max(0, at) : max(0, at) + len(part)] = np.frombuffer(part, np.uint8)
             at += len(piece)
     return numbers.reshape(array.shape, order="F")
+
+
+def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
+    """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone.
+
+    Raises:
+        CaptureError: the file is damaged, or no data set, or more than one, can be the image.
+    """
+    h5py = import_extra("h5py")
+    with path.open("rb") as begin:
+        is_matlab = begin.read(10) == b"MATLAB 7.3"
+    arrays: list[_FoundArray] = []
+    with h5py.File(path, "r") as file:
+        file.visititems(lambda name, item: arrays.extend(_found(path, name, item, is_matlab)))
+        root = _attributes(file)
+    # Attributes of the file hold for its images where these have none of that name.
+    arrays = [
+        replace(array, attributes={**root, **array.attributes}) if len(array.shape) == 3 else array
+        for array in arrays
+    ]
+    opened = _image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
+    name = opened.metadata.get("dataset") or arrays[0].name
+    with h5py.File(path, "r") as file:
+        if file[name].external or file[name].is_virtual:
+            raise CaptureError(f"{path}: the numbers of {name} lie in other files; write them into this one")
+    return opened
+
+
+def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[_FoundArray]:
+    if not hasattr(item, "shape") or item.shape is None or "#refs#" in name:
+        return []
+    shape = tuple(item.shape[::-1] if is_matlab else item.shape)
+    is_cube = len(shape) == 3
+    if not is_cube and (item.external or item.is_virtual):
+        return []
+
+    def whole() -> np.ndarray:
+        with import_extra("h5py").File(path, "r") as file:
+            stored = file[name][()]
+        return stored.T if is_matlab else stored
+
+    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+        stored_axes = axes[::-1] if is_matlab else axes
+        wanted, order = bands, slice(None)
+        if not isinstance(bands, slice):  # h5py wants each index once, in rising order
+            wanted, order = np.unique(bands, return_inverse=True)
+        selection = {"y": rows, "x": slice(None), "b": wanted}
+        with import_extra("h5py").File(path, "r") as file:
+            part = file[name][tuple(selection[axis] for axis in stored_axes)]
+        return part.transpose([stored_axes.index(axis) for axis in "yxb"])[..., order]
+
+    # Names of the axes, by NetCDF's dimension scales or by labels.
+    names = []
+    for dimension in item.dims:
+        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
+        names.append((scales[0] or "") if scales else dimension.label)
+    dimensions = tuple(names) if any(names) else None
+    return [
+        _FoundArray(name, shape, item.dtype, whole, take if is_cube else None, _attributes(item), dimensions)
+    ]
+
+
+def _attributes(item: Any) -> dict[str, Any]:
+    """Attributes that h5py can read; files of other programs hold types that it has no word for."""
+    attributes = {}
+    for name in item.attrs:
+        with suppress(OSError, TypeError, ValueError, RuntimeError):
+            attributes[name] = item.attrs[name]
+    return attributes

@@ -1,8 +1,9 @@
+"""Cameras and views that belong together are found by their names."""
+
 import pytest
 
 from tests.captures.poses.pose_factory import ring_set
-from unmix_plugin.captures.poses.matching import match_poses
-from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.poses.pose_set import PoseSet, match_poses
 from unmix_plugin.errors import CaptureError
 
 

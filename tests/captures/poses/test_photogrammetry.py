@@ -1,0 +1,260 @@
+"""Poses of Metashape, MicMac and OpenSfM, against documents written by hand."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tests.captures.poses.pose_factory import (
+    BROWN,
+    CALIBRATION,
+    FLIP,
+    ORIENTATION,
+    PERSPECTIVE,
+    RADIAL,
+    as_json,
+    assert_same_poses,
+    metashape_document,
+    reconstruction,
+    ring,
+    text_of,
+    world_to_camera,
+    write_json,
+)
+from unmix_plugin.captures.poses.lens import project_opencv
+from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.errors import CaptureError
+
+
+def read_metashape(tmp_path, *args, **options):
+    path = tmp_path / "cameras.xml"
+    path.write_text(metashape_document(*args, **options), encoding="utf-8")
+    return read_poses(path)
+
+
+def lens_of(found):
+    lens = next(iter(found.cameras.values())).lens
+    assert lens is not None
+    return lens
+
+
+def test_cameras_of_groups_are_read_in_the_chunks_own_coordinates(tmp_path):
+    found = read_metashape(tmp_path, ring())
+    assert_same_poses(found, ring())
+    lens = lens_of(found)
+    assert (lens.focal_px, lens.center_px, lens.distortion) == ((500, 500), (323, 236), (0, 0, 0, 0))
+    assert found.up is None
+
+
+@pytest.mark.parametrize("place", ["component", "chunk"])
+def test_the_similarity_leads_to_geocentric_coordinates_with_an_offset(tmp_path, place):
+    rotation, scale = Rotation.from_euler("xyz", [0.5, 1.0, -2.0]).as_matrix(), 12.35
+    middle = np.array([-2499366.43, -4256836.52, 4029217.97])
+    element = (
+        f"<transform><rotation>{text_of(rotation)}</rotation><translation>{text_of(middle)}</translation>"
+        f"<scale>{scale}</scale></transform>"
+    )
+    found = read_metashape(tmp_path, ring(), **{place: element})
+    world = {
+        name: np.column_stack([rotation @ pose[:, :3], scale * rotation @ pose[:, 3] + middle])
+        for name, pose in ring().items()
+    }
+    assert_same_poses(found, world, atol=1e-8)
+    assert np.abs(next(iter(found.cameras.values())).camera_to_world).max() < 100
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, middle / np.linalg.norm(middle), atol=1e-4)
+
+
+def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
+    found = read_metashape(tmp_path, ring(), terms="<k1>0.1</k1><p1>0.01</p1><p2>0.02</p2><b1>2</b1>")
+    lens = lens_of(found)
+    x, y, squared = 0.3, -0.2, 0.13
+    bent_x = x * (1 + 0.1 * squared) + 0.01 * (squared + 2 * x**2) + 2 * 0.02 * x * y
+    bent_y = y * (1 + 0.1 * squared) + 0.02 * (squared + 2 * y**2) + 2 * 0.01 * x * y
+    mine = project_opencv(np.array([[x, y]]), lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+    np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
+
+
+def test_higher_radial_terms_are_kept(tmp_path):
+    found = read_metashape(tmp_path, ring(), terms="<k3>-0.05</k3><k4>0.01</k4>")
+    assert lens_of(found).higher_radial == (-0.05, 0.01)
+    assert not any("replaced" in note for note in found.notes)
+
+
+def test_skew_is_fitted_and_its_effect_said(tmp_path):
+    found = read_metashape(tmp_path, ring(), terms="<b2>0.3</b2><k3>0.01</k3>")
+    assert any("replaced by the nearest" in note and "px" in note for note in found.notes)
+    assert lens_of(found).distortion != (0, 0, 0, 0)
+    with pytest.raises(CaptureError, match=r"sensor lens: .*by up to [\d.]+ px"):
+        read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
+
+
+def test_a_sensor_without_calibration_has_its_nominal_focal_length(tmp_path):
+    found = read_metashape(tmp_path, ring(), calibration="")
+    assert lens_of(found).focal_px == (500, 400)
+    assert any("not calibrated" in note for note in found.notes)
+
+
+def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_path):
+    extra = (
+        '<camera id="90" sensor_id="0" label="loose"/>'
+        '<camera id="91" sensor_id="0" label="off" enabled="false"><transform>1</transform></camera>'
+    )
+    found = read_metashape(tmp_path, ring(), extra=extra)
+    assert_same_poses(found, ring())
+    assert "1 camera without transform: loose" in found.notes
+    assert "1 disabled camera left out" in found.notes
+    with pytest.raises(CaptureError, match="none of 2 cameras is enabled and has a transform"):
+        read_metashape(tmp_path, {}, extra=extra)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda text: text[:400], "not valid XML"),
+        (lambda text: text.replace("<document", "<!DOCTYPE d><document", 1), "DOCTYPE"),
+        (lambda text: text.replace("<transform>", "<transform>nan "), "expected 16 finite numbers"),
+        (
+            lambda text: text.replace('type="frame"', 'type="spherical"'),
+            "spherical; expected frame or fisheye",
+        ),
+        (lambda text: text.replace('width="640"', 'width="-1"'), "has no resolution"),
+        (lambda text: text.replace("<f>500", "<f>0"), "focal length 0"),
+        (
+            lambda text: (
+                text.replace("<document", "<kml").replace("</document", "</kml").replace("chunk", "c")
+            ),
+            "<kml>",
+        ),
+    ],
+)
+def test_damaged_documents_are_refused(tmp_path, spoil, message):
+    path = tmp_path / "cameras.xml"
+    path.write_text(spoil(metashape_document(ring())), encoding="utf-8")
+    with pytest.raises(CaptureError, match=message):
+        read_poses(path)
+
+
+def write_micmac(tmp_path, distortion="<ModNoDist/>", convention="eConvApero_DistM2C"):
+    folder = tmp_path / "Ori-All"
+    folder.mkdir(exist_ok=True)
+    for name, pose in ring().items():
+        rows = dict(zip(("l1", "l2", "l3"), map(text_of, pose[:, :3] @ FLIP), strict=True))
+        text = ORIENTATION.format(center=text_of(pose[:, 3]), convention=convention, **rows)
+        (folder / f"Orientation-{name.split('/')[-1]}.xml").write_text(text)
+    (folder / "AutoCal.xml").write_text(CALIBRATION.format(distortion=distortion))
+    return folder
+
+
+def test_orientations_of_a_project_are_read_with_their_calibration(tmp_path):
+    folder = write_micmac(tmp_path)
+    for place in (tmp_path, folder, folder / "Orientation-view_0.png.xml"):
+        found = read_poses(place)
+        assert_same_poses(found, {name.split("/")[-1]: pose for name, pose in ring().items()})
+    lens = found.cameras["view_0.png"].lens
+    assert lens is not None
+    assert (lens.focal_px, lens.center_px, lens.distortion) == ((500, 500), (321, 239), (0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("distortion", "p1"),
+    [
+        (f"<ModRad>{RADIAL}</ModRad>", 0.0),
+        (f"<ModPhgrStd><RadiaPart>{RADIAL}</RadiaPart><P1>1e-6</P1></ModPhgrStd>", 1e-6),
+    ],
+)
+def test_distortion_in_pixels_about_its_own_centre_is_ours_within_half_a_pixel(tmp_path, distortion, p1):
+    found = read_poses(write_micmac(tmp_path, distortion.format(a="-2e-7")))
+    lens = found.cameras["view_0.png"].lens
+    assert lens is not None
+    ideal = np.random.default_rng(0).uniform([-0.55, -0.4], [0.55, 0.4], (40, 2))
+    away = 500 * ideal + [-1.5, -2.5]
+    x, y, squared = *away.T, (away**2).sum(1)
+    factor = 1 - 2e-7 * squared - 1e-14 * squared**2
+    bent = np.column_stack([x * factor + p1 * (squared + 2 * x**2), y * factor + 2 * p1 * x * y])
+    wanted = bent + np.array([322.5, 241.5])
+    mine = lens.pixels_of(ideal)
+    np.testing.assert_allclose(mine, wanted, atol=0.5)
+    assert np.abs(500 * ideal + [321, 239] - wanted).max() > 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"distortion": "<ModUnif/>"}, "ModUnif is not supported; expected ModRad"),
+        ({"distortion": "<ModRad/>"}, "no centre <CDist>"),
+        ({"convention": "eConvAngErdas"}, "eConvAngErdas; expected eConvApero_DistM2C"),
+    ],
+)
+def test_other_models_and_conventions_are_refused(tmp_path, options, message):
+    with pytest.raises(CaptureError, match=message):
+        read_poses(write_micmac(tmp_path, **options))
+
+
+def test_a_missing_calibration_is_asked_for(tmp_path):
+    folder = write_micmac(tmp_path)
+    (folder / "AutoCal.xml").unlink()
+    with pytest.raises(
+        CaptureError, match=r"names the calibration 'Ori-All/AutoCal.xml', which is not beside it"
+    ):
+        read_poses(folder)
+
+
+def test_of_several_orientations_one_has_to_be_chosen(tmp_path):
+    write_micmac(tmp_path).rename(tmp_path / "Ori-First")
+    write_micmac(tmp_path)
+    with pytest.raises(CaptureError, match="several orientations: Ori-All, Ori-First"):
+        read_poses(tmp_path)
+
+
+def read_opensfm(tmp_path, *contents):
+    return read_poses(write_json(tmp_path / "reconstruction.json", list(contents)))
+
+
+def test_the_reconstruction_with_the_most_shots_is_read(tmp_path):
+    small = reconstruction()
+    small["shots"].popitem()
+    found = read_opensfm(tmp_path, small, reconstruction())
+    assert_same_poses(found, ring())
+    assert any("2 reconstructions" in note for note in found.notes)
+    assert found.points is not None
+    assert found.colours is not None
+    np.testing.assert_array_equal(found.points, [[1, 2, 3]])
+    np.testing.assert_array_equal(found.colours, [[36, 25, 255]])
+
+
+def test_lengths_are_in_parts_of_the_longer_side(tmp_path):
+    lens = lens_of(read_opensfm(tmp_path, reconstruction()))
+    assert (lens.focal_px, lens.center_px, lens.distortion) == ((512, 512), (320, 240), (0.1, -0.05, 0, 0))
+    lens = lens_of(read_opensfm(tmp_path, reconstruction(BROWN)))
+    assert lens.focal_px == pytest.approx((512, 480))
+    assert lens.center_px == pytest.approx((240 + 6.4, 320 - 12.8))
+    assert lens.distortion == (0.1, -0.05, 0.001, 0.002)
+
+
+def test_poses_of_a_rig_are_composed(tmp_path):
+    turn, shift = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix(), np.array([0.1, -0.2, 0.3])
+    content = reconstruction()
+    content["rig_cameras"] = {"left": as_json(turn, shift)}
+    content["rig_instances"] = {}
+    for name, shot in content["shots"].items():
+        rotation, translation = world_to_camera(ring()[name])
+        outer = as_json(turn.T @ rotation, turn.T @ (translation - shift))
+        content["rig_instances"][name] = {**outer, "rig_camera_ids": {name: "left"}}
+        del shot["rotation"], shot["translation"]
+    assert_same_poses(read_opensfm(tmp_path, content), ring())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cameras": {}}, "names the camera"),
+        ({"cameras": {"c": {**PERSPECTIVE, "projection_type": "spherical"}}}, "spherical.*expected one of"),
+        ({"cameras": {"c": {**PERSPECTIVE, "focal": 0}}}, "not above 0"),
+        ({"shots": {}}, "has no camera"),
+        ({"shots": {"a": {"rotation": [1, 2], "translation": [0, 0, 0], "camera": "c"}}}, "3 finite numbers"),
+        ({"points": {"1": {"coordinates": [1, None, 2]}}}, "a point has no 3 finite"),
+    ],
+)
+def test_faults_are_told(tmp_path, change, message):
+    with pytest.raises(CaptureError, match=message):
+        read_opensfm(tmp_path, reconstruction() | change)

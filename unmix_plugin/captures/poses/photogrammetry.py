@@ -1,0 +1,470 @@
+"""Poses of programs for photogrammetry.
+
+*Agisoft Metashape*: the XML of File > Export > Export Cameras. A camera's matrix leads from the camera (OpenCV axes)
+to its component; the component's or the chunk's similarity leads to the world, often geocentric (metres from the
+middle of the Earth). A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent
+by k1..k4 and by p1, p2, which are OpenCV's p2, p1.
+
+*MicMac*: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it. Rotations lead from
+camera (OpenCV axes) to world. Distortion is in pixels about its own centre and acts on ideal pixels. Pixels are
+counted from the centre of the first one.
+
+*OpenSfM and OpenDroneMap*: reconstruction.json. Rotations are axis and angle from world to camera (OpenCV axes);
+lengths on the picture are in parts of its longer side.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, project_fisheye, project_opencv
+from unmix_plugin.captures.poses.pose_set import (
+    FLIP,
+    PosedCamera,
+    PoseSet,
+    SparsePoints,
+    find_offset,
+    load_xml,
+    make_pose_set,
+    name_some,
+    number_of,
+    numbers_of,
+)
+from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.scenes.reading.faults import describe, read_number
+
+_EARTH_RADII = (6.2e6, 6.6e6)
+"""Metres from the middle of the Earth between which a position is geocentric."""
+_RADIAL = ("k1", "k2", "k3", "k4")
+
+
+def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
+    """Poses of all enabled cameras with a transform, in or out of groups.
+
+    Raises:
+        CaptureError: no chunk, no aligned camera, several components without a common world, or a lens that can't be
+            represented.
+    """
+    chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled", "true") != "false"]
+    chunks = [chunk for chunk in chunks if chunk.find("cameras") is not None]
+    if not chunks:
+        raise CaptureError(
+            f"{path} has no chunk with cameras; expected Metashape's File > Export > Export Cameras"
+        )
+    chunk = max(chunks, key=lambda one: len(list(one.iter("camera"))))
+    notes = [f"{len(chunks)} chunks; the one with the most cameras was read"] if len(chunks) > 1 else []
+    # Similarities to the world by component; None is the chunk's own, the identity without one.
+    owners = [(None, chunk), *((part.get("id"), part) for part in chunk.iterfind("components/component"))]
+    worlds: dict[str | None, Float64[np.ndarray, "4 4"]] = {None: np.eye(4)}
+    for component, owner in owners:
+        if (own := owner.find("transform")) is not None:
+            worlds[component] = _similarity(own, path)
+    aligned = _of_one_world(_aligned(chunk, path, notes), worlds, notes)
+    used = {camera.get("sensor_id") for camera in aligned}
+    lenses: dict[str | None, Lens | None] = {}
+    for sensor in chunk.iterfind("sensors/sensor"):
+        if sensor.get("id") in used:
+            lenses[sensor.get("id")], said = _lens(sensor, str(path))
+            notes += said
+    raw = []
+    for camera in aligned:
+        world = worlds.get(camera.get("component_id"), worlds[None])
+        values = numbers_of(camera.find("transform"), 16, f"{path}: camera {camera.get('label')}")
+        if values is None:
+            raise CaptureError(
+                f"{path}: camera {camera.get('label')}: <transform> is empty; expected 16 numbers"
+            )
+        scale = np.cbrt(np.abs(np.linalg.det(world[:3, :3]))) or 1.0
+        matrix = world @ values.reshape(4, 4)
+        pose = np.column_stack([matrix[:3, :3] / scale @ FLIP, matrix[:3, 3]])
+        name = camera.get("label") or f"camera {camera.get('id')}"
+        raw.append((name, PosedCamera(pose, lenses.get(camera.get("sensor_id")))))
+    middle = np.mean([camera.camera_to_world[:, 3] for _, camera in raw], axis=0)
+    is_geocentric = _EARTH_RADII[0] < np.linalg.norm(middle) < _EARTH_RADII[1]
+    notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
+    has_world = any(np.abs(world - np.eye(4)).max() > 0 for world in worlds.values())
+    up = middle if is_geocentric else np.array([0.0, 0.0, 1.0]) if has_world else None
+    return make_pose_set(raw, f"Metashape's {path.name}", str(path), None, up, dict.fromkeys(notes))
+
+
+def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[ElementTree.Element]:
+    cameras = [camera for group in chunk.findall("cameras") for camera in group.iter("camera")]
+    enabled = [camera for camera in cameras if camera.get("enabled", "true") != "false"]
+    if len(enabled) < len(cameras):
+        notes.append(f"{counted(len(cameras) - len(enabled), 'disabled camera')} left out")
+    aligned = [camera for camera in enabled if camera.find("transform") is not None]
+    missing = [camera.get("label", "?") for camera in enabled if camera.find("transform") is None]
+    if not aligned:
+        raise CaptureError(
+            f"{path}: none of {len(cameras)} cameras is enabled and has a transform; align photos in Metashape first"
+        )
+    if missing:
+        why = ""
+        if any(camera.get("master_id") for camera in enabled if camera.find("transform") is None):
+            why = ", some of them lenses of a rig, whose places beside the first lens are not read"
+        notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {name_some(missing)}")
+    return aligned
+
+
+def _similarity(element: ElementTree.Element, path: Path) -> Float64[np.ndarray, "4 4"]:
+    """rotation, translation and scale of an element, or its 16 numbers."""
+    where = str(path)
+    if len(element) == 0:
+        values = numbers_of(element, 16, where)
+        return np.eye(4) if values is None else values.reshape(4, 4)
+    rotation, translation = (
+        numbers_of(element.find(tag), count, where) for tag, count in (("rotation", 9), ("translation", 3))
+    )
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.eye(3) if rotation is None else rotation.reshape(3, 3)
+    matrix[:3, :3] *= number_of(element, "scale", where, default=1.0)
+    matrix[:3, 3] = 0.0 if translation is None else translation
+    return matrix
+
+
+def _of_one_world(
+    cameras: list[ElementTree.Element],
+    worlds: dict[str | None, Float64[np.ndarray, "4 4"]],
+    notes: list[str],
+) -> list[ElementTree.Element]:
+    """Cameras whose components share a world; without a transform, a component's world is its own."""
+    by_component: dict[str | None, list[ElementTree.Element]] = {}
+    for camera in cameras:
+        by_component.setdefault(camera.get("component_id"), []).append(camera)
+    loose = [component for component in by_component if component not in worlds]
+    if len(by_component) == 1 or not loose:
+        return cameras
+    kept = max(by_component.values(), key=len)
+    notes.append(
+        f"{len(by_component)} components are not aligned to each other: {len(kept)} of {len(cameras)} cameras"
+    )
+    return kept
+
+
+def _lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
+    """The lens of a sensor, None without any focal length; and what is not exactly as in the file."""
+    name = sensor.get("label", "?")
+    where = f"{where}: sensor {name}"
+    calibration, size = _calibration(sensor, where)
+    if calibration is None:
+        return _from_physical(sensor, size), [f"sensor {name} is not calibrated: nominal focal length"]
+    kind = calibration.get("type") or sensor.get("type", "frame")
+    if kind not in ("frame", "fisheye"):
+        raise CaptureError(
+            f"{where} is of the type {kind}; expected frame or fisheye: export undistorted photos"
+        )
+    width, height = size
+    values = {
+        tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
+    }
+    f_x = number_of(calibration, "fx", where, values["f"] + values["b1"])
+    f_y = number_of(calibration, "fy", where, values["f"])
+    skew = number_of(calibration, "skew", where, values["b2"])
+    if min(f_x, f_y) <= 0:
+        raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
+    focal, center = (f_x, f_y), (width / 2 + values["cx"], height / 2 + values["cy"])
+    radial = tuple(values[key] for key in _RADIAL)
+    tangential = (values["p2"], values["p1"])
+    if kind == "frame" and not skew:
+        bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])
+        return Lens(width, height, focal, center, *bends), []
+
+    def project(ideal: Points) -> Points:
+        if kind == "fisheye":
+            bent = project_fisheye(ideal, (1.0, 1.0), (0.0, 0.0), radial)
+        else:
+            bent = project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
+        return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center
+
+    model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"
+    fitted, note = fit_lens(project, Lens(width, height, focal, center), model, where)
+    return fitted, [f"sensor {name}: {note}"]
+
+
+def _calibration(
+    sensor: ElementTree.Element, where: str
+) -> tuple[ElementTree.Element | None, tuple[int, int]]:
+    """The adjusted calibration, otherwise the first one, and the size of the picture."""
+    found = sorted(sensor.findall("calibration"), key=lambda one: one.get("class") != "adjusted")
+    calibration = found[0] if found else None
+    for owner in (calibration, sensor):
+        resolution = None if owner is None else owner.find("resolution")
+        if resolution is None:
+            continue
+        texts = resolution.get("width", ""), resolution.get("height", "")
+        if all(text.isdecimal() and 0 < int(text) < 1_000_000 for text in texts):
+            return calibration, (int(texts[0]), int(texts[1]))
+    raise CaptureError(f"{where} has no resolution; expected its width and height in pixels")
+
+
+def _from_physical(sensor: ElementTree.Element, size: tuple[int, int]) -> Lens | None:
+    """A pinhole from focal length and pixel size in mm."""
+    texts = {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
+    try:
+        focal, *sides = (float(texts[name]) for name in ("focal_length", "pixel_width", "pixel_height"))
+    except (KeyError, ValueError):
+        return None
+    if not 0 < min(focal, *sides) <= max(focal, *sides) < np.inf:
+        return None
+    x, y = (focal / side for side in sides)
+    return Lens(*size, (x, y), (size[0] / 2, size[1] / 2))
+
+
+_PREFIX = "Orientation-"
+_CONVENTION = "eConvApero_DistM2C"
+
+
+def find_orientations(folder: Path) -> list[Path]:
+    """Orientation files of a folder, otherwise of the only folder `Ori-...` in it."""
+    own = sorted(folder.glob(f"{_PREFIX}*.xml"))
+    below = [sorted(place.glob(f"{_PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
+    below = [files for files in below if files]
+    if own or not below:
+        return own
+    if len(below) > 1:
+        names = ", ".join(files[0].parent.name for files in below)
+        raise CaptureError(f"{folder} has several orientations: {names}; give the folder of one")
+    return below[0]
+
+
+def read_micmac(paths: list[Path]) -> PoseSet:
+    """Poses of orientation files.
+
+    Raises:
+        CaptureError: a file is damaged, of another convention, or its calibration is missing or can't be represented.
+    """
+    lenses: dict[str, Lens] = {}
+    notes: list[str] = []
+    raw = []
+    for path in paths:
+        root = load_xml(path)
+        orientation = root if root.tag == "OrientationConique" else root.find("OrientationConique")
+        if orientation is None:
+            raise CaptureError(f"{path} holds no <OrientationConique>; expected an orientation of MicMac")
+        lens = _lens_micmac(orientation, path, lenses, notes)
+        name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
+        raw.append((name, PosedCamera(_matrix(orientation, str(path)), lens)))
+    is_far = find_offset(np.stack([camera.camera_to_world[:, 3] for _, camera in raw])).any()
+    up = np.array([0.0, 0.0, 1.0]) if is_far else None
+    folder = paths[0].parent
+    return make_pose_set(raw, f"MicMac's {folder.name}", str(folder), None, up, dict.fromkeys(notes))
+
+
+def _matrix(orientation: ElementTree.Element, where: str) -> Float64[np.ndarray, "3 4"]:
+    convention = (
+        orientation.findtext("ConvOri/KnownConv") or orientation.findtext("Externe/KnownConv") or _CONVENTION
+    )
+    if convention.strip() != _CONVENTION:
+        raise CaptureError(f"{where} has the convention {convention.strip()}; expected {_CONVENTION}")
+    center = numbers_of(orientation.find("Externe/Centre"), 3, where)
+    code = orientation.find("Externe/ParamRotation/CodageMatr")
+    rows = [None if code is None else numbers_of(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
+    if center is None or any(row is None for row in rows):
+        raise CaptureError(
+            f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing; export it again"
+        )
+    return np.column_stack([np.array(rows) @ FLIP, center])
+
+
+def _lens_micmac(
+    orientation: ElementTree.Element, path: Path, lenses: dict[str, Lens], notes: list[str]
+) -> Lens:
+    inner = orientation.find("Interne")
+    name = (orientation.findtext("FileInterne") or "").strip()
+    key = name if inner is None else str(path)
+    if key not in lenses:
+        where = str(path)
+        if inner is None:
+            file = path.parent / Path(name.replace("\\", "/")).name  # whatever folder it was written in
+            if not name or not file.is_file():
+                raise CaptureError(
+                    f"{path} names the calibration {name!r}, which is not beside it; copy it into {path.parent}"
+                )
+            where, root = str(file), load_xml(file)
+            inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
+        if inner is None:
+            raise CaptureError(
+                f"{where} holds no <CalibrationInternConique>; expected a calibration of MicMac"
+            )
+        lenses[key], said = _calibration_micmac(inner, where)
+        notes += said
+    return lenses[key]
+
+
+def _calibration_micmac(inner: ElementTree.Element, where: str) -> tuple[Lens, list[str]]:
+    center, size = numbers_of(inner.find("PP"), 2, where), numbers_of(inner.find("SzIm"), 2, where)
+    focal = number_of(inner, "F", where)
+    if center is None or size is None or focal <= 0 or size.min() < 1 or size.max() > 1e6:
+        raise CaptureError(f"{where}: <PP>, <F> or <SzIm> are missing or not above 0")
+    width, height = (int(side) for side in size)
+    start = Lens(width, height, (focal, focal), (float(center[0]) + 0.5, float(center[1]) + 0.5))
+    bends = [
+        model for holder in inner.findall("CalibDistortion") for model in holder if model.tag != "ModNoDist"
+    ]
+    unknown = [model.tag for model in bends if model.tag not in ("ModRad", "ModPhgrStd")]
+    if unknown:
+        raise CaptureError(
+            f"{where}: the distortion {unknown[0]} is not supported; expected ModRad or ModPhgrStd: "
+            "calibrate with RadialStd or Fraser, or undistort with Drunk"
+        )
+    if not bends:
+        return start, []
+
+    def project(ideal: Points) -> Points:
+        pixels = focal * ideal + center
+        for model in reversed(bends):
+            pixels = _bend(pixels, model, where)
+        return pixels + 0.5
+
+    lens, note = fit_lens(project, start, " and ".join(model.tag for model in bends), where)
+    return lens, [note]
+
+
+def _bend(pixels: Points, model: ElementTree.Element, where: str) -> Points:
+    """ModRad: radial terms of r^2, r^4, ... about a centre; ModPhgrStd adds P1, P2, b1, b2."""
+    radial = model if model.tag == "ModRad" else model.find("RadiaPart")
+    middle = None if radial is None else numbers_of(radial.find("CDist"), 2, where)
+    if radial is None or middle is None:
+        raise CaptureError(f"{where}: <{model.tag}> has no centre <CDist>; the file is damaged")
+    terms = [numbers_of(element, 1, where) for element in radial.findall("CoeffDist")]
+    away = pixels - middle
+    squared = (away**2).sum(axis=1)
+    factor = 1.0 + sum(
+        term[0] * squared ** (power + 1) for power, term in enumerate(terms) if term is not None
+    )
+    x, y = away.T
+    p1, p2, b1, b2 = (number_of(model, tag, where) for tag in ("P1", "P2", "b1", "b2"))
+    bent_x = x * factor + p1 * (squared + 2 * x**2) + 2 * p2 * x * y + b1 * x + b2 * y
+    bent_y = y * factor + p2 * (squared + 2 * y**2) + 2 * p1 * x * y
+    return np.column_stack([bent_x, bent_y]) + middle
+
+
+_PLAIN = ("perspective", "simple_radial", "radial", "brown")
+_FISHEYES = ("fisheye", "fisheye_opencv")
+
+
+def is_reconstruction(content: Any) -> bool:
+    """Whether JSON looks like a reconstruction.json: a list of objects with shots, or one."""
+    parts = content if isinstance(content, list) else [content]
+    return any(isinstance(part, dict) and "shots" in part for part in parts)
+
+
+def read_opensfm(path: Path, content: Any) -> PoseSet:
+    """Poses, lenses and points of the reconstruction with the most shots.
+
+    Raises:
+        CaptureError: a shot without a sound pose or camera, or a lens that can't be represented.
+    """
+    parts = [part for part in (content if isinstance(content, list) else [content]) if isinstance(part, dict)]
+    parts = [part for part in parts if isinstance(part.get("shots"), dict)]
+    best = max(parts, key=lambda part: len(part["shots"]), default={})
+    notes = [f"{len(parts)} reconstructions; the one with the most shots was read"] if len(parts) > 1 else []
+    shots: dict[str, Any] = best.get("shots", {})
+    lenses: dict[str, Lens] = {}
+    raw, loose = [], []
+    for name, shot in shots.items():
+        where = f"{path}: shot {name}"
+        pose = _world_to_camera(best, name, shot, where)
+        if pose is None:
+            loose.append(name)
+            continue
+        camera = shot.get("camera")
+        if not isinstance(camera, str) or camera not in _object(best, "cameras"):
+            raise CaptureError(f"{where} names the camera {describe(camera)}; expected one of 'cameras'")
+        if camera not in lenses:
+            lenses[camera], note = _lens_opensfm(best["cameras"][camera], f"{path}: camera {camera}")
+            notes += [] if note is None else [note]
+        rotation = pose[:, :3].T
+        matrix = np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]])
+        raw.append((name, PosedCamera(matrix, lenses[camera])))
+    notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
+    up = np.array([0.0, 0.0, 1.0])
+    return make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
+
+
+def _world_to_camera(
+    content: dict[str, Any], name: str, shot: Any, where: str
+) -> Float64[np.ndarray, "3 4"] | None:
+    """The shot's own pose, otherwise that of its rig: first into the rig, then into its camera. None without either."""
+    if not isinstance(shot, dict):
+        raise CaptureError(
+            f"{where} is {describe(shot)}; expected an object with 'rotation' and 'translation'"
+        )
+    if "rotation" in shot:
+        return _pose(shot, where)
+    for instance in _object(content, "rig_instances").values():
+        members = instance.get("rig_camera_ids") if isinstance(instance, dict) else None
+        if not isinstance(members, dict) or name not in members:
+            continue
+        lens = _object(content, "rig_cameras").get(members[name])
+        if not isinstance(lens, dict):
+            raise CaptureError(
+                f"{where} names the rig camera {describe(members[name])}; expected one of 'rig_cameras'"
+            )
+        outer, inner = _pose(instance, where), _pose(lens, where)
+        return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
+    return None
+
+
+def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
+    from scipy.spatial.transform import Rotation
+
+    vectors = [_vector(values.get(key)) for key in ("rotation", "translation")]
+    if vectors[0] is None or vectors[1] is None:
+        raise CaptureError(f"{where}: 'rotation' and 'translation' have to be 3 finite numbers each")
+    return np.column_stack([Rotation.from_rotvec(vectors[0]).as_matrix(), vectors[1]])
+
+
+def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
+    values = camera if isinstance(camera, dict) else {}
+    numbers = {key: read_number(value) for key, value in values.items()}
+
+    def number(key: str, default: float = 0.0) -> float:
+        value = numbers.get(key)
+        return default if value is None else value
+
+    width, height = int(number("width")), int(number("height"))
+    focal = number("focal_x", number("focal")), number("focal_y", number("focal_x", number("focal")))
+    if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
+        raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
+    kind = values.get("projection_type", "perspective")
+    if kind not in _PLAIN + _FISHEYES:
+        raise CaptureError(
+            f"{where} is {describe(kind)}; expected one of {', '.join(_PLAIN + _FISHEYES)}: undistort with OpenSfM"
+        )
+    side = max(width, height)
+    focal = (side * focal[0], side * focal[1])
+    center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
+    radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
+    tangential = (number("p1"), number("p2"))
+    if kind in _FISHEYES:
+        start = Lens(width, height, focal, center)
+        return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, radial), start, kind, where)
+    return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
+
+
+def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
+    points = list(_object(content, "points").values())
+    positions = [_vector(point.get("coordinates")) if isinstance(point, dict) else None for point in points]
+    if not points:
+        return None
+    if any(position is None for position in positions):
+        raise CaptureError(f"{where}: a point has no 3 finite 'coordinates'; the file is damaged")
+    colours = [_vector(point.get("color")) for point in points]
+    known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
+    return np.array(positions), np.array(known).round().astype(np.uint8)
+
+
+def _object(content: dict[str, Any], key: str) -> dict[str, Any]:
+    value = content.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _vector(value: Any) -> Float64[np.ndarray, "3"] | None:
+    numbers = [read_number(number) for number in value] if isinstance(value, list) else []
+    return None if len(numbers) != 3 or None in numbers else np.array(numbers, dtype=np.float64)
