@@ -1,6 +1,4 @@
-"""Pictures and folders of pictures, against Pillow and imagecodecs; OpenEXR, against the channels its library reads.
-
-"""
+"""Pictures and folders of pictures, against Pillow and imagecodecs; OpenEXR, against the channels its library reads."""
 
 import imagecodecs
 import numpy as np
