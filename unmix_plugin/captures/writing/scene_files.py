@@ -345,7 +345,7 @@ def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
     opacity = picture[..., 3:] / 255.0
     pixels = np.rint(picture[..., :3] * opacity + _BEHIND * (1 - opacity)).astype(np.uint8)
     matter = picture[..., 3] > 127
-    pixels[matter & ~ndimage.binary_erosion(matter, border_value=1)] = _OUTLINE
+    pixels[matter & np.logical_not(ndimage.binary_erosion(matter, border_value=1))] = _OUTLINE
     mask = view.record.paths.get("mask_path")
     if mask is not None:
         with Image.open(view.picture.parent.parent / mask) as opened:
