@@ -25,9 +25,9 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture
-from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer, num_channels
+from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
-from unmix_plugin.viewer.rendering.scene import SceneAids, SceneSource
+from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 
@@ -140,9 +140,7 @@ class FixedSpeed(_Speedometer):
 
 def make_loop(source, slow_speed=None):
     """A loop that waits to be driven; `slow_speed` is a speed at which moving pictures are small."""
-    with source.borrowed() as scene:
-        channels = num_channels(scene.materials)
-    maker = PictureMaker(source, SceneAids(source, has_materials=True), channels)
+    maker = PictureMaker(source)
     if slow_speed is not None:
         maker.speed = FixedSpeed(slow_speed)
     return RenderLoop(maker)

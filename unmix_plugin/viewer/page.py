@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -226,43 +226,3 @@ class Chart:
             scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
             with self._place:
                 self._handle = self._gui.add_uplot(data=data, series=series, scales=scales, aspect=1.5)
-
-
-_NOTICE_S = 8.0
-_LONGEST_NOTICE = 2000
-"""Characters."""
-
-
-class Notices:
-    """Notices in a corner of a client's page: warnings and notes on edits replace the ones before."""
-
-    def __init__(self, client: viser.ClientHandle) -> None:
-        self._client = client
-        self._warning: viser.NotificationHandle | None = None
-        self._warning_said = (-math.inf, "")
-        self._note: viser.NotificationHandle | None = None
-        self._notes: tuple[str, ...] = ()
-
-    def say(self, title: str, text: str, colour: Literal["teal", "red"] = "teal") -> viser.NotificationHandle:
-        """Show a notice."""
-        text = text[:_LONGEST_NOTICE]
-        return self._client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color=colour)
-
-    def warn(self, text: str, title: str) -> None:
-        """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
-        in 8 s."""
-        before, self._warning_said = self._warning_said, (time.monotonic(), text)
-        if before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S:
-            return
-        if self._warning is not None:
-            self._warning.remove()
-        self._warning = self.say(title, text, "red")
-
-    def show_notes(self, notes: tuple[str, ...]) -> None:
-        """Show what is new among the notes of the edit in force, in place of those shown before."""
-        new = [note for note in notes if note not in self._notes]
-        self._notes = notes
-        if new:
-            if self._note is not None:
-                self._note.remove()
-            self._note = self.say("edited", "; ".join(new))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import threading
 import time
@@ -9,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -26,9 +27,8 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layers import layers_of
 from unmix_plugin.viewer.layers.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
-from unmix_plugin.viewer.page import Notices, failures_said, number, paragraph
+from unmix_plugin.viewer.page import failures_said, number, paragraph
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
 from unmix_plugin.viewer.rendering.pictures import (
@@ -36,10 +36,9 @@ from unmix_plugin.viewer.rendering.pictures import (
     HEIGHT_BOUNDS,
     PictureMaker,
     Shown,
-    num_channels,
 )
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
-from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids, SceneSource, usable_views
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
@@ -121,17 +120,12 @@ class Services:
         with source.borrowed() as scene:
             for path in paths:
                 relit(scene, LightChoice(path), "of this run")
-            self.layers = layers_of(scene)
             self.has_materials = isinstance(scene, TrainedScene)
             self.lights: tuple[str, ...] = (
                 (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
             )
             """Names of the scene's lights, and the paths of those that a user gives."""
-            channels = (
-                num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
-            )
-        self.aids = SceneAids(source, self.has_materials)
-        self.maker = PictureMaker(source, self.aids, channels, self.layers)
+        self.maker = PictureMaker(source)
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
         """Every client's first recipe; endmembers are given by their numbers."""
@@ -167,15 +161,15 @@ class Services:
         """Read the scene; without it the viewer only lacks what was measured."""
         if self.has_materials:
             _ = self.usable_lights  # takes a second, which the first page need not wait for
-        missing = "the scene is not at hand: "
+        aids, missing = self.maker.aids, "the scene is not at hand: "
         with failures_said(
-            "the scene could not be read", lambda reason: self.aids.set_measured(None, missing + reason)
+            "the scene could not be read", lambda reason: aids.set_measured(None, missing + reason)
         ):
             scene = self.scene = self._read_scene()
             if self.has_materials and usable_views(scene):
-                self.aids.set_measured(MeasuredViews(scene, self.source))
+                aids.set_measured(MeasuredViews(scene, self.source))
             elif self.has_materials:
-                self.aids.set_measured(None, "no training view has all bands")
+                aids.set_measured(None, "no training view has all bands")
 
 
 def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
@@ -243,6 +237,10 @@ def browser_of(client: viser.ClientHandle) -> str:
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
 """JPEG quality of pictures that are soon replaced, and of those that stay."""
 
+_NOTICE_S = 8.0
+_LONGEST_NOTICE = 2000
+"""Characters."""
+
 _SMALL_PIXELS = 1 << 14
 """Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
 
@@ -301,12 +299,15 @@ class Session:
         self._status: viser.GuiHtmlHandle | None = None
         self._legend_shown = ""
         self._object_owners: set[str] = set()
-        self._notices = Notices(client)
+        self._warning: viser.NotificationHandle | None = None
+        self._warning_said = (-math.inf, "")
+        self._note: viser.NotificationHandle | None = None
+        self._notes: tuple[str, ...] = ()
 
     def _first_settings(self) -> LayerSettings:
         if self.services.has_materials:
             return first_settings(self.materials().bands)
-        layers = self.services.layers
+        layers = self.services.maker.layers
         return LayerSettings(layer="rgb" if "rgb" in layers else next(iter(layers), "rgb"))
 
     def open(self, panels: Sequence[Panel]) -> None:
@@ -330,7 +331,7 @@ class Session:
         if kept is None:
             self._moved(self.client.camera)
         else:
-            self.services.loop.move(view, kept)
+            self.services.loop.change(view, pose=kept)
             self.look_from(camera_of(kept, 64))
 
     def close(self) -> None:
@@ -363,19 +364,37 @@ class Session:
 
         return callback
 
-    def say(self, title: str, text: str) -> None:
-        """Show a notice."""
-        if not self.is_closed:
-            self._notices.say(title, text)
+    def say(self, title: str, text: str, colour: Literal["teal", "red"] = "teal") -> Any:
+        """Show a notice; its handle, None once the client has gone."""
+        if self.is_closed:
+            return None
+        text = text[:_LONGEST_NOTICE]
+        return self.client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color=colour)
 
     def warn(self, text: str, title: str = "not done") -> None:
-        """Show a warning in place of the one before."""
-        if not self.is_closed:
-            self._notices.warn(text, title)
+        """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
+        in 8 s."""
+        before, self._warning_said = self._warning_said, (time.monotonic(), text)
+        if self.is_closed or (before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S):
+            return
+        if self._warning is not None:
+            self._warning.remove()
+        self._warning = self.say(title, text, "red")
 
     def _show_notes(self, notes: tuple[str, ...]) -> None:
-        if not self.is_closed:
-            self._notices.show_notes(notes)
+        """Show what is new among the notes of the edit in force, in place of those shown before."""
+        new = [note for note in notes if note not in self._notes]
+        self._notes = notes
+        if new and not self.is_closed:
+            if self._note is not None:
+                self._note.remove()
+            self._note = self.say("edited", "; ".join(new))
+
+    def add_button(self, label: str, work: Callable[[], None]) -> viser.GuiButtonHandle:
+        """Add a button to the folder that is open, and do something when it is clicked."""
+        button = self.client.gui.add_button(label)
+        button.on_click(self.guarded(work))
+        return button
 
     def materials(self) -> Materials:
         """The materials as this client sees them."""
@@ -383,7 +402,7 @@ class Session:
 
     def colours_of(self, materials: Materials) -> list[tuple[float, ...]]:
         """sRGB colours that stand for materials."""
-        aids = self.services.aids.for_layers()
+        aids = self.services.maker.aids.for_layers()
         assert aids is not None
         return [tuple(row) for row in aids.colours_of(materials).tolist()]
 
@@ -394,7 +413,7 @@ class Session:
             UnmixError: the edit does not fit the run; nothing has changed.
         """
         notes = self.services.maker.edited(edit).notes
-        self.services.loop.change_edit(self.view, edit)
+        self.services.loop.change(self.view, edit=edit)
         for tell in self.on_edit:
             tell()
         self._show_notes(notes)
@@ -402,7 +421,8 @@ class Session:
     def show_objects(self, owner: str, has_some: bool) -> None:
         """Note whether a panel shows objects of the browser's own, which need depth to be hidden behind the picture."""
         (self._object_owners.add if has_some else self._object_owners.discard)(owner)
-        self.services.loop.want_depth(self.view, bool(self._object_owners))
+        if (wanted := bool(self._object_owners)) != self.view.wants_depth:
+            self.services.loop.change(self.view, wants_depth=wanted)
 
     def pose(self) -> ViewPose:
         """Where the client looks from now.
@@ -426,7 +446,7 @@ class Session:
         if self.is_closed:
             return
         with failures_said("the camera could not be read", self._report):
-            self.services.loop.move(self.view, pose_from(camera))
+            self.services.loop.change(self.view, pose=pose_from(camera))
 
     def _show(self, shown: Shown) -> None:
         if self.is_closed:

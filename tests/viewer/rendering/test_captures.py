@@ -16,16 +16,16 @@ from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.viewer.layers.layers import LAYERS
 from unmix_plugin.viewer.layers.painting import LayerSettings
-from unmix_plugin.viewer.rendering import captures
+from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import (
     SpectraCanvas,
-    StripCapture,
     VideoJob,
     VideoQueue,
     check_size,
     output_of,
     render_argv,
 )
+from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import sized_camera
 
@@ -37,7 +37,7 @@ def services(source):
     running.stop()
 
 
-def captured(services, camera, take, subpixels=1):
+def captured(services, camera, take):
     """Capture a picture strip by strip; what it ended with, and the parts told."""
     ended, reasons, parts = threading.Event(), [], []
 
@@ -45,18 +45,19 @@ def captured(services, camera, take, subpixels=1):
         reasons.append(reason)
         ended.set()
 
-    StripCapture(services.loop, camera, Edit(), subpixels, take, done, parts.append).start()
+    capture = Capture(camera, Edit(), 1, lambda *strip: take(capture, *strip), done, parts.append)
+    services.loop.capture(capture)
     assert ended.wait(120)
     return reasons[0], parts
 
 
 @pytest.mark.parametrize("layer", ["rgb", "depth", "segmentation"])
 def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, layer):
-    monkeypatch.setattr(captures, "_STRIP_PIXELS", 100)
+    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 100)
     camera = sized_camera(some_pose(), 31, 23)
     settings, pixels = LayerSettings(layer=layer), np.zeros((23, 31, 3), int)
 
-    def take(row, frame):
+    def take(_, row, frame):
         pixels[row : row + frame.camera.height] = services.maker.paint(frame, settings, False, False).picture
 
     reason, parts = captured(services, camera, take)
@@ -70,13 +71,13 @@ def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, 
 
 @pytest.mark.parametrize("is_line", [False, True])
 def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch, is_line):
-    monkeypatch.setattr(captures, "_STRIP_PIXELS", 64)
+    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 64)
     camera = sized_camera(some_pose(), 17, 13)
     if is_line:
         ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     canvas = SpectraCanvas(camera, 5)
-    reason, _ = captured(services, camera, canvas.take)
+    reason, _ = captured(services, camera, lambda _, *strip: canvas.take(*strip))
     assert reason == ""
     frame = make_frame(source, camera)
     np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
@@ -88,31 +89,20 @@ def test_a_strip_that_cannot_be_taken_ends_the_capture(services, caplog):
         raise OSError("the disk is full")
 
     reason, _ = captured(services, sized_camera(some_pose(), 16, 16), refuse)
-    assert reason == "OSError: the disk is full"
+    assert reason == "the picture could not be handed over: OSError: the disk is full"
     services.stop()
     assert "the disk is full" in caplog.text
 
 
 def test_a_capture_can_be_cancelled(services, monkeypatch):
-    monkeypatch.setattr(captures, "_STRIP_PIXELS", 64)
-    ended, reasons = threading.Event(), []
+    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 64)
 
-    def done(reason):
-        reasons.append(reason)
-        ended.set()
+    def cancel(capture, *_):
+        capture.is_cancelled = True
 
-    capture = StripCapture(
-        services.loop,
-        sized_camera(some_pose(), 100, 100),
-        Edit(),
-        1,
-        lambda *_: capture.cancel(),
-        done,
-        lambda _: None,
-    )
-    capture.start()
-    assert ended.wait(120)
-    assert reasons == ["cancelled"]
+    reason, parts = captured(services, sized_camera(some_pose(), 100, 100), cancel)
+    assert reason == "cancelled"
+    assert parts[-1] < 0.1
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ from unmix_plugin.viewer.rendering.pictures import (
     FrameRender,
     _finer_height,
     _moving_height,
+    _num_channels,
     _picture_depth,
     _Speedometer,
-    num_channels,
 )
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
@@ -41,7 +41,7 @@ def test_blocks_give_what_the_scene_gives_at_once(tmp_path, specular, subpixels,
             total += render.render_block(scene, block)
         frame = render.frame(scene)
         assert isinstance(frame, MaterialView)
-        assert num_channels(scene.materials) == expected.packed.shape[-1]
+        assert _num_channels(scene.materials) == expected.packed.shape[-1]
     assert total == render.num_rays == camera.width * camera.height * subpixels**2
     assert frame.coefficients.num_endmembers == expected.num_endmembers
     assert_close(frame.coefficients.packed, expected.packed, atol=1e-5, rtol=1e-5)

@@ -22,9 +22,9 @@ from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.viewer.layers.painting import LayerSettings
-from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, num_channels
+from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, _num_channels
 from unmix_plugin.viewer.rendering.render_loop import Capture
-from unmix_plugin.viewer.rendering.scene import Edit, SceneAids
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import camera_of
 
 
@@ -56,7 +56,7 @@ def rendered(monkeypatch):
 
 
 def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(loop, screen):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     last = finest(loop, screen)
     heights = [shown.picture.shape[0] for shown in screen.shown]
     assert last.picture.shape[:2] == (LARGEST, round(LARGEST * 1.5))
@@ -67,7 +67,7 @@ def test_a_movement_is_answered_with_a_small_picture_and_rest_with_finer_ones(lo
 
 
 def test_the_finest_picture_is_what_the_scene_renders(loop, screen, source):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     finish(loop)
     frame = screen.view.frame
     with source.borrowed() as scene:
@@ -76,12 +76,12 @@ def test_the_finest_picture_is_what_the_scene_renders(loop, screen, source):
 
 
 def test_switching_layers_renders_nothing(loop, screen, rendered):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     finish(loop)
     rendered.clear()
     for layer in ("segmentation", "band", "abundances", "pca", "depth", "rgb"):
         count = len(screen.shown)
-        loop.restyle(screen.view, LayerSettings(layer=layer))
+        loop.change(screen.view, settings=LayerSettings(layer=layer))
         finish(loop)
         assert len(screen.shown) == count + 1
         assert screen.shown[-1].picture.shape[0] == LARGEST
@@ -90,12 +90,12 @@ def test_switching_layers_renders_nothing(loop, screen, rendered):
 
 def test_a_movement_interrupts_what_is_refined(loop, screen):
     screen.view.largest_height = 256
-    loop.move(screen.view, some_pose(0))
+    loop.change(screen.view, pose=some_pose(0))
     assert loop.step()
     assert loop.step()
     assert screen.view.render is not None
     count = len(screen.shown)
-    loop.move(screen.view, some_pose(1))
+    loop.change(screen.view, pose=some_pose(1))
     assert loop.step()
     assert len(screen.shown) == count + 1
     assert screen.shown[-1].picture.shape[0] < 20
@@ -104,8 +104,8 @@ def test_a_movement_interrupts_what_is_refined(loop, screen):
 
 def test_only_the_last_of_many_movements_is_answered_and_refined(loop, screen):
     for index in range(40):
-        loop.move(screen.view, some_pose(index % 4))
-    loop.move(screen.view, some_pose(2))
+        loop.change(screen.view, pose=some_pose(index % 4))
+    loop.change(screen.view, pose=some_pose(2))
     finish(loop)
     heights = [shown.picture.shape[0] for shown in screen.shown]
     assert heights == sorted(set(heights))
@@ -117,8 +117,8 @@ def test_every_view_has_its_own_camera_size_and_layer(loop):
     for index, (screen, height) in enumerate(zip(screens, (16, 24, 32), strict=True)):
         screen.view.largest_height = height
         loop.add(screen.view)
-        loop.restyle(screen.view, LayerSettings(layer=("rgb", "depth", "segmentation")[index]))
-        loop.move(screen.view, some_pose(index))
+        loop.change(screen.view, settings=LayerSettings(layer=("rgb", "depth", "segmentation")[index]))
+        loop.change(screen.view, pose=some_pose(index))
     finish(loop)
     assert [screen.shown[-1].picture.shape[0] for screen in screens] == [16, 24, 32]
     assert len({screen.shown[-1].picture.mean() for screen in screens}) == 3
@@ -130,7 +130,7 @@ def test_nobody_starves_while_eight_move(loop):
         loop.add(screen.view)
     for _ in range(3 * len(screens)):
         for index, screen in enumerate(screens):  # all move more often than there is time to answer
-            loop.move(screen.view, some_pose(index % 4))
+            loop.change(screen.view, pose=some_pose(index % 4))
         assert loop.step()
     assert [len(screen.shown) for screen in screens] == [3] * len(screens)
     assert all(not screen.reports for screen in screens)
@@ -140,7 +140,7 @@ def test_those_at_rest_are_refined_in_turn(loop):
     screens = [Screen() for _ in range(4)]
     for screen in screens:
         loop.add(screen.view)
-        loop.move(screen.view, some_pose())
+        loop.change(screen.view, pose=some_pose())
         assert loop.step()
     blocks = []
     for _ in range(8):
@@ -151,21 +151,21 @@ def test_those_at_rest_are_refined_in_turn(loop):
 
 
 def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, screen, rendered):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     before = finest(loop, screen).picture
     rendered.clear()
-    loop.change_edit(screen.view, Edit(Recipe((Scale(0, 0.1),), Light("A"))))
+    loop.change(screen.view, edit=Edit(Recipe((Scale(0, 0.1),), Light("A"))))
     assert not np.array_equal(finest(loop, screen).picture, before)
     assert rendered == []
-    loop.change_edit(screen.view, Edit(Recipe((Remove((0, 1)),))))
+    loop.change(screen.view, edit=Edit(Recipe((Remove((0, 1)),))))
     finish(loop)
     assert rendered
-    loop.change_edit(screen.view, Edit())
+    loop.change(screen.view, edit=Edit())
     assert np.array_equal(finest(loop, screen).picture, before)
 
 
 def test_pages_need_not_wait_for_a_picture_that_is_being_refined(source):
-    maker = PictureMaker(source, SceneAids(source, has_materials=True), num_channels=9)
+    maker = PictureMaker(source)
     render, blocks, ended = FrameRender(camera_of(some_pose(), 2048)), [], threading.Event()
 
     def refine():
@@ -186,8 +186,8 @@ def test_pages_need_not_wait_for_a_picture_that_is_being_refined(source):
 
 
 def test_removed_materials_leave_no_faint_specks(loop, screen):
-    loop.change_edit(screen.view, Edit(Recipe((Remove((0,)),))))
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, edit=Edit(Recipe((Remove((0,)),))))
+    loop.change(screen.view, pose=some_pose())
     shown = finest(loop, screen).picture
     opacity = screen.view.frame.opacity.numpy()
     is_trace = (opacity > 0.01) & (opacity < 0.25)
@@ -197,22 +197,24 @@ def test_removed_materials_leave_no_faint_specks(loop, screen):
 
 
 def test_depth_is_sent_only_where_it_is_wanted(loop, screen):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     assert finest(loop, screen).depth is None
-    loop.want_depth(screen.view, True)
+    loop.change(screen.view, wants_depth=True)
     shown = finest(loop, screen)
     assert shown.depth is not None
     assert shown.depth.shape == shown.picture.shape[:2]
 
 
 def test_a_capture_is_rendered_beside_the_views(loop, screen):
-    results, parts = [], []
-    render = FrameRender(camera_of(some_pose(3), 40))
-    loop.capture(Capture(render, Edit(), lambda frame, reason: results.append((frame, reason)), parts.append))
-    loop.move(screen.view, some_pose())
+    reasons, rows, parts = [], [], []
+
+    def take(_, frame):
+        rows.append(frame.camera.height)
+
+    loop.capture(Capture(camera_of(some_pose(3), 40), Edit(), 1, take, reasons.append, parts.append))
+    loop.change(screen.view, pose=some_pose())
     finest(loop, screen)
-    ((frame, reason),) = results
-    assert (frame.camera.height, reason) == (40, "")
+    assert (rows, reasons) == ([40], [""])
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
 
@@ -226,8 +228,8 @@ def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, mo
         created.append((camera.height, subpixels))
 
     monkeypatch.setattr(FrameRender, "__init__", noting)
-    loop.move(screen.view, some_pose())
-    loop.change_quality(screen.view, 24, 2)
+    loop.change(screen.view, pose=some_pose())
+    loop.change(screen.view, largest_height=24, subpixels=2)
     finest(loop, screen)
     assert created[-1] == (24, 2)
     assert all(subpixels == 1 for height, subpixels in created[:-1])
@@ -238,21 +240,21 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     loop, screen = make_loop(source), Screen()
     screen.view.largest_height = 2048
     loop.add(screen.view)
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     picture = finest(loop, screen).picture
     with source.borrowed() as scene:
-        channels = num_channels(scene.materials)
+        channels = _num_channels(scene.materials)
     assert picture.shape[0] * picture.shape[1] * channels * 4 <= 20_000
 
 
 def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, screen):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     finish(loop)
-    loop.restyle(screen.view, LayerSettings(layer="error"))
+    loop.change(screen.view, settings=LayerSettings(layer="error"))
     finish(loop)
     assert screen.reports[-1].startswith("no error to show")
     count = len(screen.shown)
-    loop.restyle(screen.view, LayerSettings(layer="rgb"))
+    loop.change(screen.view, settings=LayerSettings(layer="rgb"))
     finish(loop)
     assert len(screen.shown) == count + 1
     assert screen.reports[-1] == ""
@@ -261,13 +263,13 @@ def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, scree
 def test_a_defect_in_a_picture_is_said_logged_and_ends_nothing(loop, screen, monkeypatch, caplog):
     original = FrameRender.render_block
     monkeypatch.setattr(FrameRender, "render_block", lambda *_: 1 / 0)
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     finish(loop)
     assert len(screen.reports) == 1  # not tried again and again
     assert "ZeroDivisionError" in screen.reports[0]
     assert "Traceback" in caplog.text
     monkeypatch.setattr(FrameRender, "render_block", original)
-    loop.move(screen.view, some_pose(1))
+    loop.change(screen.view, pose=some_pose(1))
     finest(loop, screen)
 
 
@@ -276,15 +278,15 @@ def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, scre
     gone.view.show = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
     gone.view.report = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
     loop.add(gone.view)
-    loop.move(gone.view, some_pose())
-    loop.move(screen.view, some_pose())
+    loop.change(gone.view, pose=some_pose())
+    loop.change(screen.view, pose=some_pose())
     finest(loop, screen)
     assert "ConnectionError" in caplog.text
 
 
 def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen):
     screen.view.largest_height = 256
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     assert loop.step()
     assert loop.step()
     loop.remove(screen.view)
@@ -296,9 +298,9 @@ def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen
 
 
 def test_an_edit_that_does_not_fit_is_said(loop, screen):
-    loop.move(screen.view, some_pose())
+    loop.change(screen.view, pose=some_pose())
     finish(loop)
-    loop.change_edit(screen.view, Edit(Recipe((Scale(99, 2.0),))))
+    loop.change(screen.view, edit=Edit(Recipe((Scale(99, 2.0),))))
     finish(loop)
     assert "there is no endmember 99" in screen.reports[-1]
     assert "Error" not in screen.reports[-1]
@@ -307,8 +309,7 @@ def test_an_edit_that_does_not_fit_is_said(loop, screen):
 def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
     reasons = []
     for _ in range(2):
-        render = FrameRender(camera_of(some_pose(), 400))
-        loop.capture(Capture(render, Edit(), lambda _, reason: reasons.append(reason)))
+        loop.capture(Capture(camera_of(some_pose(), 400), Edit(), 1, unwanted, reasons.append))
     loop._captures[0].is_cancelled = True
     assert loop.step()
     loop.stop()
@@ -317,12 +318,14 @@ def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
 
 def test_a_capture_that_ends_while_the_loop_is_stopped_is_told_once(loop):
     reasons = []
-    render = FrameRender(camera_of(some_pose(), 16))
-    capture = Capture(render, Edit(), lambda _, reason: reasons.append(reason), lambda _: loop.stop())
-    loop.capture(capture)
-    while loop.step():
-        pass
+    camera = camera_of(some_pose(), 16)
+    loop.capture(Capture(camera, Edit(), 1, unwanted, reasons.append, lambda _: loop.stop()))
+    finish(loop)
     assert reasons == ["the viewer was stopped"]
+
+
+def unwanted(*_):
+    raise AssertionError("this capture has no end")
 
 
 def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
@@ -333,7 +336,7 @@ def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
         screen = Screen()
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
-        loop.move(screen.view, some_pose())
+        loop.change(screen.view, pose=some_pose())
         until = time.monotonic() + 120
         while len(screen.shown) < 6:
             assert time.monotonic() < until
@@ -354,7 +357,7 @@ def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
         loop.add(screen.view)
         with control.running():
             for _ in range(5):
-                loop.move(screen.view, some_pose())
+                loop.change(screen.view, pose=some_pose())
                 with control.device.training_turn(), torch.no_grad():
                     model.endmembers.mul_(0.5)
         version = source.version

@@ -20,7 +20,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.panels.probe import _take_probe
 from unmix_plugin.viewer.rendering import scene as scene_module
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
-from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneAids
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
 
 
 @pytest.fixture
@@ -194,10 +194,11 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
 def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, source, monkeypatch):
     camera = scene.cameras[scene.train_indices[1]]
     ball = replace(source, take=lambda: ball_frame(camera).scene)
-    maker = PictureMaker(ball, SceneAids(ball, has_materials=True), num_channels=8)
+    maker = PictureMaker(ball)
+    maker.aids.set_measured(views)
     turns, turn = [], source.device.guest_turn
     monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
-    taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1, views)
+    taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1)
     assert len(turns) == 1
     assert taken.measured_in == scene.frames[scene.train_indices[1]].name
     expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]

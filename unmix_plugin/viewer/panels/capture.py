@@ -22,12 +22,12 @@ from unmix_plugin.viewer.page import new_file, number
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
     SpectraCanvas,
-    StripCapture,
     VideoJob,
     check_size,
     output_of,
     render_argv,
 )
+from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, path_poses, sized_camera
 
@@ -44,7 +44,7 @@ class CapturePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._capture: StripCapture | None = None
+        self._capture: Capture | None = None
         self._video: VideoJob | None = None
         self._keys: list[ViewPose] = []
         self._preview = threading.Event()
@@ -54,12 +54,12 @@ class CapturePanel:
             self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
             self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
-            self._add_button("save a screenshot (PNG)", self._save_picture)
+            session.add_button("save a screenshot (PNG)", self._save_picture)
             if session.services.has_materials:
-                self._add_button("save the spectra (EXR)", self._save_spectra)
-            self._add_button("cancel", self._cancel)
+                session.add_button("save the spectra (EXR)", self._save_spectra)
+            session.add_button("cancel", self._cancel)
         with gui.add_folder("camera path"):
-            self._add_button("add a key frame here", self._add_key)
+            session.add_button("add a key frame here", self._add_key)
             self._key = gui.add_dropdown("key frame", _NO_KEYS)
             keys = gui.add_button_group("this one", ("look", "replace", "remove"))
             keys.on_click(session.guarded(lambda: self._change_key(str(keys.value))))
@@ -68,34 +68,22 @@ class CapturePanel:
             self._fps = gui.add_number("frames a second", 24, min=_FPS_BOUNDS[0], max=_FPS_BOUNDS[1], step=1)
             preview = gui.add_button_group("preview", ("play", "stop"))
             preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
-            self._add_button("save the path", lambda: session.say("saved", str(self._save_path())))
-            self._add_button("render a video", self._render_video)
-            self._add_button("cancel the video", self._cancel_video)
+            session.add_button("save the path", lambda: session.say("saved", str(self._save_path())))
+            session.add_button("render a video", self._render_video)
+            session.add_button("cancel the video", self._cancel_video)
             self._video_progress = gui.add_progress_bar(0.0)
-        session.on_close.append(self._abandon)
-
-    def _add_button(self, label: str, work: Callable[[], None]) -> None:
-        self._session.client.gui.add_button(label).on_click(self._session.guarded(work))
+        session.on_close += [lambda: self._preview.set(), self._cancel]
 
     def _show_progress(self, bar: Any, fraction: float) -> None:
         if not self._session.is_closed:
             bar.value = 100.0 * fraction
 
-    def _abandon(self) -> None:
-        """Nobody waits for what is under way."""
-        self._preview.set()
-        self._cancel()
-
     def _cancel(self) -> None:
         if self._capture is not None:
-            self._capture.cancel()
+            self._capture.is_cancelled = True
 
     def _camera(self, num_bands: int | None = None) -> Cameras:
-        """What the client sees, in the size asked for: the vertical field of view stays.
-
-        Raises:
-            ConfigError: too small or too large a picture, or one with too many spectra.
-        """
+        """What the client sees, in the size asked for, which is checked: the vertical field of view stays."""
         width, height = _side(self._width), _side(self._height)
         check_size(width, height, num_bands)
         return sized_camera(self._session.pose(), width, height)
@@ -137,10 +125,9 @@ class CapturePanel:
             else:
                 session.guarded(finish)()
 
-        view, loop = session.view, session.services.loop
         show = partial(self._show_progress, self._progress)
-        self._capture = StripCapture(loop, camera, view.edit, view.subpixels, take, done, show)
-        self._capture.start()
+        self._capture = Capture(camera, session.view.edit, session.view.subpixels, take, done, show)
+        session.services.loop.capture(self._capture)
 
     def _new_file(self, suffix: str) -> Path:
         return new_file(self._session.services.folder, self._name.value, suffix, "view")
@@ -177,11 +164,7 @@ class CapturePanel:
             self._list_keys(index)
 
     def _path(self, frames_per_second: float) -> list[ViewPose]:
-        """The path through the key frames.
-
-        Raises:
-            ConfigError: there are fewer than two.
-        """
+        """The path through the key frames; a ConfigError where there are fewer than two."""
         seconds = number(self._seconds.value, *_SECONDS_BOUNDS, fallback=4.0)
         return path_poses(self._keys, max(2, round(seconds * frames_per_second)))
 
@@ -249,11 +232,7 @@ class CapturePanel:
 
 
 def _side(control: Any) -> int:
-    """A width or height that was typed.
-
-    Raises:
-        ConfigError: it is out of bounds.
-    """
+    """A width or height that was typed; a ConfigError if it is out of bounds."""
     low, high = SIDE_BOUNDS
     found = number(control.value, -math.inf, math.inf, fallback=0)
     if not low <= found <= high:

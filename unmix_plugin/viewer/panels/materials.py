@@ -87,40 +87,31 @@ class MaterialsPanel:
         self._listing = self._gui.add_html("")
         self._light = self._gui.add_dropdown("light", self._lights())
         self._on(self._light, self._change_light)
-        self._add_history()
+        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start again"))
+        buttons.on_click(session.guarded(lambda: self._step(buttons.value)))
         names = session.materials().names
         self._chosen = self._gui.add_dropdown("endmember", names)
         self._on(self._chosen, self._choose)
         self._add_changes(names)
         self._chart = Chart(self._gui, "spectra under the light")
-        self._add_files()
-        self._show_materials()
-        session.on_edit.append(self._show_materials)
-
-    def _add_history(self) -> None:
-        """Buttons to go back and forth."""
-        buttons = self._gui.add_button_group("changes", ("undo", "redo", "start again"))
-
-        def step() -> None:
-            history = self._session.history
-            if buttons.value == "start again":
-                self._change_recipe(Recipe())
-                return
-            recipe = history.undone() if buttons.value == "undo" else history.redone()
-            if recipe is None:
-                raise ConfigError("there is nothing more to undo or redo")
-            self._session.change_edit(Edit(recipe))
-
-        buttons.on_click(self._session.guarded(step))
-
-    def _add_files(self) -> None:
-        """The recipe's text, and files of the run folder to save it to and to load it from."""
         with self._gui.add_folder("recipes"):
             self._text = self._gui.add_text("recipe", "", multiline=True, disabled=True)
             self._recipe_name = self._gui.add_text("save as", "recipe")
-            self._gui.add_button("save").on_click(self._session.guarded(self._save))
+            session.add_button("save", self._save)
             self._saved = self._gui.add_dropdown("saved", self._files())
-            self._gui.add_button("load").on_click(self._session.guarded(self._load))
+            session.add_button("load", self._load)
+        self._show_materials()
+        session.on_edit.append(self._show_materials)
+
+    def _step(self, action: str) -> None:
+        history = self._session.history
+        if action == "start again":
+            self._change_recipe(Recipe())
+            return
+        recipe = history.undone() if action == "undo" else history.redone()
+        if recipe is None:
+            raise ConfigError("there is nothing more to undo or redo")
+        self._session.change_edit(Edit(recipe))
 
     def _save(self) -> None:
         content = recipe_to_yaml(self._recipe).encode()
@@ -157,10 +148,10 @@ class MaterialsPanel:
             self._gloss_colour = gui.add_rgb("colour of gloss", _WHITE)
             self._name = gui.add_text("name", names[0])
             self._library = gui.add_dropdown("known material", measured_library().names)
-            replace_button = gui.add_button("replace by the known material")
+            self._session.add_button("replace by the known material", self._replace)
             self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
-            swap_button = gui.add_button("swap with the other")
-        self._on(self._factor, lambda: self._change(Scale(self._index, _factor(self._factor.value))))
+            self._session.add_button("swap with the other", self._swap)
+        self._on(self._factor, lambda: self._change(Scale(self._index, _factor(self._factor))))
         self._on(self._colour, lambda: self._change(Retint(self._index, _srgb(self._colour.value))))
         for control in (self._gloss, self._gloss_colour):
             self._on(control, self._change_gloss)
@@ -169,8 +160,6 @@ class MaterialsPanel:
         self._typed_name = Debounced(self._rename)
         self._on(self._name, self._type_name)
         self._session.on_tick.append(self._typed_name.tick)
-        replace_button.on_click(self._session.guarded(self._replace))
-        swap_button.on_click(self._session.guarded(self._swap))
 
     @property
     def _recipe(self) -> Recipe:
@@ -222,19 +211,16 @@ class MaterialsPanel:
 
     def _change_visibility(self, control: Any) -> None:
         hidden, _ = visibility(self._recipe)
-        index = self._index
-        if control is self._is_alone:
-            alone = index if self._is_alone.value is True else None
-            changed = with_visible(self._recipe, hidden - {index}, alone)
-        else:
-            now_hidden = hidden - {index} if self._is_visible.value is True else hidden | {index}
-            changed = with_visible(self._recipe, now_hidden, None)
-        self._change_recipe(changed)
+        index, is_on = self._index, control.value is True
+        is_hidden = control is self._is_visible and not is_on
+        alone = index if control is self._is_alone and is_on else None
+        hidden = hidden | {index} if is_hidden else hidden - {index}
+        self._change_recipe(with_visible(self._recipe, hidden, alone))
 
     def _change_gloss(self) -> None:
         is_white = tuple(self._gloss_colour.value[:3]) == _WHITE
         colour = None if is_white else _srgb(self._gloss_colour.value)
-        self._change(Gloss(self._index, _factor(self._gloss.value), colour))
+        self._change(Gloss(self._index, _factor(self._gloss), colour))
 
     def _replace(self) -> None:
         known = LibrarySpectrum(text(self._library.value))
@@ -316,8 +302,8 @@ class MaterialsPanel:
         return swatches(entries)
 
 
-def _factor(value: Any) -> float:
-    return number(value, *_FACTOR_BOUNDS, fallback=1.0)
+def _factor(slider: Any) -> float:
+    return number(slider.value, *_FACTOR_BOUNDS, fallback=1.0)
 
 
 def _srgb(value: Any) -> tuple[float, float, float]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
-from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
+from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import camera_of
 
@@ -83,17 +83,12 @@ def _probe_through(
 
 
 def _take_probe(
-    maker: PictureMaker,
-    edit: Edit,
-    camera: Cameras,
-    place: tuple[float, float],
-    number: int,
-    measured: MeasuredViews | None = None,
+    maker: PictureMaker, edit: Edit, camera: Cameras, place: tuple[float, float], number: int
 ) -> _ProbedPoint:
     """What is seen through a point (column, row) of a picture, and what a training view measured there."""
     with maker.edit_turn(edit) as (scene, shown):
         taken = _probe_through(shown, camera, *place, number)
-        point = torch.tensor(taken.point)
+        measured, point = maker.aids.measured, torch.tensor(taken.point)
         found = measured and measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
         return taken
@@ -127,12 +122,6 @@ def _abundances_csv(probes: Sequence[_ProbedPoint]) -> bytes:
         for one in probes
     ]
     return _csv(header, rows)
-
-
-def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    return text.getvalue().encode()
 
 
 _MOST_PROBES = 12
@@ -171,21 +160,15 @@ class ProbePanel:
         self._bars = gui.add_html("")
         self._chart = Chart(gui, "spectrum")
         self._comparison = Chart(gui, "all probes")
-        gui.add_button("save as CSV").on_click(session.guarded(self._save))
-        gui.add_button("forget all").on_click(session.guarded(self._forget))
-        session.client.scene.on_click()(
-            lambda event: session.guarded(lambda: self._take(*event.screen_pos))()
-        )
+        session.add_button("save as CSV", self._save)
+        session.add_button("forget all", self._forget)
+        _on_click(session, self._take)
 
-    def _take(self, x: Any, y: Any) -> None:
-        """Probe a point of the canvas, given in parts of its width and height."""
+    def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         if self._is_on.value is not True:
             return
         session, services = self._session, self._session.services
-        camera, place = _clicked(session, x, y)
-        taken = _take_probe(
-            services.maker, session.view.edit, camera, place, self._taken + 1, services.aids.measured
-        )
+        taken = _take_probe(services.maker, session.view.edit, camera, place, self._taken + 1)
         self._taken += 1
         self._probes.append(taken)
         while len(self._probes) > _MOST_PROBES:
@@ -253,19 +236,29 @@ class ProbePanel:
         self._markers.pop(one.number).remove()
 
 
+def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([header, *rows])
+    return text.getvalue().encode()
+
+
+def _on_click(session: Session, work: Callable[[Cameras, tuple[float, float]], None]) -> None:
+    """Do something at each click, with the camera of the canvas and the column and row that were clicked."""
+
+    def clicked(*place: Any) -> None:
+        camera = camera_of(session.pose(), _PROBED_ROWS)
+        x, y = (number(value, 0.0, 1.0, fallback=0.5) for value in place)
+        work(camera, (min(x * camera.width, camera.width - 1), min(y * camera.height, camera.height - 1)))
+
+    session.client.scene.on_click()(lambda event: session.guarded(lambda: clicked(*event.screen_pos))())
+
+
 def _label(one: _ProbedPoint) -> str:
     return f"{one.number}: {one.name}"
 
 
 def _colour(one: _ProbedPoint) -> tuple[float, float, float]:
     return _COLOURS[(one.number - 1) % len(_COLOURS)]
-
-
-def _clicked(session: Session, x: Any, y: Any) -> tuple[Cameras, tuple[float, float]]:
-    """The camera of a client's canvas, and the column and row of a click given in parts of its width and height."""
-    camera = camera_of(session.pose(), _PROBED_ROWS)
-    x, y = (number(value, 0.0, 1.0, fallback=0.5) for value in (x, y))
-    return camera, (min(x * camera.width, camera.width - 1), min(y * camera.height, camera.height - 1))
 
 
 _MOST_NUMBERS = 8
@@ -277,12 +270,10 @@ class ValuesPanel:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._text = session.client.gui.add_html(paragraph(_INVITATION))
-        session.client.scene.on_click()(
-            lambda event: session.guarded(lambda: self._take(*event.screen_pos))()
-        )
+        _on_click(session, self._take)
 
-    def _take(self, x: Any, y: Any) -> None:
-        camera, (column, row) = _clicked(self._session, x, y)
+    def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
+        column, row = place
         with self._session.services.source.borrowed() as scene:
             found = scene.probe(camera, int(column), int(row))
         rows = [

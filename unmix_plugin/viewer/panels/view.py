@@ -33,7 +33,6 @@ from unmix_plugin.viewer.view_cameras import pose_of
 if TYPE_CHECKING:
     import viser
 
-_TRANSFORMS = {title: name for name, title in VIEW_TRANSFORMS.items()}
 _NO_INDEX = "none for these bands"
 
 
@@ -45,19 +44,24 @@ class LayerPanel:
         self._settings = settings = session.view.settings
         self._gui = session.client.gui
         self._of_control: dict[str, list[Any]] = {}
-        self._layers = session.services.layers
+        self._layers = session.services.maker.layers
         titles = {one.title: name for name, one in self._layers.items()}
         shown = layer_named(settings.layer, self._layers).title
         layer = self._gui.add_dropdown("layer", tuple(titles), initial_value=shown)
-        self._connect(layer, "layer", lambda: titles.get(layer.value, layer.value))
+        self._connect(layer, "layer", read=lambda: titles.get(layer.value, layer.value))
         if session.services.has_materials:
             self._add_spectral(session.materials())
         self._add_scale()
-        self._add_tone()
-        background = self._gui.add_dropdown(
-            "background", tuple(BACKGROUNDS), initial_value=settings.background
-        )
-        self._connect(background, "background", lambda: background.value)
+        exposure = self._gui.add_slider("exposure (stops)", *EXPOSURE_BOUNDS, 0.1, settings.exposure_ev)
+        self._connect(exposure, "exposure_ev", "tone")
+        self._connect(self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma), "gamma", "tone")
+        transforms = {title: name for name, title in VIEW_TRANSFORMS.items()}
+        shown = VIEW_TRANSFORMS[settings.view_transform]
+        transform = self._gui.add_dropdown("tones", tuple(transforms), initial_value=shown)
+        self._connect(transform, "view_transform", "tone", lambda: transforms.get(transform.value))
+        backgrounds = tuple(BACKGROUNDS)
+        background = self._gui.add_dropdown("background", backgrounds, initial_value=settings.background)
+        self._connect(background, "background")
         self._show_controls()
 
     def _add_spectral(self, materials: Materials) -> None:
@@ -67,18 +71,18 @@ class LayerPanel:
         step = round(max((high_nm - low_nm) / 500, 0.01), 2)
         start = covered(bands, settings.wavelength_nm)
         wavelength = self._gui.add_slider("wavelength (nm)", low_nm, high_nm, step, start)
-        self._connect(wavelength, "wavelength_nm", lambda: wavelength.value, "wavelength")
+        self._connect(wavelength, "wavelength_nm", "wavelength")
         sliders = [
             self._gui.add_slider(f"{name} (nm)", low_nm, high_nm, step, start)
             for name, start in zip(("red", "green", "blue"), settings.false_colour_nm, strict=True)
         ]
         for slider in sliders:
             self._connect(
-                slider, "false_colour_nm", lambda: tuple(one.value for one in sliders), "false-colour"
+                slider, "false_colour_nm", "false-colour", lambda: tuple(one.value for one in sliders)
             )
         name = materials.names[min(settings.endmember, len(materials.names) - 1)]
         self._endmember = self._gui.add_dropdown("endmember", materials.names, initial_value=name)
-        self._connect(self._endmember, "endmember", lambda: index_in(self._endmember), "endmember")
+        self._connect(self._endmember, "endmember", "endmember", lambda: index_in(self._endmember))
         self._add_index(bands)
         self._session.on_edit.append(self._show_names)
 
@@ -105,7 +109,7 @@ class LayerPanel:
         def chosen() -> str:
             return text(formula.value).strip() or (text(known.value) if names else "")
 
-        self._connect(known, "index", chosen, "index")
+        self._connect(known, "index", "index", chosen)
         self._of_control["index"].append(formula)
         typed = Debounced(lambda: self._change("index", chosen))
         formula.on_update(self._session.guarded(typed.note))
@@ -113,7 +117,7 @@ class LayerPanel:
 
     def _add_scale(self) -> None:
         colour_map = self._gui.add_dropdown("colours", COLOUR_MAPS, initial_value=self._settings.colour_map)
-        self._connect(colour_map, "colour_map", lambda: colour_map.value, "scale")
+        self._connect(colour_map, "colour_map", "scale")
         own_range = self._settings.value_range
         is_own = self._gui.add_checkbox(
             "own range", own_range is not None, hint="Choose the values at the ends of the colour map."
@@ -132,31 +136,24 @@ class LayerPanel:
                     end.value = value
 
         is_own.on_update(self._session.guarded(start_from_shown))
-        self._connect(is_own, "value_range", value_range, "scale")
+        self._connect(is_own, "value_range", "scale", value_range)
         for end in ends:
-            self._connect(end, "value_range", value_range, "own-range")
+            self._connect(end, "value_range", "own-range", value_range)
 
-    def _add_tone(self) -> None:
-        settings = self._settings
-        exposure = self._gui.add_slider("exposure (stops)", *EXPOSURE_BOUNDS, 0.1, settings.exposure_ev)
-        self._connect(exposure, "exposure_ev", lambda: exposure.value, "tone")
-        gamma = self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma)
-        self._connect(gamma, "gamma", lambda: gamma.value, "tone")
-        shown = VIEW_TRANSFORMS[settings.view_transform]
-        transform = self._gui.add_dropdown("tones", tuple(_TRANSFORMS), initial_value=shown)
-        self._connect(transform, "view_transform", lambda: _TRANSFORMS.get(transform.value), "tone")
-
-    def _connect(self, control: Any, setting: str, read: Callable[[], Any], kind: str | None = None) -> None:
-        """Let a control change a setting, checked; show it only for layers that have its kind."""
+    def _connect(
+        self, control: Any, setting: str, kind: str | None = None, read: Callable[[], Any] | None = None
+    ) -> None:
+        """Let a control, or what `read` says, change a setting, checked; show it only for layers that have its kind."""
         if kind is not None:
             self._of_control.setdefault(kind, []).append(control)
+        read = read or (lambda: control.value)
         control.on_update(self._session.guarded(lambda: self._change(setting, read)))
 
     def _change(self, setting: str, read: Callable[[], Any]) -> None:
         self._settings = self._settings.changed(setting, read())
         if setting in ("layer", "value_range"):
             self._show_controls()
-        self._session.services.loop.restyle(self._session.view, self._settings)
+        self._session.services.loop.change(self._session.view, settings=self._settings)
 
     def _show_controls(self) -> None:
         wanted = layer_named(self._settings.layer, self._layers).controls
@@ -198,7 +195,7 @@ class LightPanel:
             number(self._exposure.value, *_BRIGHTNESS_BOUNDS, fallback=0.0),
         )
         view = self._session.view
-        self._session.services.loop.change_edit(view, Edit(view.edit.recipe, light))
+        self._session.services.loop.change(view, edit=Edit(view.edit.recipe, light))
 
 
 _HEIGHT_STEP = 16
@@ -221,7 +218,7 @@ class ScenePanel:
         self._views = {view.name: view.camera for view in services.views}
         with gui.add_folder("camera"):
             self._view = gui.add_dropdown("view of the scene", tuple(self._views))
-            gui.add_button("look from there").on_click(session.guarded(self._look_from_view))
+            session.add_button("look from there", self._look_from_view)
         with gui.add_folder("quality"):
             self._height = gui.add_slider(
                 "finest picture (rows)", *HEIGHT_BOUNDS, _HEIGHT_STEP, session.view.largest_height
@@ -262,7 +259,7 @@ class ScenePanel:
     def _change_quality(self) -> None:
         height = int(number(self._height.value, *HEIGHT_BOUNDS, fallback=DEFAULT_HEIGHT))
         subpixels = int(number(self._subpixels.value, *SUBPIXEL_BOUNDS, fallback=1))
-        self._session.services.loop.change_quality(self._session.view, height, subpixels)
+        self._session.services.loop.change(self._session.view, largest_height=height, subpixels=subpixels)
 
     def _add_cameras(self) -> list[viser.CameraFrustumHandle]:
         """A frustum for each view, with its image where there is one; a click looks from there."""
@@ -299,7 +296,7 @@ class ScenePanel:
 
     def _add_points(self) -> list[viser.PointCloudHandle]:
         """Surface points in the colours that the materials have now; every n-th where there are too many."""
-        aids, materials = self._session.services.aids.for_layers(), self._session.materials()
+        aids, materials = self._session.services.maker.aids.for_layers(), self._session.materials()
         assert aids is not None
         spectra, points = aids.reference.spectra(materials), aids.reference.points.cpu().numpy()
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)

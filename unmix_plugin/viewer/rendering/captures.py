@@ -1,5 +1,4 @@
-"""What leaves the viewer: pictures of any size, rendered strip by strip beside the views so that memory does not grow
-with resolution, and videos, rendered by `unmix-render` in a process of its own.
+"""What leaves the viewer: spectra of the view, and videos, rendered by `unmix-render` in a process of its own.
 
 Notation: `H x W` pixels, `B` bands.
 """
@@ -14,7 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +27,12 @@ from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.layers.painting import LayerSettings
-from unmix_plugin.viewer.rendering.pictures import FrameRender
-from unmix_plugin.viewer.rendering.render_loop import Capture, RenderLoop
-from unmix_plugin.viewer.rendering.scene import Edit
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""
 
 _MOST_PIXELS = 1 << 25
 _LARGEST_SPECTRA_BYTES = 1 << 29
-_STRIP_PIXELS = 1 << 17
 
 
 def check_size(width: int, height: int, num_bands: int | None = None) -> None:
@@ -57,64 +52,6 @@ def check_size(width: int, height: int, num_bands: int | None = None) -> None:
             f"spectra of {width} x {height} pixels are too much for the viewer; choose at most "
             f"{most / 1e6:.1f} million pixels, or render with unmix-render"
         )
-
-
-@dataclass(eq=False)
-class StripCapture:
-    """Renders a picture in strips from top to bottom and hands each on, once started."""
-
-    loop: RenderLoop
-    """Renders between what is more urgent."""
-    camera: Cameras
-    """One camera."""
-    edit: Edit
-    subpixels: int
-    """Rays through a pixel along each of its edges."""
-    take: Callable[[int, RenderedView], None]
-    """Takes the first row of a strip and the strip."""
-    done: Callable[[str], None]
-    """Told the end: an empty text, or what went wrong."""
-    progress: Callable[[float], None]
-    """Told the part that is rendered."""
-    _first_row: int = 0
-    _capture: Capture | None = field(default=None, repr=False)
-    _is_cancelled: bool = False
-
-    def start(self) -> None:
-        """Begin with the first strip, or go on with the next."""
-        width, height, first = self.camera.width, self.camera.height, self._first_row
-        count = min(max(1, _STRIP_PIXELS // width), height - first)
-        strip = self.camera.crop(0, first, width, count)
-        self._capture = Capture(
-            FrameRender(strip, self.subpixels, is_finished=True),
-            self.edit,
-            self._strip_done,
-            lambda fraction: self.progress((first + count * fraction) / height),
-        )
-        self.loop.capture(self._capture)
-
-    def cancel(self) -> None:
-        """Stop after the block under way."""
-        self._is_cancelled = True
-        if self._capture is not None:
-            self._capture.is_cancelled = True
-
-    def _strip_done(self, frame: RenderedView | None, reason: str) -> None:
-        if frame is None:
-            self.done(reason)
-            return
-        try:
-            self.take(self._first_row, frame)
-            self._first_row += frame.camera.height
-            if self._is_cancelled:
-                self.done("cancelled")
-            elif self._first_row < self.camera.height:
-                self.start()
-            else:
-                self.done("")
-        except Exception as error:
-            self.done(f"{type(error).__name__}: {error}")
-            raise
 
 
 class SpectraCanvas:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
@@ -28,7 +28,7 @@ from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layers import LAYERS, Layer, layer_named
+from unmix_plugin.viewer.layers.layers import layer_named, layers_of
 from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, as_bytes
 from unmix_plugin.viewer.rendering.scene import Edit, SceneAids, SceneSource
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
@@ -180,7 +180,7 @@ class FrameRender:
         return view if self._before is None else self._before.averaged(view)
 
 
-def num_channels(materials: Materials) -> int:
+def _num_channels(materials: Materials) -> int:
     """Coefficients of a pixel."""
     return 2 + 2 * len(materials.endmembers) + len(materials.specular_spectra)
 
@@ -257,26 +257,18 @@ LARGEST_FRAME_BYTES = 1 << 26
 class PictureMaker:
     """Renders and paints with one model; used by one thread at a time."""
 
-    def __init__(
-        self,
-        source: SceneSource,
-        aids: SceneAids,
-        num_channels: int,
-        layers: Mapping[str, Layer] = LAYERS,
-    ) -> None:
-        """
-        Args:
-            source: The model.
-            aids: What layers and edits need of it.
-            num_channels: Numbers a pixel that a frame keeps.
-            layers: What can be shown, by name.
-        """
-        self.speed = _Speedometer()
+    def __init__(self, source: SceneSource) -> None:
         self.source = source
-        self._aids = aids
+        self.speed = _Speedometer()
+        with source.borrowed() as scene:
+            self.layers = layers_of(scene)
+            """What can be shown, by name."""
+            self.aids = SceneAids(source, isinstance(scene, TrainedScene))
+            numbers = (
+                _num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
+            )
+        self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
         self._queue, self._num_asking = threading.Condition(), 0
-        self._layers = layers
-        self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * num_channels))
 
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
         """A small picture, for a camera that moved."""
@@ -313,7 +305,7 @@ class PictureMaker:
         with self._queue:
             self._queue.wait_for(lambda: self._num_asking == 0, _LONGEST_WAIT_S)
         with self.source.borrowed(cost) as scene, torch.no_grad():
-            shown = edit.apply(scene, self.source.version, self._aids.see)
+            shown = edit.apply(scene, self.source.version, self.aids.see)
             started = time.perf_counter()
             rays = render.render_block(shown, num_rays)
             if shown.device.type == "cuda":
@@ -335,7 +327,7 @@ class PictureMaker:
                 scene = stack.enter_context(self.source.borrowed_materials())
             finally:
                 self._ask(-1)
-            shown = edit.apply(scene, self.source.version, self._aids.see)
+            shown = edit.apply(scene, self.source.version, self.aids.see)
             yield scene, require_materials(shown, "of this run")
 
     def _ask(self, change: int) -> None:
@@ -354,7 +346,7 @@ class PictureMaker:
         Raises:
             UnmixError: the layer can't be shown.
         """
-        layer, aids = layer_named(settings.layer, self._layers), self._aids.for_layers()
+        layer, aids = layer_named(settings.layer, self.layers), self.aids.for_layers()
         with torch.no_grad():
             frame = _without_traces(frame)
             picture, legend = layer.paint(frame, settings, aids)

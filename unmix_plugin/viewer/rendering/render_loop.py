@@ -10,7 +10,9 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.page import failures_said
@@ -27,6 +29,8 @@ from unmix_plugin.viewer.view_cameras import ViewPose
 
 _POLL_S = 0.05
 _JOIN_S = 20.0
+_STRIP_PIXELS = 1 << 17
+"""Pixels of a capture that are held at once."""
 
 
 @dataclass(eq=False)
@@ -53,7 +57,7 @@ class View:
     frame_version: int = -1
     """The model's version that `frame` shows."""
     moved_at: float | None = None
-    """When the first camera movement without a picture yet came; None if there is none."""
+    """When the first change without a picture yet came that needs rendering; None if there is none."""
     restyled_at: float | None = None
     """The same for changes that need no rendering."""
     render: FrameRender | None = None
@@ -75,16 +79,24 @@ class View:
 
 @dataclass(eq=False)
 class Capture:
-    """A picture to be rendered apart from any view, of any size, when there is nothing more urgent."""
+    """A picture of any size, rendered strip by strip apart from any view, when there is nothing more urgent."""
 
-    render: FrameRender
+    camera: Cameras
+    """One camera."""
     edit: Edit
-    done: Callable[[RenderedView | None, str], None]
-    """Takes the frame, or None and what went wrong; called in the render loop's thread."""
+    subpixels: int
+    """Rays through a pixel along each of its edges."""
+    take: Callable[[int, RenderedView], None]
+    """Takes the first row of a strip and the strip; this and the following are called in the render loop's thread."""
+    done: Callable[[str], None]
+    """Told the end: an empty text, or what went wrong."""
     progress: Callable[[float], None] = lambda _: None
     """Told the part that is rendered."""
     is_cancelled: bool = False
     served_at: float = 0.0
+    first_row: int = 0
+    """Of the strip under way."""
+    strip: FrameRender | None = None
 
 
 class RenderLoop:
@@ -112,7 +124,7 @@ class RenderLoop:
         with self._changed:
             unfinished, self._captures = self._captures, []
         for capture in unfinished:
-            capture.done(None, "the viewer was stopped")
+            capture.done("the viewer was stopped")
 
     def add(self, view: View) -> None:
         """Serve a view."""
@@ -127,55 +139,25 @@ class RenderLoop:
             view.render = view.frame = None
             self._changed.notify_all()
 
-    def move(self, view: View, pose: ViewPose) -> None:
-        """Show the scene from elsewhere."""
+    def change(self, view: View, **what: Any) -> None:
+        """Show a view with other values of its fields; it is rendered again only where shape, gloss or rays change."""
         with self._changed:
-            view.pose = pose
-            self._ask_anew(view)
-
-    def restyle(self, view: View, settings: LayerSettings) -> None:
-        """Show something else of the same picture."""
-        with self._changed:
-            view.settings = settings
-            self._repaint(view)
-
-    def want_depth(self, view: View, wanted: bool) -> None:
-        """Send depth with pictures, or no longer."""
-        with self._changed:
-            if view.wants_depth != wanted:
-                view.wants_depth = wanted
-                self._repaint(view)
-
-    def change_edit(self, view: View, edit: Edit) -> None:
-        """Show the scene with other materials or light; rendered again only where shape or gloss changes."""
-        with self._changed:
-            view.edit = edit
-            if edit.reuses(view.frame_edit):
-                self._repaint(view)
+            for name, value in what.items():
+                setattr(view, name, value)
+            view.is_stuck = False
+            if what.keys() & {"settings", "wants_depth"} or (
+                "edit" in what and view.edit.reuses(view.frame_edit)
+            ):
+                view.restyled_at = view.restyled_at or time.monotonic()
             else:
-                self._ask_anew(view)
-
-    def change_quality(self, view: View, largest_height: int, subpixels: int) -> None:
-        """Render the finest picture otherwise."""
-        with self._changed:
-            view.largest_height, view.subpixels = largest_height, subpixels
-            self._ask_anew(view)
+                view.render, view.moved_at = None, view.moved_at or time.monotonic()
+            self._changed.notify_all()
 
     def capture(self, capture: Capture) -> None:
         """Render a picture of its own."""
         with self._changed:
             self._captures.append(capture)
             self._changed.notify_all()
-
-    def _ask_anew(self, view: View) -> None:
-        view.render, view.is_stuck = None, False
-        view.moved_at = view.moved_at or time.monotonic()
-        self._changed.notify_all()
-
-    def _repaint(self, view: View) -> None:
-        view.is_stuck = False
-        view.restyled_at = view.restyled_at or time.monotonic()
-        self._changed.notify_all()
 
     def step(self) -> bool:
         """Do the most urgent piece of work; False if there is none at this moment."""
@@ -224,14 +206,15 @@ class RenderLoop:
 
     def _guarded(self, view: View, work: Callable[[View], None]) -> None:
         """Do a piece of work for a view; what goes wrong is said to its client, and the loop goes on."""
-        with failures_said("this picture failed", lambda reason: self._fail(view, reason)):
-            work(view)
 
-    def _fail(self, view: View, reason: str) -> None:
-        with self._changed:
-            view.is_stuck = view.has_reported = True
-            view.render = view.moved_at = view.restyled_at = None
-        view.report(reason)
+        def fail(reason: str) -> None:
+            with self._changed:
+                view.is_stuck = view.has_reported = True
+                view.render = view.moved_at = view.restyled_at = None
+            view.report(reason)
+
+        with failures_said("this picture failed", fail):
+            work(view)
 
     def _answer(self, view: View) -> None:
         """A small picture at once."""
@@ -293,20 +276,34 @@ class RenderLoop:
             view.report("")
 
     def _advance_capture(self, capture: Capture) -> None:
-        """A block of a capture; after its last it is handed over."""
+        """A block of a capture; each finished strip is handed over."""
         capture.served_at = time.monotonic()
+        camera, first = capture.camera, capture.first_row
+        rows = min(max(1, _STRIP_PIXELS // camera.width), camera.height - first)
         frame: RenderedView | None = None
         reasons = ["cancelled"] if capture.is_cancelled else []
         with failures_said("the picture failed", reasons.append):
             if not reasons:
-                block = self._maker.speed.block_rays
-                frame = self._maker.advance(capture.render, capture.edit, block, RESTING_COST)
-                capture.progress(1 - capture.render.rays_left / capture.render.num_rays)
+                strip = capture.strip = capture.strip or FrameRender(
+                    camera.crop(0, first, camera.width, rows), capture.subpixels, is_finished=True
+                )
+                frame = self._maker.advance(strip, capture.edit, self._maker.speed.block_rays, RESTING_COST)
+                part = 1 - strip.rays_left / strip.num_rays
+                capture.progress((first + rows * part) / camera.height)
         if frame is None and not reasons:
             return
         with self._changed:
             if capture not in self._captures:
                 return  # `stop` has said that it will not be finished
+        if frame is not None:
+            with failures_said("the picture could not be handed over", reasons.append):
+                capture.take(first, frame)
+            capture.first_row, capture.strip = first + rows, None
+            if not reasons and capture.first_row < camera.height:
+                return
+        with self._changed:
+            if capture not in self._captures:
+                return
             self._captures.remove(capture)
-        with failures_said("the picture could not be handed over", reasons.append):
-            capture.done(frame, "".join(reasons))
+        with failures_said("the picture could not be handed over", lambda _: None):
+            capture.done("".join(reasons))
