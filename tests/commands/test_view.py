@@ -78,7 +78,7 @@ def served(trained):
 def test_what_was_measured_is_shown_where_the_scene_is_at_hand(served):
     with looking(f"ws://127.0.0.1:{served.port}") as page:
         served.services._reader.join(START_S)
-        assert served.services.aids.measured is not None, served.services.aids.why_not_measured
+        assert served.services.maker.aids.measured is not None
         page.set("layer", "error against a training view")
         page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)
         page.set("cameras", True)
