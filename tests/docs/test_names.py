@@ -70,3 +70,13 @@ def test_dotted_names_of_the_package_are_there(page):
             if not hasattr(found, part):
                 importlib.import_module(".".join(parts[:count]))
             found = getattr(found, part)
+
+
+def test_the_page_of_flags_has_every_flag_of_the_method():
+    page = text_of("docs/reference/flags.md")
+    lines = re.findall(r"^ +(--[a-z].*)$", run(train, "unmix-nerf", "--help-all").out, re.MULTILINE)
+    options = [re.findall(r"--[a-z0-9][\w.-]*", line) for line in lines if "--" in line]
+    missing = [
+        names for names in options if not any(f"`{name}" in page or f" {name}" in page for name in names)
+    ]
+    assert missing == []
