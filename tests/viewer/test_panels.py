@@ -65,14 +65,6 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
         assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
 
 
-def test_each_page_has_its_own_layer(viewer):
-    with opened(viewer) as first, opened(viewer) as second:
-        depth = show_layer(second, "depth")
-        assert not np.array_equal(depth.mean(axis=(0, 1)), decoded(first.last_picture).mean(axis=(0, 1)))
-        assert "distance along the viewing axis" in second.texts
-        assert "distance along the viewing axis" not in first.texts
-
-
 def test_a_layer_that_cannot_be_shown_says_why_and_the_next_one_is_shown(viewer):
     with opened(viewer) as page:
         page.set("layer", "error against a training view")

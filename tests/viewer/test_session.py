@@ -18,13 +18,8 @@ def test_the_page_that_was_closed_last_comes_back_first_and_once():
     for rows in (100, 200):
         pages.leave("mine", state(rows))
     pages.leave("other", state(300))
-    assert [
-        kept and kept.largest_height for kept in (pages.take("mine"), pages.take("mine"), pages.take("mine"))
-    ] == [
-        200,
-        100,
-        None,
-    ]
+    kept = [pages.take("mine") for _ in range(3)]
+    assert [one and one.largest_height for one in kept] == [200, 100, None]
 
 
 def test_what_was_left_long_ago_is_forgotten():

@@ -85,7 +85,7 @@ def make_aids(source: SceneSource) -> LayerAids:
     """What layers need."""
     with source.borrowed() as scene:
         assert isinstance(scene, TrainedScene)
-        return LayerAids(render_reference(scene, source.record.train_cameras), source.record.scene_box)
+        return LayerAids(*render_reference(scene, source.record.train_cameras), source.record.scene_box)
 
 
 def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:

@@ -3,11 +3,9 @@
 Everything is placed in inches, so that nothing is cut off, however many panels or names there are. Where a picture
 shows nothing it fades into a neutral light grey.
 
-Notation: pictures are (H, W, 3) sRGB in [0, 1].
+Pictures of tiles in a grid, each perhaps with its name above, are filled row by row.
 
-A picture of tiles in a grid, each perhaps with its name above, filled row by row.
-
-Notation: `h x W` pixels, some rows of the tiles; `T` tiles, `C` channels.
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; `h x W` pixels, some rows of the tiles; `T` tiles, `C` channels.
 """
 
 from __future__ import annotations
@@ -139,7 +137,12 @@ def draw_panels(
         bar.set_label(scale.label, fontsize=_FONT_PT)
         bar.ax.tick_params(labelsize=_FONT_PT - 1)
         bar.locator = MaxNLocator(5)
-    _draw_legend(figure, legend, legend_columns, below, page)
+    for index, (name, colour) in enumerate(legend):
+        row, column = divmod(index, legend_columns)
+        left = _MARGIN + column * _legend_width(legend)
+        base = _MARGIN + below - _GAP - (row + 1) * _LEGEND_ROW
+        draw_swatch(figure, colour, (left, base + 0.02))
+        figure.text((left + 0.24) / page[0], (base + 0.03) / page[1], name, fontsize=_FONT_PT, va="bottom")
     return figure_bytes(figure)
 
 
@@ -171,21 +174,6 @@ def _in_parts(
 def _legend_width(legend: Sequence[tuple[str, Colour]]) -> float:
     """Inches that one entry takes."""
     return 0.52 + _LETTER * max((len(name) for name, _ in legend), default=8)
-
-
-def _draw_legend(
-    figure: Any,
-    legend: Sequence[tuple[str, Colour]],
-    columns: int,
-    below: float,
-    page: tuple[float, float],
-) -> None:
-    for index, (name, colour) in enumerate(legend):
-        row, column = divmod(index, columns)
-        left = _MARGIN + column * _legend_width(legend)
-        base = _MARGIN + below - _GAP - (row + 1) * _LEGEND_ROW
-        draw_swatch(figure, colour, (left, base + 0.02))
-        figure.text((left + 0.24) / page[0], (base + 0.03) / page[1], name, fontsize=_FONT_PT, va="bottom")
 
 
 _CAPTION_PX, _GAP_PX, _FONT_PX = 18, 2, 11

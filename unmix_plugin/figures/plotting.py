@@ -1,8 +1,5 @@
-"""What all matplotlib figures share: resolution, swatches, plain axes, and colours of right and wrong.
-
-Line charts as SVG: sharp at any size.
-
-A colour for each material: its own where that can be told from the others, otherwise the nearest that can.
+"""What all figures share: resolution, swatches, plain axes; line charts as SVG; and a colour for each material, its own
+where that can be told from the others, otherwise the nearest that can.
 
 Notation: `K` materials, `N` colours; `lab` is CIE 1976 L*a*b* of sRGB colours under D65, in which equal distances look
 about equally different.

@@ -106,10 +106,12 @@ def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, s
         port: Where it listens.
         environment: Variables of the process.
     """
-    lines = [f"viewer: {_url_of(options.host, port)}"]
+    host = options.host
+    shown = "localhost" if host in _ANYWHERE else host
+    lines = [f"viewer: http://[{shown}]:{port}" if ":" in shown else f"viewer: http://{shown}:{port}"]
     if options.port not in (0, port):
         lines.append(f"port {options.port} is taken, hence {port}")
-    if not _is_local(options.host):
+    if host != "localhost" and not (_is_address(host) and ipaddress.ip_address(host).is_loopback):
         reach = f"{socket.gethostname()}:{port}"
         protected = (
             "with the token; it travels unencrypted"
@@ -118,15 +120,15 @@ def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, s
         )
         lines.append(f"warning: everyone who reaches {reach} can use the viewer {protected}")
     elif "SSH_CONNECTION" in environment:
-        lines.append(
-            f"from your own machine: {_tunnel_command(port, environment)}, then open the address there"
-        )
+        parts = environment["SSH_CONNECTION"].split()
+        is_known = len(parts) == 4
+        server = parts[2] if is_known else socket.gethostname()
+        user = environment.get("USER") or environment.get("LOGNAME")
+        command = f"ssh -N -L {port}:127.0.0.1:{port}"
+        command += f" -p {parts[3]}" if is_known and parts[3] != "22" else ""
+        command += f" {user}@{server}" if user else f" {server}"
+        lines.append(f"from your own machine: {command}, then open the address there")
     return lines
-
-
-def _is_local(host: str) -> bool:
-    """Whether only this machine can reach a host address."""
-    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def _is_address(host: str) -> bool:
@@ -135,21 +137,6 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _url_of(host: str, port: int) -> str:
-    """What to type into a browser, on this machine if the viewer listens everywhere."""
-    shown = "localhost" if host in _ANYWHERE else host
-    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
-
-
-def _tunnel_command(port: int, environment: Mapping[str, str]) -> str:
-    """The ssh command that makes the viewer of a remote machine reachable from where its user sits."""
-    parts = environment.get("SSH_CONNECTION", "").split()
-    server = parts[2] if len(parts) == 4 else socket.gethostname()
-    user = environment.get("USER") or environment.get("LOGNAME")
-    port_flag = f" -p {parts[3]}" if len(parts) == 4 and parts[3] != "22" else ""
-    return f"ssh -N -L {port}:127.0.0.1:{port}{port_flag} {f'{user}@' if user else ''}{server}"
 
 
 MOST_CLIENTS = 16

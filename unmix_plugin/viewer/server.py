@@ -21,7 +21,7 @@ from unmix_plugin.viewer.access import (
     start_notices,
 )
 from unmix_plugin.viewer.page import failures_said, paragraph, text
-from unmix_plugin.viewer.panels import PANELS
+from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
 from unmix_plugin.viewer.view_cameras import point_ahead, pose_of, up_direction
@@ -109,7 +109,14 @@ class Viewer:
         self._server, self.port = server, server.get_port()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.set_panel_label(LABEL)
-        self._look_at_the_scene(server)
+        scene = self.services.source.record
+        up = up_direction(scene.train_cameras)
+        server.scene.set_up_direction(up)
+        server.scene.world_axes.visible = False
+        camera = (scene.eval_cameras if len(scene.eval_cameras) else scene.train_cameras)[0]
+        pose, first = pose_of(camera), server.initial_camera
+        first.position, first.look_at = pose.position, point_ahead(camera, scene.scene_box)
+        first.up, first.fov = up, pose.fov
         self.services.start()
         server.on_client_connect(self._connected)
         server.on_client_disconnect(self._disconnected)
@@ -156,17 +163,6 @@ class Viewer:
                 if while_watched and unwatched_s >= _UNWATCHED_S:
                     return
 
-    def _look_at_the_scene(self, server: viser.ViserServer) -> None:
-        """Let pages start from a camera of the scene."""
-        scene = self.services.source.record
-        up = up_direction(scene.train_cameras)
-        server.scene.set_up_direction(up)
-        server.scene.world_axes.visible = False
-        camera = (scene.eval_cameras if len(scene.eval_cameras) else scene.train_cameras)[0]
-        pose, start = pose_of(camera), server.initial_camera
-        start.position, start.look_at = pose.position, point_ahead(camera, scene.scene_box)
-        start.up, start.fov = up, pose.fov
-
     def _connected(self, client: viser.ClientHandle) -> None:
         """Admit a page, ask it for the token, or refuse it."""
         with failures_said("this page could not be served", lambda said: _warn(client, said)):
@@ -208,7 +204,7 @@ class Viewer:
             if self._stopped.is_set() or client.client_id in self._sessions:
                 return
             self._sessions[client.client_id] = session
-        session.open(PANELS)
+        session.open(panels_of(self.services))
         if self._server is not None and client.client_id not in self._server.get_clients():
             self._disconnected(client)  # it left before it was noted
 

@@ -245,18 +245,6 @@ _SMALL_PIXELS = 1 << 14
 """Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One tab of a client's controls."""
-
-    title: str
-    """Label of the tab."""
-    build: Callable[[Session], object]
-    """Builds the controls in the tab that is open; what follows a run or an edit registers with the session."""
-    applies: Callable[[Services], bool] = lambda _: True
-    """Whether clients of a viewer have it."""
-
-
 class Session:
     """One client, from its admission to its disconnection; nothing that it does affects another one or the server."""
 
@@ -279,7 +267,10 @@ class Session:
         light = LightChoice() if state is None else state.light
         self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present, light))
         if state is None:
-            self.view.settings = self._first_settings()
+            if services.has_materials:
+                self.view.settings = first_settings(self.materials().bands)
+            elif "rgb" not in services.maker.layers:
+                self.view.settings = LayerSettings(layer=next(iter(services.maker.layers), "rgb"))
             rows = number(client.camera.image_height, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], DEFAULT_HEIGHT)
             self.view.largest_height = int(rows) // 16 * 16
         else:
@@ -304,22 +295,15 @@ class Session:
         self._note: viser.NotificationHandle | None = None
         self._notes: tuple[str, ...] = ()
 
-    def _first_settings(self) -> LayerSettings:
-        if self.services.has_materials:
-            return first_settings(self.materials().bands)
-        layers = self.services.maker.layers
-        return LayerSettings(layer="rgb" if "rgb" in layers else next(iter(layers), "rgb"))
-
-    def open(self, panels: Sequence[Panel]) -> None:
-        """Build the panels, in the order of their tabs, and begin to render."""
+    def open(self, panels: Sequence[tuple[str, Callable[[Session], object]]]) -> None:
+        """Build the panels, given by their titles and what builds them in the tab that is open, and begin to render."""
         gui, view = self.client.gui, self.view
         self._status = gui.add_html(paragraph("waiting for the first picture"))
         self._legend = gui.add_html("")
         tabs = gui.add_tab_group()
-        for panel in panels:
-            if panel.applies(self.services):
-                with tabs.add_tab(panel.title):
-                    panel.build(self)
+        for title, build in panels:
+            with tabs.add_tab(title):
+                build(self)
         self.services.loop.add(view)
         if self.is_closed:  # the client left while its panels were built
             self.services.loop.remove(view)

@@ -1,7 +1,8 @@
 """Between a browser's camera and ours: axes, field of view, image size; everything that comes in is checked here.
 
-Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a _quaternion w, x, y, z and a position in
-model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels."""
+Notation: a browser's pose has OpenCV axes (+x right, +y down, +z forward) as a quaternion w, x, y, z and a position in
+model space, and the vertical field of view in radians; ours has OpenGL axes and focal lengths in pixels.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ class ViewPose:
     """Where a browser looks from; always finite and within bounds."""
 
     wxyz: tuple[float, float, float, float]
-    """Rotation from camera (OpenCV axes) to model space, unit _quaternion."""
+    """Rotation from camera (OpenCV axes) to model space, unit quaternion."""
     position: tuple[float, float, float]
     """Model space."""
     fov: float
@@ -133,14 +134,14 @@ def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
 
 
 def _rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Rotation of a unit _quaternion."""
+    """Rotation of a unit quaternion."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
-    """Unit _quaternion w, x, y, z of a rotation."""
+    """Unit quaternion w, x, y, z of a rotation."""
     from scipy.spatial.transform import Rotation
 
     x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()

@@ -117,13 +117,11 @@ def test_a_band_is_painted_by_its_value_between_the_ends_of_the_scale(frame, aid
 
 
 def test_wavelengths_beyond_the_bands_show_the_outermost_band(frame, aids):
-    for wavelength, band in ((1.0, 0), (99_999.0, len(frame.materials.bands) - 1)):
+    centers = frame.materials.bands.centers_nm
+    for wavelength, center in ((1.0, float(centers[0])), (99_999.0, float(centers[-1]))):
         picture, legend = painted(frame, aids, "band", wavelength_nm=wavelength)
-        expected, _ = painted(
-            frame, aids, "band", wavelength_nm=float(frame.materials.bands.centers_nm[band])
-        )
-        assert_close(picture, expected)
-        assert f"{frame.materials.bands.centers_nm[band]:.0f} nm" in legend.label
+        assert_close(picture, painted(frame, aids, "band", wavelength_nm=center)[0])
+        assert f"{center:.0f} nm" in legend.label
 
 
 def test_false_colour_names_the_bands_that_it_shows(frame, aids):
@@ -167,18 +165,16 @@ def test_half_transparent_light_is_mixed_with_the_background_in_linear_light(fra
     assert_close(picture, linear_to_srgb((opaque["linear_rgb"] + 1) / 2), atol=1e-4, rtol=0)
 
 
-def test_principal_components_keep_their_colours_when_the_camera_moves(source, aids):
-    first = make_frame(source, source.record.train_cameras[0])
-    part = first.map(lambda packed: packed[4:12, 6:18])
-    whole, _ = painted(first, aids, "pca")
-    cropped, _ = painted(part, aids, "pca")
+def test_principal_components_keep_their_colours_when_the_camera_moves(frame, aids):
+    whole, _ = painted(frame, aids, "pca")
+    cropped, _ = painted(frame.map(lambda packed: packed[4:12, 6:18]), aids, "pca")
     assert_close(cropped, whole[4:12, 6:18], atol=1e-5, rtol=0)
 
 
-def test_scales_stay_the_same_when_the_camera_moves(source, aids):
-    legends = [
-        painted(make_frame(source, source.record.train_cameras[index]), aids, "band")[1] for index in range(3)
-    ]
+@pytest.mark.parametrize("layer", ["band", "index"])
+def test_scales_stay_the_same_when_the_camera_moves(source, aids, layer):
+    frames = [make_frame(source, source.record.train_cameras[index]) for index in range(3)]
+    legends = [painted(frame, aids, layer, index="1+r650")[1] for frame in frames]
     assert len({(legend.low, legend.high) for legend in legends}) == 1
     assert legends[0].high > legends[0].low
 
@@ -268,17 +264,12 @@ def test_a_named_index_has_its_usual_range_unless_one_is_chosen(frame, aids):
     assert (legend.low, legend.high) == (0.0, 0.1)
 
 
-def test_a_formula_has_the_range_that_is_seen_from_everywhere(source, aids):
-    legends = [
-        painted(make_frame(source, source.record.train_cameras[index]), aids, "index", index="1+r650")[1]
-        for index in range(3)
-    ]
-    reference = aids.reference
+def test_a_formula_has_the_range_that_is_seen_from_everywhere(source, frame, aids):
+    _, legend = painted(frame, aids, "index", index="1+r650")
     with source.borrowed() as scene:
-        seen = 1 + reference.spectra(scene.materials)[:, 4]
+        seen = 1 + aids.reference_spectra(scene.materials)[:, 4]
     expected = torch.quantile(seen, torch.tensor([0.01, 0.99])).tolist()
-    for legend in legends:
-        assert (legend.low, legend.high) == pytest.approx(expected, abs=1e-5)
+    assert (legend.low, legend.high) == pytest.approx(expected, abs=1e-5)
     assert expected[0] > 0.9
 
 

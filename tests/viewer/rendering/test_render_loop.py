@@ -247,14 +247,21 @@ def test_a_picture_never_takes_more_memory_than_is_set_aside(source, monkeypatch
     assert picture.shape[0] * picture.shape[1] * channels * 4 <= 20_000
 
 
-def test_a_layer_that_cannot_be_shown_is_said_and_the_next_one_works(loop, screen):
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ({"settings": LayerSettings(layer="error")}, "no error to show"),
+        ({"edit": Edit(Recipe((Scale(99, 2.0),)))}, "recipe, edit 1 (scale): there is no endmember 99"),
+    ],
+)
+def test_what_cannot_be_shown_is_said_and_the_next_one_works(loop, screen, what, said):
     loop.change(screen.view, pose=some_pose())
     finish(loop)
-    loop.change(screen.view, settings=LayerSettings(layer="error"))
+    loop.change(screen.view, **what)
     finish(loop)
-    assert screen.reports[-1].startswith("no error to show")
+    assert screen.reports[-1].startswith(said)
     count = len(screen.shown)
-    loop.change(screen.view, settings=LayerSettings(layer="rgb"))
+    loop.change(screen.view, settings=LayerSettings(), edit=Edit())
     finish(loop)
     assert len(screen.shown) == count + 1
     assert screen.reports[-1] == ""
@@ -295,15 +302,6 @@ def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen
     assert len(screen.shown) == count
     assert screen.view.frame is None
     assert loop._views == []
-
-
-def test_an_edit_that_does_not_fit_is_said(loop, screen):
-    loop.change(screen.view, pose=some_pose())
-    finish(loop)
-    loop.change(screen.view, edit=Edit(Recipe((Scale(99, 2.0),))))
-    finish(loop)
-    assert "there is no endmember 99" in screen.reports[-1]
-    assert "Error" not in screen.reports[-1]
 
 
 def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):

@@ -161,10 +161,11 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
     towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
     found = views.measurement(BALL * towards, camera, None, ball_frame(camera).scene)
     assert found is not None
-    assert found.view == scene.frames[scene.train_indices[index]].name
+    name, spectrum = found
+    assert name == scene.frames[scene.train_indices[index]].name
     coords, _ = camera.project((BALL * towards)[None], 0)
     column, row = (int(value) for value in coords[0])
-    np.testing.assert_allclose(found.spectrum, scene.cube(scene.train_indices[index])[row, column])
+    np.testing.assert_allclose(spectrum, scene.cube(scene.train_indices[index])[row, column])
 
 
 def test_a_point_inside_is_seen_by_nobody(views, scene):
@@ -188,7 +189,7 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
     plain, relit = (
         views.measurement(point, camera, shown, frame.scene) for shown in (None, light.double().numpy())
     )
-    assert_close(relit.spectrum, plain.spectrum * light)
+    assert_close(relit[1], plain[1] * light)
 
 
 def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, source, monkeypatch):

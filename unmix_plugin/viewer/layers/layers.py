@@ -53,24 +53,9 @@ _NUM_CAMERAS = 6
 _NUM_RAYS = 6000
 
 
-@dataclass(frozen=True)
-class _Reference:
-    """Coefficients of some rays through the whole scene that stay the same while the camera moves: colour scales and
-    principal axes are taken from them, so that colours mean the same from everywhere."""
-
-    coefficients: Coefficients
-    """(N, ...)."""
-    points: Float[Tensor, "N 3"]
-    """Where the rays end, model space."""
-
-    def spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
-        """What the rays show with the given materials, as if each ended fully on what it ended on."""
-        return materials.spectra(self.coefficients) / self.coefficients.accumulation[:, None]
-
-
 @torch.no_grad()
-def render_reference(scene: TrainedScene, cameras: Cameras) -> _Reference:
-    """Reference rays through some of the cameras, spread over all."""
+def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients, Float[Tensor, "N 3"]]:
+    """Coefficients of rays through some of the cameras, spread over all, and where the rays end, model space."""
     step = max(1, len(cameras) // _NUM_CAMERAS)
     chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
     cameras = cameras.one_size()
@@ -85,7 +70,7 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> _Reference:
         is_seen = seen.is_occupied
         parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
         points.append(ends[is_seen])
-    return _Reference(Coefficients.concatenate(parts), torch.cat(points))
+    return Coefficients.concatenate(parts), torch.cat(points)
 
 
 def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
@@ -108,11 +93,19 @@ _ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H 
 class LayerAids:
     """What layers need to know of the run."""
 
-    reference: _Reference
+    reference: Coefficients
+    """Of some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes
+    are taken from them, so that colours mean the same from everywhere. (N, ...)."""
+    reference_points: Float[Tensor, "N 3"]
+    """Where the rays end, model space."""
     scene_box: SceneBox
     error_of: _ErrorOf | None = None
     why_no_error: str = "the scene is not at hand"
     _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
+        """What the rays show with the given materials, as if each ended fully on what it ended on."""
+        return materials.spectra(self.reference) / self.reference.accumulation[:, None]
 
     def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
         """sRGB colours that stand for the materials, as in all pictures of a run."""
@@ -124,7 +117,7 @@ class LayerAids:
 
     def _pca_of(self, materials: Materials) -> PcaColours:
         """Principal components of what the reference rays show with the materials."""
-        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference.spectra(materials)))
+        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference_spectra(materials)))
 
     def _depth_range(self, frame: MaterialView) -> tuple[float, float]:
         """Distances between which the scene box lies, world units."""
@@ -197,10 +190,15 @@ def _layer_of(output: Output) -> Layer:
             light = values if output.kind == "linear" else srgb_to_linear(values.clamp(0, 1))
             return tone_mapped(light, frame.coverage, settings), legend
         if output.kind in ("grey", "map"):
-            return _paint_map(values, opacity, settings, output)
-        palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(
-            opacity
-        )  # neighbours are far apart
+            is_known = values.isfinite()
+            scale = output.value_range or _percentile_range(
+                values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
+            )
+            # Opacity itself is shown everywhere, also where there is little of it.
+            part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
+            return _paint_scaled(values, part, settings, scale, output.what)
+        # Neighbours of the palette are far apart.
+        palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(opacity)
         if output.kind == "labels":
             opacity, values = (values != NOTHING_ID).to(opacity), palette[values.long()]
         elif output.kind == "shares":
@@ -214,17 +212,6 @@ def _layer_of(output: Output) -> Layer:
         return over_background(values.clamp(0, 1), opacity, settings), legend
 
     return Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
-
-
-def _paint_map(
-    values: Float[Tensor, "H W"], opacity: Float[Tensor, "H W"], settings: LayerSettings, output: Output
-) -> tuple[Picture, Legend]:
-    is_known = values.isfinite()
-    seen = values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
-    scale = output.value_range or _percentile_range(seen)
-    # Opacity itself is shown everywhere, also where there is little of it.
-    part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
-    return _paint_scaled(values, part, settings, scale, output.what)
 
 
 def _paint_scaled(
@@ -251,12 +238,7 @@ _LONGEST_LABEL = 120
 
 
 def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
-    """The index that is chosen, over the background where it is undefined or hardly anything is seen.
-
-    Raises:
-        ConfigError: none is chosen, an unknown one, or a formula that can't be read.
-        SpectrumError: the bands do not cover what it needs.
-    """
+    """The index that is chosen, over the background where it is undefined or hardly anything is seen."""
     materials, bands = frame.materials, frame.materials.bands
     if not settings.index:
         edges, centers = bands.edges_nm, bands.centers_nm
@@ -272,7 +254,7 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     )
     scale = settings.value_range or index.usual_range
     if scale is None:
-        seen = index(materials.reflectance(aids.reference.coefficients))
+        seen = index(materials.reflectance(aids.reference))
         scale = _percentile_range(seen[seen.isfinite()])
     what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
     label = what if materials.light is not None else f"{what}; of radiance: light unknown"
@@ -305,10 +287,12 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     materials, bands = frame.materials, frame.materials.bands
     band = bands.nearest(covered(bands, settings.wavelength_nm))
     column = torch.eye(len(bands))[:, band : band + 1]
-    reference = aids.reference.coefficients
-    solid = materials.through(reference, column)[:, 0] / reference.accumulation.clamp(min=1e-3)
+    reference = materials.through(aids.reference, column)[:, 0] / aids.reference.accumulation.clamp(min=1e-3)
     values = _unpremultiplied(materials.through(frame.coefficients, column), frame.coverage)[..., 0]
-    scale, label = _percentile_range(solid, low_at_most=0.0), f"radiance at {bands.centers_nm[band]:.0f} nm"
+    scale, label = (
+        _percentile_range(reference, low_at_most=0.0),
+        f"radiance at {bands.centers_nm[band]:.0f} nm",
+    )
     return _paint_scaled(values, frame.coverage, settings, scale, label)
 
 

@@ -149,8 +149,7 @@ Legend: TypeAlias = ColourMapLegend | SwatchLegend | TextLegend
 def _to_display(
     light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
 ) -> Float[Tensor, "*pixels 3"]:
-    """Light as a display shows it: `srgb` clips at white, `agx` compresses 16.5 stops, as film does; gamma comes last
-    and lifts what is dark if it is above 1."""
+    """Light as a display shows it: `srgb` clips at white, `agx` compresses 16.5 stops, as film does; gamma is last."""
     exposed = light * 2.0**exposure_ev
     shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
     shown = shown.clamp(0, 1)

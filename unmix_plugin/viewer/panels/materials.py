@@ -148,9 +148,19 @@ class MaterialsPanel:
             self._gloss_colour = gui.add_rgb("colour of gloss", _WHITE)
             self._name = gui.add_text("name", names[0])
             self._library = gui.add_dropdown("known material", measured_library().names)
-            self._session.add_button("replace by the known material", self._replace)
+            self._session.add_button(
+                "replace by the known material",
+                lambda: self._change(
+                    Replace(self._index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
+                ),
+            )
             self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
-            self._session.add_button("swap with the other", self._swap)
+            self._session.add_button(
+                "swap with the other",
+                lambda: self._change_recipe(
+                    with_swap(self._recipe, Swap(self._index, index_in(self._other)))
+                ),
+            )
         self._on(self._factor, lambda: self._change(Scale(self._index, _factor(self._factor))))
         self._on(self._colour, lambda: self._change(Retint(self._index, _srgb(self._colour.value))))
         for control in (self._gloss, self._gloss_colour):
@@ -221,13 +231,6 @@ class MaterialsPanel:
         is_white = tuple(self._gloss_colour.value[:3]) == _WHITE
         colour = None if is_white else _srgb(self._gloss_colour.value)
         self._change(Gloss(self._index, _factor(self._gloss), colour))
-
-    def _replace(self) -> None:
-        known = LibrarySpectrum(text(self._library.value))
-        self._change(Replace(self._index, known, extrapolate=True))
-
-    def _swap(self) -> None:
-        self._change_recipe(with_swap(self._recipe, Swap(self._index, index_in(self._other))))
 
     def _show_materials(self) -> None:
         """Show the materials as they are now; the menus have the same endmembers chosen as before."""

@@ -92,8 +92,9 @@ def _take_probe(
         found = measured and measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
         return taken
-    view = f"{found.view}, before the edits" if edit.recipe.operations else found.view
-    return replace(taken, measured=found.spectrum.double().numpy(), measured_in=view)
+    view, spectrum = found
+    view = f"{view}, before the edits" if edit.recipe.operations else view
+    return replace(taken, measured=spectrum.double().numpy(), measured_in=view)
 
 
 def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:

@@ -52,7 +52,12 @@ class TrainingPanel:
             steering.disabled = not control.is_running
         self._bar.value = 0.0 if status is None else 100 * status.progress
         if self._ticks % _TICKS_A_CHART == 0:
-            self._draw_curves()
+            for chart, name, colour in (
+                (self._loss, "loss", _LOSS_COLOUR),
+                (self._psnr, "psnr", _PSNR_COLOUR),
+            ):
+                steps, values = self._session.services.curve.line(name)
+                chart.draw(steps, [Line(name, values, colour)])
         self._ticks += 1
 
     def _condition(self) -> str:
@@ -62,12 +67,6 @@ class TrainingPanel:
         if not control.is_running:
             return "has not begun" if control.status is None else "done"
         return "paused" if control.is_paused else "running"
-
-    def _draw_curves(self) -> None:
-        curve = self._session.services.curve
-        for chart, name, colour in ((self._loss, "loss", _LOSS_COLOUR), (self._psnr, "psnr", _PSNR_COLOUR)):
-            steps, values = curve.line(name)
-            chart.draw(steps, [Line(name, values, colour)])
 
     def _toggle(self) -> None:
         if self._control.is_paused:

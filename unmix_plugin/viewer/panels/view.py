@@ -298,7 +298,7 @@ class ScenePanel:
         """Surface points in the colours that the materials have now; every n-th where there are too many."""
         aids, materials = self._session.services.maker.aids.for_layers(), self._session.materials()
         assert aids is not None
-        spectra, points = aids.reference.spectra(materials), aids.reference.points.cpu().numpy()
+        spectra, points = aids.reference_spectra(materials), aids.reference_points.cpu().numpy()
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
         colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()
         step = max(1, -(-len(points) // _MOST_POINTS))

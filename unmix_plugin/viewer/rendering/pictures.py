@@ -205,8 +205,7 @@ _MOST_DEPTH_ROWS = 256
 
 
 def _picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
-    """Depth along the viewing axis, scene units, of the pixels or of every n-th; far where less than half of the
-    light ends. The browser hides its own objects behind it."""
+    """Depth along the viewing axis, scene units, of the pixels or of every n-th; far where they are half empty."""
     coefficients, camera = frame.coefficients, frame.camera
     distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
     sides = (camera.width, camera.height)
@@ -284,13 +283,13 @@ class PictureMaker:
         if isinstance(frame, ModelView) and frame.camera.height >= target and wants_more(frame):
             return FrameRender(frame.camera, subpixels, frame)
         height = _finer_height(frame.camera.height, target) or target
-        is_last = height == target and not self.source.is_changing
+        is_last = height == target and not self.source.device.is_training
         return FrameRender(camera_of(pose, height, self._largest_pixels), subpixels if is_last else 1)
 
     def target_height(self, pose: ViewPose, largest_height: int) -> int:
         """Rows of the finest picture: as asked for, but while training no more than keep up with it."""
         largest = camera_of(pose, largest_height, self._largest_pixels).height
-        if not self.source.is_changing:
+        if not self.source.device.is_training:
             return largest
         share = self.source.device.guest_share
         speed = self.speed.rays_per_second * share / (share + RESTING_COST * (1 - share))
@@ -348,7 +347,14 @@ class PictureMaker:
         """
         layer, aids = layer_named(settings.layer, self.layers), self.aids.for_layers()
         with torch.no_grad():
-            frame = _without_traces(frame)
+            if (
+                isinstance(frame, MaterialView)
+                and isinstance(frame.scene.field, EditedField)
+                and not bool(frame.scene.field.is_kept.all())
+            ):
+                # Removed materials leave faint specks where they were mixed with others.
+                is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
+                frame = frame.map(lambda packed: packed * is_left)
             picture, legend = layer.paint(frame, settings, aids)
         depth = _picture_depth(frame) if with_depth and isinstance(frame, MaterialView) else None
         return Shown(as_bytes(picture), depth, legend, is_moving, layer.is_labels)
@@ -357,14 +363,3 @@ class PictureMaker:
 def wants_more(frame: RenderedView) -> bool:
     """Whether a frame is an estimate that is to be averaged with others."""
     return isinstance(frame, ModelView) and frame.num_estimates < frame.num_wanted
-
-
-def _without_traces(frame: RenderedView) -> RenderedView:
-    """A frame without the faint specks that removed materials leave where they were mixed with others."""
-    if not isinstance(frame, MaterialView):
-        return frame
-    field = frame.scene.field
-    if not isinstance(field, EditedField) or bool(field.is_kept.all()):
-        return frame
-    is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
-    return frame.map(lambda packed: packed * is_left)

@@ -145,12 +145,11 @@ class RenderLoop:
             for name, value in what.items():
                 setattr(view, name, value)
             view.is_stuck = False
-            if what.keys() & {"settings", "wants_depth"} or (
-                "edit" in what and view.edit.reuses(view.frame_edit)
-            ):
-                view.restyled_at = view.restyled_at or time.monotonic()
-            else:
+            is_other_shape = "edit" in what and not view.edit.reuses(view.frame_edit)
+            if is_other_shape or what.keys() & {"pose", "largest_height", "subpixels"}:
                 view.render, view.moved_at = None, view.moved_at or time.monotonic()
+            else:
+                view.restyled_at = view.restyled_at or time.monotonic()
             self._changed.notify_all()
 
     def capture(self, capture: Capture) -> None:
@@ -168,17 +167,13 @@ class RenderLoop:
         return unit is not None
 
     def _run(self) -> None:
-        while (unit := self._awaited_unit()) is not None:
+        while True:
+            with self._changed:
+                while (unit := None if self._is_stopping else self._next_unit()) is None:
+                    if self._is_stopping:
+                        return
+                    self._changed.wait(_POLL_S if self._views or self._captures else None)
             unit()
-
-    def _awaited_unit(self) -> Callable[[], None] | None:
-        """What is most urgent, as soon as there is something; None once the loop is to end."""
-        with self._changed:
-            while not self._is_stopping:
-                if (unit := self._next_unit()) is not None:
-                    return unit
-                self._changed.wait(_POLL_S if self._views or self._captures else None)
-        return None
 
     def _next_unit(self) -> Callable[[], None] | None:
         """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""

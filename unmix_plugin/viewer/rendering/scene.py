@@ -82,11 +82,6 @@ class SceneSource:
         """Rises with each change of the scene: training steps that it has seen."""
         return self.device.training_turns
 
-    @property
-    def is_changing(self) -> bool:
-        """Whether the next picture of the same view would be another one."""
-        return self.device.is_training
-
 
 def source_of_run(run: LoadedRun) -> SceneSource:
     """The scene of a finished run."""
@@ -175,16 +170,6 @@ _STEPS_KEPT = 200
 _VIEWS_TRIED = 6
 
 
-@dataclass(frozen=True)
-class _Measurement:
-    """What a training view measured of a point."""
-
-    view: str
-    """Name of the view."""
-    spectrum: Float32[Tensor, "B"]
-    """Radiance, [0, 1]."""
-
-
 def usable_views(scene: Scene) -> list[int]:
     """Training views whose spectra can be put beside those of the model."""
     return [index for index in scene.train_indices if scene.sensor_of(index).sees_all_bands]
@@ -231,8 +216,9 @@ class MeasuredViews:
         camera: Cameras,
         light: Float64[np.ndarray, " B"] | None,
         scene: TrainedScene,
-    ) -> _Measurement | None:
-        """What the training view nearest to a camera measured of a point; None where no view tried sees it.
+    ) -> tuple[str, Float32[Tensor, "B"]] | None:
+        """Name of the training view nearest to a camera that sees a point, and the radiance measured there; None
+        where no view tried sees it.
 
         Args:
             point: Model space.
@@ -245,7 +231,7 @@ class MeasuredViews:
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
                 spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
-                return _Measurement(self._scene.frames[self._indices[index]].name, spectrum)
+                return self._scene.frames[self._indices[index]].name, spectrum
         return None
 
     def _in_light(
@@ -320,12 +306,12 @@ class SceneAids:
             return None
         kept, version = self._for_layers, self._source.version
         age = 0 if kept is None else version - kept[0]
-        if kept is None or age >= _STEPS_KEPT or (age > 0 and not self._source.is_changing):
+        if kept is None or age >= _STEPS_KEPT or (age > 0 and not self._source.device.is_training):
             error_of = None if self.measured is None else self.measured.error
             why_not, record = self._why_not_measured, self._source.record
             with self._source.borrowed_materials() as scene:
                 reference = render_reference(scene, record.train_cameras)
-            kept = (version, LayerAids(reference, record.scene_box, error_of, why_not))
+            kept = (version, LayerAids(*reference, record.scene_box, error_of, why_not))
             self._for_layers = kept
         return kept[1]
 
