@@ -13,7 +13,13 @@ import pytest
 from tests.captures.poses.alignment import align_poses
 from tests.commands.running import run
 from unmix_plugin.captures import demo as demo_capture
-from unmix_plugin.captures.demo import FULL_WELL, READ_NOISE, WHITE_SHARE, demo_line_camera, make_demo_capture
+from unmix_plugin.captures.demo import (
+    FULL_WELL,
+    READ_NOISE,
+    WHITE_SHARE,
+    _demo_line_camera,
+    make_demo_capture,
+)
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.commands.process import process
 from unmix_plugin.errors import ConfigError
@@ -116,7 +122,7 @@ def test_bad_bands_are_dead_or_drowned_in_noise(folder):
 
 def test_noise_is_that_of_electrons_counted_and_read():
     wavelengths = band_centers_nm(BANDS)
-    camera = demo_line_camera(8, wavelengths, lamp_power(wavelengths))
+    camera = _demo_line_camera(8, wavelengths, lamp_power(wavelengths))
     light = np.full((4000, 8, BANDS), 0.25, np.float32)
     counts = camera.expose(light, np.random.default_rng(0)).astype(float)
     electrons = 0.25 * camera.white_electrons
@@ -127,7 +133,7 @@ def test_noise_is_that_of_electrons_counted_and_read():
 
 def test_bright_highlights_are_cut_off_at_the_largest_count():
     wavelengths = band_centers_nm(BANDS)
-    camera = demo_line_camera(8, wavelengths, lamp_power(wavelengths))
+    camera = _demo_line_camera(8, wavelengths, lamp_power(wavelengths))
     counts = camera.expose(np.full((2, 8, BANDS), 3.0, np.float32), np.random.default_rng(0))
     assert (counts.max(axis=(0, 1))[GOOD] == 65535).any()
 

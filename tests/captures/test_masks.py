@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from unmix_plugin.captures.masks import clean, find_background
+from unmix_plugin.captures.masks import _find_background, clean
 from unmix_plugin.errors import CaptureError
 
 GENERATOR = np.random.default_rng(0)
@@ -14,13 +14,13 @@ GENERATOR = np.random.default_rng(0)
 @pytest.mark.parametrize(("kind", "level", "matter"), [("black", 0.03, 0.12), ("white", 0.95, 0.8)])
 def test_the_threshold_lies_beyond_the_noise_of_the_border(kind, level: float, matter: float):
     border = level + 0.01 * GENERATOR.standard_normal((5000, 8)).astype(np.float32)
-    rule = find_background(kind, border, 1.0)
+    rule = _find_background(kind, border, 1.0)
     assert rule.matter(border[None]).mean() < 1e-3
     assert rule.matter(np.full((1, 10, 8), matter, np.float32)).all()
 
 
 def test_a_white_background_is_bright_in_every_band():
-    rule = find_background("white", np.full((100, 8), 0.98, np.float32), 1.0)
+    rule = _find_background("white", np.full((100, 8), 0.98, np.float32), 1.0)
     leaf = np.full((1, 1, 8), 0.98, np.float32)
     leaf[..., 3] = 0.4
     assert rule.matter(leaf).all()
@@ -29,7 +29,7 @@ def test_a_white_background_is_bright_in_every_band():
 @pytest.mark.parametrize(("kind", "level"), [("black", 0.5), ("white", 0.2)])
 def test_a_border_of_another_kind_is_refused(kind, level: float):
     with pytest.raises(CaptureError, match=f"--mask {kind}: the border of the views is at {level:.0%}"):
-        find_background(kind, np.full((100, 8), level, np.float32), 1.0)
+        _find_background(kind, np.full((100, 8), level, np.float32), 1.0)
 
 
 def test_large_holes_and_parts_stay():

@@ -15,7 +15,7 @@ from tests.scenes.scene_factory import make_scene, ring_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.posing import complete_rigs, place_poses
+from unmix_plugin.captures.posing import _complete_rigs, _place_poses
 from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.writing.scene_files import _write_points
 from unmix_plugin.scenes import load_scene
@@ -24,7 +24,7 @@ FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 
 
 def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
-    placed = place_poses(elsewhere(ring_set(12)))
+    placed = _place_poses(elsewhere(ring_set(12)))
     stacked = np.stack([camera.camera_to_world for camera in placed.poses.cameras.values()])
     np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
     np.testing.assert_allclose(stacked[:, 2, 0], 0, atol=1e-9)  # horizontal axes lie flat
@@ -35,7 +35,7 @@ def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
 
 def test_what_was_placed_returns_to_the_source():
     poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
-    placed = place_poses(poses)
+    placed = _place_poses(poses)
     for name, camera in placed.poses.cameras.items():
         back = placed.placement.to_source(camera.camera_to_world[:, 3])
         np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
@@ -49,10 +49,10 @@ def test_what_was_placed_returns_to_the_source():
 def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
     row = in_a_row()
-    placed = place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
+    placed = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
     np.testing.assert_array_equal(placed.placement.rotation, np.eye(3))
     assert "up is the source's" in placed.notes
-    placed = place_poses(type(row)(row.cameras, row.source, points))
+    placed = _place_poses(type(row)(row.cameras, row.source, points))
     np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), [2, 2, -3])
     assert "up is the mean of the cameras' up vectors" in placed.notes
 
@@ -65,7 +65,7 @@ def flight_over(points):
 
 def test_land_lies_level_below_the_cameras_of_a_flight():
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * np.array([1, 1, 0.01])
-    placed = place_poses(flight_over(points), is_flight=True)
+    placed = _place_poses(flight_over(points), is_flight=True)
     assert placed.poses.points is not None
     assert np.ptp(placed.poses.points[:, 2]) < 0.1 * np.ptp(placed.poses.points[:, 0])
     assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.poses.cameras.values())
@@ -76,7 +76,7 @@ def test_land_lies_level_below_the_cameras_of_a_flight():
 def test_cameras_turned_about_a_subject_are_no_flight_whatever_took_them():
     given = elsewhere(ring_set(12))
     np.testing.assert_array_equal(
-        place_poses(given, is_flight=True).placement.rotation, place_poses(given).placement.rotation
+        _place_poses(given, is_flight=True).placement.rotation, _place_poses(given).placement.rotation
     )
 
 
@@ -93,7 +93,7 @@ def test_sparse_points_are_written_with_their_colours(tmp_path):
 
 def test_written_placements_are_read_back_to_the_source(tmp_path):
     poses = elsewhere(ring_set(offset=FAR))
-    placed = place_poses(poses)
+    placed = _place_poses(poses)
     stacked = {name: camera.camera_to_world for name, camera in placed.poses.cameras.items()}
     found = read_poses(
         write_json(tmp_path / "transforms.json", transforms(stacked, **placed.placement.to_json()))
@@ -146,7 +146,7 @@ def turned_camera(seed: int) -> PosedCamera:
 def test_rotations_in_the_files_turn_a_lens_against_another():
     views = [rig_view("r1", sensor, ANGLES[sensor]) for sensor in "abc"]
     posed = {"r1b": turned_camera(3)}
-    completed, notes = complete_rigs(views, posed)
+    completed, notes = _complete_rigs(views, posed)
     to_reference = {
         sensor: Rotation.from_euler(
             "XYZ", [float(text) for text in angles.split(",")], degrees=True
@@ -172,7 +172,7 @@ def test_offsets_between_posed_lenses_go_before_those_in_the_files():
     for release in ("r1", "r2"):
         square = np.vstack([posed[f"{release}a"].camera_to_world, [0, 0, 0, 1]])
         posed[f"{release}b"] = PosedCamera((square @ offset)[:3], SMALL_LENS)
-    completed, notes = complete_rigs(views, posed)
+    completed, notes = _complete_rigs(views, posed)
     expected = np.vstack([posed["r3a"].camera_to_world, [0, 0, 0, 1]]) @ offset
     np.testing.assert_allclose(completed["r3b"].camera_to_world, expected[:3], atol=1e-12)
     assert notes == (
@@ -187,7 +187,7 @@ def test_views_without_any_help_are_left_out_and_said():
         rig_view("r2", "a", ANGLES["a"]),
         rig_view("r2", "b", ANGLES["b"]),
     ]
-    completed, notes = complete_rigs(views, {"r1a": turned_camera(1)})
+    completed, notes = _complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}
     assert any("1 view of lens b left out: there is no pose, and nothing says" in note for note in notes)
     assert sum("no lens of their release has a pose" in note for note in notes) == 2
@@ -195,6 +195,6 @@ def test_views_without_any_help_are_left_out_and_said():
 
 def test_views_without_release_are_left_alone():
     single = [CaptureView("one", rig_view("", "a").cube), CaptureView("two", rig_view("", "a").cube)]
-    completed, notes = complete_rigs(single, {"one": turned_camera(1)})
+    completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
     assert set(completed) == {"one"}
     assert notes == ()

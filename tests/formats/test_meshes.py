@@ -61,15 +61,7 @@ def test_a_property_that_the_format_has_no_type_for_is_refused(tmp_path):
 def written_obj(folder):
     names = ["red clay", "blue/green", "never used"]
     return write_obj(
-        folder / "a.mesh",
-        POSITIONS,
-        NORMALS,
-        COLOURS,
-        FACES,
-        MATERIALS,
-        names,
-        PALETTE,
-        ["about\nit"],
+        folder / "a.mesh", POSITIONS, NORMALS, COLOURS, FACES, MATERIALS, names, PALETTE, ["about\nit"]
     )
 
 
@@ -117,13 +109,7 @@ def test_each_face_has_the_material_it_was_given_in_its_colour(tmp_path):
 def written_glb(folder):
     numbers = {"_MATERIAL": NORMALS[:, 0]}
     return write_glb(
-        folder / "mesh.glb",
-        POSITIONS,
-        NORMALS,
-        COLOURS,
-        FACES,
-        numbers,
-        {"materials": ["oak", "löss"]},
+        folder / "mesh.glb", POSITIONS, NORMALS, COLOURS, FACES, numbers, {"materials": ["oak", "löss"]}
     )
 
 

@@ -23,7 +23,7 @@ from tests.captures.poses.pose_factory import (
 )
 from unmix_plugin.captures.poses.pose_set import match_poses
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.posing import place_poses
+from unmix_plugin.captures.posing import _place_poses
 from unmix_plugin.formats.meshes import read_ply_points
 
 _SIMILARITY = (
@@ -47,7 +47,7 @@ COLMAP_POINTS = b"1 0.5 0.25 1 255 0 7 0.3 1 0 2 0\n2 1 2 3 1 2 3 0.5\n"
 def read_and_place(path: Path) -> None:
     """Read poses and do with them what a scene needs."""
     poses = read_poses(path)
-    placed = place_poses(poses)
+    placed = _place_poses(poses)
     match_poses(poses, [(name, []) for name in poses.cameras])
     for camera in placed.poses.cameras.values():
         assert np.isfinite(camera.camera_to_world).all()

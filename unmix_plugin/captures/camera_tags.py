@@ -159,8 +159,9 @@ def band_of(tags: XmpTags) -> BandTable | None:
     for name in ("Camera:CentralWavelength", "BandFreq"):
         value = tag_value(tags, name) or []
         items = [value] if isinstance(value, str) else value
-        centres = [_first_number(item) for item in items]
-        if not centres or any(centre is None or not 100.0 < centre < 20_000.0 for centre in centres):
+        found = [re.search(_NUMBER, item) for item in items]
+        centres = [float(number[0]) for number in found if number]
+        if not found or len(centres) < len(found) or not all(100 < centre < 20_000 for centre in centres):
             continue
         halves = [re.search(rf"\+\s*/?\s*-\s*({_NUMBER})", item) for item in items]
         widths = tag_numbers(tags, "Camera:WavelengthFWHM") or []
@@ -169,12 +170,6 @@ def band_of(tags: XmpTags) -> BandTable | None:
         fwhm_nm = np.array(widths) if len(widths) == len(centres) else None
         return BandTable(np.array(centres, dtype=np.float64), f"XMP tag {name}, nm", fwhm_nm)
     return None
-
-
-def _first_number(text: str) -> float | None:
-    """The first number of a text."""
-    found = re.search(_NUMBER, text)
-    return float(found[0]) if found else None
 
 
 @dataclass(frozen=True)
@@ -200,10 +195,7 @@ class RadiometricModel:
         return f"{unit} by {self.maker}'s calibration in the file, black level {self.black_level:g}"
 
     def apply(
-        self,
-        values: Float[np.ndarray, "h W b"],
-        rows: slice = slice(None),
-        columns: slice = slice(None),
+        self, values: Float[np.ndarray, "h W b"], rows: slice = slice(None), columns: slice = slice(None)
     ) -> Float32[np.ndarray, "h W b"]:
         """Radiance of some rows; a little below 0 where noise goes below the black level.
 

@@ -396,6 +396,3 @@ def _slope(first: SeenView, second: SeenView, points: _Points) -> float | None:
     angle = float(np.arccos(np.clip(first.axis @ second.axis, -1.0, 1.0)))
     slope = np.polyfit((along - middle) / radius, ratio[good], 1)[0]
     return float(slope / angle)
-
-
-_WIDTH = 110

@@ -110,18 +110,14 @@ def make_demo_capture(
         truth.mkdir()
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
         write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
-        _write_images(staging, cameras, spectra, demo_line_camera(size, sampling.centers_nm, lamp), sampling)
+        _write_images(staging, cameras, spectra, _demo_line_camera(size, sampling.centers_nm, lamp), sampling)
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
 
 
 def _write_images(
-    folder: Path,
-    cameras: Cameras,
-    spectra: Float[np.ndarray, "K B"],
-    camera: _LineCamera,
-    bands: Bands,
+    folder: Path, cameras: Cameras, spectra: Float[np.ndarray, "K B"], camera: _LineCamera, bands: Bands
 ) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
@@ -211,7 +207,7 @@ class _LineCamera:
         return counts.round().clip(0, np.iinfo(np.uint16).max).astype(np.uint16)
 
 
-def demo_line_camera(
+def _demo_line_camera(
     width: int, wavelengths_nm: Float[np.ndarray, " B"], lamp: Float[np.ndarray, " B"]
 ) -> _LineCamera:
     """The demo's line camera.
@@ -234,6 +230,5 @@ def demo_line_camera(
     )
     dark[1::2] += _DARK_SPREAD
     return _LineCamera(
-        (WHITE_SHARE * FULL_WELL * light / light.max()).astype(np.float32),
-        dark.clip(0).astype(np.float32),
+        (WHITE_SHARE * FULL_WELL * light / light.max()).astype(np.float32), dark.clip(0).astype(np.float32)
     )

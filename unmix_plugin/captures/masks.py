@@ -97,7 +97,7 @@ def _brightness(kind: _Background, values: Float32[np.ndarray, "*pixels B"]) -> 
     return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
-def find_background(
+def _find_background(
     kind: _Background, border: Float32[np.ndarray, "N B"], brightest: float
 ) -> BackgroundRule:
     """The rule that fits pixels at the border of the views.
@@ -140,7 +140,7 @@ def background_rule(
         CaptureError: most of the border is not of this kind.
     """
     pixels = _border(sensor, views, scale)
-    return find_background(kind, pixels, _brightest(kind, sample, pixels))
+    return _find_background(kind, pixels, _brightest(kind, sample, pixels))
 
 
 def white_background_note(

@@ -46,12 +46,7 @@ class Plan:
             if key not in ("output_dir", "overwrite", "poses")
         }
         files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
-        return {
-            "version": __version__,
-            "options": asked,
-            "decisions": self.decisions,
-            "files": stamps(files),
-        }
+        return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps(files)}
 
 
 def make_plan(

@@ -149,7 +149,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         (view.name, [*view.cube.files, *([] if view.picture is None else [view.picture])]) for view in views
     ]
     cameras, said = match_poses(poses, files)
-    cameras, completed = complete_rigs(views, cameras)
+    cameras, completed = _complete_rigs(views, cameras)
     matched = [note for note in said if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
     if len(posed) < _LEAST_VIEWS:
@@ -162,7 +162,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         for view in posed
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
-    placed = place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
+    placed = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     keys = placed.placement.to_json() if poses.has_world else {}
     return PosedViews(posed, placed.poses, keys, (*poses.notes, *matched, *completed, *placed.notes))
 
@@ -194,7 +194,7 @@ def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
     )
 
 
-def complete_rigs(
+def _complete_rigs(
     views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
 ) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
     """Give views without pose that of another lens of the same release, moved by the rig.
@@ -289,7 +289,7 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
-def place_poses(poses: PoseSet, is_flight: bool = False) -> _PlacedPoses:
+def _place_poses(poses: PoseSet, is_flight: bool = False) -> _PlacedPoses:
     """Settle up axis, middle and scale of a scene.
 
     The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from unmix_plugin.captures.calibration.sensor import References
-from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
+from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import input_files, make_plan
 from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
@@ -93,7 +93,7 @@ def _check(options: ProcessOptions) -> None:
 def _open_capture(options: ProcessOptions) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     references = tuple(path for path in (options.dark, options.white) if path is not None)
-    asked = LayoutOptions(wavelengths, options.dataset, options.axes, references)
+    asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=references)
     capture = find_views(options.layout, options.data, asked)
     first: dict[str, SpectralFile] = {}
     for view in capture.views:

@@ -39,7 +39,7 @@ _lock = threading.Lock()
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a user adds to a file that doesn't say enough of itself, or against what it says."""
+    """What a user adds to files that don't say enough of themselves, or against what they say."""
 
     dataset: str | None = None
     """Variable or data set to take from a file that holds several."""
@@ -49,6 +49,8 @@ class ReadOptions:
     """Order of the axes in formats that don't fix it: NumPy, MATLAB, HDF5, torch, pages of a TIFF."""
     size: tuple[int, int] | None = None
     """Rows and columns of an image that is stored as a list of pixels, column after column as MATLAB writes it."""
+    exclude: tuple[Path, ...] = ()
+    """Files in a folder that are not views, such as dark and white references."""
 
 
 @dataclass(frozen=True)

@@ -251,12 +251,6 @@ def _read_envi_library(path: Path) -> SpectraTable:
 
     Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
     `reflectance scale factor` (values are divided by it) and `data ignore value`.
-
-    Args:
-        path: Its header, or the file of numbers beside which the header lies.
-    Raises:
-        SpectrumError: a part is missing, is not such a library, has a unit of wavelength that is not known, or holds
-            values that are ignored, not finite or negative.
     """
     header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
     try:

@@ -74,9 +74,7 @@ def write_ply(
     return write_file(path, "\n".join([*header, "end_header", ""]).encode("ascii", "replace") + body)
 
 
-def read_ply_points(
-    path: Path,
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
     """Positions and, if there are any, colours of the vertices of a PLY, binary or text.
 
     Raises:

@@ -7,7 +7,7 @@ import pytest
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.sensor import (
-    BandChoice,
+    _BandChoice,
     _drop_found,
     _find_saturation,
     _noise_shares,
@@ -46,7 +46,7 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
     found, _ = _drop_found(
-        BandChoice(WAVELENGTHS_NM, {0: "named"}), _Sample(values[:, 1:], saturated[:, 1:]), 0.5
+        _BandChoice(WAVELENGTHS_NM, {0: "named"}), _Sample(values[:, 1:], saturated[:, 1:]), 0.5
     )
     assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
         0: "named",
@@ -60,24 +60,24 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
 def test_a_white_background_that_saturates_every_band_drops_none():
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert _drop_found(BandChoice(WAVELENGTHS_NM, {}), _Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
+    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), _Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
 
 
 def test_bands_that_have_nothing_in_common_are_not_all_noise():
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
-    found, notes = _drop_found(BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
+    found, notes = _drop_found(_BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
     assert found.dropped == {}
     assert notes == ("12 of 12 bands have noise above 30% of their signal; all are kept",)
 
 
 def test_bands_are_sorted_and_binned_by_wavelength():
-    choice = BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), {3: "named"})
+    choice = _BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), {3: "named"})
     np.testing.assert_array_equal(choice.kept, [1, 4, 2, 0])
     np.testing.assert_allclose(choice.centers_nm(2), [525.0, 650.0])
 
 
 def test_a_wavelength_is_used_once():
-    assert list(BandChoice(np.array([500.0, 510.0, 500.0]), {}).without_repeated().dropped) == [2]
+    assert list(_BandChoice(np.array([500.0, 510.0, 500.0]), {}).without_repeated().dropped) == [2]
 
 
 @pytest.mark.parametrize(("top", "expected"), [(4095, 4095.0), (3900, 3900.0), (None, 65535.0)])

@@ -8,9 +8,9 @@ import OpenEXR
 import torch
 from PIL import Image
 
-from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.spectral_file import ReadOptions
 
-PLAIN = LayoutOptions()
+PLAIN = ReadOptions()
 
 
 def pose(index: int) -> list[list[float]]:

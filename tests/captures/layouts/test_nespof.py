@@ -14,8 +14,8 @@ from tests.captures.layouts.data_sets import (
     write_nespof,
     write_real,
 )
-from unmix_plugin.captures.layouts.nespof import find_nespof, find_nespof_real, open_intensity, open_opacity
-from unmix_plugin.captures.layouts.registry import LayoutOptions
+from unmix_plugin.captures.layouts.nespof import _open_intensity, _open_opacity, find_nespof, find_nespof_real
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
 
@@ -78,7 +78,7 @@ def test_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
 
 def test_given_wavelengths_replace_the_names_of_folders(tmp_path):
     write_nespof(tmp_path)
-    options = LayoutOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
+    options = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
     wavelengths = find_nespof(tmp_path, options).views[0].cube.bands.wavelengths_nm
     assert wavelengths is not None
     assert wavelengths.tolist() == [500.0, 510.0, 520.0]
@@ -88,14 +88,14 @@ def test_given_wavelengths_replace_the_names_of_folders(tmp_path):
 def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, kind):
     names = [f"ch{index:02d}" for index in range(16)]
     write_exr(tmp_path / "a.exr", {name: np.full((3, 4), float(i)) for i, name in enumerate(names)}, kind)
-    assert (open_intensity(tmp_path / "a.exr").read() == 4.0).all()
-    assert open_opacity(tmp_path / "a.exr") is None
+    assert (_open_intensity(tmp_path / "a.exr").read() == 4.0).all()
+    assert _open_opacity(tmp_path / "a.exr") is None
 
 
 def test_channels_are_known_by_name_wherever_they_stand(tmp_path):
     write_exr(tmp_path / "a.exr", {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
-    assert (open_intensity(tmp_path / "a.exr").read() == 2.0).all()
-    alpha = open_opacity(tmp_path / "a.exr")
+    assert (_open_intensity(tmp_path / "a.exr").read() == 2.0).all()
+    alpha = _open_opacity(tmp_path / "a.exr")
     assert alpha is not None
     assert (alpha.read() == 0.5).all()
 
@@ -103,7 +103,7 @@ def test_channels_are_known_by_name_wherever_they_stand(tmp_path):
 def test_other_channels_are_refused(tmp_path):
     write_exr(tmp_path / "a.exr", {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
     with pytest.raises(CaptureError, match="has the channels G, R; expected s0 to s3"):
-        open_intensity(tmp_path / "a.exr")
+        _open_intensity(tmp_path / "a.exr")
 
 
 def test_missing_files_are_counted_and_named(tmp_path):

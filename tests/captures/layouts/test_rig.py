@@ -23,12 +23,11 @@ from tests.captures.layouts.rig_flight import (
     write_poses,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.layouts.registry import LayoutOptions
-from unmix_plugin.captures.layouts.rig import find_rig, lens_of, splits_of
+from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.process import process_capture
-from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
 
@@ -143,7 +142,7 @@ def test_releases_stay_together_when_views_are_split(scene):
 )
 def test_what_is_evaluated_lies_in_the_middle_of_a_flight(count, evaluated):
     names = [f"IMG_{number:04d}" for number in range(count)]
-    splits = splits_of(names)
+    splits = _splits_of(names)
     assert [number for number, name in enumerate(names) if splits[name] == "eval"] == evaluated
 
 
@@ -271,10 +270,10 @@ def test_thermal_bands_and_missing_bands_are_said(tmp_path):
 def test_given_wavelengths_are_one_a_lens(tmp_path):
     for band in (1, 2):
         write_band_file(tmp_path / f"IMG_0000_{band}.tif", np.full((4, 5), 9), {})
-    views = find_rig(tmp_path, LayoutOptions(wavelengths_nm=np.array([500.0, 600.0]))).views
+    views = find_rig(tmp_path, ReadOptions(wavelengths_nm=np.array([500.0, 600.0]))).views
     assert [view.cube.bands.wavelengths_nm for view in views] == [500.0, 600.0]
     with pytest.raises(CaptureError, match=r"gives 3 numbers for 2 lenses \(1, 2\)"):
-        find_rig(tmp_path, LayoutOptions(wavelengths_nm=np.array([500.0, 600.0, 700.0])))
+        find_rig(tmp_path, ReadOptions(wavelengths_nm=np.array([500.0, 600.0, 700.0])))
 
 
 def test_a_lens_twice_in_one_release_is_refused(tmp_path):

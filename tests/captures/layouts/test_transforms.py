@@ -23,10 +23,11 @@ from tests.captures.layouts.data_sets import (
     write_real,
     write_unmix,
 )
-from unmix_plugin.captures.layouts.registry import LAYOUTS, LayoutOptions, find_views
+from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.layouts.transforms import find_hs_nerf, find_nerfstudio, find_unmix_nerf
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
@@ -78,7 +79,7 @@ def test_wavelengths_are_those_of_the_file_unless_given(tmp_path):
     assert bands.wavelengths_nm is not None
     assert bands.wavelengths_nm.tolist() == [450.0, 500.0, 550.0, 600.0]
     assert "transforms.json" in bands.evidence
-    given = LayoutOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
+    given = ReadOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
     bands = find_unmix_nerf(tmp_path, given).views[0].cube.bands
     assert bands.wavelengths_nm is not None
     assert bands.wavelengths_nm.tolist() == [400.0, 410.0, 420.0, 430.0]
@@ -178,7 +179,7 @@ def test_tensors_of_8_bits_are_fractions_of_255(tmp_path, kind, scale):
 def test_given_wavelengths_must_be_one_a_band(tmp_path):
     write_hs(tmp_path)
     with pytest.raises(CaptureError, match=r"frame_00000.pt.* 3 "):
-        find_hs_nerf(tmp_path, LayoutOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
+        find_hs_nerf(tmp_path, ReadOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])

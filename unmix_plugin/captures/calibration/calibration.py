@@ -37,15 +37,7 @@ def is_srgb(file: SpectralFile) -> bool:
 
 
 def _linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
-    """Numbers of some whole rows: pictures decoded, and the calibration applied that the file carries itself.
-
-    Args:
-        file: Where they are from.
-        stored: As read.
-        rows: Which rows of the file they are.
-    Raises:
-        CaptureError: the calibration in the file is damaged.
-    """
+    """Numbers of some whole rows: pictures decoded, and the calibration applied that the file carries itself."""
     if is_srgb(file):  # IEC 61966-2-1:1999
         top = np.iinfo(stored.dtype).max
         levels = np.arange(top + 1) / top
@@ -183,10 +175,7 @@ def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.nda
 
 
 def white_reference(
-    reference: Reference,
-    dark: Reference | None,
-    reflectance: str,
-    wavelengths_nm: Float64[np.ndarray, " B"],
+    reference: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> WhiteReference:
     """A white panel that is brighter than the dark.
 

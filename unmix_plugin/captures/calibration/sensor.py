@@ -58,7 +58,7 @@ _LEAST_BRIGHT = 0.05
 
 
 @dataclass(frozen=True)
-class BandChoice:
+class _BandChoice:
     """The bands of one sensor: in order of wavelength, without bad ones."""
 
     wavelengths_nm: Float64[np.ndarray, " B"]
@@ -78,12 +78,12 @@ class BandChoice:
         count = len(kept) // binning
         return kept[: count * binning].reshape(count, binning).mean(axis=1)
 
-    def without(self, marks: Bool[np.ndarray, " B"], reason: str) -> BandChoice:
+    def without(self, marks: Bool[np.ndarray, " B"], reason: str) -> _BandChoice:
         """The choice without some more bands."""
         added = {int(index): reason for index in np.flatnonzero(marks)}
-        return BandChoice(self.wavelengths_nm, {**added, **self.dropped})
+        return _BandChoice(self.wavelengths_nm, {**added, **self.dropped})
 
-    def without_repeated(self) -> BandChoice:
+    def without_repeated(self) -> _BandChoice:
         """The choice without bands whose wavelength an earlier band has."""
         repeated = np.ones(len(self.wavelengths_nm), bool)
         repeated[np.unique(self.wavelengths_nm, return_index=True)[1]] = False
@@ -113,7 +113,7 @@ class Sensor:
 
     name: str
     calibration: Calibration
-    bands: BandChoice
+    bands: _BandChoice
     unit: str
     """What values are: reflectance, relative radiance, ..."""
     is_absolute: bool
@@ -212,14 +212,14 @@ def prepare_sensor(
     )
 
 
-def _stated_bands(file: SpectralFile, options: ProcessOptions) -> BandChoice:
+def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
     wavelengths = file.bands.wavelengths_nm
     if wavelengths is None:
         raise CaptureError(
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
             "with --wavelengths, as a list in nm or a CSV file"
         )
-    choice = BandChoice(wavelengths, {}).without_repeated()
+    choice = _BandChoice(wavelengths, {}).without_repeated()
     if file.bands.bad is not None:
         choice = choice.without(file.bands.bad, "marked as bad in the file")
     if options.drop_bands is not None:
@@ -228,7 +228,7 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> BandChoice:
 
 
 def _references(
-    views: Sequence[CaptureView], choice: BandChoice, options: ProcessOptions, references: References
+    views: Sequence[CaptureView], choice: _BandChoice, options: ProcessOptions, references: References
 ) -> tuple[Reference | None, WhiteReference | None]:
     cube = views[0].cube
     dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
@@ -281,7 +281,7 @@ def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
 
 
 def _evidence(
-    views: Sequence[CaptureView], choice: BandChoice, dark: Reference | None, white: WhiteReference | None
+    views: Sequence[CaptureView], choice: _BandChoice, dark: Reference | None, white: WhiteReference | None
 ) -> dict[str, Any]:
     """References, bands, and what sunshine sensors measured, by view."""
     used = {"dark": dark, "white": None if white is None else white.reference}
@@ -349,16 +349,9 @@ def _places(files: Sequence[SpectralFile], rows: list[int]) -> Iterator[tuple[Sp
 
 
 def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
-    """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence.
-
-    Files of floating-point numbers have none, as they were processed.
-
-    Args:
-        files: Of the views of one sensor.
-        bands: Indices of bands that may be usable; those with one value in all sampled pixels are left out here.
-    """
+    """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence."""
     dtype = files[0].dtype
-    if dtype.kind not in "iu" or dtype.itemsize > 2:
+    if dtype.kind not in "iu" or dtype.itemsize > 2:  # such numbers were processed
         return None, f"none: the files hold {dtype.name}"
     low = int(np.iinfo(dtype).min)
     counts = np.zeros(np.iinfo(dtype).max - low + 1, dtype=np.int64)
@@ -391,14 +384,7 @@ class _Sample:
 
 
 def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sample:
-    """Pixels on the sampled rows, evenly spaced along them.
-
-    Args:
-        files: Of the views of one sensor.
-        calibration: Without band binning; all bands that it keeps are sampled.
-    Raises:
-        CaptureError: every sampled pixel is missing, or a file can't be read.
-    """
+    """Pixels on the sampled rows, evenly spaced along them, at all bands that the calibration keeps."""
     raster = calibration.raster
     rows = sampled_rows(raster.height)
     step = max(1, len(files) * len(rows) * raster.width // _MOST_PIXELS)
@@ -419,17 +405,10 @@ def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sa
     return sample
 
 
-def _drop_found(choice: BandChoice, sample: _Sample, max_noise: float) -> tuple[BandChoice, tuple[str, ...]]:
-    """Leave out bands that are dead, saturated or noisy in the sample.
-
-    Where most bands are noisy none is left out for it: bands have little in common then, or the whole capture is noisy.
-
-    Args:
-        choice: Bands that were kept so far; the sample has these, in their order.
-        max_noise: Greatest noise as a share of a band's signal.
-    Returns:
-        The choice, and what a user should know.
-    """
+def _drop_found(
+    choice: _BandChoice, sample: _Sample, max_noise: float
+) -> tuple[_BandChoice, tuple[str, ...]]:
+    """Leave out bands that are dead, saturated or noisy in the sample, which has all that were kept; and notes."""
     kept, notes = choice.kept, ()
     shares = sample.saturated.mean(axis=0)
     is_saturated = shares > _MOST_SATURATED + np.median(shares)
@@ -438,7 +417,7 @@ def _drop_found(choice: BandChoice, sample: _Sample, max_noise: float) -> tuple[
     usable = ~sample.saturated[:, ~is_dead].any(axis=1)
     noise[~is_dead] = _noise_shares(sample.values[usable][:, ~is_dead])
     is_noisy = noise > max_noise  # false for NaN
-    if is_noisy.mean() > _MOST_NOISY:
+    if is_noisy.mean() > _MOST_NOISY:  # bands have little in common then, or the whole capture is noisy
         notes = (
             f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal; all are kept",
         )
@@ -448,7 +427,7 @@ def _drop_found(choice: BandChoice, sample: _Sample, max_noise: float) -> tuple[
     many = f"saturated in more than {_MOST_SATURATED:.0%} of sampled pixels"
     reasons |= dict.fromkeys(kept[is_saturated].tolist(), many)
     reasons |= dict.fromkeys(kept[is_dead].tolist(), "dead: the same value in every sampled pixel")
-    return BandChoice(choice.wavelengths_nm, reasons | choice.dropped), notes
+    return _BandChoice(choice.wavelengths_nm, reasons | choice.dropped), notes
 
 
 def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:

@@ -10,9 +10,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from unmix_plugin.captures.layouts.registry import LayoutOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
+from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
 _CUBE_SUFFIXES = frozenset(
@@ -25,7 +24,7 @@ _REFERENCE_NAME = re.compile(
 """Names of files that hold no view."""
 
 
-def find_cubes(root: Path, options: LayoutOptions) -> Capture:
+def find_cubes(root: Path, options: ReadOptions) -> Capture:
     """The views of a folder.
 
     Raises:
@@ -65,8 +64,8 @@ def find_cubes(root: Path, options: LayoutOptions) -> Capture:
     return Capture("cubes", root, tuple(views), notes=tuple(notes))
 
 
-def _open(path: Path, options: LayoutOptions) -> SpectralFile:
-    file = open_spectral_file(path, options.read)
+def _open(path: Path, options: ReadOptions) -> SpectralFile:
+    file = open_spectral_file(path, options)
     is_picture = path.suffix.lower() in _PICTURE_SUFFIXES and file.dtype.itemsize == 1
     if is_picture and "encoding" not in file.metadata:
         file = replace(file, metadata={**file.metadata, "encoding": "sRGB"})

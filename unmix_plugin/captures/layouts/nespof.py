@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.layouts.registry import FoundFiles, LayoutOptions, view_names
+from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
 from unmix_plugin.captures.layouts.transforms import make_capture, read_frames, with_wavelengths
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -41,7 +41,7 @@ _WAVELENGTH_NAME = re.compile(r"(\d+(?:\.\d+)?)(?:\s*nm)?", re.IGNORECASE)
 _POSES = "poses_bounds.npy"
 
 
-def find_nespof(root: Path, options: LayoutOptions) -> Capture:
+def find_nespof(root: Path, options: ReadOptions) -> Capture:
     """The views of a rendered scene.
 
     Raises:
@@ -65,7 +65,7 @@ def find_nespof(root: Path, options: LayoutOptions) -> Capture:
             CaptureView(
                 name,
                 _stack_intensities(dict(zip(folders, there, strict=True)), options),
-                alpha=open_opacity(there[0]),
+                alpha=_open_opacity(there[0]),
                 labels=next((path for path in labels if path.is_file()), None),
                 split=frame.split,
             )
@@ -76,7 +76,7 @@ def find_nespof(root: Path, options: LayoutOptions) -> Capture:
     return make_capture("nespof", root, listed, views)
 
 
-def find_nespof_real(root: Path, options: LayoutOptions) -> Capture:
+def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
     """The views of a real capture.
 
     Raises:
@@ -135,14 +135,14 @@ def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
     return dict(sorted(entries.items()))
 
 
-def _stack_intensities(files: dict[float, Path], options: LayoutOptions) -> SpectralFile:
+def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> SpectralFile:
     """Files of one view by their wavelength, as one cube."""
-    parts = [open_intensity(file) for file in files.values()]
+    parts = [_open_intensity(file) for file in files.values()]
     bands = BandTable(np.array(list(files), dtype=np.float64), "names of the folders or files, nm")
     return with_wavelengths(replace(stack_bands(parts, parts[0].path), bands=bands), options)
 
 
-def open_intensity(path: Path) -> SpectralFile:
+def _open_intensity(path: Path) -> SpectralFile:
     """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels.
 
     Raises:
@@ -161,7 +161,7 @@ def open_intensity(path: Path) -> SpectralFile:
     return open_spectral_file(path, ReadOptions(named[0]))
 
 
-def open_opacity(path: Path) -> SpectralFile | None:
+def _open_opacity(path: Path) -> SpectralFile | None:
     """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
     channel = _opacity_channel(_channels(path))
     return None if channel is None else open_spectral_file(path, ReadOptions(channel))

@@ -7,38 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-import numpy as np
-from jaxtyping import Float64
-
-from unmix_plugin.captures.spectral_file import Axes, Capture, ReadOptions
+from unmix_plugin.captures.spectral_file import Capture, ReadOptions
 from unmix_plugin.errors import CaptureError, counted
 
-
-@dataclass(frozen=True)
-class LayoutOptions:
-    """What a user says about the files of a capture."""
-
-    wavelengths_nm: Float64[np.ndarray, " B"] | None = None
-    """Band centres in nm, in the order of the files; they replace what the files say."""
-    dataset: str | None = None
-    """Data set to take from files that hold several."""
-    axes: Axes | None = None
-    """Order of the axes in files that don't fix it."""
-    exclude: tuple[Path, ...] = ()
-    """Files in the folder that are not views, such as dark and white references."""
-
-    @property
-    def read(self) -> ReadOptions:
-        """What the readers get."""
-        return ReadOptions(self.dataset, self.wavelengths_nm, self.axes)
-
-
-_FindViews: TypeAlias = Callable[[Path, LayoutOptions], Capture]
+_FindViews: TypeAlias = Callable[[Path, ReadOptions], Capture]
 """Finds the views below a folder; raises CaptureError where there are none or they can't be opened."""
 
 _FUNCTIONS = {
@@ -55,7 +31,7 @@ _FUNCTIONS = {
 LAYOUTS = tuple(_FUNCTIONS)
 
 
-def find_views(layout: str, root: Path, options: LayoutOptions) -> Capture:
+def find_views(layout: str, root: Path, options: ReadOptions) -> Capture:
     """The views of a capture in one of `LAYOUTS`.
 
     Raises:

@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.layouts.registry import LayoutOptions, view_names
+from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, SpectralFile
+from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 
 _TIFF_SUFFIXES = (".tif", ".tiff")
@@ -55,7 +55,7 @@ _LIMIT_PX = 10.0
 """By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
 
 
-def find_rig(root: Path, options: LayoutOptions) -> Capture:
+def find_rig(root: Path, options: ReadOptions) -> Capture:
     """The views of a multispectral camera; see the module.
 
     Raises:
@@ -74,7 +74,7 @@ def find_rig(root: Path, options: LayoutOptions) -> Capture:
         )
     sensors = _sensor_names(bands)
     releases = _release_names(bands, str(root))
-    splits = splits_of(releases)
+    splits = _splits_of(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
     notes = _notes(opened, bands, paths, releases)
     views: list[CaptureView] = []
@@ -111,10 +111,7 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
         same = first.setdefault(view.sensor, view)
         tables = (same.cube.bands.wavelengths_nm, view.cube.bands.wavelengths_nm)
         centres = [None if table is None else float(table[0]) for table in tables]
-        for what, expected, found in (
-            ("pixels", same.cube.shape[:2], view.cube.shape[:2]),
-            ("nm", *centres),
-        ):
+        for what, expected, found in (("pixels", same.cube.shape[:2], view.cube.shape[:2]), ("nm", *centres)):
             if expected != found:
                 raise CaptureError(
                     f"{view.cube.path} has {found} {what}, {same.cube.path} of the same lens {view.sensor} {expected}; "
@@ -122,7 +119,7 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
                 )
 
 
-def _with_given_bands(views: list[CaptureView], options: LayoutOptions) -> list[CaptureView]:
+def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[CaptureView]:
     """Wavelengths of a user, one a lens in the order of their names."""
     given = options.wavelengths_nm
     if given is None:
@@ -228,7 +225,7 @@ def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
     return [names[key] for key in keys]
 
 
-def splits_of(releases: Iterable[str]) -> dict[str, Split]:
+def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
     """One of every eight releases is for evaluation, with all its lenses: in their middle, since what the first and
     the last of a flight show no other does."""
     names = sorted(set(releases))

@@ -17,16 +17,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from unmix_plugin.captures.layouts.registry import FoundFiles, LayoutOptions, view_names
+from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, SpectralFile
+from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
@@ -159,7 +160,7 @@ def make_capture(
     return Capture(layout, root, tuple(sorted(views, key=lambda view: view.name)), poses, tuple(said))
 
 
-def with_wavelengths(file: SpectralFile, options: LayoutOptions) -> SpectralFile:
+def with_wavelengths(file: SpectralFile, options: ReadOptions) -> SpectralFile:
     """The file with the wavelengths that a user gives; unchanged where there are none.
 
     Raises:
@@ -175,7 +176,7 @@ def with_wavelengths(file: SpectralFile, options: LayoutOptions) -> SpectralFile
     return replace(file, bands=BandTable(given, "given with --wavelengths"))
 
 
-def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
+def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
     """The views of a scene of pictures. EXIF's orientation is ignored: poses refer to the stored raster.
 
     Raises:
@@ -197,7 +198,7 @@ def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
     found.refuse_missing("copy them into the folder, or drop the frames")
     views = []
     for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True):
-        file = open_spectral_file(path, options.read)
+        file = open_spectral_file(path, options)
         if file.bands.wavelengths_nm is None:
             file = replace(file, bands=replace(file.bands, evidence=_NO_WAVELENGTHS))
         picture = path if path.suffix in _SUFFIXES else None
@@ -205,25 +206,8 @@ def find_nerfstudio(root: Path, options: LayoutOptions) -> Capture:
     return make_capture("nerfstudio", root, listed, views)
 
 
-def find_unmix_nerf(root: Path, options: LayoutOptions) -> Capture:
-    """The views of a scene of UnMix-NeRF.
-
-    Raises:
-        CaptureError: no frames, files are missing or can't be read, or a path leaves the folder.
-    """
-    return _find_cubes("unmix-nerf", root, options)
-
-
-def find_hs_nerf(root: Path, options: LayoutOptions) -> Capture:
-    """The views of a scene of HS-NeRF.
-
-    Raises:
-        CaptureError: no frames, files are missing or can't be read, or a path leaves the folder.
-    """
-    return _find_cubes("hs-nerf", root, options)
-
-
-def _find_cubes(layout: str, root: Path, options: LayoutOptions) -> Capture:
+def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
+    """The views of a scene whose frames name cubes."""
     listed = read_frames(root, _CUBE_KEY)
     names = view_names([frame.text(_CUBE_KEY) for frame in listed.frames], str(root))
     found, moved = FoundFiles(root), 0
@@ -258,6 +242,11 @@ def _find_cubes(layout: str, root: Path, options: LayoutOptions) -> Capture:
     return make_capture(layout, root, listed, views, [followed] if moved else [])
 
 
+find_unmix_nerf = partial(_find_cubes, "unmix-nerf")
+find_hs_nerf = partial(_find_cubes, "hs-nerf")
+"""Views of a scene of UnMix-NeRF and of HS-NeRF; CaptureError where files are missing or lie outside of the folder."""
+
+
 def _in_eval(text: str) -> str:
     """The path with a folder `val` replaced by `eval`.
 
@@ -268,9 +257,9 @@ def _in_eval(text: str) -> str:
     return str(PurePosixPath(*("eval" if part == "val" else part for part in path.parent.parts), path.name))
 
 
-def _open_cube(path: Path, wavelengths: np.ndarray | None, options: LayoutOptions) -> SpectralFile:
+def _open_cube(path: Path, wavelengths: np.ndarray | None, options: ReadOptions) -> SpectralFile:
     """A cube; numbers of 8 bits stand for fractions of 255."""
-    file = open_spectral_file(path, options.read)
+    file = open_spectral_file(path, options)
     if file.dtype == np.uint8 and file.scale is None:
         file = replace(file, scale=255.0)
     if wavelengths is not None and len(wavelengths) == file.shape[2] and file.bands.wavelengths_nm is None:

@@ -128,9 +128,7 @@ def _similarity(element: ElementTree.Element, path: Path) -> Float64[np.ndarray,
 
 
 def _of_one_world(
-    cameras: list[ElementTree.Element],
-    worlds: dict[str | None, Float64[np.ndarray, "4 4"]],
-    notes: list[str],
+    cameras: list[ElementTree.Element], worlds: dict[str | None, Float64[np.ndarray, "4 4"]], notes: list[str]
 ) -> list[ElementTree.Element]:
     """Cameras whose components share a world; without a transform, a component's world is its own."""
     by_component: dict[str | None, list[ElementTree.Element]] = {}

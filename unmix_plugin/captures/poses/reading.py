@@ -46,6 +46,8 @@ _KNOWN = (
 _SPLIT_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "eval", "test"))
 _LLFF_FILE, _LLFF_PICTURES = "poses_bounds.npy", ("images", "exr")
 """Poses, and the folders with the pictures, in the order of whose names the poses come."""
+_Size: TypeAlias = tuple[int, int]
+"""Width, height in pixels."""
 
 
 def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> PoseSet:
@@ -184,8 +186,6 @@ def _read_llff(path: Path) -> PoseSet:
     return make_pose_set(cameras, f"LLFF's {path.name}", str(path), notes=[note])
 
 
-_Size: TypeAlias = tuple[int, int]
-"""Width, height in pixels."""
 _NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""
 _PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
@@ -201,14 +201,7 @@ def _has_frames(content: Any) -> bool:
 
 
 def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
-    """Poses of one transforms.json, or of one for each split.
-
-    Args:
-        contents: JSON of the files.
-        sizes: Of pictures by name, file name or stem, where neither the files nor the pictures themselves tell them.
-    Raises:
-        CaptureError: no list of frames, a frame without a sound pose, or a lens that can't be represented.
-    """
+    """Poses of one transforms.json, or of one for each split."""
     cameras: list[tuple[str, PosedCamera]] = []
     notes: list[str] = []
     points: SparsePoints | None = None

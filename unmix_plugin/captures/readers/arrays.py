@@ -92,11 +92,7 @@ class _FoundArray:
 def _image_of_arrays(
     path: Path, reader: str, arrays: Sequence[_FoundArray], options: ReadOptions
 ) -> SpectralFile:
-    """The image of a file: the array that is named, otherwise the only one of three axes.
-
-    Raises:
-        CaptureError: no array, or more than one, can be the image.
-    """
+    """The image of a file: the array that is named, otherwise the only one of three axes."""
     image = _find_image(path, arrays, options)
     what = image.name or "the array"
     size = _pixel_list_size(image, arrays, options)

@@ -244,11 +244,7 @@ def _header_beside(data_path: Path) -> Path | None:
 
 
 def _open_envi(path: Path, _: ReadOptions) -> SpectralFile:
-    """Open an image by its header, or by the file of numbers beside it.
-
-    Raises:
-        CaptureError: a file is missing, is of another kind, or holds less than the header promises.
-    """
+    """Open an image by its header, or by the file of numbers beside it."""
     is_header = path.suffix.lower() == ".hdr" or _is_envi_header(path)
     header_path = path if is_header else _header_beside(path)
     if header_path is None:

@@ -237,11 +237,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
 
 
 def _list_channels(header: bytes) -> list[_Channel]:
-    """Channels of the first part, from the first bytes of a file.
-
-    Raises:
-        ValueError: there is no list of channels, or it is damaged.
-    """
+    """Channels of the first part, from the first bytes of a file; ValueError where they are damaged."""
     position = header.find(_MARK) + len(_MARK)
     if position < len(_MARK):
         raise ValueError("no list of channels in the header")

@@ -97,11 +97,7 @@ def write_scene_files(
 
 
 def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
-    """Write the sparse points, in the scene's world, beside a scene's transforms.json; its key, if there are any.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write the sparse points, in the scene's world, beside a scene's transforms.json; its key, if there are any."""
     if poses.points is None or len(poses.points) == 0:
         return {}
     columns = {axis: poses.points[:, index].astype(np.float32) for index, axis in enumerate("xyz")}
@@ -285,14 +281,7 @@ def _contact_sheet(
     colours: UInt8[np.ndarray, "P 3"] | None,
     heading: str,
 ) -> bytes:
-    """The sheet as a PNG.
-
-    Args:
-        views: At least one.
-        spectra: One a sensor.
-        points, colours: Sparse points in the scene's world and their sRGB.
-        heading: First line.
-    """
+    """The sheet as a PNG, with one group of spectra a sensor and the points in their sRGB."""
     from matplotlib.figure import Figure
 
     tiles = _tiles(views)
