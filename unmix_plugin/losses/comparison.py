@@ -8,7 +8,6 @@ Notation: `R` pixels of a sensor, `N` rays, `b` channels of a sensor, `B` bands 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -40,6 +39,8 @@ _OUTLIER = 1.0
 """Error of an exposed value above which it counts in proportion instead of squared. It matters in dark scenes only: a
 blown-out pixel would otherwise outweigh all others. What a saturated value misses is unknown anyway, so for such pixels
 the bound is divided by the exposure."""
+_NO_OUTLIER = 1e6
+"""The same where errors are squared however large; infinity would have no gradient."""
 _SPARSITY_PART = 0.25
 """Part of the training in which sparsity is asked for: later it would thin out surfaces."""
 _SURFACE_PART = 0.5
@@ -190,7 +191,7 @@ class BatchComparison:
         target = over_background(exposure * measured.spectra, measured.alpha, grey)
         predicted = over_background(exposure * part.spectra, part.opacities, grey)
         predicted = forgive_saturation(predicted, target, measured.spectra)
-        bound = math.inf if self.as_published else _OUTLIER
+        bound = _NO_OUTLIER if self.as_published else _OUTLIER
         outliers = torch.where(is_blown_out(measured.spectra), bound / exposure, bound)[:, None]
         squares = bounded_square(predicted - target, outliers)
         weights, power = self.balance.of(measured.sensor), choose(self.config.relative, 0.0)
