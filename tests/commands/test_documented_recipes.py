@@ -46,16 +46,7 @@ def test_both_pages_have_recipes():
 def test_a_documented_recipe_works(five_materials, tmp_path, recipe):
     (tmp_path / "paints.csv").write_text("wavelength,ochre,umber\n300,0.2,0.1\n1100,0.6,0.3\n")
     (tmp_path / "edits.yml").write_text(recipe)
-    words = [
-        "--edits",
-        tmp_path / "edits.yml",
-        "--outputs",
-        "rgb",
-        "--output",
-        tmp_path / "out",
-        "--device",
-        "cpu",
-    ]
-    ended = run(render, "--run", five_materials, *words)
+    words = ["--edits", tmp_path / "edits.yml", "--outputs", "rgb", "--output", tmp_path / "out"]
+    ended = run(render, "--run", five_materials, *words, "--device", "cpu")
     assert ended.status == 0, ended.err
     assert list((tmp_path / "out").rglob("*.png"))

@@ -47,28 +47,19 @@ def test_words_default_to_those_of_the_process(monkeypatch):
     assert seen == ["unmix-nerf"]
 
 
-@pytest.mark.parametrize("lines", [1, 100_000])
-def test_output_that_nobody_reads_to_the_end_is_no_error(lines):
+@pytest.mark.parametrize(
+    "command",
+    [
+        "lambda _: print('line')",
+        "lambda _: [print('line') for _ in range(100_000)]",
+        "lambda _: [say(CommandConsole(), 'line') for _ in range(10)]",
+    ],
+)
+def test_output_that_nobody_reads_to_the_end_is_no_error(command):
     """As after `| head -1`, whether all of it waits in the buffer or not."""
     code = (
         "from unmix_plugin.commands.entry import run_command; "
-        f"run_command(lambda _: [print('line') for _ in range({lines})], [])"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.close()
-        assert process.stderr.read() == b""
-    assert process.returncode == 141
-
-
-def test_a_line_of_the_console_that_nobody_reads_is_no_error_either():
-    code = (
-        "from unmix_plugin.commands.entry import run_command; "
-        "from unmix_plugin.commands.reporting import CommandConsole, say; "
-        "run_command(lambda _: [say(CommandConsole(), 'line') for _ in range(10)], [])"
+        f"from unmix_plugin.commands.reporting import CommandConsole, say; run_command({command}, [])"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -103,13 +94,9 @@ def test_a_signal_to_end_cleans_up_first(number, status):
     "error",
     [
         MemoryError(),
-        MemoryError(
-            "Unable to allocate 8.00 TiB for an array with shape (1099511627776,) and data type float64"
-        ),
+        MemoryError("Unable to allocate 8.00 TiB for an array with shape (1099511627776,)"),
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB."),
-        RuntimeError(
-            "[enforce fail at alloc_cpu.cpp:121] DefaultCPUAllocator: can't allocate memory: you tried"
-        ),
+        RuntimeError("[alloc_cpu.cpp:121] DefaultCPUAllocator: can't allocate memory: you tried"),
         RuntimeError("Failed to allocate 400 bytes on device 'cuda:0'"),
     ],
 )

@@ -2,20 +2,18 @@
 
 import errno
 import importlib.metadata
-import io
 import os
 import shutil
 
 import numpy as np
 import pytest
 from PIL import Image
-from rich.console import Console
 
 from tests.commands.running import picture_size, run
 from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
+from tests.engine.stopped_runs import finished
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine import registry
-from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run
 
@@ -83,17 +81,6 @@ def test_views_are_chosen_by_split_and_named_as_the_frames(trained, tmp_path, vi
     assert names == {name for name in frames if views == "all" or name.startswith(views)}
 
 
-def test_exports_go_into_the_run_by_default_and_need_no_data(trained, run_copy, tmp_path):
-    shutil.move(trained.scene, tmp_path / "elsewhere")
-    try:
-        for product in ("abundances", "segmentation", "endmembers"):
-            ended = run(export, product, "--run", run_copy)
-            assert ended.status == 0, ended.err
-            assert list((run_copy / "exports" / product).iterdir())
-    finally:
-        shutil.move(tmp_path / "elsewhere", trained.scene)
-
-
 def test_without_run_the_newest_is_exported(run_copy, monkeypatch, tmp_path):
     shutil.move(run_copy.parents[2], tmp_path / "outputs")
     monkeypatch.chdir(tmp_path)
@@ -102,22 +89,6 @@ def test_without_run_the_newest_is_exported(run_copy, monkeypatch, tmp_path):
     assert (
         tmp_path / "outputs/demo/unmix-nerf" / run_copy.name / "exports/endmembers/endmembers.csv"
     ).is_file()
-
-
-@pytest.mark.parametrize("product", ["abundances", "segmentation", "endmembers"])
-def test_files_of_an_earlier_export_are_kept_unless_overwrite_is_given(trained, tmp_path, product):
-    words = [product, "--run", trained.run, "--output", tmp_path]
-    assert run(export, *words).status == 0
-    files = [path for path in tmp_path.rglob("*") if path.is_file()]
-    for path in files:
-        path.write_bytes(b"mine")
-    files[0].unlink()
-    ended = run(export, *words)
-    assert ended.status == 2
-    assert "--overwrite" in ended.err
-    assert {path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == {b"mine"}
-    assert run(export, *words, "--overwrite").status == 0
-    assert b"mine" not in {path.read_bytes() for path in files}
 
 
 @pytest.mark.parametrize("product", ["abundances", "segmentation"])
@@ -161,8 +132,7 @@ def own(registered):  # noqa: F811
 
 @pytest.mark.usefixtures("own")
 def test_a_product_of_a_method_is_listed_and_written_with_its_options(short_config, tmp_path):  # noqa: F811
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
-    trainer.train()
+    trainer = finished(short_config)
     assert "view-names" in run(export, "--help").out
     words = ["view-names", "--run", trainer.run.path, "--output", tmp_path / "out", "--device", "cpu"]
     ended = run(export, *words, "--capitals")

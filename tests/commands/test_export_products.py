@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,11 @@ import pytest
 import spectral.io.envi as envi
 from plyfile import PlyData
 
-from tests.commands.running import SMALL_METHOD, picture_size, run
+from tests.commands.running import picture_size, run
 from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
-from unmix_plugin.commands.train import train
 from unmix_plugin.scenes import load_scene
-from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.open_run import load_run, open_run
 
@@ -37,39 +34,19 @@ def words(name, *more):
     return [name, *SMALL.get(name, []), "--device", "cpu", *more]
 
 
-@dataclass(frozen=True)
-class Solid:
-    """A run and its scene."""
-
-    run: Path
-    scene: Path
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A run whose hull is opaque from its first step on, so that there is a surface; twenty steps."""
-    folder = tmp_path_factory.mktemp("solid")
-    make_demo_scene(folder / "scene", 16, 8, 8)
-    given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 20]
-    opaque = ["--pipeline.model.initial-opacity", 0.6, "--steps-per-log", 5]
-    ended = run(train, "unmix-nerf", *given, *opaque, *SMALL_METHOD)
-    assert ended.status == 0, ended.err
-    return Solid(Path(ended.last_line.removeprefix("run: ")), folder / "scene")
-
-
 @pytest.fixture
-def run_copy(trained, tmp_path):
+def solid_copy(solid, tmp_path):
     """A copy of the run that a test may damage."""
-    return Path(shutil.copytree(trained.run, tmp_path / "copy" / trained.run.name))
+    return Path(shutil.copytree(solid.run, tmp_path / "copy" / solid.run.name))
 
 
 @pytest.fixture(scope="module")
-def exported(trained, tmp_path_factory):
+def exported(solid, tmp_path_factory):
     """A folder of every product."""
     root = tmp_path_factory.mktemp("exported")
     said = {}
     for name in NAMES:
-        ended = run(export, *words(name, "--run", trained.run, "--output", root / name))
+        ended = run(export, *words(name, "--run", solid.run, "--output", root / name))
         assert ended.status == 0, (name, ended.err)
         said[name] = ended.out
     return root, said
@@ -86,40 +63,40 @@ def test_every_file_written_is_named_and_nothing_else_is_there(exported, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_file_is_replaced_unless_overwrite_is_given(trained, exported, tmp_path, name):
+def test_no_file_is_replaced_unless_overwrite_is_given(solid, exported, tmp_path, name):
     copy = shutil.copytree(exported[0] / name, tmp_path / name)
     victim = sorted(path for path in copy.rglob("*") if path.is_file())[-1]
     for path in copy.rglob("*"):
         if path.is_file() and path != victim:
             path.unlink()
     victim.write_bytes(b"mine")
-    ended = run(export, *words(name, "--run", trained.run, "--output", copy))
+    ended = run(export, *words(name, "--run", solid.run, "--output", copy))
     assert ended.status == 2
     assert str(victim) in ended.err
     assert "--overwrite" in ended.err
     assert [path.read_bytes() for path in copy.rglob("*") if path.is_file()] == [b"mine"]
-    assert run(export, *words(name, "--run", trained.run, "--output", copy, "--overwrite")).status == 0
+    assert run(export, *words(name, "--run", solid.run, "--output", copy, "--overwrite")).status == 0
     assert victim.read_bytes() != b"mine"
 
 
-def test_every_product_comes_from_the_run_folder_alone(trained, run_copy, tmp_path):
-    shutil.move(trained.scene, tmp_path / "elsewhere")
+def test_every_product_comes_from_the_run_folder_alone(solid, solid_copy, tmp_path):
+    shutil.move(solid.scene, tmp_path / "elsewhere")
     try:
         for name in NAMES:
-            ended = run(export, *words(name, "--run", run_copy))
+            ended = run(export, *words(name, "--run", solid_copy))
             assert ended.status == 0, (name, ended.err)
-            assert list((run_copy / "exports" / name).iterdir())
+            assert list((solid_copy / "exports" / name).iterdir())
     finally:
-        shutil.move(tmp_path / "elsewhere", trained.scene)
-    with (run_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
+        shutil.move(tmp_path / "elsewhere", solid.scene)
+    with (solid_copy / "exports/spectrum/eval_002_x8_y8.csv").open() as file:
         assert next(csv.reader(file)) == ["wavelength", "predicted", "diffuse", "specular"]
-    page = (run_copy / "exports/report/report.html").read_text()
+    page = (solid_copy / "exports/report/report.html").read_text()
     assert "Not evaluated: run unmix-eval" in page
     assert_self_contained(page)
 
 
-def test_more_views_are_segmented_into_a_folder_with_the_same_legend(trained, tmp_path):
-    common = ["--run", trained.run, "--output", tmp_path, "--device", "cpu"]
+def test_more_views_are_segmented_into_a_folder_with_the_same_legend(solid, tmp_path):
+    common = ["--run", solid.run, "--output", tmp_path, "--device", "cpu"]
     assert run(export, "segmentation", *common).status == 0
     assert run(export, "segmentation", "--views", "train", *common).status == 0
     assert len(list((tmp_path / "labels").iterdir())) == 8
@@ -132,8 +109,8 @@ def test_more_views_are_segmented_into_a_folder_with_the_same_legend(trained, tm
     assert "legend.csv exist" in ended.err
 
 
-def test_cubes_are_what_the_model_renders(trained, exported):
-    loaded = load_run(trained.run, "cpu")
+def test_cubes_are_what_the_model_renders(solid, exported):
+    loaded = load_run(solid.run, "cpu")
     expected = loaded.scene.render(loaded.record.eval_cameras[0], ["spectral"])["spectral"]
     base = exported[0] / "cubes" / "eval_002"
     np.testing.assert_array_equal(np.load(f"{base}.npy"), expected)
@@ -141,8 +118,8 @@ def test_cubes_are_what_the_model_renders(trained, exported):
     np.testing.assert_array_equal(from_envi.open_memmap(), expected)
 
 
-def test_points_and_mesh_lie_where_the_scene_is(trained, exported):
-    scene = load_scene(trained.scene, SceneOptions())
+def test_points_and_mesh_lie_where_the_scene_is(solid, exported):
+    scene = load_scene(solid.scene, SceneOptions())
     corners = scene.normalisation.to_world(scene.scene_box.aabb.numpy())
     low, high = corners.min(axis=0) - 1e-4, corners.max(axis=0) + 1e-4
     vertices = PlyData.read(exported[0] / "point-cloud" / "points.ply")["vertex"]
@@ -154,9 +131,9 @@ def test_points_and_mesh_lie_where_the_scene_is(trained, exported):
         assert ((mesh.vertices >= low - 0.2) & (mesh.vertices <= high + 0.2)).all()
 
 
-def test_points_have_the_indices_asked_for_of_reflectance(trained, tmp_path):
+def test_points_have_the_indices_asked_for_of_reflectance(solid, tmp_path):
     outputs = ["--outputs", "index:redness", "index:r650/r450"]
-    ended = run(export, *words("point-cloud", "--run", trained.run, "--output", tmp_path, *outputs))
+    ended = run(export, *words("point-cloud", "--run", solid.run, "--output", tmp_path, *outputs))
     assert ended.status == 0, ended.err
     ply = PlyData.read(tmp_path / "points.ply")
     redness, ratio = (np.asarray(ply["vertex"][name]) for name in ("index_redness", "index_1"))
@@ -168,8 +145,8 @@ def test_points_have_the_indices_asked_for_of_reflectance(trained, tmp_path):
     assert "of radiance" not in ply.comments[-1]
 
 
-def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(trained, exported):
-    scene = load_scene(trained.scene, SceneOptions())
+def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exported):
+    scene = load_scene(solid.scene, SceneOptions())
     index = [frame.name for frame in scene.frames].index("eval_002")
     base = exported[0] / "spectrum" / "eval_002_x8_y8"
     with base.with_suffix(".csv").open() as file:
@@ -187,8 +164,8 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(trained, e
     assert min(picture_size(base.with_suffix(".png"))) > 300
 
 
-def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(trained, tmp_path):
-    common = ["--run", trained.run, "--output", tmp_path, "--device", "cpu"]
+def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(solid, tmp_path):
+    common = ["--run", solid.run, "--output", tmp_path, "--device", "cpu"]
     assert run(export, "spectrum", "--view", 0, "--pixel", "8,8", *common).status == 0
     assert (tmp_path / "eval_002_x8_y8.csv").is_file()
     assert run(export, "spectrum", "--point", "-0.0,0.05,0.2", *common).status == 0
@@ -196,23 +173,14 @@ def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(trained, t
         assert next(csv.reader(file)) == ["wavelength", "predicted"]
 
 
-def test_own_reflectances_are_compared_with_too(trained, tmp_path):
-    wavelengths = load_run(trained.run, "cpu").record.metadata["wavelengths_nm"]
+def test_own_reflectances_are_compared_with_too(solid, tmp_path):
+    wavelengths = load_run(solid.run, "cpu").record.metadata["wavelengths_nm"]
     lines = [f"{wavelength},{0.1 + 0.05 * index}" for index, wavelength in enumerate(wavelengths)]
     (tmp_path / "mine.csv").write_text("\n".join(["wavelength,my very own", *lines]))
-    common = [
-        "--run",
-        trained.run,
-        "--output",
-        tmp_path / "out",
-        "--device",
-        "cpu",
-        "--library",
-        tmp_path / "mine.csv",
-    ]
-    assert (
-        run(export, "spectrum", "--view", 0, "--pixel", "8,8", "--compare", "continuum", *common).status == 0
-    )
+    common = ["--run", solid.run, "--output", tmp_path / "out", "--device", "cpu"]
+    common += ["--library", tmp_path / "mine.csv"]
+    compared = ["--view", 0, "--pixel", "8,8", "--compare", "continuum"]
+    assert run(export, "spectrum", *compared, *common).status == 0
     assert run(export, "report", "--max-views", 1, *common).status == 0
     assert "184 known" in (tmp_path / "out" / "report.html").read_text()
     ended = run(export, "spectrum", "--view", 0, "--pixel", "9,9", *common[:-1], tmp_path / "none.csv")
@@ -234,26 +202,26 @@ def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
     assert "num_endmembers" in outline.text
 
 
-def test_a_report_quotes_the_figures_that_eval_found(run_copy):
-    (run_copy / "eval").mkdir()
-    (run_copy / "eval" / "metrics.json").write_text(
+def test_a_report_quotes_the_figures_that_eval_found(solid_copy):
+    (solid_copy / "eval").mkdir()
+    (solid_copy / "eval" / "metrics.json").write_text(
         json.dumps({"psnr": 12.34, "miou": None, "definitions": {}})
     )
-    assert run(export, *words("report", "--run", run_copy)).status == 0
-    page = (run_copy / "exports" / "report" / "report.html").read_text()
+    assert run(export, *words("report", "--run", solid_copy)).status == 0
+    page = (solid_copy / "exports" / "report" / "report.html").read_text()
     assert "eval/metrics.json" in page
     assert "12.34" in page
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("mesh", "point-cloud")])
-def test_every_product_can_be_edited_and_relit(trained, tmp_path, name):
+def test_every_product_can_be_edited_and_relit(solid, tmp_path, name):
     recipe = tmp_path / "recipe.yml"
     recipe.write_text("edits:\n  - rename: {endmember: 0, name: old oak}\n")
-    common = ["--run", trained.run, "--output", tmp_path / "out", "--edits", recipe, "--illuminant", "A"]
+    common = ["--run", solid.run, "--output", tmp_path / "out", "--edits", recipe, "--illuminant", "A"]
     ended = run(export, *words(name, *common))
     assert ended.status == 0, ended.err
     if name == "endmembers":
-        plain, lit = (open_run(trained.run, "cpu").materials, tmp_path / "out" / "endmembers.csv")
+        plain, lit = (open_run(solid.run, "cpu").materials, tmp_path / "out" / "endmembers.csv")
         with lit.open() as file:
             rows = list(csv.DictReader(file))
         assert "old oak" in rows[0]
@@ -266,14 +234,14 @@ def test_every_product_can_be_edited_and_relit(trained, tmp_path, name):
         assert "Worst views" not in page
 
 
-def test_removed_matter_leaves_the_surface(trained, tmp_path):
+def test_removed_matter_leaves_the_surface(solid, tmp_path):
     recipe = tmp_path / "recipe.yml"
-    assert run(export, *words("point-cloud", "--run", trained.run, "--output", tmp_path / "all")).status == 0
+    assert run(export, *words("point-cloud", "--run", solid.run, "--output", tmp_path / "all")).status == 0
     vertices = PlyData.read(tmp_path / "all" / "points.ply")["vertex"]
     material = int(np.bincount(vertices["material"]).argmax())
     recipe.write_text(f"edits:\n  - remove: {material}\n")
     ended = run(
-        export, *words("point-cloud", "--run", trained.run, "--output", tmp_path / "some", "--edits", recipe)
+        export, *words("point-cloud", "--run", solid.run, "--output", tmp_path / "some", "--edits", recipe)
     )
     assert ended.status == 0, ended.err
     left = PlyData.read(tmp_path / "some" / "points.ply")["vertex"]
@@ -305,8 +273,8 @@ def test_removed_matter_leaves_the_surface(trained, tmp_path):
         (["cubes", "--edits", "none.yml"], "none.yml"),
     ],
 )
-def test_bad_options_are_refused_with_what_to_do(trained, tmp_path, given, said):
-    ended = run(export, *given, "--run", trained.run, "--output", tmp_path / "out", "--device", "cpu")
+def test_bad_options_are_refused_with_what_to_do(solid, tmp_path, given, said):
+    ended = run(export, *given, "--run", solid.run, "--output", tmp_path / "out", "--device", "cpu")
     assert ended.status == 2
     assert said in ended.err
     assert not (tmp_path / "out").exists()

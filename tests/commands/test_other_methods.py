@@ -1,21 +1,19 @@
 """A method without spectra or endmembers gets every command that does not need them, without a change outside it."""
 
-import io
 import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from tests.commands.running import run
 from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
+from tests.engine.stopped_runs import finished
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.open_run import load_run, open_run
 from unmix_plugin.trained.protocol import RenderableScene
@@ -24,8 +22,7 @@ from unmix_plugin.trained.protocol import RenderableScene
 @pytest.fixture
 def ball_run(short_config: TrainerConfig) -> Path:  # noqa: F811
     """A run of the plain RGB method."""
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
-    trainer.train()
+    trainer = finished(short_config)
     return trainer.run.path
 
 

@@ -162,29 +162,27 @@ def test_further_outputs_of_the_same_cameras_may_join_earlier_ones(trained, tmp_
     assert "cameras-dataset-eval.json" in ended.err
 
 
-BAD = {
-    "output": (["--outputs", "spectrl"], "no output named 'spectrl' (did you mean spectral"),
-    "wavelength": (["--outputs", "band:2000nm"], "no band at 2000 nm: 8 bands"),
-    "format": (["--formats", "tiff"], "there is no format 'tiff'"),
-    "format that does not suit": (
-        ["--outputs", "spectral", "--formats", "png"],
-        "spectral can't be written as png",
-    ),
-    "cameras": (["--cameras", "orbits"], "unknown cameras 'orbits' (did you mean orbit?)"),
-    "camera file": (["--cameras", "none.json"], "can't read the camera file none.json"),
-    "view": (["--view", "eval_003"], "no view 'eval_003'"),
-    "size": (["--size", "64"], "--size 64: expected width and height in pixels, as in 640x480"),
-    "absurd size": (["--size", "99999x3"], "--size: 99999 x 3 pixels"),
-    "frames": (["--frames", "3"], "--frames is for the paths that are made here"),
-    "light": (["--illuminant", "sun"], "sun"),
-    "recipe": (["--edits", "none.yml"], "none.yml"),
-    "device": (["--device", "cuda"], "--device cuda, but"),
-}
-
-
-@pytest.mark.parametrize("fault", BAD)
-def test_what_cannot_be_rendered_exits_2_before_anything_is_written(trained, tmp_path, monkeypatch, fault):
-    words, said = BAD[fault]
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--outputs", "spectrl"], "no output named 'spectrl' (did you mean spectral"),
+        (["--outputs", "band:2000nm"], "no band at 2000 nm: 8 bands"),
+        (["--formats", "tiff"], "there is no format 'tiff'"),
+        (["--outputs", "spectral", "--formats", "png"], "spectral can't be written as png"),
+        (["--cameras", "orbits"], "unknown cameras 'orbits' (did you mean orbit?)"),
+        (["--cameras", "none.json"], "can't read the camera file none.json"),
+        (["--view", "eval_003"], "no view 'eval_003'"),
+        (["--size", "64"], "--size 64: expected width and height in pixels, as in 640x480"),
+        (["--size", "99999x3"], "--size: 99999 x 3 pixels"),
+        (["--frames", "3"], "--frames is for the paths that are made here"),
+        (["--illuminant", "sun"], "sun"),
+        (["--edits", "none.yml"], "none.yml"),
+        (["--device", "cuda"], "--device cuda, but"),
+    ],
+)
+def test_what_cannot_be_rendered_exits_2_before_anything_is_written(
+    trained, tmp_path, monkeypatch, words, said
+):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     ended = run(render, "--run", trained.run, "--output", tmp_path / "out", *words)
     assert ended.status == 2

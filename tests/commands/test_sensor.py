@@ -1,18 +1,14 @@
 """`--sensor`: files have the sensor's bands, materials stay, and products that would mix bands refuse."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from plyfile import PlyData
 
-from tests.commands.running import SMALL_METHOD, run
+from tests.commands.running import run
 from tests.products.render.render_factory import read_envi
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
-from unmix_plugin.commands.train import train
 from unmix_plugin.editing.edited_run import load_edited_run
-from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.open_run import load_run
@@ -33,17 +29,6 @@ RESPONSES = """wavelength,red,green,blue,nir
 
 
 @pytest.fixture(scope="module")
-def solid(tmp_path_factory):
-    """A run whose hull is opaque from its first step on, so that there is a surface."""
-    folder = tmp_path_factory.mktemp("solid")
-    make_demo_scene(folder / "scene", 16, 8, 8)
-    given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 20]
-    ended = run(train, "unmix-nerf", *given, "--pipeline.model.initial-opacity", 0.6, *SMALL_METHOD)
-    assert ended.status == 0, ended.err
-    return Path(ended.last_line.removeprefix("run: "))
-
-
-@pytest.fixture(scope="module")
 def camera(tmp_path_factory):
     """A camera with three channels that the run's bands cover, and one that they don't."""
     path = tmp_path_factory.mktemp("camera") / "toy.csv"
@@ -52,11 +37,11 @@ def camera(tmp_path_factory):
 
 
 def seen_by(camera, solid):
-    return read_sensor(camera).seen_by(Bands.of(load_run(solid, "cpu").record.metadata["wavelengths_nm"]))
+    return read_sensor(camera).seen_by(Bands.of(load_run(solid.run, "cpu").record.metadata["wavelengths_nm"]))
 
 
 def test_a_render_has_the_sensors_bands(solid, camera, tmp_path):
-    words = ["--run", solid, "--device", "cpu", "--illuminant", "A", "--formats", "envi", "png", "npy"]
+    words = ["--run", solid.run, "--device", "cpu", "--illuminant", "A", "--formats", "envi", "png", "npy"]
     outputs = ["--outputs", "spectral", "rgb", "segmentation", "abundances", "false-colour:617,530,460"]
     ended = run(render, *words, *outputs, "--output", tmp_path / "seen", "--sensor", camera)
     assert ended.status == 0, ended.err
@@ -77,7 +62,7 @@ def test_a_render_has_the_sensors_bands(solid, camera, tmp_path):
 
 
 def test_a_point_cloud_has_other_colours_and_the_same_materials(solid, camera, tmp_path):
-    words = ["point-cloud", "--run", solid, "--num-points", 300, "--device", "cpu"]
+    words = ["point-cloud", "--run", solid.run, "--num-points", 300, "--device", "cpu"]
     clouds = []
     for name, more in (("all", []), ("seen", ["--sensor", camera])):
         ended = run(export, *words, "--output", tmp_path / name, *more)
@@ -94,7 +79,7 @@ def test_a_point_cloud_has_other_colours_and_the_same_materials(solid, camera, t
 
 def test_endmembers_are_the_runs_through_the_sensor(solid, camera, tmp_path):
     for name, more in (("all", []), ("seen", ["--sensor", camera])):
-        ended = run(export, "endmembers", "--run", solid, "--output", tmp_path / name, *more)
+        ended = run(export, "endmembers", "--run", solid.run, "--output", tmp_path / name, *more)
         assert ended.status == 0, ended.err
     whole, seen = (
         np.loadtxt(tmp_path / name / "endmembers.csv", delimiter=",", skiprows=1) for name in ("all", "seen")
@@ -117,7 +102,9 @@ def test_endmembers_are_the_runs_through_the_sensor(solid, camera, tmp_path):
     ids=lambda words: words[0],
 )
 def test_every_other_product_that_takes_a_sensor_is_written(solid, camera, tmp_path, words):
-    ended = run(export, *words, "--run", solid, "--output", tmp_path, "--device", "cpu", "--sensor", camera)
+    ended = run(
+        export, *words, "--run", solid.run, "--output", tmp_path, "--device", "cpu", "--sensor", camera
+    )
     assert ended.status == 0, ended.err
     if words[0] == "cubes":
         assert np.load(tmp_path / "eval_002.npy").shape == (16, 16, 3)
@@ -132,7 +119,7 @@ def test_a_camera_of_one_channel_is_one_too(solid, tmp_path):
     path = tmp_path / "pan.csv"
     path.write_text("wavelength,pan\n450,1\n650,1\n")
     outputs = ["--outputs", "spectral", "rgb", "pca", "material_scores"]
-    ended = run(render, "--run", solid, "--output", tmp_path / "out", *outputs, "--sensor", path)
+    ended = run(render, "--run", solid.run, "--output", tmp_path / "out", *outputs, "--sensor", path)
     assert ended.status == 0, ended.err
     assert read_envi(tmp_path / "out" / "spectral" / "eval_002")[0].shape == (16, 16, 1)
 
@@ -141,7 +128,7 @@ def test_a_camera_of_one_channel_is_one_too(solid, tmp_path):
     "words", [["report"], ["metamerism"], ["spectrum", "--view", "0", "--pixel", "1,1"]], ids=lambda w: w[0]
 )
 def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_path, words):
-    ended = run(export, *words, "--run", solid, "--output", tmp_path / "out", "--sensor", camera)
+    ended = run(export, *words, "--run", solid.run, "--output", tmp_path / "out", "--sensor", camera)
     assert ended.status == 2
     said = " ".join(ended.err.split())
     assert f"{words[0]} compares with what is known in the run's own bands" in said
@@ -156,15 +143,15 @@ def test_a_sensor_that_is_not_there_or_sees_nothing_exits_2(solid, tmp_path):
     far = tmp_path / "far.csv"
     far.write_text("wavelength,swir\n1565,1\n1655,1\n")
     for path, said in ((tmp_path / "none.csv", "can't read spectra"), (far, "sees nothing: the bands cover")):
-        ended = run(render, "--run", solid, "--output", tmp_path / "out", "--sensor", path)
+        ended = run(render, "--run", solid.run, "--output", tmp_path / "out", "--sensor", path)
         assert ended.status == 2
         assert said in " ".join(ended.err.split())
     assert not (tmp_path / "out").exists()
 
 
 def test_bands_light_and_notes_follow_and_the_run_stays(solid, camera):
-    seen = load_edited_run(solid, "cpu", None, "A", camera).materials_scene
-    lit = load_edited_run(solid, "cpu", None, "A").materials_scene
+    seen = load_edited_run(solid.run, "cpu", None, "A", camera).materials_scene
+    lit = load_edited_run(solid.run, "cpu", None, "A").materials_scene
     expected = seen_by(camera, solid)
     np.testing.assert_allclose(seen.bands.centers_nm, expected.bands.centers_nm)
     assert seen.light_power is not None

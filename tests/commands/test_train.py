@@ -131,18 +131,20 @@ def test_a_bad_word_exits_2_with_its_cause_and_writes_nothing(monkeypatch, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
-def test_more_endmembers_than_bands_exit_2_with_both_numbers_and_write_nothing(trained, tmp_path):
-    ended = run(train, *small_training(trained, tmp_path / "out", "--pipeline.model.num-endmembers", 9))
-    assert ended.status == 2
-    assert "num-endmembers is 9 but the scene has 8 bands" in ended.err
-    assert not (tmp_path / "out").exists()
-
-
-def test_cuda_without_cuda_exits_2_and_writes_nothing(trained, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--pipeline.model.num-endmembers", 9], "num-endmembers is 9 but the scene has 8 bands"),
+        (["--device", "cuda"], "--device cuda, but"),
+    ],
+)
+def test_what_does_not_fit_scene_or_machine_exits_2_and_writes_nothing(
+    trained, tmp_path, monkeypatch, words, said
+):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    ended = run(train, *small_training(trained, tmp_path / "out", "--device", "cuda"))
+    ended = run(train, *small_training(trained, tmp_path / "out", *words))
     assert ended.status == 2
-    assert "--device cuda, but" in ended.err
+    assert said in ended.err
     assert not (tmp_path / "out").exists()
 
 
@@ -299,18 +301,25 @@ def test_remarks_are_read_from_the_metrics_of_a_run(tmp_path):
     assert _read_remarks(tmp_path / "missing.jsonl") == []
 
 
-def test_poses_that_ran_away_are_said():
+@pytest.mark.parametrize(
+    ("name", "few", "many", "told"),
+    [
+        (
+            "poses_undone",
+            0.0,
+            3.0,
+            "3 views went beyond a quarter of the distance to the scene or too far a turn",
+        ),
+        (
+            "pose_outliers",
+            0.01,
+            0.12,
+            "12% of the views, or of the rows of line cameras, still fit far worse",
+        ),
+    ],
+)
+def test_poses_that_ran_away_or_are_not_believed_are_said(name, few, many, told):
     lines = course(1.0, 0.2, 0.1, 0.09)
-    assert _remarks([*lines[:-1], {**lines[-1], "poses_undone": 0.0}]) == []
-    said = _remarks([*lines[:-1], {**lines[-1], "poses_undone": 3.0}])
-    assert (
-        "corrections of the poses of 3 views went beyond a quarter of the distance to the scene or too far a turn"
-        in said[0]
-    )
-
-
-def test_poses_that_are_not_believed_are_said():
-    lines = course(1.0, 0.2, 0.1, 0.09)
-    assert _remarks([*lines[:-1], {**lines[-1], "pose_outliers": 0.01}]) == []
-    said = _remarks([*lines[:-1], {**lines[-1], "pose_outliers": 0.12}])
-    assert "12% of the views, or of the rows of line cameras, still fit far worse than the others" in said[0]
+    assert _remarks([*lines[:-1], {**lines[-1], name: few}]) == []
+    (said,) = _remarks([*lines[:-1], {**lines[-1], name: many}])
+    assert told in said

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from tests.commands.running import run
 from tests.commands.test_bad_runs import SPOILT, contents
 from tests.commands.watching import START_S, address, looking, started, visited
 from tests.formats.video_reading import read_video
+from unmix_plugin.commands.export import export
 from unmix_plugin.commands.view import ViewOptions, prepared, view
+from unmix_plugin.editing import Recipe, Scale, recipe_to_yaml
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.viewer.access import ViewerOptions
 
@@ -33,9 +36,11 @@ def test_a_run_that_cannot_be_used_is_refused_with_one_message(run_copy, spoil):
         (["--viewer.port", "99999"], "--viewer.port is a number from 0"),
         (["--viewer.host", "203.0.113.7"], "can't listen at --viewer.host 203.0.113.7"),
         (["--viewer.token", ""], "--viewer.token is empty"),
+        (["--illuminant", "D66"], "there is no light 'D66'; nearest: D65"),
+        (["--edits", "nowhere.yml"], "can't read the recipe nowhere.yml"),
     ],
 )
-def test_an_address_that_is_none_is_refused(trained, words, message):
+def test_an_address_or_an_edit_that_is_none_is_refused(trained, words, message):
     ended = run(view, "--run", trained.run, "--device", "cpu", *words)
     assert ended.status == 2
     assert message in ended.err
@@ -46,7 +51,7 @@ def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
     def visit(printed):
         printed("stop with Ctrl-C")
         with looking(address(printed)) as page:
-            page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
+            wait_for_control(page, "layer")
             os.kill(os.getpid(), number)
             page.wait_until(lambda: page.is_closed)
 
@@ -58,7 +63,7 @@ def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
 def test_a_run_is_served_by_a_process_of_its_own_until_ctrl_c(trained):
     with started("view", "--run", trained.run, "--device", "cpu", "--viewer.port", "0") as command:
         with looking(command.address) as page:
-            page.wait_until(lambda: any(one.get("label") == "layer" for one in page.controls.values()))
+            wait_for_control(page, "layer")
             command.process.send_signal(signal.SIGINT)
             page.wait_until(lambda: page.is_closed)
         assert command.end() == 0
@@ -66,19 +71,26 @@ def test_a_run_is_served_by_a_process_of_its_own_until_ctrl_c(trained):
         assert not any("viser" in line for line in command.lines)
 
 
-@pytest.fixture
-def served(trained):
-    """The viewer of a run whose scene is at hand."""
-    viewer = prepared(ViewOptions(run=trained.run, device="cpu", viewer=ViewerOptions(port=0)))
+@contextmanager
+def served(run, **options):
+    """The viewer of a run, and a page with its first picture."""
+    viewer = prepared(ViewOptions(run=run, device="cpu", viewer=ViewerOptions(port=0), **options))
     viewer.start()
-    yield viewer
-    viewer.stop()
+    try:
+        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
+            yield viewer, page
+    finally:
+        viewer.stop()
 
 
-def test_what_was_measured_is_shown_where_the_scene_is_at_hand(served):
-    with looking(f"ws://127.0.0.1:{served.port}") as page:
-        served.services._reader.join(START_S)
-        assert served.services.maker.aids.measured is not None
+def wait_for_control(page, label):
+    page.wait_until(lambda: any(one.get("label") == label for one in page.controls.values()))
+
+
+def test_what_was_measured_is_shown_where_the_scene_is_at_hand(trained):
+    with served(trained.run) as (viewer, page):
+        viewer.services._reader.join(START_S)
+        assert viewer.services.maker.aids.measured is not None
         page.set("layer", "error against a training view")
         page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)
         page.set("cameras", True)
@@ -89,93 +101,52 @@ def test_a_run_whose_scene_has_gone_is_shown_without_what_was_measured(run_copy)
     scene = json.loads((run_copy / "scene.json").read_text())
     scene["summary"]["root"] = "/nowhere/at/all"
     (run_copy / "scene.json").write_text(json.dumps(scene))
-    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
-    viewer.start()
-    try:
-        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
-            page.set("layer", "error against a training view")
-            page.wait_until(lambda: "no error to show: the scene is not at hand" in page.texts)
-            assert "/nowhere/at/all" in page.texts
-    finally:
-        viewer.stop()
+    with served(run_copy) as (_, page):
+        page.set("layer", "error against a training view")
+        page.wait_until(lambda: "no error to show: the scene is not at hand" in page.texts)
+        assert "/nowhere/at/all" in page.texts
 
 
 def test_a_path_becomes_a_video_of_the_edited_scene(run_copy):
-    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
-    viewer.start()
-    try:
-        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
-            page.wait_until(
-                lambda: any(one.get("label") == "render a video" for one in page.controls.values())
-            )
-            for number, angle in enumerate((0.3, 0.6), start=1):
-                page.look_from(angle)
-                page.set("add a key frame here", True)
-                key = page.controls[page.control("key frame")]
-                page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
-            page.set("light", "A")
-            for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
-                page.set(label, value)
-            page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])
-            page.set("render a video", True)
-            page.wait_until(lambda: any(name.endswith(".mp4") for name in page.downloads), START_S)
-        (video,) = (run_copy / "exports" / "viewer").rglob("*.mp4")
-        frames, _ = read_video(video)
-        assert frames.shape == (3, 32, 32, 3)
-        assert frames.std() > 4
-        assert "illuminant: A" in (run_copy / "exports" / "viewer" / "view-path.yml").read_text()
-    finally:
-        viewer.stop()
+    with served(run_copy) as (_, page):
+        wait_for_control(page, "render a video")
+        for number, angle in enumerate((0.3, 0.6), start=1):
+            page.look_from(angle)
+            page.set("add a key frame here", True)
+            key = page.controls[page.control("key frame")]
+            page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+        page.set("light", "A")
+        for label, value in (("width", 33), ("height", 32), ("seconds", 0.5), ("frames a second", 6)):
+            page.set(label, value)
+        page.wait_until(lambda: "illuminant: A" in page.controls[page.control("recipe")]["value"])
+        page.set("render a video", True)
+        page.wait_until(lambda: any(name.endswith(".mp4") for name in page.downloads), START_S)
+    (video,) = (run_copy / "exports" / "viewer").rglob("*.mp4")
+    frames, _ = read_video(video)
+    assert frames.shape == (3, 32, 32, 3)
+    assert frames.std() > 4
+    assert "illuminant: A" in (run_copy / "exports" / "viewer" / "view-path.yml").read_text()
 
 
 def test_nothing_is_written_into_a_run_that_is_only_looked_at(run_copy):
     before = contents(run_copy)
-    viewer = prepared(ViewOptions(run=run_copy, device="cpu", viewer=ViewerOptions(port=0)))
-    viewer.start()
-    with looking(f"ws://127.0.0.1:{viewer.port}"):
+    with served(run_copy):
         pass
-    viewer.stop()
     assert contents(run_copy) == before
 
 
 def test_a_run_is_shown_with_the_edits_and_the_light_asked_for(run_copy):
     recipe = run_copy / "recipe.yml"
     recipe.write_text("edits:\n  - rename: {endmember: endmember_1, name: clay}\n")
-    options = ViewOptions(
-        run=run_copy, device="cpu", edits=recipe, illuminant="fl2", viewer=ViewerOptions(port=0)
-    )
-    viewer = prepared(options)
-    viewer.start()
-    try:
-        with looking(f"ws://127.0.0.1:{viewer.port}") as page:
-            page.wait_until(
-                lambda: any(one.get("label") == "render a video" for one in page.controls.values())
-            )
-            assert page.controls[page.control("light")]["value"] == "FL2"
-            assert "clay" in page.controls[page.control("other endmember")]["options"]
-            page.set("changes", "start again")
-            page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")
-    finally:
-        viewer.stop()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--illuminant", "D66"], "there is no light 'D66'; nearest: D65"),
-        (["--edits", "nowhere.yml"], "can't read the recipe nowhere.yml"),
-    ],
-)
-def test_edits_that_are_none_are_refused(trained, words, message):
-    ended = run(view, "--run", trained.run, "--device", "cpu", *words)
-    assert ended.status == 2
-    assert message in ended.err
+    with served(run_copy, edits=recipe, illuminant="fl2") as (_, page):
+        wait_for_control(page, "render a video")
+        assert page.controls[page.control("light")]["value"] == "FL2"
+        assert "clay" in page.controls[page.control("other endmember")]["options"]
+        page.set("changes", "start again")
+        page.wait_until(lambda: page.controls[page.control("light")]["value"] == "as recorded")
 
 
 def test_a_recipe_of_the_viewer_is_taken_by_other_commands(run_copy):
-    from unmix_plugin.commands.export import export
-    from unmix_plugin.editing import Recipe, Scale, recipe_to_yaml
-
     recipe = run_copy / "recipe.yml"
     recipe.write_text(recipe_to_yaml(Recipe((Scale(0, 0.5),))))
     ended = run(export, "endmembers", "--run", run_copy, "--edits", recipe, "--output", run_copy / "edited")

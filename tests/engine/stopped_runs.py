@@ -1,4 +1,4 @@
-"""Trainings without a display that are stopped after a step."""
+"""Trainings without a display, to their end or stopped after a step."""
 
 import io
 import os
@@ -18,6 +18,12 @@ from unmix_plugin.engine.training.training_control import Interrupted
 
 def quiet_trainer(config: TrainerConfig) -> Trainer:
     return Trainer(config, console=Console(file=io.StringIO()))
+
+
+def finished(config: TrainerConfig) -> Trainer:
+    trainer = quiet_trainer(config)
+    trainer.train()
+    return trainer
 
 
 def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> None:

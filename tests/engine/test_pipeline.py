@@ -1,18 +1,16 @@
 """What a pipeline computes from a model and a data manager, whatever they are."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
 
+from tests.engine.stopped_runs import finished, quiet_trainer
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline, evaluating
 from unmix_plugin.engine.runs.load_run import load_pipeline
-from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 
 
@@ -97,7 +95,7 @@ def test_callbacks_run_at_their_place_in_order_with_step_and_progress():
 
 
 def test_training_calls_the_callbacks_of_every_step_with_rising_progress(short_config: TrainerConfig):
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(short_config)
     seen: list[tuple[int, float]] = []
     where = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
     trainer.callbacks.append(TrainingCallback(where, lambda step, progress: seen.append((step, progress))))
@@ -118,15 +116,13 @@ def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(
         original(self, initial_data, generator)
 
     monkeypatch.setattr(RgbNerf, "initialise", counted)
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
-    trainer.train()
+    trainer = finished(short_config)
     load_pipeline(trainer.run.path, "cpu")
     assert calls == [{"raw_density"}]
 
 
 def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerConfig, tmp_path: Path):
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
-    trainer.train()
+    trainer = finished(short_config)
     assert short_config.data is not None
     moved = short_config.data.rename(tmp_path / "moved")
     loaded = load_pipeline(trainer.run.path, "cpu", data=moved)
@@ -137,7 +133,7 @@ def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerC
 
 def test_two_runs_of_one_seed_are_equal_and_of_another_seed_are_not(short_config: TrainerConfig):
     def trained(seed: int) -> torch.Tensor:
-        trainer = Trainer(replace(short_config, seed=seed), console=Console(file=io.StringIO()))
+        trainer = quiet_trainer(replace(short_config, seed=seed))
         trainer.train()
         return next(trainer.pipeline.model.parameters()).detach()
 

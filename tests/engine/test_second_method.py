@@ -1,20 +1,18 @@
 """A method that has nothing to do with spectra is found, trained and brought back by the engine as it is."""
 
 import ast
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
 
 from tests.engine import rgb_nerf_plugin
+from tests.engine.stopped_runs import finished, quiet_trainer
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.load_run import load_model, load_pipeline
-from unmix_plugin.engine.training.trainer import Trainer
 
 
 @pytest.mark.usefixtures("registered")
@@ -24,7 +22,7 @@ def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path: Path, d
     config = replace(
         find_method("rgb-nerf").config, data=tmp_path / "ball", output_dir=tmp_path, device=device
     )
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config)
     assert trainer.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"] < 12
     record = trainer.train()
     loaded = load_pipeline(trainer.run.path, "cpu")
@@ -40,8 +38,7 @@ def test_the_second_method_imports_nothing_of_ours_but_the_public_engine():
 
 
 def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfig, tmp_path: Path):
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
-    trainer.train()
+    trainer = finished(short_config)
     expected = trainer.pipeline.eval().model.get_outputs_for_camera(
         trainer.pipeline.datamanager.eval_cameras[1]
     )
@@ -57,7 +54,7 @@ def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfi
 
 
 def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, monkeypatch):
-    trainer = Trainer(replace(short_config, average_decay=0.9), console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(replace(short_config, average_decay=0.9))
     asked = []
 
     def between_steps(step, _progress, data):
@@ -76,7 +73,7 @@ def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, mo
 
 
 def test_a_model_is_warmed_up_once(short_config, monkeypatch):
-    trainer, warmed = Trainer(short_config, console=Console(file=io.StringIO())), []
+    trainer, warmed = quiet_trainer(short_config), []
     monkeypatch.setattr(trainer.pipeline.model, "warm_up", lambda: warmed.append(trainer.step))
     trainer.warm_up()
     trainer.train()
@@ -84,7 +81,7 @@ def test_a_model_is_warmed_up_once(short_config, monkeypatch):
 
 
 def test_training_json_says_how_long_and_how_much_was_trained(short_config: TrainerConfig):
-    trainer = Trainer(short_config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(short_config)
     record = trainer.train()
     written = json.loads(trainer.run.training_path.read_text())
     assert written["steps"] == 12

@@ -8,7 +8,7 @@ import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.fuzz.reader import Reader
+from tests.fuzz.mutation import Reader
 from tests.fuzz.readers import READERS
 
 

@@ -11,8 +11,7 @@ from functools import partial
 
 from tests.fuzz import pose_samples, run_readers, scene_readers
 from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture
-from tests.fuzz.mutation import Mutator, mutate_bytes, mutate_json
-from tests.fuzz.reader import Reader
+from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json
 from unmix_plugin.errors import CaptureError
 
 

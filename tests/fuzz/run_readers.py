@@ -11,8 +11,7 @@ import numpy as np
 import safetensors.torch
 import torch
 
-from tests.fuzz.mutation import mutate_json
-from tests.fuzz.reader import Reader
+from tests.fuzz.mutation import Reader, mutate_json
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.editing import read_recipe, recipe_from_yaml, recipe_to_yaml

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from tests.fuzz.mutation import mutate_json, mutate_png
-from tests.fuzz.reader import Reader
+from tests.fuzz.mutation import Reader, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.envi import read_library_table

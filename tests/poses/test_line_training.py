@@ -1,15 +1,13 @@
 """Training on line cameras: rays by row, a whole view rendered in all bands, and the run folder that gives it back."""
 
-import io
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from rich.console import Console
 from torch.testing import assert_close
 
-from tests.engine.stopped_runs import stop_at
+from tests.engine.stopped_runs import quiet_trainer, stop_at
 from tests.method_factory import CONFIG
 from tests.poses.test_training import trained
 from tests.scenes.line_factory import make_line_scene
@@ -34,7 +32,7 @@ def trainer(tmp_path_factory) -> Trainer:
         device="cpu",
         pipeline=PipelineConfig(datamanager=data, model=replace(CONFIG, num_endmembers=1)),
     )
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config)
     trainer.train()
     return trainer
 

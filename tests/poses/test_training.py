@@ -1,6 +1,5 @@
 """Training that corrects poses: it carves by corrected cameras, goes on where it stopped, and moves its views."""
 
-import io
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -8,10 +7,9 @@ from typing import Any, Literal
 
 import pytest
 import torch
-from rich.console import Console
 from torch.testing import assert_close
 
-from tests.engine.stopped_runs import stop_at
+from tests.engine.stopped_runs import quiet_trainer, stop_at
 from tests.method_factory import CONFIG
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
@@ -40,7 +38,7 @@ def config_for(folder: Path, poses: Literal["fixed", "refine"] = "refine", steps
 
 
 def trained(config: TrainerConfig) -> Trainer:
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config)
     trainer.train()
     return trainer
 
@@ -57,9 +55,7 @@ def test_poses_that_are_taken_as_they_are_leave_training_as_it_was(folder):
     assert model.poses is None
     assert not [name for name, _ in model.named_parameters() if name.startswith("poses")]
     assert "field.level_weights" not in model.state_dict()
-    rays, _ = Trainer(
-        config_for(folder, "fixed"), console=Console(file=io.StringIO())
-    ).pipeline.datamanager.next_train(0)
+    rays, _ = quiet_trainer(config_for(folder, "fixed")).pipeline.datamanager.next_train(0)
     bare = replace(rays, axes=None, pixel_coords=None)
     model.generator = torch.Generator().manual_seed(0)
     first = model.train().get_outputs(rays)["spectral"]
@@ -74,7 +70,7 @@ def test_space_is_carved_once_by_the_corrected_cameras(folder, monkeypatch):
         asked.append((trainer.step, refined(poses, cameras)))
         return asked[-1][1]
 
-    trainer = Trainer(config_for(folder, steps=20), console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config_for(folder, steps=20))
     model: Any = trainer.pipeline.model
     assert bool(model.grid.reachable.all())
     monkeypatch.setattr(PoseRefinement, "refined", watched)
@@ -90,7 +86,7 @@ def test_space_is_carved_once_by_the_corrected_cameras(folder, monkeypatch):
 
 
 def test_nothing_is_carved_by_cameras_that_contradict_each_other(folder):
-    trainer = Trainer(config_for(folder), console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config_for(folder))
     datamanager: Any = trainer.pipeline.datamanager
     right = datamanager.train_cameras
     turned = right.camera_to_world.clone()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
-from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
+from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint, save_checkpoint
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.errors import RunError
 
@@ -59,6 +59,12 @@ class Killed(BaseException):
     """Stands for SIGKILL: nothing that runs after it has any effect."""
 
 
+def complete(folder: Path) -> Checkpoint:
+    found = newest_complete_checkpoint(folder)
+    assert found is not None
+    return found
+
+
 def calls_of_a_save(folder: Path, dead: bool = True) -> int:
     with pytest.MonkeyPatch.context() as monkeypatch:
         faults = Faults(monkeypatch, None, Killed, dead)
@@ -77,8 +83,7 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
     }
     path = save_checkpoint(tmp_path / "new", 7, tensors, {"seconds": 1.25, "list": [1, "x", None]})
     assert path.name == "step-000007.json"
-    loaded = newest_complete_checkpoint(tmp_path / "new")
-    assert loaded is not None
+    loaded = complete(tmp_path / "new")
     assert loaded.step == 7
     assert loaded.record["seconds"] == 1.25
     assert loaded.record["list"] == [1, "x", None]
@@ -93,8 +98,7 @@ def test_views_and_tied_tensors_are_saved_as_what_they_show(tmp_path: Path):
     parameter = torch.nn.Parameter(base.clone())
     tensors = {"base": base, "transposed": base.T, "row": base[1], "again": base, "parameter": parameter}
     save_checkpoint(tmp_path, 1, tensors, {})
-    loaded = newest_complete_checkpoint(tmp_path)
-    assert loaded is not None
+    loaded = complete(tmp_path)
     for name, tensor in tensors.items():
         assert torch.equal(loaded.tensors[name], tensor.detach())
 
@@ -115,8 +119,7 @@ def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path, 
             Faults(monkeypatch, at, Killed, dead=True)
             with contextlib.suppress(Killed):
                 save_checkpoint(folder, 2, tensors_of(2), {}, keep=1 + same_step)
-        found = newest_complete_checkpoint(folder)
-        assert found is not None
+        found = complete(folder)
         assert found.damaged == ()
         assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
         seen.add(found.step)
@@ -143,8 +146,7 @@ def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Pa
         names = {path.name for path in folder.iterdir()}
         assert not [name for name in names if name.endswith(".tmp")]
         assert {"step-000001.json", "step-000001.safetensors"} <= names
-        found = newest_complete_checkpoint(folder)
-        assert found is not None
+        found = complete(folder)
         assert found.damaged == ()
 
 
@@ -200,15 +202,13 @@ def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    found = newest_complete_checkpoint(tmp_path)
-    assert found is not None
+    found = complete(tmp_path)
     assert found.step == 1
     assert "step-000002" in found.damaged[0]
     path.unlink()
-    assert newest_complete_checkpoint(tmp_path) is not None
+    assert complete(tmp_path).step == 1
     (tmp_path / "step-000002.json").write_text('{"format_ver')
-    found = newest_complete_checkpoint(tmp_path)
-    assert found is not None
+    found = complete(tmp_path)
     assert found.step == 1
 
 
@@ -245,7 +245,6 @@ def test_saving_the_same_tensors_again_only_rewrites_the_record(tmp_path: Path):
     save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 1})
     before = (tmp_path / "step-000001.safetensors").stat().st_mtime_ns
     save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 2})
-    found = newest_complete_checkpoint(tmp_path)
-    assert found is not None
+    found = complete(tmp_path)
     assert found.record["seconds"] == 2
     assert (tmp_path / "step-000001.safetensors").stat().st_mtime_ns == before

@@ -1,16 +1,16 @@
 """Optimisers and schedules, the guard against non-finite numbers, and the average of the parameters."""
 
-import io
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rich.console import Console
 from torch import nn
 
+from tests.engine.stopped_runs import quiet_trainer
 from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
@@ -155,7 +155,7 @@ def test_only_refusals_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
 
 def poisoned_trainer(config: TrainerConfig, steps: set[int]) -> Trainer:
     """Its loss is NaN in `steps`."""
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config)
     original = trainer.pipeline.get_train_loss_dict
 
     def poisoned(step: int):
@@ -193,33 +193,33 @@ def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
     assert all(tensor.isfinite().all() for tensor in checkpoint.tensors.values())
 
 
-def test_the_average_of_a_constant_is_the_constant():
-    module = nn.Linear(3, 2)
-    expected = module.weight.detach().clone()
-    average = ParameterAverage(module, decay=0.9)
-    for step in range(1, 30):
+def averaged(weights: Iterable[float], decay: float, interval: int = 1) -> ParameterAverage:
+    """The average of a weight that began at 0 and had these values in a training's steps."""
+    module = nn.Linear(1, 1, bias=False)
+    nn.init.zeros_(module.weight)
+    average = ParameterAverage(module, decay, interval)
+    for step, weight in enumerate(weights, start=1):
+        nn.init.constant_(module.weight, weight)
         average.update(step)
-    torch.testing.assert_close(average.values["weight"], expected, rtol=0, atol=1e-7)
+    return average
+
+
+def test_the_average_of_a_constant_is_the_constant():
+    assert averaged([0.0] * 30, decay=0.9).values["weight"].item() == 0.0
 
 
 def test_after_many_steps_the_average_is_exponential():
-    module = nn.Linear(1, 1, bias=False)
-    average = ParameterAverage(module, decay=0.5)
+    weights = [float(step % 7) for step in range(1, 60)]
     expected = 0.0
-    for step in range(1, 60):
-        with torch.no_grad():
-            module.weight.fill_(float(step % 7))
-        average.update(step)
-        expected = 0.5 * expected + 0.5 * (step % 7)
-    torch.testing.assert_close(average.values["weight"].item(), expected, rtol=1e-5, atol=1e-5)
+    for weight in weights:
+        expected = 0.5 * expected + 0.5 * weight
+    found = averaged(weights, decay=0.5).values["weight"].item()
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_an_interval_of_two_updates_at_every_second_step_with_the_decay_squared():
-    module = nn.Linear(1, 1, bias=False)
-    average = ParameterAverage(module, decay=0.9, interval=2)
+    average = averaged([1.0, 1.0], decay=0.9, interval=2)
     assert average.decay == 0.9**2
-    average.update(1)
-    average.update(2)
     before = average.updates
     for step in range(3, 8):
         average.update(step)
@@ -227,14 +227,7 @@ def test_an_interval_of_two_updates_at_every_second_step_with_the_decay_squared(
 
 
 def test_the_steps_of_the_first_interval_are_each_taken_in_so_that_a_short_training_shows():
-    module = nn.Linear(1, 1, bias=False)
-    with torch.no_grad():
-        module.weight.fill_(0.0)
-    average = ParameterAverage(module, decay=0.99, interval=8)
-    with torch.no_grad():
-        module.weight.fill_(1.0)
-    for step in range(1, 4):
-        average.update(step)
+    average = averaged([1.0] * 3, decay=0.99, interval=8)
     assert average.updates == 3
     assert average.values["weight"].item() > 0.95
 
@@ -244,14 +237,10 @@ def test_the_steps_of_the_first_interval_are_each_taken_in_so_that_a_short_train
 def test_before_the_decay_bites_the_average_spans_the_same_part_of_a_training_of_any_length(
     num_steps, interval
 ):
-    module = nn.Linear(1, 1, bias=False)
-    average = ParameterAverage(module, decay=0.99999, interval=interval)
-    for step in range(1, num_steps + 1):
-        with torch.no_grad():
-            module.weight.fill_(step / num_steps)
-        average.update(step)
+    weights = [step / num_steps for step in range(1, num_steps + 1)]
     # A mean in which the weight of a step grows with its number to the 8th lags a tenth of the way behind.
-    assert average.values["weight"].item() == pytest.approx(0.9, abs=0.02)
+    found = averaged(weights, decay=0.99999, interval=interval).values["weight"].item()
+    assert found == pytest.approx(0.9, abs=0.02)
 
 
 def test_swapping_in_shows_the_average_and_gives_the_parameters_back():
@@ -268,7 +257,7 @@ def test_swapping_in_shows_the_average_and_gives_the_parameters_back():
 
 def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: TrainerConfig):
     config = replace(short_config, average_decay=0.8, steps_per_eval_all_images=12)
-    trainer = Trainer(config, console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(config)
     trainer.train()
     assert trainer.average is not None
     loaded = load_model(trainer.run.path, "cpu")
@@ -281,7 +270,7 @@ def test_a_run_with_an_average_is_evaluated_and_loaded_with_it(short_config: Tra
 
 
 def test_the_average_takes_parameters_as_callbacks_after_the_step_leave_them(short_config: TrainerConfig):
-    trainer = Trainer(replace(short_config, average_decay=0.0), console=Console(file=io.StringIO()))
+    trainer = quiet_trainer(replace(short_config, average_decay=0.0))
     grid = dict(trainer.pipeline.model.named_parameters())["field.grid"]
 
     def bound(step: int, progress: float) -> None:  # noqa: ARG001
