@@ -26,7 +26,7 @@ def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path: Path, d
     assert trainer.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"] < 12
     record = trainer.train()
     loaded = load_pipeline(trainer.run.path, "cpu")
-    assert loaded.step == record.steps == 200
+    assert loaded.training.steps == record.steps == 200
     assert loaded.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"] > 23
 
 

@@ -88,11 +88,6 @@ class OptimizerConfig:
     """Times the parameters, added to their gradient: draws what the data leaves open to 0."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
         rules = {
             "lr above 0 and finite": 0 < self.lr < math.inf,
             "final-factor in (0, 1]": 0 < self.final_factor <= 1,
@@ -110,11 +105,7 @@ class DataManagerConfig(InstantiateConfig):
     """Rays of the first training step; a model may adapt the number later."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings; a subclass with rules of its own calls this too.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
+        """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
         require_in_range("train_num_rays_per_batch", self.train_num_rays_per_batch, 1, 2**22)
 
 
@@ -127,17 +118,11 @@ class ModelConfig(InstantiateConfig):
     """Rays rendered at once for a whole image; fewer take less memory."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings; a subclass with rules of its own calls this too.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
+        """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
         require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 1, 2**22)
 
     def resolve_auto(
-        self,
-        initial_data: Callable[[], Mapping[str, np.ndarray]],
-        generator: torch.Generator,
+        self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
     ) -> tuple[ModelConfig, str]:
         """These settings with every `auto` replaced by a value, and the reasons in words.
 
@@ -167,11 +152,6 @@ class MachineConfig:
     the cores. Several machines: start them with torchrun, which says how many there are."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible numbers.
-
-        Raises:
-            ConfigError: out of range.
-        """
         require_in_range("machine.num_devices", self.num_devices, 1, MOST_PROCESSES)
 
 
@@ -214,11 +194,6 @@ class TrainerConfig:
     """Settings of the optimiser by parameter group."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range, or no limit at all.
-        """
         rules = {
             "max-num-iterations of at least 0": self.max_num_iterations is None
             or self.max_num_iterations >= 0,

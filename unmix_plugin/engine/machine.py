@@ -65,7 +65,10 @@ def step_seed(seed: int, step: int, stream: int = 0) -> int:
     """
     state = 0
     for value in (seed, step, stream):
-        state = _mixed((state ^ (value & _MASK)) + 0x9E3779B97F4A7C15)
+        state = ((state ^ (value & _MASK)) + 0x9E3779B97F4A7C15) & _MASK
+        state = ((state ^ (state >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+        state = ((state ^ (state >> 27)) * 0x94D049BB133111EB) & _MASK
+        state ^= state >> 31
     return state >> 1
 
 
@@ -81,10 +84,3 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
     np.random.seed(step_seed(seed, 0) & 0xFFFFFFFF)  # noqa: NPY002
     random.seed(seed)
-
-
-def _mixed(value: int) -> int:
-    value &= _MASK
-    value = ((value ^ (value >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
-    value = ((value ^ (value >> 27)) * 0x94D049BB133111EB) & _MASK
-    return value ^ (value >> 31)

@@ -13,7 +13,7 @@ from unmix_plugin.engine.configs import PipelineConfig
 from unmix_plugin.engine.machine import step_generator, step_seed
 from unmix_plugin.engine.model import DataManager, Model, TrainOutputs
 
-MODEL_STREAM = 1
+_MODEL_STREAM = 1
 """Stream of randomness of the model's own draws in a step; data managers draw from stream 0."""
 _PROCESS_STREAM = 2
 """From which the other processes of a training take their seeds."""
@@ -57,9 +57,9 @@ class Pipeline(nn.Module):
 
     def seed_step(self, step: int) -> None:
         """Make everything that the model draws in training step `step` a function of (seed, step)."""
-        self.model.generator = step_generator(self.seed, step, self.model.device, MODEL_STREAM)
+        self.model.generator = step_generator(self.seed, step, self.model.device, _MODEL_STREAM)
         # For what takes no generator, such as dropout.
-        torch.manual_seed(step_seed(self.seed, step, MODEL_STREAM))
+        torch.manual_seed(step_seed(self.seed, step, _MODEL_STREAM))
 
     def get_train_loss_dict(self, step: int) -> TrainOutputs:
         """Outputs, losses and metrics of training step `step`."""

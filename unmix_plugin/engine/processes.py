@@ -102,8 +102,9 @@ class Processes:
         """What the first process says: the progress of the step to take now, or None if training is over."""
         if self.count == 1:
             return progress
-        order = torch.tensor([-1.0 if progress is None else progress], dtype=torch.float64)
-        found = float(self.of_first(order.to(self._device)))
+        device = "cuda" if distributed.get_backend() == "nccl" else "cpu"
+        order = torch.tensor([-1.0 if progress is None else progress], dtype=torch.float64, device=device)
+        found = float(self.of_first(order))
         return None if found < 0 else found
 
     def gather(self, value: _T) -> list[_T]:
@@ -149,22 +150,13 @@ class Processes:
             raise failure
         raise RunError(f"process {failed[0] + 1} of {self.count}: {said[failed[0]]}")
 
-    @property
-    def _device(self) -> torch.device:
-        """Where numbers that are exchanged have to be."""
-        return torch.device("cuda" if distributed.get_backend() == "nccl" else "cpu")
-
     def _reduce(self, values: Tensor, operation: str) -> Tensor:
         if self.count > 1:
             self._call(lambda: distributed.all_reduce(values, op=getattr(distributed.ReduceOp, operation)))
         return values
 
     def _call(self, exchange: Callable[[], object]) -> None:
-        """An exchange with the others.
-
-        Raises:
-            RunError: one of them is gone.
-        """
+        """An exchange with the others; a RunError if one of them is gone."""
         try:
             exchange()
         except RuntimeError as error:
@@ -349,10 +341,7 @@ def _forwarded_signals(first: subprocess.Popen[bytes]) -> Iterator[None]:
         with suppress(OSError):
             first.send_signal(number)
 
-    def ignore(_number: int, _frame: FrameType | None) -> None:
-        return
-
-    handlers = {"SIGTERM": forward, "SIGHUP": forward, "SIGINT": ignore}
+    handlers = {"SIGTERM": forward, "SIGHUP": forward, "SIGINT": lambda *_: None}
     known = {getattr(signal, name): handler for name, handler in handlers.items() if hasattr(signal, name)}
     before = {number: signal.signal(number, handler) for number, handler in known.items()}
     try:

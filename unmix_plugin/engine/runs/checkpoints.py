@@ -67,7 +67,8 @@ def save_checkpoint(
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale_temporaries(folder)
         _remove_orphans(folder)
-        if not _has_tensors(record_path, sha256):
+        is_there = record_path.exists() and tensors_path.exists()
+        if not is_there or hashlib.sha256(tensors_path.read_bytes()).hexdigest() != sha256:
             record_path.unlink(missing_ok=True)
             write_file(tensors_path, data)
         write_run_json(record_path, {**record, "step": step, "sha256": sha256})
@@ -125,14 +126,6 @@ def _separate(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return separate
 
 
-def _has_tensors(record_path: Path, sha256: str) -> bool:
-    """Whether a checkpoint with just these tensors is there already, so that its record alone needs writing."""
-    if not record_path.exists():
-        return False
-    tensors_path = record_path.with_suffix(".safetensors")
-    return tensors_path.exists() and hashlib.sha256(tensors_path.read_bytes()).hexdigest() == sha256
-
-
 def _remove_orphans(folder: Path) -> None:
     """Remove tensors without a record: their writer was stopped before the checkpoint was one."""
     for path in folder.glob("step-*.safetensors"):
@@ -174,11 +167,6 @@ class TrainingRecord:
     """Learning rates of the last step, by parameter group."""
 
     def __post_init__(self) -> None:
-        """Refuse numbers that no training counts.
-
-        Raises:
-            ConfigError: one is negative, or there are no rays.
-        """
         for name in ("steps", "train_seconds", "total_rays", "skipped_steps", "average_updates"):
             require_in_range(name, getattr(self, name), 0, 2**62)
         require_in_range("num_rays", self.num_rays, 1, 2**30)
@@ -219,7 +207,7 @@ def collect_tensors(
         for key, value in state.items():
             tensors[f"{_OPTIMIZER}{names[id(param)]}/{key}"] = value
     if average is not None:
-        tensors.update({AVERAGE + name: value for name, value in average.state_dict().items()})
+        tensors.update({AVERAGE + name: value for name, value in average.values.items()})
     tensors.update({_DATAMANAGER + name: value for name, value in datamanager.state_dict().items()})
     return tensors
 

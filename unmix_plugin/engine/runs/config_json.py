@@ -91,7 +91,8 @@ def _read(value: Any, hint: Any, default: Any, where: str) -> Any:
 
 def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) -> Any:
     """The member type of `default` is tried first, then the others in their order."""
-    fits_default = [choice for choice in choices if _is_class(choice) and isinstance(default, choice)]
+    classes = [choice for choice in choices if isinstance(choice, type) and get_origin(choice) is None]
+    fits_default = [choice for choice in classes if isinstance(default, choice)]
     problems: list[str] = []
     for choice in fits_default + [choice for choice in choices if choice not in fits_default]:
         try:
@@ -99,10 +100,6 @@ def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) 
         except ConfigError as error:  # noqa: PERF203
             problems.append(str(error))
     raise ConfigError("; or ".join(problems))
-
-
-def _is_class(hint: Any) -> bool:
-    return isinstance(hint, type) and get_origin(hint) is None
 
 
 def _read_sequence(value: Any, kind: type, hints: tuple[Any, ...], default: Any, where: str) -> Any:

@@ -45,11 +45,6 @@ class LoadedPipeline:
     scene: SceneRecord
     training: TrainingRecord
 
-    @property
-    def step(self) -> int:
-        """Training steps done."""
-        return self.training.steps
-
 
 def load_model(path: Path, device: str = "auto") -> LoadedModel:
     """The newest complete checkpoint of a run as a model; reads nothing but the run folder.
@@ -62,7 +57,10 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
     checkpoint = require_checkpoint(run)
-    model = _model_of(config, scene, run)
+    try:
+        model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
+    except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise RunError(f"config.json and scene.json in {run.path} describe no model: {error}") from error
     restore_model(checkpoint.tensors, model, averaged=True)
     record = TrainingRecord.from_json(checkpoint.record)
     return LoadedModel(run, config, model.to(place).eval(), scene, record)
@@ -85,18 +83,6 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     check_same_scene(scene, pipeline.datamanager, run)
     restore_model(checkpoint.tensors, pipeline.model, averaged=True)
     return LoadedPipeline(run, config, pipeline.eval(), scene, TrainingRecord.from_json(checkpoint.record))
-
-
-def _model_of(config: TrainerConfig, scene: SceneRecord, run: RunFolder) -> Model:
-    """The model that a run's settings and scene describe, its values not yet restored.
-
-    Raises:
-        RunError: they describe none.
-    """
-    try:
-        return config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
-    except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise RunError(f"config.json and scene.json in {run.path} describe no model: {error}") from error
 
 
 def load_config(path: Path) -> TrainerConfig:

@@ -101,11 +101,9 @@ def newest_run(output_dir: Path) -> RunFolder:
     Raises:
         RunError: there is none.
     """
+    # By time, not by name, which only says what a clock once said.
     found = [
-        (
-            (path / "config.json").stat().st_mtime_ns,
-            path,
-        )  # not the name, which only says what a clock once said
+        ((path / "config.json").stat().st_mtime_ns, path)
         for path in output_dir.glob("*/*/*")
         if (path / "config.json").is_file() and checkpoint_steps(path / "checkpoints")
     ]
@@ -161,11 +159,13 @@ class RunLock:
             if fcntl is not None:
                 fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            if self._descriptor is None or error.errno in (
-                errno.EAGAIN,
-                errno.EACCES,
-            ):  # others: no locks here
-                raise RunError(self._refusal(path, error)) from error
+            if self._descriptor is None:
+                raise RunError(f"can't write {path}: {error.strerror or error}") from error
+            if error.errno in (errno.EAGAIN, errno.EACCES):  # others: no locks here
+                holder = os.read(self._descriptor, 20).decode(errors="replace")
+                raise RunError(
+                    f"another training writes to {path.parent} (process {holder}); stop it first, or wait for its end"
+                ) from error
         os.ftruncate(self._descriptor, 0)
         os.write(self._descriptor, str(os.getpid()).encode())
 
@@ -176,11 +176,3 @@ class RunLock:
             self._descriptor = None
 
     __del__ = release
-
-    def _refusal(self, path: Path, error: OSError) -> str:
-        if self._descriptor is None:
-            return f"can't write {path}: {error.strerror or error}"
-        holder = os.read(self._descriptor, 20).decode(errors="replace")
-        return (
-            f"another training writes to {path.parent} (process {holder}); stop it first, or wait for its end"
-        )

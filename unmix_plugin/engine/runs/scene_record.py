@@ -79,16 +79,10 @@ def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolde
     Raises:
         RunError: metadata, scene box or identity differ from what the run was trained with.
     """
-    kept = {
-        **scene.metadata,
-        "scene_box": scene.scene_box.aabb.tolist(),
-        **datamanager.identity(scene.summary),
-    }
-    found = {
-        **datamanager.metadata(),
-        "scene_box": datamanager.scene_box.aabb.tolist(),
-        **datamanager.identity(datamanager.summary()),
-    }
+    box, other_box = scene.scene_box.aabb.tolist(), datamanager.scene_box.aabb.tolist()
+    kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary)}
+    summary = datamanager.summary()
+    found = {**datamanager.metadata(), "scene_box": other_box, **datamanager.identity(summary)}
     differing = differences(kept, found)
     if differing:
         raise RunError(

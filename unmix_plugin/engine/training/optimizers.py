@@ -40,22 +40,17 @@ def build_optimizer(
             f"no optimizer config for the parameter group {', '.join(missing)}; configs: {', '.join(sorted(configs))}"
         )
     groups = [
-        {
-            "name": name,
-            "params": params,
-            "lr": configs[name].lr,
-            "weight_decay": configs[name].weight_decay,
-        }
-        for name, params in param_groups.items()
-        if params
+        {"name": name, "params": found, "lr": configs[name].lr, "weight_decay": configs[name].weight_decay}
+        for name, found in param_groups.items()
+        if found
     ]
-    return torch.optim.Adam(groups, betas=_BETAS, eps=_EPS, fused=_all_fusable(param_groups))
+    params = [param for found in param_groups.values() for param in found]
+    is_fusable = all(param.is_floating_point() and param.device.type in ("cpu", "cuda") for param in params)
+    return torch.optim.Adam(groups, betas=_BETAS, eps=_EPS, fused=is_fusable)
 
 
 def set_learning_rates(
-    optimizer: torch.optim.Optimizer,
-    configs: Mapping[str, OptimizerConfig],
-    progress: float,
+    optimizer: torch.optim.Optimizer, configs: Mapping[str, OptimizerConfig], progress: float
 ) -> dict[str, float]:
     """Set every group's step size for `progress`; returns them by group name."""
     names = [group["name"] for group in optimizer.param_groups]
@@ -71,12 +66,6 @@ def forget_gradients(optimizer: torch.optim.Optimizer, names: Collection[str]) -
         if group["name"] in names:
             for param in group["params"]:
                 optimizer.state.pop(param, None)
-
-
-def _all_fusable(param_groups: Mapping[str, list[nn.Parameter]]) -> bool:
-    """Whether torch has a fused Adam for these parameters: real floating point on the CPU or a CUDA GPU."""
-    params = [param for group in param_groups.values() for param in group]
-    return all(param.is_floating_point() and param.device.type in ("cpu", "cuda") for param in params)
 
 
 _MAX_IN_A_ROW = 20
@@ -108,22 +97,16 @@ class GradientGuard:
         # One transfer for all of them: each would wait for the GPU.
         numbers = torch.stack([loss.detach().float(), *norms.values()])
         finite, value = torch.stack([torch.isfinite(numbers).all().float(), numbers[0]]).tolist()
-        if finite:
-            self.in_a_row = 0
-        else:
-            self._refuse(value, norms)
-        return bool(finite), value
-
-    def _refuse(self, loss: float, norms: Mapping[str, Tensor]) -> None:
-        self.skipped += 1
-        self.in_a_row += 1
+        self.skipped += not finite
+        self.in_a_row = 0 if finite else self.in_a_row + 1
         if self.in_a_row >= _MAX_IN_A_ROW:
             bad = [name for name, norm in norms.items() if not torch.isfinite(norm)]
             raise RunError(
-                f"{self.in_a_row} training steps in a row had a non-finite loss or gradient (loss {loss:g}; "
+                f"{self.in_a_row} training steps in a row had a non-finite loss or gradient (loss {value:g}; "
                 f"gradients of {', '.join(bad) or 'no group'}); the last checkpoint is good. Lower the learning rates, "
                 "or look for values far outside [0, 1] in the scene"
             )
+        return bool(finite), value
 
 
 def _norm(gradients: list[Tensor]) -> Tensor:
@@ -155,6 +138,7 @@ class ParameterAverage:
         self.updates = 0
         self.params = {name: param for name, param in module.named_parameters() if param.requires_grad}
         self.values = {name: param.detach().clone() for name, param in self.params.items()}
+        """The averages by parameter name."""
 
     @torch.no_grad()
     def update(self, step: int) -> None:
@@ -175,12 +159,8 @@ class ParameterAverage:
         finally:
             self._swap()
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """The averaged values by parameter name."""
-        return self.values
-
-    def load_state_dict(self, values: Mapping[str, Tensor], updates: int) -> None:
-        """Restore `state_dict` and the number of updates."""
+    def restore(self, values: Mapping[str, Tensor], updates: int) -> None:
+        """Go on from these `values`, after so many updates."""
         for name, value in self.values.items():
             value.copy_(values[name])
         self.updates = updates

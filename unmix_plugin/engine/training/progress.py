@@ -127,13 +127,7 @@ class ProgressDisplay:
     def __init__(
         self, console: Console, plain_interval_s: float = 5.0, live_interval_s: float = 0.25
     ) -> None:
-        """Choose the display.
-
-        Args:
-            console: Where to show.
-            plain_interval_s: Seconds between lines where the console is not a terminal.
-            live_interval_s: Seconds between refreshes where it is one.
-        """
+        """Seconds between plain lines, and between refreshes where the console is a terminal."""
         self.console = console
         self.interval_s = live_interval_s if console.is_terminal else plain_interval_s
         self._bar: Progress | None = None
@@ -274,7 +268,7 @@ def _append(path: Path, line: str) -> None:
 
 
 def _keep_until(path: Path, step: int) -> None:
-    """Rewrite a JSON-lines file without the lines of later steps and without a last line cut off by a kill."""
+    """Rewrite a JSON-lines file without later steps' lines and without one cut off by a kill."""
     if not path.exists():
         return
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()

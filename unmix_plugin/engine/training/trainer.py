@@ -493,7 +493,7 @@ class Trainer:
         self.average = self._new_average()
         averaged = part(checkpoint.tensors, AVERAGE)
         if self.average is not None and averaged:
-            self.average.load_state_dict(averaged, record.average_updates)
+            self.average.restore(averaged, record.average_updates)
         write_config(self.run, self.config)
         for reason in checkpoint.damaged:
             self.log.write(f"passed over a damaged checkpoint: {reason}")

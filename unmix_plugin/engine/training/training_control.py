@@ -149,12 +149,9 @@ _STATUS_INTERVAL_S = 0.25
 class TrainingControl:
     """Joins a trainer with whoever watches it. Everything asked for happens between two steps."""
 
-    def __init__(self, device: DeviceShare | None = None) -> None:
-        """
-        Args:
-            device: Turns with others that compute on the same device; None for turns of its own.
-        """
-        self.device = device or DeviceShare()
+    def __init__(self) -> None:
+        self.device = DeviceShare()
+        """Turns with others that compute on the same device."""
         self.status: TrainingStatus | None = None
         """How far training has come, renewed a few times a second; None before the first step."""
         self.is_stop_requested = False
@@ -241,10 +238,6 @@ class StopSignals:
     ignored. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
     """
 
-    SIGNALS = tuple(
-        getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-    )
-
     def __init__(self) -> None:
         self.requested = False
         """Whether a stop was asked for."""
@@ -252,9 +245,11 @@ class StopSignals:
 
     def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():
+            names = ("SIGINT", "SIGTERM", "SIGHUP")
+            caught = [getattr(signal, name) for name in names if hasattr(signal, name)]
             self._previous = {
                 number: signal.signal(number, self._note)
-                for number in self.SIGNALS
+                for number in caught
                 if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
             }
         return self

@@ -97,7 +97,7 @@ def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
     name, model = trainer.config.method_name, trainer.pipeline.model
 
     def take() -> RenderableScene:
-        averages = None if trainer.average is None else trainer.average.state_dict()
+        averages = None if trainer.average is None else trainer.average.values
         return snapshot(model, name, record, averages)
 
     source = SceneSource(trainer.run, record, trainer.control.device, take, trainer.control)
