@@ -1,9 +1,12 @@
+
 """`unmix-export`: what is written and refused, and products that methods bring along."""
 
 import errno
 import importlib.metadata
 import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -165,3 +168,17 @@ def test_products_that_fail_or_whose_name_is_taken_are_skipped_and_said(own):
     assert "skipped the plugin rgb-3: its products: ImportError: no module named scissors" in ended.err
     assert "view-names" in ended.out
     assert run(export, "mesh", "--help").out.count("--smoothing") > 0
+
+
+def test_help_imports_neither_torch_nor_what_writes_products():
+    code = (
+        "import sys\nfrom unmix_plugin.commands.entry import run_command\n"
+        "from unmix_plugin.commands.export import export\n"
+        "for words in ['--help'], ['mesh', '--help']:\n"
+        "    try:\n        run_command(export, words)\n"
+        "    except SystemExit as stop:\n"
+        "        heavy = {'torch', 'warp', 'scipy', 'skimage', 'matplotlib', 'PIL'}\n"
+        "        print('end:', stop.code, sorted(heavy & set(sys.modules)))\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.count("end: 0 []\n") == 2, ended.stdout

@@ -2,7 +2,6 @@
 
 import csv
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from PIL import Image
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.products.metamerism import (
-    Metamerism,
     _find_metamers,
     _metamerism_paths,
     _write_metamerism,
@@ -26,7 +24,7 @@ from unmix_plugin.spectral.materials import Materials
 BANDS = Bands.of(np.linspace(400, 700, 31))
 SCENE_LIGHT = illuminant_power("D50", BANDS)
 GREY = np.full(31, 0.4)
-BOTH = Metamerism(lights=("D65", "A"))
+BOTH = ("all", ("D65", "A"), 2.0, 4.0)
 
 
 def hidden(strength: float) -> np.ndarray:
@@ -51,7 +49,7 @@ MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
 
 
 def pairs_of(surfaces: str) -> list[set[str]]:
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces=surfaces))
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, surfaces, *BOTH[1:])
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 
 
@@ -66,7 +64,7 @@ def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first()
 
 def test_materials_that_do_not_reach_all_bands_are_passed_over():
     longer = LIBRARY.extended(SHORT, "test")
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, longer, BOTH)
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, longer, *BOTH)
     assert "own/short" not in found.names
 
 
@@ -80,18 +78,18 @@ def test_bands_that_no_eye_sees_play_no_part():
         SpectraTable(Bands.of([390, 790]), ("own/wide",), np.full((1, 2), 0.4)), "test"
     )
     found = _find_metamers(
-        Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, BOTH
+        Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, *BOTH
     )
     assert found.bands == Bands.of(np.linspace(400, 780, 39))
     assert {"slate", "own/wide"} <= set(found.names)
     assert {"slate", "paint"} in [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
-        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, BOTH)
+        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, *BOTH)
 
 
 def test_the_table_names_materials_lights_and_differences(tmp_path):
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, "run", *BOTH[1:])
     assert _write_metamerism(tmp_path / "new", found) == _metamerism_paths(tmp_path / "new")
     rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text())))
     [row] = rows
@@ -102,7 +100,7 @@ def test_the_table_names_materials_lights_and_differences(tmp_path):
 
 
 def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, replace(BOTH, surfaces="run"))
+    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, "run", *BOTH[1:])
     _write_metamerism(tmp_path, found)
     with Image.open(tmp_path / "metamerism.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3) / 255
@@ -116,7 +114,7 @@ def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
 @pytest.mark.parametrize("lights", [("D65", "A"), ("D65", "A", "FL2", "FL11", "E")])
 def test_a_figure_without_pairs_is_drawn_all_the_same(tmp_path, lights):
     grey = run_materials(GREY, names=("slate",))
-    found = _find_metamers(grey, None, MaterialLibrary(()), Metamerism(lights=lights))
+    found = _find_metamers(grey, None, MaterialLibrary(()), "all", lights, 2.0, 4.0)
     assert found.pairs == []
     _write_metamerism(tmp_path, found)
     with Image.open(tmp_path / "metamerism.png") as picture:

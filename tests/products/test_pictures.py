@@ -19,7 +19,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import Abundances, _draw_abundances, colour_panel
+from unmix_plugin.products.abundances import _draw_abundances, _write_view, colour_panel
 from unmix_plugin.products.endmembers import _draw_endmembers
 from unmix_plugin.products.evaluation import (
     _draw_colour,
@@ -143,7 +143,7 @@ def test_an_exported_array_is_zero_where_nothing_is(tmp_path):
     given = materials(3)
     view = rendered(given)
     folder = tmp_path / "new"
-    assert Abundances().write_view(folder, "view", view, given) == Abundances().paths(folder, "view")
+    _write_view(("npy",), folder, "view", view, given)
     exported = np.load(tmp_path / "new" / "view.npy")
     assert (exported.dtype, exported.shape) == (np.float32, (12, 16, 3))
     assert (exported[:, :4] == 0).all()

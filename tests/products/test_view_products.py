@@ -13,10 +13,8 @@ from PIL import Image
 
 from tests.method_factory import make_scene
 from tests.trained.camera_scenes import around
-from unmix_plugin.products.abundances import Abundances
-from unmix_plugin.products.cubes import Cubes
+from unmix_plugin.products import abundances, cubes, segmentation
 from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
-from unmix_plugin.products.segmentation import Segmentation, _legend_bytes
 from unmix_plugin.trained.evaluation import render_view
 from unmix_plugin.trained.run_materials import endmember_colours
 
@@ -27,30 +25,31 @@ NAME = "view.0"
 
 
 @pytest.fixture(scope="module")
-def cubes(tmp_path_factory):
+def written_cubes(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cubes")
-    product = Cubes(formats=("envi", "exr", "npy"))
-    assert product.write_view(folder, NAME, VIEW, MATERIALS) == product.paths(folder, NAME)
+    formats = ("envi", "exr", "npy")
+    cubes._write_view(formats, folder, NAME, VIEW, MATERIALS)
+    assert set(folder.iterdir()) == set(abundances.view_paths(formats, folder, NAME))
     return folder
 
 
-def test_every_format_of_a_cube_holds_the_same_float32_spectra(cubes):
+def test_every_format_of_a_cube_holds_the_same_float32_spectra(written_cubes):
     expected = VIEW.spectra.numpy()
     assert expected.max() > 0.05
-    from_envi: Any = envi.open(str(cubes / f"{NAME}.hdr"), str(cubes / f"{NAME}.img"))
+    from_envi: Any = envi.open(str(written_cubes / f"{NAME}.hdr"), str(written_cubes / f"{NAME}.img"))
     np.testing.assert_array_equal(from_envi.open_memmap(), expected)
     assert from_envi.bands.centers == [450.0, 500.0, 550.0, 600.0, 650.0]
-    np.testing.assert_array_equal(np.load(cubes / f"{NAME}.npy"), expected)
-    channels = OpenEXR.File(str(cubes / f"{NAME}.exr"), separate_channels=True).channels()
+    np.testing.assert_array_equal(np.load(written_cubes / f"{NAME}.npy"), expected)
+    channels = OpenEXR.File(str(written_cubes / f"{NAME}.exr"), separate_channels=True).channels()
     for index, wavelength in enumerate((450, 500, 550, 600, 650)):
         np.testing.assert_array_equal(channels[f"S0.{wavelength},000000nm"].pixels, expected[..., index])
     np.testing.assert_array_equal(channels["A"].pixels, VIEW.accumulation.numpy())
 
 
 def test_every_format_of_abundances_holds_the_same_float32_shares(tmp_path):
-    product = Abundances(formats=("npy", "png", "envi", "exr"))
-    assert product.write_view(tmp_path, NAME, VIEW, MATERIALS) == product.paths(tmp_path, NAME)
-    assert all(path.is_file() for path in product.paths(tmp_path, NAME))
+    formats = ("npy", "png", "envi", "exr")
+    abundances._write_view(formats, tmp_path, NAME, VIEW, MATERIALS)
+    assert set(tmp_path.iterdir()) == set(abundances.view_paths(formats, tmp_path, NAME))
     expected = VIEW.abundances.numpy()
     np.testing.assert_array_equal(np.load(tmp_path / f"{NAME}.npy"), expected)
     from_envi: Any = envi.open(str(tmp_path / f"{NAME}.hdr"), str(tmp_path / f"{NAME}.img"))
@@ -70,13 +69,13 @@ def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
 
 
 def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
-    paths = Segmentation().write_view(tmp_path, NAME, VIEW, MATERIALS)
-    with Image.open(paths[2]) as labels:
+    segmentation._write_view(tmp_path, NAME, VIEW, MATERIALS)
+    with Image.open(segmentation._view_paths(tmp_path, NAME)[2]) as labels:
         ids, colours = np.asarray(labels), np.asarray(labels.convert("RGB"))
         assert labels.mode == "P"
     np.testing.assert_array_equal(ids, VIEW.segmentation.numpy())
     assert len(np.unique(ids)) > 2
-    legend = _legend_bytes(MATERIALS).decode().splitlines()
+    legend = segmentation._legend_bytes(MATERIALS).decode().splitlines()
     rows = {int(row["id"]): row for row in csv.DictReader(legend)}
     assert [rows[index]["name"] for index in (0, 1, 2, 255)] == [*MATERIALS.names, "nothing"]
     for index in np.unique(ids):
@@ -91,7 +90,7 @@ def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
 
 def test_named_endmembers_keep_their_names(tmp_path):
     named = replace(SCENE.materials, names=("oak, old", "v1.2", "löss"))
-    [path] = Abundances(formats=("exr",)).write_view(tmp_path, NAME, VIEW, named)
-    channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    abundances._write_view(("exr",), tmp_path, NAME, VIEW, named)
+    channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
     assert set(channels) == {"abundances.oak, old", "abundances.v1_2", "abundances.löss"}
     assert torch.equal(torch.from_numpy(channels["abundances.v1_2"].pixels), VIEW.abundances[..., 1])

@@ -1,6 +1,6 @@
 """`unmix-export PRODUCT --run PATH`: files for others, from the run folder alone.
 
-A product is one module in `products` and one entry in `PRODUCTS`, or is brought along by a method
+A product is one module in `products` and its options in `products/scene_products.py`, or is brought along by a method
 (`MethodSpecification.products`).
 """
 
@@ -17,19 +17,8 @@ import tyro
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.registry import BrokenPlugin, discover_methods
 from unmix_plugin.errors import ConfigError, counted
-from unmix_plugin.products.abundances import Abundances
-from unmix_plugin.products.cubes import Cubes
-from unmix_plugin.products.endmembers import Endmembers
-from unmix_plugin.products.mesh import Mesh
-from unmix_plugin.products.metamerism import Metamerism
-from unmix_plugin.products.pca import Pca
-from unmix_plugin.products.point_cloud import PointCloud
-from unmix_plugin.products.poses import Poses
 from unmix_plugin.products.product import Job, Product, RunProduct, ViewProduct
-from unmix_plugin.products.report.report import Report
-from unmix_plugin.products.segmentation import Segmentation
-from unmix_plugin.products.spectrum import Spectrum
-from unmix_plugin.products.volume import Volume
+from unmix_plugin.products.scene_products import PRODUCTS
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
@@ -84,22 +73,6 @@ def own_products(taken: frozenset[str]) -> tuple[dict[str, OwnProduct], list[Bro
             found[product.name] = OwnProduct(product, (*(known.methods if known else ()), method_name))
     return found, broken
 
-
-PRODUCTS: tuple[Product, ...] = (
-    Abundances(),
-    Cubes(),
-    Endmembers(),
-    Mesh(),
-    Metamerism(),
-    Pca(),
-    PointCloud(),
-    Poses(),
-    Report(),
-    Segmentation(),
-    Spectrum(),
-    Volume(),
-)
-"""All that scenes of mixed materials have, with the defaults of its options."""
 
 _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
 """Products that compare with spectra and lights known in the run's own bands, and that no sensor can come between."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -22,57 +21,49 @@ from unmix_plugin.figures.pictures import (
 from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import array_bytes, write_file
-from unmix_plugin.products.product import ViewProduct
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import PredictedView, as_numpy, picture
 from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.run_views import ViewChoice
 
 SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 """Colours of abundances, the same in every figure."""
 
-_WHAT = "abundances, summing to the opacity"
+
+def export_abundances(job: Job, choice: ViewChoice, formats: Sequence[str]) -> list[Path]:
+    """Write the abundances of views: npy, envi and exr hold the same float32 numbers, png is a figure."""
+    return job.write_views(choice, partial(view_paths, formats), partial(_write_view, formats))
 
 
-@dataclass(frozen=True)
-class Abundances(ViewProduct):
-    """Abundance of each endmember, summing to the opacity, 0 where nothing is: of each view VIEW.npy, (H, W, K)
-    float32, and VIEW.png, a figure; on request ENVI and EXR images."""
-
-    name = "abundances"
-
-    formats: tuple[Literal["npy", "png", "envi", "exr"], ...] = ("npy", "png")
-    """npy, envi (.hdr and .img), exr (a channel for each endmember), png."""
-
-    def paths(self, folder: Path, view: str) -> list[Path]:
-        """Files of a view."""
-        return [path for kind in self.formats for path in view_paths(folder, view, kind)]
-
-    def write_view(
-        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
-    ) -> list[Path]:
-        """Write the abundances of a view: npy, envi and exr hold the same float32 numbers, png is the figure."""
-        shares = rendered.abundances.numpy().astype(np.float32)
-        about = f"{view}: {_WHAT}"
-        for kind in self.formats:
-            path = folder / f"{view}.{kind}"
-            if kind == "npy":
-                write_file(path, array_bytes(shares))
-            elif kind == "png":
-                write_file(path, _draw_abundances(view, rendered, materials))
-            elif kind == "envi":
-                write_envi_cube(folder / view, shares, None, materials.names, about)
-            else:
-                names = layer_names("abundances", materials.names)
-                planes = dict(zip(names, np.moveaxis(shares, -1, 0), strict=True))
-                write_exr(path, planes, {"comments": about})
-        return self.paths(folder, view)
+def _write_view(
+    formats: Sequence[str], folder: Path, view: str, rendered: PredictedView, materials: Materials
+) -> None:
+    shares = rendered.abundances.numpy().astype(np.float32)
+    about = f"{view}: abundances, summing to the opacity"
+    for kind in formats:
+        path = folder / f"{view}.{kind}"
+        if kind == "npy":
+            write_file(path, array_bytes(shares))
+        elif kind == "png":
+            write_file(path, _draw_abundances(view, rendered, materials))
+        elif kind == "envi":
+            write_envi_cube(folder / view, shares, None, materials.names, about)
+        else:
+            names = layer_names("abundances", materials.names)
+            planes = dict(zip(names, np.moveaxis(shares, -1, 0), strict=True))
+            write_exr(path, planes, {"comments": about})
 
 
-def view_paths(folder: Path, view: str, kind: str) -> list[Path]:
-    """Files of a view in one format: ENVI has two, the others one."""
-    return envi_cube_paths(folder / view) if kind == "envi" else [folder / f"{view}.{kind}"]
+def view_paths(formats: Sequence[str], folder: Path, view: str) -> list[Path]:
+    """Files of a view: ENVI has two, the other formats one."""
+    return [
+        path
+        for kind in formats
+        for path in (envi_cube_paths(folder / view) if kind == "envi" else [folder / f"{view}.{kind}"])
+    ]
 
 
 def colour_panel(view: PredictedView, bands: Bands) -> TitledPicture:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -19,17 +18,10 @@ _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
 
 
-@dataclass(frozen=True)
-class Endmembers(Product):
-    """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, and a plot over
-    wavelength, endmembers.png."""
-
-    name = "endmembers"
-
-    def write(self, job: Job) -> list[Path]:
-        """Write table, library and plot."""
-        job.claim(_endmember_paths(job.folder))
-        return _write_endmembers(job.folder, job.materials)
+def export_endmembers(job: Job) -> list[Path]:
+    """Write table, library and plot."""
+    job.claim(_endmember_paths(job.folder))
+    return _write_endmembers(job.folder, job.materials)
 
 
 def _endmember_paths(folder: Path) -> list[Path]:

@@ -10,9 +10,9 @@ Notation: `V` vertices, `F` faces.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
@@ -20,20 +20,20 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import (
     GridPoints,
     SeenSurface,
+    SurfaceAppearance,
     SurfacePoints,
+    look_from_above,
     may_be_solid,
     sample_densities,
+    sample_slice,
 )
 from unmix_plugin.trained.trained_scene import TrainedScene
-
-if TYPE_CHECKING:
-    from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.trained.surface import GridPoints, SeenSurface, SurfaceAppearance
-
 
 _END_QUANTILE = 0.07
 """Rays end inside what they hit: this part of them where the density is still lower than at the surface."""
@@ -168,80 +168,50 @@ def _links(mesh: _TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, whi
     return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
 
 
-_MeshFormat = Literal["ply", "glb", "obj"]
-
 _MOST_SMOOTHING = 8.0
 _NUM_RAYS = 300_000
 """Rays that tell what of the surface is seen."""
 
 
-@dataclass(frozen=True)
-class Mesh(Product):
-    """The surface as triangles: mesh.ply, mesh.glb or mesh.obj with position and normal in the scene's world
-    coordinates, colour and material; PLY and GLB with every abundance too."""
+def export_mesh(
+    job: Job,
+    formats: Sequence[str],
+    resolution: int,
+    density: float | None,
+    smoothing: float,
+    keeps_unseen: bool,
+) -> list[Path]:
+    """Sample the density, march through it, trim and colour the surface.
 
-    name = "mesh"
-
-    formats: tuple[_MeshFormat, ...] = ("ply", "glb")
-    """ply, glb, obj (with mesh.mtl)."""
-    resolution: int = 192
-    """Cells along the longest edge of the scene box."""
-    density: float | None = None
-    """Density per world unit at which the surface lies; None: that at which rays end. Lower ones close holes, higher
-    ones drop floaters."""
-    smoothing: float = 1.0
-    """Blur before the surface is looked for: standard deviation in cells, 0 for none."""
-    unseen: Literal["drop", "keep"] = "drop"
-    """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Sample the density, march through it, trim and colour the surface."""
-
-        _require_sound(self.density, self.smoothing)
-        job.claim(_mesh_paths(job.folder, self.formats))
-        surface, densities, grid = job.surface(_NUM_RAYS), *self._sample(job)
-        with job.working("making the mesh"):
-            if self.density is None:
-                threshold = _surface_density(job.scene, surface.points())
-            else:
-                threshold = self.density / job.frame.scale
-            mesh = self._extract(job, densities, grid, threshold, surface)
-            written = _write_mesh(job.folder, self.formats, mesh, job.scene, job.frame)
-        job.say(
-            f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
-            f"at a density of {threshold * job.frame.scale:.4g} per world unit"
-        )
-        return written
-
-    def _sample(self, job: Job) -> tuple[Float32[np.ndarray, "X Y Z"], GridPoints]:
-        from unmix_plugin.trained.surface import GridPoints, sample_slice
-
-        scene = job.scene
-        grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
-        slices = job.follow("sampling the density", range(grid.shape[0]))
-        return np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices]), grid
-
-    def _extract(
-        self,
-        job: Job,
-        densities: Float32[np.ndarray, "X Y Z"],
-        grid: GridPoints,
-        threshold: float,
-        surface: SeenSurface,
-    ) -> _TriangleMesh:
-        """The surface, model space."""
-
-        pixel_size = job.scene.pixel_size
-        if self.unseen == "keep":
-            return _without_stray_pieces(
-                _extract_mesh(densities, grid, threshold, self.smoothing, pixel_size)
-            )
-        solid = _filled(densities, grid, job.scene, surface)
-        mesh = _extract_mesh(solid, grid, threshold, self.smoothing, pixel_size)
-        return _without_stray_pieces(_trim_unseen(mesh, surface))
+    Args:
+        job: The run and where to write.
+        formats: Of `ply`, `glb`, `obj`.
+        resolution: Cells along the longest edge of the scene box.
+        density: Per world unit at which the surface lies; None: that at which rays end.
+        smoothing: Standard deviation of the blur, cells.
+        keeps_unseen: Whether surfaces that no camera sees stay.
+    """
+    _require_sound(density, smoothing)
+    job.claim(_mesh_paths(job.folder, formats))
+    scene, surface = job.scene, job.surface(_NUM_RAYS)
+    grid = GridPoints.over(scene.scene_box.aabb, resolution)
+    slices = job.follow("sampling the density", range(grid.shape[0]))
+    densities = np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices])
+    with job.working("making the mesh"):
+        ends = surface.points()
+        threshold = _surface_density(scene, ends) if density is None else density / job.frame.scale
+        solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
+        mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
+        mesh = _without_stray_pieces(mesh if keeps_unseen else _trim_unseen(mesh, surface))
+        written = _write_mesh(job.folder, formats, mesh, scene, job.frame)
+    job.say(
+        f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
+        f"at a density of {threshold * job.frame.scale:.4g} per world unit"
+    )
+    return written
 
 
-def _mesh_paths(folder: Path, formats: tuple[_MeshFormat, ...]) -> list[Path]:
+def _mesh_paths(folder: Path, formats: Sequence[str]) -> list[Path]:
     """Files that `_write_mesh` makes."""
     return [path for kind in formats for path in _paths(folder, kind)]
 
@@ -256,7 +226,7 @@ def _require_sound(density: float | None, smoothing: float) -> None:
 
 def _write_mesh(
     folder: Path,
-    formats: tuple[_MeshFormat, ...],
+    formats: Sequence[str],
     mesh: _TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
@@ -267,9 +237,6 @@ def _write_mesh(
     normals, colours (sRGB) and the material of each face. Large coordinates are float64 in PLY and OBJ; glTF has them
     less `offset` in the extras of its mesh.
     """
-    from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
-    from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above
-
     if len(mesh.faces) == 0:
         raise RunError(
             "nothing is left of the surface: no camera of the run sees it; keep it with --unseen keep"
@@ -331,7 +298,7 @@ def _write_glb(
     return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras)]
 
 
-def _paths(folder: Path, kind: _MeshFormat) -> list[Path]:
+def _paths(folder: Path, kind: str) -> list[Path]:
     return obj_paths(folder / "mesh") if kind == "obj" else [folder / f"mesh.{kind}"]
 
 

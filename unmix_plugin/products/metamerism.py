@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,7 +20,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
 from unmix_plugin.formats.files import write_file
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
 from unmix_plugin.spectral.colour.difference import (
@@ -30,43 +31,37 @@ from unmix_plugin.spectral.colour.difference import (
 )
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.run_materials import library_with
 
 _MOST_DRAWN = 12
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
 _SWATCH = 0.46
 
 
-@dataclass(frozen=True)
-class Metamerism(Product):
-    """Pairs of materials that look alike in one light and differ in another, as an eye adapted to each light sees them:
-    metamerism.csv, the pairs with their differences, and metamerism.png, swatches."""
+_Surfaces = Literal["run", "library", "all"]
 
-    name = "metamerism"
 
-    surfaces: Literal["run", "library", "all"] = "all"
-    """Pair the run's endmembers, materials of the library, or both together."""
-    lights: tuple[str, ...] = ("D65", "A", "FL2", "FL11")
-    """Lights to compare: CIE illuminants, lamps or .csv files (wavelength,power)."""
-    alike: float = 2.0
-    """Colour difference (CIEDE2000) up to which two materials look alike."""
-    different: float = 4.0
-    """Colour difference from which they look different."""
-    library: tuple[Path, ...] = ()
-    """CSV files or ENVI spectral libraries with reflectances of your own, beside the measured ones."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Compare all pairs in all lights."""
-        from unmix_plugin.trained.run_materials import library_with
-
-        job.claim(_metamerism_paths(job.folder))
-        with job.working("comparing colours"):
-            found = _find_metamers(job.materials, job.scene.light_power, library_with(self.library), self)
-            written = _write_metamerism(job.folder, found)
-        job.say(
-            f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
-            f"over {found.bands}"
+def export_metamerism(
+    job: Job,
+    surfaces: _Surfaces,
+    lights: Sequence[str],
+    alike: float,
+    different: float,
+    library: Sequence[Path],
+) -> list[Path]:
+    """Compare all pairs in all lights; `alike` and `different` are bounds of CIEDE2000."""
+    job.claim(_metamerism_paths(job.folder))
+    with job.working("comparing colours"):
+        known = library_with(library)
+        found = _find_metamers(
+            job.materials, job.scene.light_power, known, surfaces, lights, alike, different
         )
-        return written
+        written = _write_metamerism(job.folder, found)
+    job.say(
+        f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
+        f"over {found.bands}"
+    )
+    return written
 
 
 @dataclass(frozen=True)
@@ -91,23 +86,26 @@ def _find_metamers(
     materials: Materials,
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
-    options: Metamerism,
+    surfaces: _Surfaces,
+    light_names: Sequence[str],
+    alike: float,
+    different: float,
 ) -> _Metamers:
     """Look at all pairs of surfaces in all lights."""
     is_visible = materials.bands.visible_mask
     if not is_visible.any():
         raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")
     bands = Bands.of(materials.bands.centers_nm[is_visible])
-    lights = [parse_light(word) for word in options.lights]
+    lights = [parse_light(word) for word in light_names]
     powers = (
         np.stack([illuminant_power(light, bands) for light in lights])
         if lights
         else np.zeros((0, len(bands)))
     )
-    names, rows = _surfaces(materials, scene_light, library, options.surfaces, bands)
+    names, rows = _surfaces(materials, scene_light, library, surfaces, bands)
     reflectance = np.array(rows).reshape(len(names), len(bands))
-    pairs = metameric_pairs(reflectance, powers, bands, options.alike, options.different)
-    num_own = 0 if options.surfaces == "library" else len(materials.names)
+    pairs = metameric_pairs(reflectance, powers, bands, alike, different)
+    num_own = 0 if surfaces == "library" else len(materials.names)
     pairs.sort(key=lambda pair: pair.first >= num_own)  # stable: the run's own first, then by difference
     labels = tuple(light.stem if isinstance(light, Path) else light for light in lights)
     return _Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
@@ -159,7 +157,7 @@ def _surfaces(
     materials: Materials,
     scene_light: Float64[np.ndarray, " B"] | None,
     library: MaterialLibrary,
-    chosen: Literal["run", "library", "all"],
+    chosen: _Surfaces,
     bands: Bands,
 ) -> tuple[list[str], list[Float64[np.ndarray, " V"]]]:
     """Names of what is paired, and reflectances at `bands`, the visible ones of the run."""

@@ -10,7 +10,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,15 +20,12 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.pictures import over_neutral
 from unmix_plugin.formats.files import rgba_png_bytes, write_file
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.evaluation import PredictedView, as_numpy
 from unmix_plugin.trained.run_views import ViewChoice, resized_views
-
-if TYPE_CHECKING:
-    from unmix_plugin.trained.trained_scene import TrainedScene
-
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PcaOf = Literal["spectra", "abundances"]
 
@@ -39,29 +36,17 @@ _LEAST_EXPLAINED = 1e-6
 """Part of the variance that a component has to explain to be shown."""
 
 
-@dataclass(frozen=True)
-class Pca(Product):
-    """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
-    what red, green and blue stand for."""
-
-    name = "pca"
-
-    of: _PcaOf = "spectra"
-    """What has its components taken."""
-    views: ViewChoice = "eval"
-    """Which of the scene's views to render."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Find the components of all views, then paint each."""
-        views, scene = resized_views(job.views(self.views)), job.scene
-        job.claim([*(_pca_path(job.folder, view.name) for view in views), _components_path(job.folder)])
-        seen = [_survey_view(scene, view.camera, self.of) for view in job.follow("finding components", views)]
-        components = _find_components(seen, self.of)
-        written = [
-            _write_pca(job.folder, view.name, job.render(view), components)
-            for view in job.follow("rendering views", views)
-        ]
-        return [*written, _write_components(job.folder, components, job.materials)]
+def export_pca(job: Job, of: _PcaOf, choice: ViewChoice) -> list[Path]:
+    """Find the components of all views, then paint each."""
+    views, scene = resized_views(job.views(choice)), job.scene
+    job.claim([*(_pca_path(job.folder, view.name) for view in views), _components_path(job.folder)])
+    seen = [_survey_view(scene, view.camera, of) for view in job.follow("finding components", views)]
+    components = _find_components(seen, of)
+    written = [
+        _write_pca(job.folder, view.name, job.render(view), components)
+        for view in job.follow("rendering views", views)
+    ]
+    return [*written, _write_components(job.folder, components, job.materials)]
 
 
 @dataclass(frozen=True)

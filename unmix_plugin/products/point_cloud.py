@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,7 +19,8 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.meshes import write_ply
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
+from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.maps.reflectance_maps import (
@@ -30,11 +30,8 @@ from unmix_plugin.spectral.maps.reflectance_maps import (
     seen_reflectance,
 )
 from unmix_plugin.spectral.materials import Materials
-
-if TYPE_CHECKING:
-    from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.trained.surface import SurfacePoints
-
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
 
 _OUTLIER_NEIGHBOURS = 8
 _OUTLIER_FACTOR = 4.0
@@ -184,31 +181,16 @@ _RAYS_PER_POINT = 5
 _COUNT_BOUNDS = (1, 10_000_000)
 
 
-@dataclass(frozen=True)
-class PointCloud(Product):
-    """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
-    every abundance of each point, and with --outputs more numbers."""
-
-    name = "point-cloud"
-
-    num_points: int = 100_000
-    """Most points to write; they cover what the run's cameras see evenly."""
-    outputs: tuple[str, ...] = ()
-    """Numbers to add to each point: spectral indices and targets, as in index:ndvi target:ace:paint.csv."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Look through all cameras of the run, clean and thin what they see."""
-
-        count, materials = _require_count(self.num_points), job.materials
-        scores = _require_point_scores(self.outputs, materials.bands)
-        job.claim([_point_cloud_path(job.folder)])
-        surface = job.surface(_RAYS_PER_POINT * count)
-        with job.working("cleaning and thinning the points"):
-            path, written = _write_point_cloud(
-                job.folder, surface.points(), count, materials, job.frame, scores
-            )
-        job.say(counted(written, "point"))
-        return [path]
+def export_point_cloud(job: Job, num_points: int, outputs: Sequence[str]) -> list[Path]:
+    """Look through all cameras of the run, clean and thin what they see."""
+    count, materials = _require_count(num_points), job.materials
+    scores = _require_point_scores(outputs, materials.bands)
+    job.claim([_point_cloud_path(job.folder)])
+    surface = job.surface(_RAYS_PER_POINT * count)
+    with job.working("cleaning and thinning the points"):
+        path, written = _write_point_cloud(job.folder, surface.points(), count, materials, job.frame, scores)
+    job.say(counted(written, "point"))
+    return [path]
 
 
 def _point_cloud_path(folder: Path) -> Path:
@@ -240,9 +222,6 @@ def _write_point_cloud(
     Returns:
         The file, and how many points are in it.
     """
-    from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
-    from unmix_plugin.trained.surface import SurfaceAppearance
-
     points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
     if len(points) == 0:
         raise RunError(

@@ -4,35 +4,26 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from unmix_plugin.formats.files import make_folder, write_file
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import camera_entry
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 
-@dataclass(frozen=True)
-class Poses(Product):
-    """Cameras of all views as transforms.json, in the world of the scene's poses; those of training views as training
-    corrected them, where it did."""
-
-    name = "poses"
-
-    def write(self, job: Job) -> list[Path]:
-        """Write transforms.json."""
-        path = job.folder / "transforms.json"
-        job.claim([path])
-        make_folder(job.folder)
-        scene = job.loaded.scene
-        is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
-        content = _poses_json(scene.views, scene.frame, is_refined)
-        write_file(path, (json.dumps(content, indent=1) + "\n").encode())
-        return [path]
+def export_poses(job: Job) -> list[Path]:
+    """Write transforms.json."""
+    path = job.folder / "transforms.json"
+    job.claim([path])
+    make_folder(job.folder)
+    scene = job.loaded.scene
+    is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
+    content = _poses_json(scene.views, scene.frame, is_refined)
+    return [write_file(path, (json.dumps(content, indent=1) + "\n").encode())]
 
 
 def _poses_json(views: Sequence[RunView], frame: Normalisation, is_refined: bool) -> dict[str, Any]:

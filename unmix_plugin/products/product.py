@@ -7,20 +7,20 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.engine.processes import ALONE, Processes
 from unmix_plugin.formats.files import refuse_to_overwrite
-from unmix_plugin.trained.run_views import RunView, ViewChoice, resized_views, views_of
 
 if TYPE_CHECKING:
+    from unmix_plugin.engine.processes import Processes
     from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.trained.evaluation import PredictedView
     from unmix_plugin.trained.open_run import LoadedRun
+    from unmix_plugin.trained.run_views import RunView, ViewChoice
     from unmix_plugin.trained.surface import SeenSurface
     from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -70,35 +70,10 @@ class Product(RunProduct):
 class ViewProduct(Product):
     """A product of which every view has files of its own."""
 
-    views: ViewChoice = "eval"
+    views: Literal["eval", "train", "all"] = "eval"
     """Which of the scene's views to render."""
     num_devices: int = 1
     """Processes that share the views, on CUDA each on a device of its own."""
-
-    @abstractmethod
-    def paths(self, folder: Path, view: str) -> list[Path]:
-        """Files of a view."""
-
-    @abstractmethod
-    def write_view(
-        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
-    ) -> list[Path]:
-        """Write the files of a view, in a folder that is made.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
-
-    def write(self, job: Job) -> list[Path]:
-        """Render the views, one after the other, and write each; several processes share them."""
-        views, processes = resized_views(job.views(self.views)), job.processes
-        paths = [path for view in views for path in self.paths(job.folder, view.name)]
-        with processes.together():
-            job.claim(paths)
-        with processes.together():
-            for view in job.follow("rendering views", views[processes.rank :: processes.count]):
-                self.write_view(job.folder, view.name, job.render(view), job.materials)
-        return paths
 
 
 @dataclass(frozen=True)
@@ -115,7 +90,7 @@ class Job:
     """Context that shows that something of unknown length is under way."""
     follow: Callable[[str, Sequence[Any]], Iterator[Any]]
     """The items given, while it is shown how many are done."""
-    processes: Processes = ALONE
+    processes: Processes
     """That share the views."""
 
     @property
@@ -151,6 +126,8 @@ class Job:
 
     def views(self, choice: ViewChoice) -> list[RunView]:
         """Views of the run."""
+        from unmix_plugin.trained.run_views import views_of
+
         return views_of(self.loaded.scene.views, choice)
 
     def render(self, view: RunView) -> PredictedView:
@@ -158,6 +135,30 @@ class Job:
         from unmix_plugin.trained.evaluation import render_view
 
         return render_view(self.scene, view.camera)
+
+    def write_views(
+        self,
+        choice: ViewChoice,
+        paths: Callable[[Path, str], list[Path]],
+        write: Callable[[Path, str, PredictedView, Materials], None],
+    ) -> list[Path]:
+        """Render views, one after the other, and write each; several processes share them.
+
+        Args:
+            choice: Of the run's views.
+            paths: Files of a view, from the folder and its name.
+            write: Writes them.
+        """
+        from unmix_plugin.trained.run_views import resized_views
+
+        views, processes = resized_views(self.views(choice)), self.processes
+        files = [path for view in views for path in paths(self.folder, view.name)]
+        with processes.together():
+            self.claim(files)
+        with processes.together():
+            for view in self.follow("rendering views", views[processes.rank :: processes.count]):
+                write(self.folder, view.name, self.render(view), self.materials)
+        return files
 
     def surface(self, num_rays: int) -> SeenSurface:
         """What all cameras of the run see, with about so many rays."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,45 +15,37 @@ from unmix_plugin.figures.pictures import NEUTRAL, Picture, TitledPicture, draw_
 from unmix_plugin.figures.plotting import Colour
 from unmix_plugin.formats.files import array_bytes, indexed_png_bytes, write_file
 from unmix_plugin.products.abundances import colour_panel
-from unmix_plugin.products.product import Job, ViewProduct
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import PredictedView
 from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.run_views import ViewChoice
 
 
-@dataclass(frozen=True)
-class Segmentation(ViewProduct):
-    """Material of each pixel: labels/VIEW.png with ids and their palette (255: nothing), VIEW.npy with scores (H, W, K)
-    float32, VIEW.png, a figure with a legend, and legend.csv, which names the ids."""
+def export_segmentation(job: Job, choice: ViewChoice) -> list[Path]:
+    """Write scores, figure and ids of views, and the legend of the ids."""
+    path, legend = job.folder / "legend.csv", _legend_bytes(job.materials)
+    if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same
+        job.claim([path])
+    written = job.write_views(choice, _view_paths, _write_view)
+    if job.processes.is_first:
+        write_file(path, legend)
+    return [*written, path]
 
-    name = "segmentation"
 
-    def paths(self, folder: Path, view: str) -> list[Path]:
-        """Files of a view: scores, figure, ids."""
-        return [folder / f"{view}.npy", folder / f"{view}.png", folder / "labels" / f"{view}.png"]
+def _view_paths(folder: Path, view: str) -> list[Path]:
+    """Scores, figure, ids."""
+    return [folder / f"{view}.npy", folder / f"{view}.png", folder / "labels" / f"{view}.png"]
 
-    def write_view(
-        self, folder: Path, view: str, rendered: PredictedView, materials: Materials
-    ) -> list[Path]:
-        """Write a view's scores, a figure, and its ids; the id of a pixel is the index of its largest score."""
-        scores_path, figure_path, labels_path = self.paths(folder, view)
-        write_file(scores_path, array_bytes(_scores_of(rendered, materials).numpy().astype(np.float32)))
-        write_file(figure_path, _draw_segmentation(view, rendered, materials))
-        ids = rendered.segmentation.numpy()
-        palette = _id_palette(dict(enumerate(endmember_colours(materials))))
-        write_file(labels_path, indexed_png_bytes(ids, palette, NOTHING_ID))
-        return [scores_path, figure_path, labels_path]
 
-    def write(self, job: Job) -> list[Path]:
-        """Write the legend, then each view."""
-        path, legend = job.folder / "legend.csv", _legend_bytes(job.materials)
-        if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same
-            job.claim([path])
-        written = super().write(job)
-        if job.processes.is_first:
-            write_file(path, legend)
-        return [*written, path]
+def _write_view(folder: Path, view: str, rendered: PredictedView, materials: Materials) -> None:
+    """The id of a pixel is the index of its largest score."""
+    scores_path, figure_path, labels_path = _view_paths(folder, view)
+    write_file(scores_path, array_bytes(_scores_of(rendered, materials).numpy().astype(np.float32)))
+    write_file(figure_path, _draw_segmentation(view, rendered, materials))
+    palette = _id_palette(dict(enumerate(endmember_colours(materials))))
+    write_file(labels_path, indexed_png_bytes(rendered.segmentation.numpy(), palette, NOTHING_ID))
 
 
 def _legend_bytes(materials: Materials) -> bytes:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,103 +18,89 @@ from jaxtyping import Float
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.files import make_folder, write_file
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
-from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.open_run import find_scene
+from unmix_plugin.trained.protocol import Probe
+from unmix_plugin.trained.run_materials import (
+    LIGHT_UNKNOWN,
+    ShownMatch,
+    endmember_colours,
+    library_with,
+    match_json,
+    relit,
+    shown_matches,
+)
 from unmix_plugin.trained.run_views import RunView, find_view
-
-if TYPE_CHECKING:
-    from unmix_plugin.trained.protocol import Probe
-    from unmix_plugin.trained.run_materials import ShownMatch
-
 
 _MOST_BARS = 12
 
 
-@dataclass(frozen=True)
-class Spectrum(Product):
-    """Spectrum of a pixel (--view 3 --pixel 120,80) or of a point of space (--point=0.1,-0.2,0.5): predicted, and
-    measured where the scene folder is found, as CSV and plot; abundances and nearest known materials as JSON."""
+def export_spectrum(
+    job: Job,
+    place: tuple[str | None, str | None, str | None],
+    data: Path | None,
+    library: Sequence[Path],
+    comparison: Comparison,
+) -> list[Path]:
+    """Probe a place and write what is there.
 
-    name = "spectrum"
-
-    view: str | None = None
-    """View of the pixel: its name, or its number among the evaluation views, from 0."""
-    pixel: str | None = None
-    """Column and row, from 0 at the top left, as in 120,80."""
-    point: str | None = None
-    """Point in the scene's world coordinates, as in 0.1,0.2,0.5."""
-    data: Path | None = None
-    """Scene folder, where it is no longer where the run was trained on it."""
-    library: tuple[Path, ...] = ()
-    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
-    compare: Comparison = "scale"
-    """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Probe the place and write what is there."""
-        if self.point is not None and self.view is None and self.pixel is None:
-            point = _numbers(self.point, 3, "--point", "0.1,0.2,0.5")
-            name = f"point_{'_'.join(f'{value:g}' for value in point)}"
-            job.claim(_spectrum_paths(job.folder, name))
-            place = self._point(job, (point[0], point[1], point[2]))
-        elif self.point is None and self.view is not None and self.pixel is not None:
-            pixel = _whole_numbers(self.pixel)
-            view = find_view(job.views("eval"), self.view, job.views("train"))
-            name = f"{view.name}_x{pixel[0]}_y{pixel[1]}"
-            job.claim(_spectrum_paths(job.folder, name))
-            place = self._pixel(job, view, pixel)
-        else:
-            raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
-        return _write_spectrum(job.folder, name, place, job.materials)
-
-    def _pixel(self, job: Job, view: RunView, pixel: tuple[int, int]) -> _ProbedPlace:
-
+    Args:
+        job: The run and where to write.
+        place: View and pixel, or a point, as the command line has them.
+        data: Scene folder, where it is no longer where the run was trained on it.
+        library: Files of reflectances to compare with too.
+        comparison: How spectra are compared.
+    """
+    view_name, pixel_text, point_text = place
+    measured = None
+    if point_text is not None and view_name is None and pixel_text is None:
+        point = _numbers(point_text, 3, "--point", "0.1,0.2,0.5")
+        name = f"point_{'_'.join(f'{value:g}' for value in point)}"
+        job.claim(_spectrum_paths(job.folder, name))
+        probe = job.scene.probe_point(point[0], point[1], point[2])
+        facts: dict[str, Any] = {"point": point}
+        title = f"point {', '.join(f'{value:g}' for value in point)}"
+    elif point_text is None and view_name is not None and pixel_text is not None:
+        pixel = _whole_numbers(pixel_text)
+        view = find_view(job.views("eval"), view_name, job.views("train"))
+        name = f"{view.name}_x{pixel[0]}_y{pixel[1]}"
+        job.claim(_spectrum_paths(job.folder, name))
         probe = job.scene.probe(view.camera, *pixel)
         facts = {"view": view.name, "pixel": list(pixel)}
         title = f"{view.name}, column {pixel[0]}, row {pixel[1]}"
-        return self._place(job, title, facts, probe, self._measured(job, view, pixel))
+        measured = _measured(job, view, pixel, data)
+    else:
+        raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
+    light, matches = job.scene.light_power, []
+    if light is None:
+        job.say(LIGHT_UNKNOWN)
+    if probe.opacity < OCCUPIED_ACCUMULATION:
+        job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
+    else:
+        spectra, bands = probe.spectra["predicted"][None], job.materials.bands
+        [matches] = shown_matches(spectra, bands, light, library_with(library), comparison=comparison)
+    probed = _ProbedPlace(title, facts, probe, measured, matches)
+    return _write_spectrum(job.folder, name, probed, job.materials)
 
-    def _point(self, job: Job, point: tuple[float, float, float]) -> _ProbedPlace:
 
-        probe = job.scene.probe_point(*point)
-        title = f"point {', '.join(f'{value:g}' for value in point)}"
-        return self._place(job, title, {"point": list(point)}, probe, None)
-
-    def _place(
-        self, job: Job, title: str, facts: dict[str, object], probe: Probe, measured: np.ndarray | None
-    ) -> _ProbedPlace:
-        from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, library_with, shown_matches
-
-        light = job.scene.light_power
-        if light is None:
-            job.say(LIGHT_UNKNOWN)
-        if probe.opacity < OCCUPIED_ACCUMULATION:
-            job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
-            return _ProbedPlace(title, facts, probe, measured, ())
-        library, bands = library_with(self.library), job.materials.bands
-        spectra = probe.spectra["predicted"][None]
-        [matches] = shown_matches(spectra, bands, light, library, comparison=self.compare)
-        return _ProbedPlace(title, facts, probe, measured, matches)
-
-    def _measured(self, job: Job, view: RunView, pixel: tuple[int, int]) -> np.ndarray | None:
-        """What the scene has in a pixel, in the light asked for."""
-        from unmix_plugin.trained.open_run import find_scene
-        from unmix_plugin.trained.run_materials import relit
-
-        with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
-        names = [] if scene is None else [frame.name for frame in scene.frames]
-        if scene is None or view.name not in names:
-            job.say("the scene folder was not found: no measured spectrum; give it with --data")
-            return None
-        if not scene.sensor_of(names.index(view.name)).sees_all_bands:
-            job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
-            return None
-        recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
-        return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)
+def _measured(
+    job: Job, view: RunView, pixel: tuple[int, int], data: Path | None
+) -> Float[np.ndarray, " B"] | None:
+    """What the scene has in a pixel, in the light asked for."""
+    with job.working("looking for the scene"):
+        scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, data)
+    names = [] if scene is None else [frame.name for frame in scene.frames]
+    if scene is None or view.name not in names:
+        job.say("the scene folder was not found: no measured spectrum; give it with --data")
+        return None
+    if not scene.sensor_of(names.index(view.name)).sees_all_bands:
+        job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+        return None
+    recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
+    return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)
 
 
 @dataclass(frozen=True)
@@ -198,8 +184,6 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
     is_something = probe.opacity >= OCCUPIED_ACCUMULATION
     shares = dict(zip(materials.names, probe.abundances.tolist(), strict=True))
     position = probe.world_position
-    from unmix_plugin.trained.run_materials import match_json
-
     return {
         **place.facts,
         "world_position": None if position is None else position.tolist(),

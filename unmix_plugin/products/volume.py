@@ -7,44 +7,27 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as
-from unmix_plugin.products.product import Job, Product
-
-if TYPE_CHECKING:
-    from unmix_plugin.scenes.scene import Normalisation
-    from unmix_plugin.trained.surface import GridPoints
-    from unmix_plugin.trained.trained_scene import TrainedScene
-
+from unmix_plugin.products.product import Job
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.run_views import affine_to_world
+from unmix_plugin.trained.surface import GridPoints, sample_slice
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
 
 
-@dataclass(frozen=True)
-class Volume(Product):
-    """Density and abundances on a regular grid: volume.npz with `density` (X, Y, Z), per world unit, `abundances`
-    (X, Y, Z, K), the matrix `index_to_world`, and names and spectra of the endmembers."""
-
-    name = "volume"
-
-    resolution: int = 128
-    """Cells along the longest edge of the scene box."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Sample the field, slice by slice."""
-        from unmix_plugin.trained.surface import GridPoints
-
-        scene = job.scene
-        grid = GridPoints.over(scene.scene_box.aabb, self.resolution)
-        job.claim([_volume_path(job.folder)])
-        slices = job.follow("sampling the field", range(grid.shape[0]))
-        return [_write_volume(job.folder, scene, grid, job.frame, slices)]
+def export_volume(job: Job, resolution: int) -> list[Path]:
+    """Sample the field, slice by slice."""
+    grid = GridPoints.over(job.scene.scene_box.aabb, resolution)
+    job.claim([_volume_path(job.folder)])
+    slices = job.follow("sampling the field", range(grid.shape[0]))
+    return [_write_volume(job.folder, job.scene, grid, job.frame, slices)]
 
 
 def _volume_path(folder: Path) -> Path:
@@ -61,9 +44,6 @@ def _write_volume(
     cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points.
     `endmember_names`, `endmembers` (K, B) float32 and `wavelengths_nm` (B,) say what the abundances are of.
     """
-    from unmix_plugin.trained.run_views import affine_to_world
-    from unmix_plugin.trained.surface import sample_slice
-
     path, materials = _volume_path(folder), scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {

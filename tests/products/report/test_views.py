@@ -8,9 +8,14 @@ import pytest
 import torch
 
 from tests.products.report.page_outline import Outline, assert_self_contained
-from unmix_plugin.products.report.page import render_page, view_values
 from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
-from unmix_plugin.products.report.report import _read_metrics, figure_rows, training_charts
+from unmix_plugin.products.report.report import (
+    _figure_rows,
+    _read_metrics,
+    _render_page,
+    _training_charts,
+    _view_values,
+)
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.materials import Materials
@@ -62,7 +67,7 @@ OTHERS = {
 
 
 def outline(views: ReportViews, **others) -> Outline:
-    return assert_self_contained(render_page({**OTHERS, **view_values(views), **others}))
+    return assert_self_contained(_render_page({**OTHERS, **_view_values(views), **others}))
 
 
 def shown_texts(views: ReportViews, **others) -> dict[str, str]:
@@ -101,7 +106,7 @@ def test_without_the_scene_there_is_nothing_measured_and_no_error():
 
 def test_with_labels_segmentation_is_scored_and_matched():
     views = gathered([0.0])
-    assert len(view_values(views)["segmentation"].pictures) == 3
+    assert len(_view_values(views)["segmentation"].pictures) == 3
     text = shown_texts(views)["segmentation"]
     assert text.count("1.000") == 3
     assert "<clay>" in text
@@ -127,7 +132,7 @@ def test_there_is_a_map_for_each_endmember_in_the_views_chosen(count):
     )
     views.add("first", view, None)
     views.add("second", view, None)
-    [(name, maps)] = view_values(views)["shares"]
+    [(name, maps)] = _view_values(views)["shares"]
     assert name == "second"
     assert [one.caption for one in maps] == list(materials.names)
     text = shown_texts(views)["abundances"]
@@ -160,7 +165,7 @@ def test_bands_that_no_known_material_covers_are_said():
 
 
 def test_figures_come_with_their_definitions_or_with_what_to_do():
-    rows = figure_rows({"psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
+    rows = _figure_rows({"psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
     text = shown_texts(gathered([]), figures=rows, figures_source="From a file.")["figures"]
     assert all(part in text for part in ("31.25", "as it was then", "no truth", "From a file."))
     assert "run unmix-eval" in shown_texts(gathered([]))["figures"]
@@ -172,11 +177,11 @@ def test_a_training_is_drawn_with_its_evaluations(tmp_path):
     evaluated = {"split": "eval_all", "psnr": 19}
     records = [{**kind, "seconds": second} for kind in (train, evaluated) for second in (1, 2)]
     path.write_text("\n".join(map(json.dumps, records)))
-    charts = training_charts(path)
+    charts = _training_charts(path)
     assert [chart.y_label for chart in charts] == ["loss", "PSNR (dB)", "learning rate", "rays a second"]
     assert [line.label for line in charts[1].lines] == ["training batches", "evaluation views"]
     assert "evaluation views" in shown_texts(gathered([]), training=charts)["training"]
-    assert training_charts(tmp_path / "none") == []
+    assert _training_charts(tmp_path / "none") == []
 
 
 def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):

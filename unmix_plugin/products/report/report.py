@@ -1,32 +1,214 @@
-"""One HTML file about a run: everything that it learnt and how well, to read, to send or to print."""
+"""One HTML file about a run: everything that it learnt and how well, to read, to send or to print. It holds all that it
+shows: no script, no font, no request."""
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from unmix_plugin import __version__
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import ChartLine, LineChart
-from unmix_plugin.products.product import Job, Product
+from unmix_plugin.figures.plotting import ChartLine, LineChart, css_colour, draw_chart
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.products.abundances import SHARE_SCALE
+from unmix_plugin.products.product import Job
+from unmix_plugin.products.report import pictures
+from unmix_plugin.products.report.pictures import (
+    ERROR_SCALE,
+    ReportViews,
+    TrueMaterials,
+    evenly,
+    material_cards,
+)
+from unmix_plugin.scenes.scene import Scene
+from unmix_plugin.spectral.colour.conversion import describe_colour
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.evaluation import DEFINITIONS
-from unmix_plugin.trained.open_run import LoadedRun
-from unmix_plugin.trained.run_views import world_frame
+from unmix_plugin.trained.evaluation import DEFINITIONS, Evaluation, finite_or_none, scene_truth, view_truth
+from unmix_plugin.trained.open_run import LoadedRun, find_scene
+from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, library_with
+from unmix_plugin.trained.run_views import RunView, world_frame
 
-if TYPE_CHECKING:
-    from unmix_plugin.products.report.pictures import ReportViews
-    from unmix_plugin.scenes.scene import Scene
-    from unmix_plugin.trained.run_views import RunView
+_VIEWS_WITH_SHARES = 2
+
+
+def export_report(
+    job: Job, max_views: int, data: Path | None, library: Sequence[Path], is_edited: bool
+) -> list[Path]:
+    """Render, compare and lay out.
+
+    Args:
+        job: The run and where to write.
+        max_views: Most evaluation views to render.
+        data: Scene folder, where it is no longer where the run was trained on it.
+        library: Files of reflectances to compare with too.
+        is_edited: Whether the scene differs from the one that was trained.
+    """
+    if max_views < 1:
+        raise ConfigError(f"--max-views is {max_views}; choose at least 1")
+    job.claim([job.folder / "report.html"])
+    known = library_with(library)
+    chosen = evenly(job.views("eval"), max_views)
+    scene, notes = None, []
+    if is_edited:
+        notes.append(
+            "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
+            "are those of the run itself."
+        )
+    else:
+        with job.working("looking for the scene"):
+            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, data)
+        if scene is None:
+            job.say("the scene folder was not found: nothing measured in the report; give it with --data")
+    views = _look(job, chosen, scene)
+    if len(chosen) < len(job.loaded.record.eval_cameras):
+        notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
+    with job.working("laying out the report"):
+        return [_write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes)]
+
+
+def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
+    """Render the views, and compare each with what was measured, if the scene folder is found and unchanged."""
+    materials, evaluation, indices = job.materials, None, {}
+    if scene is not None:
+        evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
+        indices = {frame.name: index for index, frame in enumerate(scene.frames)}
+    views = ReportViews(materials, evaluation, {view.name for view in evenly(chosen, _VIEWS_WITH_SHARES)})
+    for view in job.follow("rendering views", chosen):
+        truth = None if scene is None else view_truth(scene, indices[view.name])
+        if truth is not None and truth.sensor is not None:
+            truth = None  # of a rig, only views with all bands are put beside the prediction
+        views.add(view.name, job.render(view), truth)
+    return views
+
+
+def _stored_figures(job: Job) -> dict[str, Any] | None:
+    """What `unmix-eval` found, if it was run."""
+    path = job.loaded.folder.eval / "metrics.json"
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+_WORST_VIEWS = 3
+
+
+def _write_report(
+    folder: Path,
+    loaded: LoadedRun,
+    views: ReportViews,
+    library: MaterialLibrary,
+    stored_figures: dict[str, Any] | None,
+    notes: Sequence[str],
+) -> Path:
+    """Write `report.html`; without `stored_figures`, with those of `views` if they were compared."""
+    materials, light = views.materials, loaded.materials_scene.light_power
+    figures, source = stored_figures, "From the run's eval/metrics.json."
+    if figures is None and views.evaluation is not None:
+        figures = finite_or_none(views.evaluation.figures())
+        source = f"Of the {len(views.shown)} views rendered for this report."
+    truth = _true_materials(loaded, light)
+    page = _render_page(
+        {
+            "title": f"{_scene_name(loaded)}: spectral unmixing report",
+            "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
+            "notes": notes,
+            "facts": _scene_facts(loaded, materials, figures),
+            "cards": material_cards(materials, views.proportions, light, library, truth),
+            "num_known": len(library.names),
+            "light_unknown": LIGHT_UNKNOWN if light is None else None,
+            "figures": None if figures is None else _figure_rows(figures),
+            "figures_source": source,
+            "training": _training_charts(loaded.folder.metrics_path),
+            "settings": _settings_text(loaded),
+            "versions": _version_rows(loaded),
+            **_view_values(views),
+        }
+    )
+    return write_file(folder / "report.html", page.encode())
+
+
+def _view_values(views: ReportViews) -> dict[str, Any]:
+    """What the template shows of views."""
+    shown, worst = evenly(views.shown, pictures.SHOWN_VIEWS), views.worst_first
+    colour = describe_colour(views.materials.bands)
+    return {
+        "colour_note": colour[0].upper() + colour[1:],
+        "views": pictures.colour_pictures(shown),
+        "is_compared": any(view.measured is not None for view in shown),
+        "worst": pictures.colour_pictures(worst[:_WORST_VIEWS]),
+        "num_worst": min(len(worst), _WORST_VIEWS),
+        "num_compared": len(worst),
+        "best_psnr_db": worst[-1].psnr_db if worst else None,
+        "shares": pictures.share_pictures(views),
+        "share_columns": pictures.map_columns(len(views.materials.names)),
+        "share_scale": (SHARE_SCALE, pictures.scale_strip(SHARE_SCALE)),
+        "error_scale": (ERROR_SCALE, pictures.scale_strip(ERROR_SCALE)),
+        "segmentation": pictures.segmentation_pictures(views),
+        "error_chart": pictures.error_chart(views),
+    }
+
+
+def _true_materials(loaded: LoadedRun, light: np.ndarray | None) -> TrueMaterials | None:
+    summary = loaded.record.summary
+    if not summary.get("endmembers"):
+        return None
+    reflectance = np.array(summary["endmembers"], dtype=np.float64)
+    names = summary.get("material_names") or [f"material {index}" for index in range(len(reflectance))]
+    return TrueMaterials([str(name) for name in names], reflectance if light is None else reflectance * light)
+
+
+_LARGEST_SIDE_PX = 640
+"""Larger pictures are shrunk, as a page would show them."""
+
+
+def _render_page(values: Mapping[str, Any]) -> str:
+    """The template filled in; text is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("unmix_plugin.products.report", "."),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters |= {"css": css_colour, "png": _png_url, "svg": _svg_url}
+    return environment.get_template("report.html").render(values)
+
+
+def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> str:
+    """An sRGB picture, in [0, 1] or 8-bit, as a URL with the picture in it; large ones are shrunk."""
+    from PIL import Image
+
+    is_float = np.issubdtype(image.dtype, np.floating)
+    pixels = Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8) if is_float else image)
+    longest = max(pixels.size)
+    if longest > _LARGEST_SIDE_PX:
+        size = [max(1, round(side * _LARGEST_SIDE_PX / longest)) for side in pixels.size]
+        pixels = pixels.resize((size[0], size[1]), Image.Resampling.LANCZOS)
+    buffer = io.BytesIO()
+    pixels.save(buffer, format="PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def _svg_url(chart: LineChart) -> str:
+    """A chart as a URL with the drawing in it."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"
 
 
 _PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "scikit-image", "colour-science", "matplotlib", "pillow")
@@ -39,7 +221,7 @@ _MAIN_FIGURES = {
 _COLOURS = ("#0b5cad", "#c8501e", "#2d8659", "#7d4fb0")
 
 
-def scene_facts(
+def _scene_facts(
     loaded: LoadedRun, materials: Materials, figures: Mapping[str, Any] | None
 ) -> list[tuple[str, str]]:
     """What was trained on what, and how well that went, in a few words."""
@@ -54,7 +236,7 @@ def scene_facts(
             for key, (label, unit) in _MAIN_FIGURES.items()
             if figures is not None and figures.get(key) is not None
         ),
-        ("Scene", scene_name(loaded)),
+        ("Scene", _scene_name(loaded)),
         ("Bands", str(materials.bands)),
         ("Views", f"{len(scene.train_cameras)} training, {len(scene.eval_cameras)} evaluation"),
         ("Image size", ", ".join(f"{width} x {height}" for width, height in sizes) + " pixels"),
@@ -67,13 +249,13 @@ def scene_facts(
     ]
 
 
-def scene_name(loaded: LoadedRun) -> str:
+def _scene_name(loaded: LoadedRun) -> str:
     """What the run calls its scene: the folder's name."""
     root = loaded.record.summary.get("root")
     return Path(str(root)).name if root else loaded.folder.path.parents[1].name
 
 
-def figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Each figure of merit, as `eval/metrics.json` has it, with its definition."""
     definitions = {**DEFINITIONS, **(values.get("definitions") or {})}
     return [
@@ -83,7 +265,7 @@ def figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def training_charts(path: Path) -> list[LineChart]:
+def _training_charts(path: Path) -> list[LineChart]:
     """Loss, PSNR, learning rates and speed over training, from a run's `metrics.jsonl`; none without a record."""
     records = _read_metrics(path)
     train = [record for record in records if record.get("split") == "train"]
@@ -111,12 +293,12 @@ def training_charts(path: Path) -> list[LineChart]:
     ]
 
 
-def settings_text(loaded: LoadedRun) -> str:
+def _settings_text(loaded: LoadedRun) -> str:
     """Every setting of the run, as JSON."""
     return json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1)
 
 
-def version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
+def _version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
     """What made this report, of what."""
     hashes = loaded.record.summary.get("input_hashes") or {}
     return [
@@ -162,95 +344,3 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-_VIEWS_WITH_SHARES = 2
-
-
-@dataclass(frozen=True)
-class Report(Product):
-    """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
-    known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
-    shown where the scene folder is found."""
-
-    name = "report"
-
-    max_views: int = 24
-    """Most evaluation views to render; of more, an even choice."""
-    data: Path | None = None
-    """Scene folder, where it is no longer where the run was trained on it."""
-    library: tuple[Path, ...] = ()
-    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Render, compare and lay out."""
-        from unmix_plugin.products.report.page import write_report
-        from unmix_plugin.products.report.pictures import evenly
-        from unmix_plugin.trained.run_materials import library_with
-
-        if self.max_views < 1:
-            raise ConfigError(f"--max-views is {self.max_views}; choose at least 1")
-        job.claim([report_path(job.folder)])
-        library = library_with(self.library)
-        chosen = evenly(job.views("eval"), self.max_views)
-        views, notes = self._look(job, chosen), []
-        if self._is_edited:
-            notes.append(
-                "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
-                "are those of the run itself."
-            )
-        if len(chosen) < len(job.loaded.record.eval_cameras):
-            notes.append(
-                f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views."
-            )
-        with job.working("laying out the report"):
-            return [write_report(job.folder, job.loaded, views, library, _stored_figures(job), notes)]
-
-    @property
-    def _is_edited(self) -> bool:
-        return self.edits is not None or self.illuminant is not None
-
-    def _look(self, job: Job, chosen: list[RunView]) -> ReportViews:
-        """Render the views, and compare each with what was measured, if the scene folder is found and unchanged."""
-        from unmix_plugin.products.report.pictures import ReportViews, evenly
-        from unmix_plugin.trained.evaluation import Evaluation, scene_truth, view_truth
-
-        materials, scene = job.materials, self._scene(job)
-        evaluation = None
-        if scene is not None:
-            evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
-        with_shares = {view.name for view in evenly(chosen, _VIEWS_WITH_SHARES)}
-        views = ReportViews(materials, evaluation, with_shares)
-        indices = {} if scene is None else {frame.name: index for index, frame in enumerate(scene.frames)}
-        for view in job.follow("rendering views", chosen):
-            truth = None if scene is None else view_truth(scene, indices[view.name])
-            if truth is not None and truth.sensor is not None:
-                truth = None  # of a rig, only views with all bands are put beside the prediction
-            views.add(view.name, job.render(view), truth)
-        return views
-
-    def _scene(self, job: Job) -> Scene | None:
-        from unmix_plugin.trained.open_run import find_scene
-
-        if self._is_edited:
-            return None
-        with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, self.data)
-        if scene is None:
-            job.say("the scene folder was not found: nothing measured in the report; give it with --data")
-        return scene
-
-
-def report_path(folder: Path) -> Path:
-    """The file that `write_report` makes."""
-    return folder / "report.html"
-
-
-def _stored_figures(job: Job) -> dict[str, Any] | None:
-    """What `unmix-eval` found, if it was run."""
-    path = job.loaded.folder.eval / "metrics.json"
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        return None
-    return found if isinstance(found, dict) else None

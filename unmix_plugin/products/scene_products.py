@@ -1,0 +1,267 @@
+"""What `unmix-export` offers of scenes of mixed materials: each product with its options. The help needs nothing
+else, so the work of a product, in the module of its name, is imported when it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from unmix_plugin.products.product import Job, Product, ViewProduct
+
+
+@dataclass(frozen=True)
+class Abundances(ViewProduct):
+    """Abundance of each endmember, summing to the opacity, 0 where nothing is: of each view VIEW.npy, (H, W, K)
+    float32, and VIEW.png, a figure; on request ENVI and EXR images."""
+
+    name = "abundances"
+
+    formats: tuple[Literal["npy", "png", "envi", "exr"], ...] = ("npy", "png")
+    """npy, envi (.hdr and .img), exr (a channel for each endmember), png."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Render the views and write the abundances of each."""
+        from unmix_plugin.products.abundances import export_abundances
+
+        return export_abundances(job, self.views, self.formats)
+
+
+@dataclass(frozen=True)
+class Cubes(ViewProduct):
+    """Spectral images: of each view radiance on black, (H, W, bands) float32, 1 = full scale, as ENVI (VIEW.hdr and
+    VIEW.img), spectral OpenEXR (VIEW.exr) or VIEW.npy."""
+
+    name = "cubes"
+
+    formats: tuple[Literal["envi", "exr", "npy"], ...] = ("envi",)
+    """envi, exr, npy (without wavelengths)."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Render the views and write the spectra of each."""
+        from unmix_plugin.products.cubes import export_cubes
+
+        return export_cubes(job, self.views, self.formats)
+
+
+@dataclass(frozen=True)
+class Endmembers(Product):
+    """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, and a plot over
+    wavelength, endmembers.png."""
+
+    name = "endmembers"
+
+    def write(self, job: Job) -> list[Path]:
+        """Write table, library and plot."""
+        from unmix_plugin.products.endmembers import export_endmembers
+
+        return export_endmembers(job)
+
+
+@dataclass(frozen=True)
+class Mesh(Product):
+    """The surface as triangles: mesh.ply, mesh.glb or mesh.obj with position and normal in the scene's world
+    coordinates, colour and material; PLY and GLB with every abundance too."""
+
+    name = "mesh"
+
+    formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply", "glb")
+    """ply, glb, obj (with mesh.mtl)."""
+    resolution: int = 192
+    """Cells along the longest edge of the scene box."""
+    density: float | None = None
+    """Density per world unit at which the surface lies; None: that at which rays end. Lower ones close holes, higher
+    ones drop floaters."""
+    smoothing: float = 1.0
+    """Blur before the surface is looked for: standard deviation in cells, 0 for none."""
+    unseen: Literal["drop", "keep"] = "drop"
+    """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Sample the density, march through it, trim and colour the surface."""
+        from unmix_plugin.products.mesh import export_mesh
+
+        return export_mesh(
+            job,
+            self.formats,
+            self.resolution,
+            self.density,
+            self.smoothing,
+            self.unseen == "keep",
+        )
+
+
+@dataclass(frozen=True)
+class Metamerism(Product):
+    """Pairs of materials that look alike in one light and differ in another, as an eye adapted to each light sees them:
+    metamerism.csv, the pairs with their differences, and metamerism.png, swatches."""
+
+    name = "metamerism"
+
+    surfaces: Literal["run", "library", "all"] = "all"
+    """Pair the run's endmembers, materials of the library, or both together."""
+    lights: tuple[str, ...] = ("D65", "A", "FL2", "FL11")
+    """Lights to compare: CIE illuminants, lamps or .csv files (wavelength,power)."""
+    alike: float = 2.0
+    """Colour difference (CIEDE2000) up to which two materials look alike."""
+    different: float = 4.0
+    """Colour difference from which they look different."""
+    library: tuple[Path, ...] = ()
+    """CSV files or ENVI spectral libraries with reflectances of your own, beside the measured ones."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Compare all pairs in all lights."""
+        from unmix_plugin.products.metamerism import export_metamerism
+
+        return export_metamerism(job, self.surfaces, self.lights, self.alike, self.different, self.library)
+
+
+@dataclass(frozen=True)
+class Pca(Product):
+    """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
+    what red, green and blue stand for."""
+
+    name = "pca"
+
+    of: Literal["spectra", "abundances"] = "spectra"
+    """What has its components taken."""
+    views: Literal["eval", "train", "all"] = "eval"
+    """Which of the scene's views to render."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Find the components of all views, then paint each."""
+        from unmix_plugin.products.pca import export_pca
+
+        return export_pca(job, self.of, self.views)
+
+
+@dataclass(frozen=True)
+class PointCloud(Product):
+    """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
+    every abundance of each point, and with --outputs more numbers."""
+
+    name = "point-cloud"
+
+    num_points: int = 100_000
+    """Most points to write; they cover what the run's cameras see evenly."""
+    outputs: tuple[str, ...] = ()
+    """Numbers to add to each point: spectral indices and targets, as in index:ndvi target:ace:paint.csv."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Look through all cameras of the run, clean and thin what they see."""
+        from unmix_plugin.products.point_cloud import export_point_cloud
+
+        return export_point_cloud(job, self.num_points, self.outputs)
+
+
+@dataclass(frozen=True)
+class Poses(Product):
+    """Cameras of all views as transforms.json, in the world of the scene's poses; those of training views as training
+    corrected them, where it did."""
+
+    name = "poses"
+
+    def write(self, job: Job) -> list[Path]:
+        """Write transforms.json."""
+        from unmix_plugin.products.poses import export_poses
+
+        return export_poses(job)
+
+
+@dataclass(frozen=True)
+class Report(Product):
+    """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
+    known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
+    shown where the scene folder is found."""
+
+    name = "report"
+
+    max_views: int = 24
+    """Most evaluation views to render; of more, an even choice."""
+    data: Path | None = None
+    """Scene folder, where it is no longer where the run was trained on it."""
+    library: tuple[Path, ...] = ()
+    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Render, compare and lay out."""
+        from unmix_plugin.products.report.report import export_report
+
+        is_edited = self.edits is not None or self.illuminant is not None
+        return export_report(job, self.max_views, self.data, self.library, is_edited)
+
+
+@dataclass(frozen=True)
+class Segmentation(ViewProduct):
+    """Material of each pixel: labels/VIEW.png with ids and their palette (255: nothing), VIEW.npy with scores (H, W, K)
+    float32, VIEW.png, a figure with a legend, and legend.csv, which names the ids."""
+
+    name = "segmentation"
+
+    def write(self, job: Job) -> list[Path]:
+        """Render the views and write the materials of each."""
+        from unmix_plugin.products.segmentation import export_segmentation
+
+        return export_segmentation(job, self.views)
+
+
+@dataclass(frozen=True)
+class Spectrum(Product):
+    """Spectrum of a pixel (--view 3 --pixel 120,80) or of a point of space (--point=0.1,-0.2,0.5): predicted, and
+    measured where the scene folder is found, as CSV and plot; abundances and nearest known materials as JSON."""
+
+    name = "spectrum"
+
+    view: str | None = None
+    """View of the pixel: its name, or its number among the evaluation views, from 0."""
+    pixel: str | None = None
+    """Column and row, from 0 at the top left, as in 120,80."""
+    point: str | None = None
+    """Point in the scene's world coordinates, as in 0.1,0.2,0.5."""
+    data: Path | None = None
+    """Scene folder, where it is no longer where the run was trained on it."""
+    library: tuple[Path, ...] = ()
+    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+    compare: Literal["scale", "continuum"] = "scale"
+    """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Probe the place and write what is there."""
+        from unmix_plugin.products.spectrum import export_spectrum
+
+        place = (self.view, self.pixel, self.point)
+        return export_spectrum(job, place, self.data, self.library, self.compare)
+
+
+@dataclass(frozen=True)
+class Volume(Product):
+    """Density and abundances on a regular grid: volume.npz with `density` (X, Y, Z), per world unit, `abundances`
+    (X, Y, Z, K), the matrix `index_to_world`, and names and spectra of the endmembers."""
+
+    name = "volume"
+
+    resolution: int = 128
+    """Cells along the longest edge of the scene box."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Sample the field, slice by slice."""
+        from unmix_plugin.products.volume import export_volume
+
+        return export_volume(job, self.resolution)
+
+
+PRODUCTS: tuple[Product, ...] = (
+    Abundances(),
+    Cubes(),
+    Endmembers(),
+    Mesh(),
+    Metamerism(),
+    Pca(),
+    PointCloud(),
+    Poses(),
+    Report(),
+    Segmentation(),
+    Spectrum(),
+    Volume(),
+)
+"""All that scenes of mixed materials have, with the defaults of its options."""
