@@ -148,8 +148,13 @@ def _retinted(
 
     reflectance, to_rgb = surface.reflectance, surface.to_linear_rgb
     base = reflectance + _FLOOR
-    weights = (_EXACTNESS * _srgb_slope(linear_rgb))[:, None]
-    smoothness = _smoothness(surface.bands)
+    # The sRGB curve is 12.92 steep in the dark and 0.44 at white.
+    bright = 1.055 / 2.4 * np.clip(linear_rgb, 0.0031308, 1.0) ** (1 / 2.4 - 1)
+    weights = (_EXACTNESS * np.where(linear_rgb <= 0.0031308, 12.92, bright))[:, None]
+    # Rows whose squares sum to the integral that is minimised, wavelengths in units of the reach.
+    centers, widths = surface.bands.centers_nm / _REACH_NM, surface.bands.widths_nm / _REACH_NM
+    slopes = np.diff(np.eye(len(centers)), axis=0) / np.sqrt(np.diff(centers))[:, None]
+    smoothness = np.concatenate([slopes, np.diag(np.sqrt(widths))])
     lower, upper = -reflectance / base, np.maximum(greatest - reflectance, 0.0) / base
     solution = lsq_linear(
         np.concatenate([smoothness, weights * (to_rgb * base[:, None]).T]),
@@ -158,19 +163,6 @@ def _retinted(
         method="bvls",
     )
     return np.clip(reflectance + base * solution.x, 0.0, max(greatest, float(reflectance.max())))
-
-
-def _srgb_slope(linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-    """Slope of the sRGB curve at each channel: 12.92 in the dark, 0.44 at white."""
-    linear = np.clip(linear_rgb, 0.0031308, 1.0)
-    return np.where(linear_rgb <= 0.0031308, 12.92, 1.055 / 2.4 * linear ** (1 / 2.4 - 1))
-
-
-def _smoothness(bands: Bands) -> Float64[np.ndarray, "rows B"]:
-    """Rows whose squares sum to the integral that is minimised, wavelengths in units of the reach."""
-    centers, widths = bands.centers_nm / _REACH_NM, bands.widths_nm / _REACH_NM
-    slopes = np.diff(np.eye(len(bands)), axis=0) / np.sqrt(np.diff(centers))[:, None]
-    return np.concatenate([slopes, np.diag(np.sqrt(widths))])
 
 
 def with_sensor(scene: TrainedScene, sensor: Sensor) -> TrainedScene:
@@ -204,16 +196,6 @@ _VISIBLE_DIFFERENCE = 2.5 / 255
 
 _REPLACED, _RETINTED, _NAMED, _COLOURED = "replaced", "retinted", "renamed", "given a colour of gloss"
 _REMOVED, _ISOLATED = "removed", "isolated"
-
-
-def _carry_out(recipe: Recipe, state: MaterialState) -> None:
-    """Make all edits of a recipe, in order."""
-    for position, operation in enumerate(recipe.operations):
-        where = recipe.where(position)
-        try:
-            _HANDLERS[type(operation)](state, operation, where)
-        except UnmixError as error:
-            raise ConfigError(f"{where}: {error}") from error
 
 
 def _swap(state: MaterialState, edit: Swap, _: str) -> None:
@@ -292,7 +274,8 @@ def _remove(state: MaterialState, edit: Remove, where: str) -> None:
         _refuse_both(state, index, _ISOLATED, _REMOVED)
         state.done[_REMOVED, index] = where
         state.is_kept[index] = False
-    _require_something(state)
+    if not state.is_kept.any():
+        raise ConfigError("nothing is left: every endmember is removed; keep at least one")
 
 
 def _isolate(state: MaterialState, edit: Isolate, where: str) -> None:
@@ -362,11 +345,6 @@ def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> Non
         )
 
 
-def _require_something(state: MaterialState) -> None:
-    if not state.is_kept.any():
-        raise ConfigError("nothing is left: every endmember is removed; keep at least one")
-
-
 def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = None) -> TrainedScene:
     """The edited scene. Edits are made in order, in the light that the scene was recorded in; then the recipe's light
     is lit. Endmembers keep their numbers.
@@ -383,7 +361,12 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     if seen is None and recipe.wants_pictures:
         seen = sample_seen(scene)
     state = MaterialState.of(scene.materials, light, seen)
-    _carry_out(recipe, state)
+    for position, operation in enumerate(recipe.operations):
+        where = recipe.where(position)
+        try:
+            _HANDLERS[type(operation)](state, operation, where)
+        except UnmixError as error:
+            raise ConfigError(f"{where}: {error}") from error
     factors, told = _light_factors(scene, recipe)
     specular_spectra, gloss = _specular(state)
     materials = replace(

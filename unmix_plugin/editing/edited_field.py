@@ -25,7 +25,6 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.editing.recipe import Colour, Endmember
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.lamp import MovingLamp
@@ -49,8 +48,12 @@ def sample_seen(scene: TrainedScene) -> Coefficients:
     """What pixels are made of in coarse pictures of a few training views: rows of pixels (N, ...)."""
     cameras = [view.camera for view in scene.views if view.split == "train"]
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(_NUM_VIEWS, len(cameras))).round().astype(int))
-    views = [scene.look(_coarse(cameras[int(i)]), subpixels=1) for i in chosen]
-    return Coefficients.concatenate([view.coefficients.flatten() for view in views])
+    found = []
+    for camera in (cameras[int(index)] for index in chosen):
+        shrink = min(1.0, _LONGEST_SIDE_PX / max(camera.width, camera.height))
+        width, height = (max(1, math.floor(side * shrink)) for side in (camera.width, camera.height))
+        found.append(scene.look(camera.resized(width, height), subpixels=1).coefficients.flatten())
+    return Coefficients.concatenate(found)
 
 
 @dataclass(frozen=True)
@@ -108,12 +111,6 @@ def appearance_of(state: MaterialState, index: int) -> _Appearance | None:
 
 def _rows(values: Tensor, chosen: Tensor) -> np.ndarray:
     return values[chosen].detach().double().cpu().numpy()
-
-
-def _coarse(camera: Cameras) -> Cameras:
-    """The same view in few pixels."""
-    shrink = min(1.0, _LONGEST_SIDE_PX / max(camera.width, camera.height))
-    return camera.resized(*(max(1, math.floor(side * shrink)) for side in (camera.width, camera.height)))
 
 
 _GONE_SHARE, _WHOLE_SHARE = 0.25, 0.75
@@ -268,7 +265,8 @@ class EditedField(CoefficientField):
         densities, features = self.field.density_of(encoded)
         if self._removes:
             kept_share = self.field.abundances_of(features) @ self.is_kept.to(features)
-            densities = densities * _left_of(kept_share)
+            t = ((kept_share - _GONE_SHARE) / (_WHOLE_SHARE - _GONE_SHARE)).clamp(0, 1)
+            densities = densities * (t * t * (3 - 2 * t))  # a cubic with level ends
         return densities, features
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
@@ -299,9 +297,3 @@ class EditedField(CoefficientField):
         """What abundances are multiplied with, so that those of what is left sum to 1."""
         is_kept = self.is_kept.to(abundances)
         return is_kept / (abundances @ is_kept).clamp(min=_SMALLEST_SHARE)[:, None]
-
-
-def _left_of(kept_share: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
-    """Factor on the density: a cubic with level ends."""
-    t = ((kept_share - _GONE_SHARE) / (_WHOLE_SHARE - _GONE_SHARE)).clamp(0, 1)
-    return t * t * (3 - 2 * t)

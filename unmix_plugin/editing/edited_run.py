@@ -58,8 +58,6 @@ def requested_recipe(edits: Path | None, illuminant: str | None) -> Recipe | Non
     if illuminant is None:
         return recipe
     light = Light(parse_light(illuminant))
-    return (
-        Recipe(illuminant=light, source="--illuminant")
-        if recipe is None
-        else replace(recipe, illuminant=light)
-    )
+    if recipe is None:
+        return Recipe(illuminant=light, source="--illuminant")
+    return replace(recipe, illuminant=light)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,44 +119,42 @@ def choose_formats(
         ConfigError: an unknown output or format, a format that suits no output, or an output that no format suits.
         SpectrumError: a wavelength outside the bands.
     """
-    names = dict.fromkeys(_expanded(outputs or _default_outputs(scene, is_path), scene))
+    known = [output.name for output in scene.outputs]
+    if not outputs:
+        usual = ("rgb",) if is_path else _DEFAULT_STILLS
+        outputs = [name for name in usual if name in known] or known
+    names = dict.fromkeys(one for name in outputs for one in (known if name == _EVERY_OUTPUT else [name]))
     chosen = [scene.output(name) for name in names]
     wanted: list[_Format] = [_format(name) for name in dict.fromkeys(formats)]
-    _refuse_same_files(chosen)
-    found = [
-        FormattedOutput(output, one)
-        for output in chosen
-        for one in (_suited(output, wanted) if wanted else _usual(output, is_path))
-    ]
+    owners: dict[str, str] = {}
+    for output in chosen:
+        name = file_name(output)
+        if name in owners:
+            raise ConfigError(
+                f"the outputs {owners[name]} and {output.name} would have the same files; ask for one of them"
+            )
+        owners[name] = output.name
+    found: list[FormattedOutput] = []
+    for output in chosen:
+        # Linear light is for other programs, but a composite of bands is for people.
+        is_composite = output.kind == "linear" and ":" in output.name
+        possible = _COMPOSITE if is_composite else _BY_KIND[output.kind]
+        suited = [one for one in wanted if one in possible.suited]
+        if wanted and not suited:
+            reason = _REASONS.get((output.kind, wanted[0]), "the format does not suit it")
+            raise ConfigError(
+                f"{output.name} can't be written as {' or '.join(wanted)}: {reason}. "
+                f"Formats for {output.name}: {', '.join(possible.suited)}"
+            )
+        found += [
+            FormattedOutput(output, one)
+            for one in suited or (possible.moving if is_path else possible.stills)
+        ]
     for one in wanted:
         if all(formatted.format != one for formatted in found):
             asked = " or ".join(output.name for output in chosen)
             raise ConfigError(f"--formats {one} suits none of the outputs asked for: {asked}")
     return tuple(found)
-
-
-def _default_outputs(scene: RenderableScene, is_path: bool) -> list[str]:
-    known = [output.name for output in scene.outputs]
-    wanted = ("rgb",) if is_path else _DEFAULT_STILLS
-    return [name for name in wanted if name in known] or known
-
-
-def _expanded(outputs: Iterable[str], scene: RenderableScene) -> Iterable[str]:
-    for name in outputs:
-        if name == _EVERY_OUTPUT:
-            yield from (output.name for output in scene.outputs)
-        else:
-            yield name
-
-
-def _kind_formats(output: Output) -> _KindFormats:
-    # Linear light is for other programs, but a composite of bands is for people.
-    is_composite = output.kind == "linear" and ":" in output.name
-    return _COMPOSITE if is_composite else _BY_KIND[output.kind]
-
-
-def _usual(output: Output, is_path: bool) -> tuple[_Format, ...]:
-    return _kind_formats(output).moving if is_path else _kind_formats(output).stills
 
 
 def _format(name: str) -> _Format:
@@ -165,29 +163,6 @@ def _format(name: str) -> _Format:
             return known
     hint = did_you_mean(name, _FORMATS, likeness=0.5, form=" ({})")
     raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(_FORMATS)}")
-
-
-def _suited(output: Output, wanted: Sequence[_Format]) -> list[_Format]:
-    known = _kind_formats(output).suited
-    suited: list[_Format] = [one for one in wanted if one in known]
-    if not suited:
-        reason = _REASONS.get((output.kind, wanted[0]), "the format does not suit it")
-        raise ConfigError(
-            f"{output.name} can't be written as {' or '.join(wanted)}: {reason}. "
-            f"Formats for {output.name}: {', '.join(known)}"
-        )
-    return suited
-
-
-def _refuse_same_files(outputs: Sequence[Output]) -> None:
-    seen: dict[str, str] = {}
-    for output in outputs:
-        name = file_name(output)
-        if name in seen:
-            raise ConfigError(
-                f"the outputs {seen[name]} and {output.name} would have the same files; ask for one of them"
-            )
-        seen[name] = output.name
 
 
 _SWEEP_SECONDS, _SWEEP_FPS = 6.0, (4.0, 24.0)
@@ -308,17 +283,12 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
     add(canvas.pixels)
 
 
-def _shape_of(output: Output, setting: RenderSetting) -> tuple[int, ...]:
-    """Shape of an output of a whole view."""
-    width, height = setting.size
-    names = setting.channels.get(output.name)
-    return (height, width) if names is None else (height, width, len(names))
-
-
 @contextmanager
 def _npy(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    dtype = np.uint8 if output.kind == "labels" else np.float32
-    with npy_rows(path, _shape_of(output, setting), dtype) as add:
+    width, height = setting.size
+    names = setting.channels.get(output.name)
+    shape = (height, width) if names is None else (height, width, len(names))
+    with npy_rows(path, shape, np.uint8 if output.kind == "labels" else np.float32) as add:
         yield lambda rows: add(rows.values[output.name])
 
 
