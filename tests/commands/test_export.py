@@ -1,4 +1,3 @@
-
 """`unmix-export`: what is written and refused, and products that methods bring along."""
 
 import errno
