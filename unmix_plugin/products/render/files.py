@@ -139,7 +139,7 @@ def choose_formats(
         # Linear light is for other programs, but a composite of bands is for people.
         is_composite = output.kind == "linear" and ":" in output.name
         possible = _COMPOSITE if is_composite else _BY_KIND[output.kind]
-        suited = [one for one in wanted if one in possible.suited]
+        suited: tuple[_Format, ...] = tuple(one for one in wanted if one in possible.suited)
         if wanted and not suited:
             reason = _REASONS.get((output.kind, wanted[0]), "the format does not suit it")
             raise ConfigError(
