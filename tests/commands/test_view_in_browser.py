@@ -14,7 +14,7 @@ from PIL import Image
 from tests.commands.browser import CHROMIUM, FLAGS
 from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.access import ViewerOptions
-from unmix_plugin.viewer.layers.layers import LAYERS
+from unmix_plugin.viewer.rendering.painting import LAYERS
 
 MISSING = [
     name

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer import page
-from unmix_plugin.viewer.layers.painting import ColourMapLegend, SwatchLegend, TextLegend, legend_html
 from unmix_plugin.viewer.page import WAIT_S, Debounced, choice, new_file, number, text
+from unmix_plugin.viewer.rendering.painting import ColourMapLegend, _SwatchLegend, _TextLegend, legend_html
 
 anything = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers()), st.binary()
@@ -134,8 +134,8 @@ def parsed(content):
         page.paragraph(EVIL, is_warning=True),
         page.bars([(EVIL, 0.5, (1.0, 0.0, 0.0))]),
         page.table([(EVIL, EVIL)]),
-        legend_html(TextLegend(EVIL)),
-        legend_html(SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
+        legend_html(_TextLegend(EVIL)),
+        legend_html(_SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
         legend_html(ColourMapLegend("viridis", 0.0, 1.0, EVIL)),
         page.swatches([(EVIL, (0.0, 0.0, 0.0))]),
     ],

@@ -25,7 +25,7 @@ from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
-from unmix_plugin.viewer.layers.painting import BACKGROUNDS
+from unmix_plugin.viewer.rendering.painting import BACKGROUNDS
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 
 

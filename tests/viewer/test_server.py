@@ -195,7 +195,7 @@ def try_a_wrong_token(page):
 @pytest.fixture(autouse=True)
 def brief(monkeypatch):
     """Pages that are turned away need no time to read why."""
-    monkeypatch.setattr("unmix_plugin.viewer.web_server._READING_S", 0.2)
+    monkeypatch.setattr("unmix_plugin.viewer.server._READING_S", 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -243,7 +243,7 @@ def test_a_page_of_another_site_is_refused_and_one_of_its_own_is_served(source):
 
 
 def test_a_page_whose_headers_cannot_be_read_is_refused(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.server.headers_of", lambda _: None)
+    monkeypatch.setattr("unmix_plugin.viewer.server._headers_of", lambda _: None)
     with page_of(viewer) as page:
         page.look_from(0.3)
         page.wait_until(lambda: "this page is from another site" in page.texts)
@@ -273,7 +273,7 @@ def test_what_a_page_uploads_is_not_kept(viewer, guarded, is_guarded):
 
 @pytest.mark.slow
 def test_there_is_a_limit_to_connections_that_are_not_served(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.web_server._MOST_CONNECTIONS", 2)
+    monkeypatch.setattr("unmix_plugin.viewer.server._MOST_CONNECTIONS", 2)
     with page_of(viewer) as first, page_of(viewer) as second:
         for page in (first, second):
             page.look_from(0.3)
@@ -295,7 +295,7 @@ def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
 
 def test_the_private_parts_are_those_of_the_version_that_they_were_taken_from(viewer):
     assert viser.__version__.startswith("1.1."), (
-        "read web_server.py beside the source of this viser, then name it here"
+        "read server.py beside the source of this viser, then name it here"
     )
     server = viewer._server
     with opened(viewer):

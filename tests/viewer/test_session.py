@@ -4,8 +4,8 @@ import numpy as np
 
 from tests.viewer.pages import decoded, opened, page_of, show_layer
 from unmix_plugin.engine.training.progress import TrainingStatus
-from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.recipes import RecipeHistory
+from unmix_plugin.viewer.rendering.painting import LayerSettings
 from unmix_plugin.viewer.session import KEPT_S, KeptPages, _PageState, _TrainingCurve
 
 

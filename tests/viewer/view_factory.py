@@ -23,8 +23,15 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layers import LAYERS, LayerAids, layer_named, render_reference
-from unmix_plugin.viewer.layers.painting import LayerSettings, Legend, Picture
+from unmix_plugin.viewer.rendering.painting import (
+    LAYERS,
+    LayerAids,
+    LayerSettings,
+    Legend,
+    _Picture,
+    layer_named,
+    render_reference,
+)
 from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
@@ -88,7 +95,7 @@ def make_aids(source: SceneSource) -> LayerAids:
         return LayerAids(*render_reference(scene, source.record.train_cameras), source.record.scene_box)
 
 
-def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def paint_layer(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     """The picture of the layer that the settings name, and its legend."""
     return layer_named(settings.layer, LAYERS).paint(frame, settings, aids)
 

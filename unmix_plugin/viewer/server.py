@@ -1,15 +1,28 @@
-"""The viewer's life cycle: listen, admit pages or ask them for the token, keep their sessions, shut down cleanly."""
+"""The viewer's life cycle: listen, admit pages or ask them for the token, keep their sessions, shut down cleanly.
+
+viser's server as the viewer needs it comes first: our title, no public tunnel, no uploads, connections that can be
+closed. viser has no setting for these; all that this package uses of its private parts is here, as in viser 1.1.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import atexit
+import io
 import os
+import shutil
 import signal
+import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
 
 import viser
+from viser import infra
+from viser._messages import FileTransferPart, FileTransferStartUpload
 
 from unmix_plugin.editing import Recipe
 from unmix_plugin.viewer.access import (
@@ -25,15 +38,116 @@ from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
 from unmix_plugin.viewer.view_cameras import point_ahead, pose_of, up_direction
-from unmix_plugin.viewer.web_server import (
-    LABEL,
-    address_of,
-    close_soon,
-    headers_of,
-    open_server,
-    quiet,
-    send_what_is_queued,
-)
+
+_LABEL = "unmix-nerf"
+
+_HEAD = f"""<title>{_LABEL}</title>
+<script>
+  const asked = new URLSearchParams(location.search);
+  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {{
+    asked.set("darkMode", "");
+    history.replaceState(null, "", "?" + asked);
+  }}
+</script>"""
+
+_MOST_CONNECTIONS = 64
+"""Connections that may be open at once, served or not."""
+
+_SENDING_S = 0.2
+_READING_S = 2.0
+"""How long a page that is turned away shows why before its connection is closed."""
+
+
+class _PageServer(infra.WebsockServer):
+    """Sends viser's page under our title, dark where the browser's user prefers that."""
+
+    def __init__(self, *, http_server_root: Path, **options: Any) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        page = (http_server_root / "index.html").read_text()
+        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1))
+        super().__init__(http_server_root=folder, **options)
+
+
+class _LocalServer(viser.ViserServer):
+    """Never opens a public tunnel."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+def _open_server(host: str, port: int) -> viser.ViserServer:
+    """A server that listens."""
+    original = infra.WebsockServer
+    infra.WebsockServer = _PageServer
+    try:
+        with _quiet():
+            server = _LocalServer(host=host, port=port, label=_LABEL, verbose=False)
+    finally:
+        infra.WebsockServer = original
+    websocket_server = server._websock_server
+    _refuse_uploads(websocket_server)
+
+    async def accept(connection: Any) -> None:
+        _refuse_uploads(connection)
+        if len(websocket_server._live_connections) > _MOST_CONNECTIONS:
+            await websocket_server._live_connections[connection.client_id].close(1013)
+
+    websocket_server.on_client_connect(accept)
+    return server
+
+
+def _headers_of(client: viser.ClientHandle) -> dict[str, str] | None:
+    """Headers of the request that opened a client's connection; None where they can't be read."""
+    request = getattr(_connection_of(client), "request", None)
+    return None if request is None else dict(request.headers.raw_items())
+
+
+def _address_of(client: viser.ClientHandle) -> str:
+    """Where a client connects from; empty if unknown."""
+    remote = getattr(_connection_of(client), "remote_address", None)
+    return str(remote[0]) if remote else ""
+
+
+def _close_soon(client: viser.ClientHandle) -> None:
+    """Close a client's connection, once it has shown what it was told."""
+    connection = _connection_of(client)
+    if connection is None:
+        return
+
+    async def close() -> None:
+        await asyncio.sleep(_READING_S)
+        await connection.close(1008)
+
+    client.flush()
+    asyncio.run_coroutine_threadsafe(close(), client._viser_server._event_loop)
+
+
+def _send_what_is_queued(server: viser.ViserServer) -> None:
+    """Send pages what is queued for them, before a server is stopped."""
+    server.flush()
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(_SENDING_S), server._event_loop).result()
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Context without viser's own banner and farewell; ours name the real host and port."""
+    with redirect_stdout(io.StringIO()):
+        yield
+
+
+def _connection_of(client: viser.ClientHandle) -> Any:
+    """The websocket of a client; None if it has gone, or this viser keeps it elsewhere."""
+    server = getattr(getattr(client, "_viser_server", None), "_websock_server", None)
+    return getattr(server, "_live_connections", {}).get(client.client_id)
+
+
+def _refuse_uploads(handler: Any) -> None:
+    """No control takes files, and viser would keep what a page sends, whether or not the page is served."""
+    for kind in (FileTransferStartUpload, FileTransferPart):
+        if kind in handler._incoming_handlers:
+            handler.unregister_handler(kind)
+
 
 _TICK_S = 0.5
 _UNWATCHED_S = 5
@@ -105,10 +219,10 @@ class Viewer:
         """
         # A page that is closed while it is being sent something is not a reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        server = open_server(self._options.host, free_port(self._options.host, self._options.port))
+        server = _open_server(self._options.host, free_port(self._options.host, self._options.port))
         self._server, self.port = server, server.get_port()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(LABEL)
+        server.gui.set_panel_label(_LABEL)
         scene = self.services.source.record
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
@@ -136,10 +250,10 @@ class Viewer:
             session.tick()  # so that the page ends with the final state of the training
             session.close()
         if self._server is not None and sessions:
-            send_what_is_queued(self._server)
+            _send_what_is_queued(self._server)
         self.services.stop()
         if self._server is not None:
-            with quiet():
+            with _quiet():
                 self._server.stop()
         if self._ticker.is_alive():
             self._ticker.join()
@@ -170,7 +284,7 @@ class Viewer:
             if not reason and gate is None:
                 self._open(client)
             elif not reason and gate is not None:
-                if gate.enter(client.client_id, address_of(client)):
+                if gate.enter(client.client_id, _address_of(client)):
                     with client.atomic():  # nobody can answer before the answer is listened for
                         self._prompts[client.client_id] = _TokenPrompt(client, gate)
                 else:
@@ -179,13 +293,13 @@ class Viewer:
                     )
             if reason:
                 _warn(client, reason)
-                close_soon(client)
+                _close_soon(client)
 
     def _refusal(self, client: viser.ClientHandle) -> str:
         """Why a page is not served; empty if it is."""
         if len(self._sessions) >= MOST_CLIENTS:
             return f"{MOST_CLIENTS} pages are open already: close one and load this page again"
-        headers = headers_of(client)
+        headers = _headers_of(client)
         if self._gate is not None or is_own_page(headers, self._options.host):
             return ""
         site = (headers or {}).get("Origin", "unknown")[:100]

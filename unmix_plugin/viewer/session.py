@@ -27,10 +27,10 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
 from unmix_plugin.viewer.page import failures_said, number, paragraph
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
+from unmix_plugin.viewer.rendering.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     HEIGHT_BOUNDS,

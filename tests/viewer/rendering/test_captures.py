@@ -15,8 +15,6 @@ from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.viewer.layers.layers import LAYERS
-from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import (
     SpectraCanvas,
@@ -26,6 +24,7 @@ from unmix_plugin.viewer.rendering.captures import (
     output_of,
     render_argv,
 )
+from unmix_plugin.viewer.rendering.painting import LAYERS, LayerSettings
 from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import sized_camera

@@ -167,7 +167,7 @@ _METRES_PER_SECOND = 299_792_458.0
 _ALPHA = ("A", "alpha")
 _COLOURS = ("R", "G", "B")
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
-_LAYERS = ("S0", "T", "")
+LAYERS = ("S0", "T", "")
 """Which of several layers is taken: radiance, reflectance, any other."""
 
 
@@ -262,7 +262,7 @@ def _choose(path: Path, names: list[str], wanted: str | None) -> tuple[BandTable
     if wanted is not None and wanted in names:
         return BandTable(names=(wanted,)), ()
     spectral = _spectral_channels(names)
-    layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*_LAYERS, layer).index(layer))
+    layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*LAYERS, layer).index(layer))
     if wanted is not None and wanted not in layers:
         raise CaptureError(
             f"{path}: no layer or channel '{wanted}'; it has {', '.join(layers + names)[:300]}"

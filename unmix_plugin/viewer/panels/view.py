@@ -16,15 +16,16 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.viewer.layers.layers import covered, layer_named
-from unmix_plugin.viewer.layers.painting import (
+from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
+from unmix_plugin.viewer.rendering.painting import (
     BACKGROUNDS,
     COLOUR_MAPS,
     EXPOSURE_BOUNDS,
     GAMMA_BOUNDS,
     VIEW_TRANSFORMS,
+    covered,
+    layer_named,
 )
-from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session

@@ -26,7 +26,7 @@ from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.layers.painting import LayerSettings
+from unmix_plugin.viewer.rendering.painting import LayerSettings
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""

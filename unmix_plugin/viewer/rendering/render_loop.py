@@ -14,8 +14,8 @@ from typing import Any
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.layers.painting import LayerSettings
 from unmix_plugin.viewer.page import failures_said
+from unmix_plugin.viewer.rendering.painting import LayerSettings
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     RESTING_COST,

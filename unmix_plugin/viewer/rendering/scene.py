@@ -31,7 +31,7 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_materials import relit as relit_measurement
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.layers import LayerAids, render_reference
+from unmix_plugin.viewer.rendering.painting import LayerAids, render_reference
 
 
 @dataclass(frozen=True)

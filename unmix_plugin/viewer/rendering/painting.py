@@ -1,34 +1,42 @@
-"""What can be shown of a rendered view: functions to a picture and its legend, and what they need of the run.
+"""What can be shown of a rendered view, how a user has chosen to see it, and what the colours mean.
 
-Titles, kinds and ranges are those of the table of outputs; here is how they are painted.
+A layer is a function from a view to a picture and its legend. Titles, kinds and ranges are those of the table of
+outputs; here is how they are painted.
 
-Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `N` reference rays that end
-on something, `B` bands.
+Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `light` is linear RGB in sRGB
+primaries, 0 and up, 1 = the full scale of the sensor before exposure. `N` reference rays that end on something, `B`
+bands.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from html import escape
+from typing import Any, Literal, TypeAlias, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.registry import Output, OutputKind
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
+    agx,
     band_composite_matrix,
     describe_colour,
+    linear_to_srgb,
     rgb_matrix,
     srgb_to_linear,
 )
-from unmix_plugin.spectral.maps.indices import parse_index
+from unmix_plugin.spectral.maps.indices import available_indices, parse_index
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.spectral.subspace import PcaColours
@@ -36,18 +44,197 @@ from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.layers.painting import (
-    ColourMapLegend,
-    LayerSettings,
-    Legend,
-    Picture,
-    SwatchLegend,
-    TextLegend,
-    colour_table,
-    over_background,
-    paint_values,
-    tone_mapped,
-)
+from unmix_plugin.viewer.page import BLOCK_STYLE, choice, number, paragraph, swatches, text
+
+_ViewTransform = Literal["srgb", "agx"]
+VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
+    "srgb": "sRGB (exact up to white)",
+    "agx": "AgX (keeps highlights)",
+}
+"""Names and what users read."""
+
+BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
+"""sRGB value of what shows nothing; grey is that of the figures."""
+
+COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
+"""As matplotlib names them."""
+
+EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
+_WAVELENGTH_BOUNDS = (1.0, 1e5)
+_VALUE_BOUNDS = (-1e6, 1e6)
+_LONGEST_INDEX = 1000
+"""Letters that are kept: more than a formula may have, so that none becomes another one by being cut."""
+
+
+@dataclass(frozen=True)
+class LayerSettings:
+    """What is shown and how; every value lies within bounds."""
+
+    layer: str = "rgb"
+    wavelength_nm: float = 550.0
+    """Shown by the layer `band`."""
+    false_colour_nm: tuple[float, float, float] = (650.0, 550.0, 450.0)
+    """Shown as red, green, blue by the layer `false-colour`."""
+    endmember: int = 0
+    """Shown by the layer `abundance`."""
+    index: str = ""
+    """Shown by the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
+    colour_map: str = "viridis"
+    value_range: tuple[float, float] | None = None
+    """Values at the ends of the colour map; None for the layer's own."""
+    exposure_ev: float = 0.0
+    """Stops."""
+    gamma: float = 1.0
+    view_transform: _ViewTransform = "srgb"
+    background: str = "grey"
+    """Where nothing is seen; one of `BACKGROUNDS`."""
+
+    def changed(self, name: str, value: Any) -> LayerSettings:
+        """With one setting as a browser sent it, brought within its bounds; what makes no sense changes nothing."""
+        return replace(self, **{name: _CHECKS[name](value, getattr(self, name))})
+
+
+def first_settings(bands: Bands) -> LayerSettings:
+    """What a page shows at first; false colour from the middles of the long, middle and short third of the bands."""
+    centers_nm, count = bands.centers_nm.tolist(), len(bands)
+    starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
+    return LayerSettings(false_colour_nm=starts, index=next(iter(available_indices(bands)), ""))
+
+
+def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    try:
+        low, high = (number(part, *_VALUE_BOUNDS, fallback=math.nan) for part in value)
+    except (TypeError, ValueError):
+        return before
+    return (low, high) if low < high else before
+
+
+def _checked_wavelengths(value: Any, before: tuple[float, float, float]) -> tuple[float, ...]:
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        return before
+    return tuple(
+        number(one, *_WAVELENGTH_BOUNDS, fallback=old) for one, old in zip(value, before, strict=True)
+    )
+
+
+_CHECKS: dict[str, Callable[[Any, Any], Any]] = {
+    "layer": lambda value, before: value if isinstance(value, str) and len(value) < 100 else before,
+    "wavelength_nm": lambda value, before: number(value, *_WAVELENGTH_BOUNDS, fallback=before),
+    "false_colour_nm": _checked_wavelengths,
+    "endmember": lambda value, before: int(number(value, 0, 254, fallback=before)),
+    "index": lambda value, before: (
+        " ".join(text(value).split())[:_LONGEST_INDEX] if isinstance(value, str) else before
+    ),
+    "colour_map": lambda value, before: choice(value, COLOUR_MAPS, before),
+    "value_range": _checked_range,
+    "exposure_ev": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),
+    "gamma": lambda value, before: number(value, *GAMMA_BOUNDS, fallback=before),
+    "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
+    "background": lambda value, before: choice(value, BACKGROUNDS, before),
+}
+
+
+_Picture: TypeAlias = Float[Tensor, "H W 3"]
+
+_LEVELS = 1024
+
+
+@dataclass(frozen=True)
+class ColourMapLegend:
+    """Values and their colours."""
+
+    colour_map: str
+    low: float
+    high: float
+    label: str
+
+
+@dataclass(frozen=True)
+class _SwatchLegend:
+    """Names and their sRGB colours."""
+
+    entries: tuple[tuple[str, tuple[float, ...]], ...]
+
+
+@dataclass(frozen=True)
+class _TextLegend:
+    """One phrase."""
+
+    text: str
+
+
+Legend: TypeAlias = ColourMapLegend | _SwatchLegend | _TextLegend
+
+
+def _to_display(
+    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
+) -> Float[Tensor, "*pixels 3"]:
+    """Light as a display shows it: `srgb` clips at white, `agx` compresses 16.5 stops, as film does; gamma is last."""
+    exposed = light * 2.0**exposure_ev
+    shown = agx(exposed) if transform == "agx" else linear_to_srgb(exposed.clamp(0, 1))
+    shown = shown.clamp(0, 1)
+    return shown if math.isclose(gamma, 1.0) else shown.pow(1 / gamma)
+
+
+def _paint_values(values: Float[Tensor, "H W"], scale: tuple[float, float], colour_map: str) -> _Picture:
+    """Values as colours; those outside the scale get the colours of its ends."""
+    fraction = (values - scale[0]) / (scale[1] - scale[0])
+    levels = (fraction.nan_to_num(0.0).clamp(0, 1) * (_LEVELS - 1) + 0.5).long()
+    return _colour_table(colour_map).to(values)[levels]
+
+
+@lru_cache(maxsize=len(COLOUR_MAPS))
+def _colour_table(colour_map: str) -> Float[Tensor, "levels 3"]:
+    """sRGB colours of a map from its low to its high end."""
+    from matplotlib import colormaps
+
+    return torch.as_tensor(colormaps[colour_map](np.linspace(0, 1, _LEVELS))[:, :3], dtype=torch.float32)
+
+
+def _over_background(picture: _Picture, opacity: Float[Tensor, "H W"], settings: LayerSettings) -> _Picture:
+    """A picture that is not multiplied by its opacity, laid over the background."""
+    part = opacity.clamp(0, 1)[..., None]
+    return picture * part + BACKGROUNDS[settings.background] * (1 - part)
+
+
+def _tone_mapped(
+    light: Float[Tensor, "H W 3"], opacity: Float[Tensor, "H W"], settings: LayerSettings
+) -> _Picture:
+    """Linear light seen on black as a display shows it, over the background; edges are mixed in linear light."""
+    part = opacity.clamp(0, 1)[..., None]
+    solid = _to_display(
+        light / part.clamp(min=1e-3), settings.exposure_ev, settings.gamma, settings.view_transform
+    )
+    behind = BACKGROUNDS[settings.background]
+    behind_linear = float(srgb_to_linear(torch.tensor(behind)))
+    mixed = linear_to_srgb(srgb_to_linear(solid) * part + behind_linear * (1 - part))
+    return mixed.clamp(0, 1)
+
+
+def as_bytes(picture: _Picture) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture as 8-bit values on the CPU."""
+    return (picture * 255 + 0.5).clamp(0, 255).to(torch.uint8).cpu().numpy()
+
+
+def legend_html(shown: Legend) -> str:
+    """What the colours of a picture mean."""
+    if isinstance(shown, _TextLegend):
+        return paragraph(shown.text)
+    if isinstance(shown, _SwatchLegend):
+        return swatches(shown.entries)
+    table = _colour_table(shown.colour_map)
+    chosen = np.linspace(0, len(table) - 1, 17).round().astype(int)
+    stops = ",".join(css_colour(table[index].tolist()) for index in chosen)
+    return (
+        f'<div style="{BLOCK_STYLE}"><div>{escape(shown.label)}</div>'
+        f'<div style="height:0.9em;background:linear-gradient(to right,{stops})"></div>'
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{shown.low:.4g}</span><span>{(shown.low + shown.high) / 2:.4g}</span>"
+        f"<span>{shown.high:.4g}</span></div></div>"
+    )
+
 
 _NUM_CAMERAS = 6
 _NUM_RAYS = 6000
@@ -138,12 +325,12 @@ class LayerAids:
         return found
 
 
-_Painter = Callable[[Any, LayerSettings, Any], tuple[Picture, Legend]]
+_Painter = Callable[[Any, LayerSettings, Any], tuple[_Picture, Legend]]
 """From a rendered view, of the kind of scene that has the layer, and what layers need of the run."""
 
 
 @dataclass(frozen=True)
-class Layer:
+class _Layer:
     """A name, what users read, and the function that paints it."""
 
     name: str
@@ -157,7 +344,7 @@ class Layer:
     """Whether each colour stands for something of its own, so that pictures must not be compressed with loss."""
 
 
-def layer_named(name: str, layers: Mapping[str, Layer]) -> Layer:
+def layer_named(name: str, layers: Mapping[str, _Layer]) -> _Layer:
     """A layer by its name.
 
     Raises:
@@ -181,14 +368,14 @@ _PAINTED_KINDS: dict[OutputKind, frozenset[str]] = {
 """Kinds of outputs that can be painted without knowing more of them, and the controls of their layers."""
 
 
-def _layer_of(output: Output) -> Layer:
+def _layer_of(output: Output) -> _Layer:
     """The layer of an output of a kind that can be painted."""
 
-    def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[Picture, Legend]:
-        values, opacity, legend = frame[output.name], frame.opacity, TextLegend(output.what)
+    def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[_Picture, Legend]:
+        values, opacity, legend = frame[output.name], frame.opacity, _TextLegend(output.what)
         if output.kind in ("srgb", "linear"):
             light = values if output.kind == "linear" else srgb_to_linear(values.clamp(0, 1))
-            return tone_mapped(light, frame.coverage, settings), legend
+            return _tone_mapped(light, frame.coverage, settings), legend
         if output.kind in ("grey", "map"):
             is_known = values.isfinite()
             scale = output.value_range or _percentile_range(
@@ -198,7 +385,7 @@ def _layer_of(output: Output) -> Layer:
             part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
             return _paint_scaled(values, part, settings, scale, output.what)
         # Neighbours of the palette are far apart.
-        palette = colour_table("turbo")[torch.arange(256) * 389 % 1024].to(opacity)
+        palette = _colour_table("turbo")[torch.arange(256) * 389 % 1024].to(opacity)
         if output.kind == "labels":
             opacity, values = (values != NOTHING_ID).to(opacity), palette[values.long()]
         elif output.kind == "shares":
@@ -208,10 +395,10 @@ def _layer_of(output: Output) -> Layer:
             legend = _swatches(names, palette)
         elif output.kind == "vectors":
             values = (values + 1) / 2
-            legend = TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
-        return over_background(values.clamp(0, 1), opacity, settings), legend
+            legend = _TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
+        return _over_background(values.clamp(0, 1), opacity, settings), legend
 
-    return Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
+    return _Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
 
 
 def _paint_scaled(
@@ -220,15 +407,15 @@ def _paint_scaled(
     settings: LayerSettings,
     scale: tuple[float, float],
     label: str,
-) -> tuple[Picture, Legend]:
+) -> tuple[_Picture, Legend]:
     """Values in the colours of a scale, or of the user's own, over the background where they fill but a part."""
     shown = settings.value_range or scale
-    picture = paint_values(values, shown, settings.colour_map)
-    return over_background(picture, part, settings), ColourMapLegend(settings.colour_map, *shown, label)
+    picture = _paint_values(values, shown, settings.colour_map)
+    return _over_background(picture, part, settings), ColourMapLegend(settings.colour_map, *shown, label)
 
 
-def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> SwatchLegend:
-    return SwatchLegend(tuple(zip(names, map(tuple, colours.tolist()), strict=True)))
+def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> _SwatchLegend:
+    return _SwatchLegend(tuple(zip(names, map(tuple, colours.tolist()), strict=True)))
 
 
 _CHUNK = 1 << 16
@@ -237,7 +424,7 @@ _CHUNK = 1 << 16
 _LONGEST_LABEL = 120
 
 
-def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     """The index that is chosen, over the background where it is undefined or hardly anything is seen."""
     materials, bands = frame.materials, frame.materials.bands
     if not settings.index:
@@ -262,28 +449,30 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
 
 
 def _paint_colour(diffuse: bool, specular: bool) -> _Painter:
-    def paint(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+    def paint(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[_Picture, Legend]:
         bands = frame.materials.bands
         light = frame.materials.through(
             frame.coefficients, rgb_matrix(bands), diffuse=diffuse, specular=specular
         )
         # The view-dependent part is light added to what is there: it has no opacity of its own.
         part = frame.coverage if diffuse else torch.ones_like(light[..., 0])
-        return tone_mapped(light, part, settings), TextLegend(describe_colour(bands))
+        return _tone_mapped(light, part, settings), _TextLegend(describe_colour(bands))
 
     return paint
 
 
-def _paint_false_colour(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+def _paint_false_colour(
+    frame: MaterialView, settings: LayerSettings, _: LayerAids
+) -> tuple[_Picture, Legend]:
     bands = frame.materials.bands
     wavelengths = tuple(covered(bands, value) for value in settings.false_colour_nm)
     light = frame.materials.through(frame.coefficients, band_composite_matrix(bands, wavelengths))
     shown = [f"{bands.centers_nm[bands.nearest(value)]:.0f} nm" for value in wavelengths]
-    legend = TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
-    return tone_mapped(light, frame.coverage, settings), legend
+    legend = _TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
+    return _tone_mapped(light, frame.coverage, settings), legend
 
 
-def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     materials, bands = frame.materials, frame.materials.bands
     band = bands.nearest(covered(bands, settings.wavelength_nm))
     column = torch.eye(len(bands))[:, band : band + 1]
@@ -296,7 +485,7 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     return _paint_scaled(values, frame.coverage, settings, scale, label)
 
 
-def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[Picture, Legend]:
+def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids) -> tuple[_Picture, Legend]:
     names = frame.materials.names
     index = min(max(settings.endmember, 0), len(names) - 1)
     values = _unpremultiplied(frame.coefficients.abundances, frame.opacity)[..., index]
@@ -305,36 +494,36 @@ def _paint_abundance(frame: MaterialView, settings: LayerSettings, _: LayerAids)
 
 def _paint_abundances(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
-) -> tuple[Picture, Legend]:
+) -> tuple[_Picture, Legend]:
     colours = aids.colours_of(frame.materials)
     picture = _unpremultiplied(frame.coefficients.abundances, frame.opacity) @ colours
-    return over_background(picture, frame.opacity, settings), _swatches(frame.materials.names, colours)
+    return _over_background(picture, frame.opacity, settings), _swatches(frame.materials.names, colours)
 
 
 def _paint_segmentation(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
-) -> tuple[Picture, Legend]:
+) -> tuple[_Picture, Legend]:
     ids, colours = frame["segmentation"], aids.colours_of(frame.materials)
     palette = torch.cat([colours, colours.new_zeros(256 - len(colours), 3)])
-    picture = over_background(palette[ids.long()], (ids != NOTHING_ID).to(colours.dtype), settings)
+    picture = _over_background(palette[ids.long()], (ids != NOTHING_ID).to(colours.dtype), settings)
     return picture, _swatches(frame.materials.names, colours)
 
 
-def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     colours = aids._pca_of(frame.materials)
     seen = _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
     components = seen - colours.mean @ colours.axes
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
-    legend = TextLegend("red, green, blue: first, second, third principal component of the spectra")
-    return over_background(stretched.clamp(0, 1), frame.opacity, settings), legend
+    legend = _TextLegend("red, green, blue: first, second, third principal component of the spectra")
+    return _over_background(stretched.clamp(0, 1), frame.opacity, settings), legend
 
 
-def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     label = "distance along the viewing axis, world units"
     return _paint_scaled(frame.depth, frame.opacity, settings, aids._depth_range(frame), label)
 
 
-def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[Picture, Legend]:
+def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     if aids.error_of is None:
         raise ConfigError(f"no error to show: {aids.why_no_error}")
     values, is_known, view = aids.error_of(frame)
@@ -353,20 +542,22 @@ def covered(bands: Bands, wavelength_nm: float) -> float:
     return min(max(low, wavelength_nm), high)
 
 
-def _own(name: str, paint: _Painter, *controls: str) -> Layer:
+def _own(name: str, paint: _Painter, *controls: str) -> _Layer:
     """A layer with a painter of its own; the rest is that of the output, or the family of outputs, of its name."""
     output = OUTPUTS[name] if name in OUTPUTS else FAMILIES[name]
-    return Layer(name, output.title, paint, frozenset(controls), output.kind == "labels")
+    return _Layer(name, output.title, paint, frozenset(controls), output.kind == "labels")
 
 
-LAYERS: dict[str, Layer] = {
+LAYERS: dict[str, _Layer] = {
     layer.name: layer
     for layer in (
         _own("rgb", _paint_colour(True, True), "tone"),
         _own("false-colour", _paint_false_colour, "tone", "false-colour"),
         _own("band", _paint_band, "scale", "wavelength"),
         _own("index", _paint_index, "scale", "index"),
-        Layer("abundance", "abundance of one endmember", _paint_abundance, frozenset({"scale", "endmember"})),
+        _Layer(
+            "abundance", "abundance of one endmember", _paint_abundance, frozenset({"scale", "endmember"})
+        ),
         _own("abundances", _paint_abundances),
         _own("segmentation", _paint_segmentation),
         _layer_of(OUTPUTS["confidence"]),
@@ -375,13 +566,13 @@ LAYERS: dict[str, Layer] = {
         _own("pca", _paint_pca),
         _own("depth", _paint_depth, "scale"),
         _layer_of(OUTPUTS["accumulation"]),
-        Layer("error", "error against a training view", _paint_error, frozenset({"scale"})),
+        _Layer("error", "error against a training view", _paint_error, frozenset({"scale"})),
     )
 }
 """All that can be shown of mixed materials, in the order in which it is offered."""
 
 
-def layers_of(scene: RenderableScene) -> dict[str, Layer]:
+def layers_of(scene: RenderableScene) -> dict[str, _Layer]:
     """All that can be shown of a scene, by name: what its materials allow, and its outputs that can be painted."""
     if not isinstance(scene, TrainedScene):
         return {output.name: _layer_of(output) for output in scene.outputs if output.kind in _PAINTED_KINDS}

@@ -1,1 +1,0 @@
-"""What the viewer can show of a rendered view."""
