@@ -20,7 +20,8 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from unmix_plugin.commands.entry import USER_ERROR, run_command
+from tests.commands.running import run
+from unmix_plugin.commands.entry import USER_ERROR
 from unmix_plugin.commands.process import process as process_command
 from unmix_plugin.errors import UnmixError
 
@@ -89,7 +90,7 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
     "Git LFS pointer": (
         lambda root: (root / "view_09.tif").write_text("version https://git-lfs.github.com/spec/v1\n"),
         {},
-        r"view_09\.tif: a pointer of Git LFS",
+        r"view_09\.tif: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'",
     ),
     "a header of terabytes": (
         lambda root: write_cube(root, "view_01", COUNTS, header={"lines": 10**9, "samples": 10**6}),
@@ -236,34 +237,25 @@ def test_a_bad_capture_is_refused(tmp_path: Path, case: str):
     assert not (tmp_path / "scene.unfinished" / "transforms.json").exists()
 
 
-def _run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as caught:
-        run_command(process_command, list(map(str, arguments)))
-    assert isinstance(caught.value.code, int)
-    return caught.value.code
+@pytest.mark.parametrize(
+    ("layout", "folder", "message"),
+    [
+        ("cubes", "nowhere", "nowhere is not there; give the folder of the capture with --data"),
+        ("cube", ".", "did you mean cubes?"),
+        ("cubes", ".", "holds no cubes; expected one file a view"),
+    ],
+)
+def test_the_command_ends_with_the_users_error(tmp_path: Path, layout: str, folder: str, message: str):
+    ended = run(process_command, layout, "--data", tmp_path / folder, "--output-dir", tmp_path / "scene")
+    assert ended.status == USER_ERROR
+    assert message in " ".join(ended.err.split())
 
 
-def test_the_command_ends_with_the_users_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert _run("cubes", "--data", tmp_path / "nowhere", "--output-dir", tmp_path / "scene") == USER_ERROR
-    assert "nowhere is not there; give the folder of the capture with --data" in capsys.readouterr().err
-
-
-def test_an_unknown_layout_is_refused_with_the_nearest(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert _run("cube", "--data", tmp_path, "--output-dir", tmp_path / "scene") == USER_ERROR
-    assert "did you mean cubes?" in capsys.readouterr().err
-
-
-def test_an_empty_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "capture").mkdir()
-    assert _run("cubes", "--data", tmp_path / "capture", "--output-dir", tmp_path / "scene") == USER_ERROR
-    assert "holds no cubes; expected one file a view" in capsys.readouterr().err
-
-
-def test_the_last_line_names_the_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_last_line_names_the_scene(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
-    arguments = ["--data", capture.root, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
-    assert _run("cubes", *arguments) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == f"scene: {tmp_path / 'scene'}"
+    words = ["--data", capture.root, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
+    ended = run(process_command, "cubes", *words)
+    assert (ended.status, ended.last_line) == (0, f"scene: {tmp_path / 'scene'}")
 
 
 @pytest.mark.parametrize("name", ["file.txt", "folder/precious.txt"])

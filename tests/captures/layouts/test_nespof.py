@@ -106,33 +106,37 @@ def test_other_channels_are_refused(tmp_path):
         _open_intensity(tmp_path / "a.exr")
 
 
-def test_missing_files_are_counted_and_named(tmp_path):
-    write_nespof(tmp_path)
-    shutil.rmtree(tmp_path / "460" / "train")
-    with pytest.raises(CaptureError, match=r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"):
-        find_nespof(tmp_path, PLAIN)
+def _without_a_folder(root):
+    shutil.rmtree(root / "460" / "train")
 
 
-def test_a_truncated_file_is_refused(tmp_path):
-    write_nespof(tmp_path)
-    path = tmp_path / "450" / "val" / "r_0.exr"
+def _cut_short(root):
+    path = root / "450" / "val" / "r_0.exr"
     path.write_bytes(path.read_bytes()[:20])
-    with pytest.raises(CaptureError, match=r"r_0.exr can't be read as OpenEXR"):
-        find_nespof(tmp_path, PLAIN)
 
 
-def test_files_of_different_sizes_are_refused(tmp_path):
-    write_nespof(tmp_path)
-    write_exr(tmp_path / "460" / "val" / "r_0.exr", stokes(np.zeros((5, 8))))
-    with pytest.raises(CaptureError, match="the bands of one view have one size"):
-        find_nespof(tmp_path, PLAIN)
+def _of_another_size(root):
+    write_exr(root / "460" / "val" / "r_0.exr", stokes(np.zeros((5, 8))))
 
 
-def test_a_path_that_leaves_the_folder_is_refused(tmp_path):
-    write_nespof(tmp_path / "scene")
-    path = tmp_path / "scene" / "transforms_val.json"
+def _outside(root):
+    path = root / "transforms_val.json"
     path.write_text(path.read_text().replace("./val/r_0", "../../r_0"))
-    with pytest.raises(CaptureError, match="leaves the folder"):
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (_without_a_folder, r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"),
+        (_cut_short, r"r_0.exr can't be read as OpenEXR"),
+        (_of_another_size, "the bands of one view have one size"),
+        (_outside, "leaves the folder"),
+    ],
+)
+def test_a_spoilt_scene_is_refused(tmp_path, spoil, message):
+    write_nespof(tmp_path / "scene")
+    spoil(tmp_path / "scene")
+    with pytest.raises(CaptureError, match=message):
         find_nespof(tmp_path / "scene", PLAIN)
 
 
@@ -166,27 +170,17 @@ def test_poses_go_with_views_in_the_order_of_names(tmp_path):
         assert (lens.height, lens.width, lens.focal_px) == (5, 7, (9.0, 9.0))
 
 
-def test_more_poses_than_views_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda exr: shutil.rmtree(exr / "v2"), r"holds 2 poses, .* 1 views"),
+        (lambda exr: (exr / "v2" / "460.exr").unlink(), "460 nm in one of them alone"),
+        (lambda exr: write_exr(exr / "v2" / "450nm.exr", stokes(intensity(1, 450))), "are both 450 nm"),
+        (shutil.rmtree, "holds no folder exr"),
+    ],
+)
+def test_a_spoilt_real_capture_is_refused(tmp_path, spoil, message):
     write_real(tmp_path)
-    shutil.rmtree(tmp_path / "exr" / "v2")
-    with pytest.raises(CaptureError, match=r"holds 2 poses, .* 1 views"):
-        find_nespof_real(tmp_path, PLAIN)
-
-
-def test_views_of_different_wavelengths_are_refused(tmp_path):
-    write_real(tmp_path, poses=False)
-    (tmp_path / "exr" / "v2" / "460.exr").unlink()
-    with pytest.raises(CaptureError, match="460 nm in one of them alone"):
-        find_nespof_real(tmp_path, PLAIN)
-
-
-def test_one_wavelength_twice_is_refused(tmp_path):
-    write_real(tmp_path, poses=False)
-    write_exr(tmp_path / "exr" / "v2" / "450nm.exr", stokes(intensity(1, 450)))
-    with pytest.raises(CaptureError, match="are both 450 nm"):
-        find_nespof_real(tmp_path, PLAIN)
-
-
-def test_a_folder_without_exr_is_refused(tmp_path):
-    with pytest.raises(CaptureError, match="holds no folder exr"):
+    spoil(tmp_path / "exr")
+    with pytest.raises(CaptureError, match=message):
         find_nespof_real(tmp_path, PLAIN)

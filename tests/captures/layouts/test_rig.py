@@ -17,12 +17,10 @@ from tests.captures.layouts.rig_flight import (
     image,
     lens_pose,
     rays,
-    stored,
     write_flight,
     write_panel,
     write_poses,
 )
-from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
@@ -67,33 +65,10 @@ def test_every_file_is_a_view_of_its_lens_and_release(flight):
         assert len(of_release) == 1
 
 
-def test_bands_come_from_the_tags(flight):
-    capture = find_rig(flight, PLAIN)
-    for lens in LENSES:
-        bands = _view(capture, 3, lens.ending).cube.bands
-        assert bands.wavelengths_nm is not None
-        assert bands.fwhm_nm is not None
-        assert (bands.wavelengths_nm[0], bands.fwhm_nm[0]) == (lens.centre_nm, lens.width_nm)
-
-
 def test_what_is_left_out_or_ignored_is_said(flight):
     notes = " ".join(find_rig(flight, PLAIN).notes)
     assert "1 colour picture left out" in notes
     assert "EXIF's orientation of 40 files is ignored" in notes
-
-
-def test_the_stored_raster_is_not_turned(flight):
-    view = _view(find_rig(flight, PLAIN), 2, "RED")
-    np.testing.assert_array_equal(view.cube.read()[..., 0], stored(image(2, LENSES[1]), LENSES[1]))
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
-def test_radiance_is_that_of_the_ground_within_1_percent(flight, lens):
-    view = _view(find_rig(flight, PLAIN), 4, lens.ending)
-    model = radiometric_model(view.cube)
-    assert model is not None
-    found = model.apply(view.cube.read().astype(np.float64))[..., 0]
-    np.testing.assert_allclose(found, image(4, lens), rtol=0.001)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
@@ -295,13 +270,6 @@ def test_files_of_one_lens_that_differ_are_refused(tmp_path, size, centre, messa
     )
     with pytest.raises(CaptureError, match=message):
         find_rig(tmp_path, PLAIN)
-
-
-def test_a_truncated_file_is_refused(flight, tmp_path):
-    whole = next(flight.glob("*_GRE.TIF")).read_bytes()
-    (tmp_path / "IMG_0000_1.tif").write_bytes(whole[: len(whole) // 3])
-    with pytest.raises(CaptureError, match=r"IMG_0000_1.tif"):
-        find_rig(tmp_path, PLAIN).views[0].cube.read()
 
 
 LENS_WIDTH, LENS_HEIGHT = 1280, 960

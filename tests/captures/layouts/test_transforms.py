@@ -53,11 +53,6 @@ def test_cubes_pictures_and_labels_are_found_where_the_converter_left_them(tmp_p
     assert told == (written == "eval")
 
 
-def test_folders_say_the_split(tmp_path):
-    write_unmix(tmp_path)
-    assert [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views] == ["train"] * 3 + ["eval"] * 2
-
-
 def test_lists_go_before_folders(tmp_path):
     lists = {
         "train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)],

@@ -278,11 +278,3 @@ def test_a_file_of_many_gigabytes_opens_at_once(tmp_path):
     file = open_spectral_file(path)
     assert file.shape == (20000, 10000, 60)
     assert file.read(slice(19999, 20000), slice(58, 60)).shape == (1, 10000, 2)
-
-
-def test_pointers_of_git_lfs_are_named(tmp_path):
-    (tmp_path / "a.tif").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
-    with pytest.raises(
-        CaptureError, match="a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'"
-    ):
-        open_spectral_file(tmp_path / "a.tif")
