@@ -186,14 +186,15 @@ def test_what_is_below_the_black_level_stays_below_0(tmp_path):
     assert (model_of(file).apply(file.read().astype(np.float64)) < 0.0).all()
 
 
-@pytest.mark.parametrize(("tags", "irradiance"), [(MICASENSE, 1.085), (DJI, 7423.1), (SEQUOIA, None)])
-def test_the_sunshine_sensor_is_reported(tmp_path, pixels, tags, irradiance):
-    assert model_of(make(tmp_path, pixels, tags)).irradiance == irradiance
+SECOND_SENSOR = {"Camera:HorizontalIrradiance": "108.5", "Camera:IrradianceScaleToSIUnits": "0.01"}
 
 
-def test_irradiance_of_the_second_sensor_is_scaled_to_si(tmp_path, pixels):
-    tags = MICASENSE | {"Camera:HorizontalIrradiance": "108.5", "Camera:IrradianceScaleToSIUnits": "0.01"}
-    assert model_of(make(tmp_path, pixels, tags)).irradiance == pytest.approx(1.085)
+@pytest.mark.parametrize(
+    ("tags", "irradiance"),
+    [(MICASENSE, 1.085), (MICASENSE | SECOND_SENSOR, 1.085), (DJI, 7423.1), (SEQUOIA, None)],
+)
+def test_the_sunshine_sensor_is_reported_in_si(tmp_path, pixels, tags, irradiance):
+    assert model_of(make(tmp_path, pixels, tags)).irradiance == pytest.approx(irradiance)
 
 
 def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):

@@ -138,8 +138,6 @@ def test_views_without_a_pose_are_left_out(tmp_path: Path):
 
 
 def test_pictures_become_linear_bands(tmp_path: Path):
-    from PIL import Image
-
     root = tmp_path / "capture"
     root.mkdir()
     generator = np.random.default_rng(0)
@@ -252,17 +250,13 @@ def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path
     assert len(load_scene(tmp_path / "scene").frames) == 4
 
 
-def test_other_options_start_again(interrupted, writer, tmp_path: Path):
-    process(interrupted.root, tmp_path / "scene", bin_bands=3)
-    assert len(writer.written) == 4
-
-
-def test_changed_input_starts_again(interrupted, writer, tmp_path: Path):
-    path = interrupted.root / "view_03.raw"
-    numbers = np.fromfile(path, "<u2")
-    numbers[5] += 1
-    numbers.tofile(path)
-    process(interrupted.root, tmp_path / "scene")
+@pytest.mark.parametrize("options", [{"bin_bands": 3}, {}], ids=["options", "input"])
+def test_other_options_or_inputs_start_again(interrupted, writer, tmp_path: Path, options):
+    if not options:
+        numbers = np.fromfile(interrupted.root / "view_03.raw", "<u2")
+        numbers[5] += 1
+        numbers.tofile(interrupted.root / "view_03.raw")
+    process(interrupted.root, tmp_path / "scene", **options)
     assert len(writer.written) == 4
 
 

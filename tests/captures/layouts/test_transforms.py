@@ -302,8 +302,6 @@ def test_nerfstudio_says_what_three_bands_may_stand_for(tmp_path):
         process("nerfstudio", tmp_path / "room", tmp_path / "scene")
     scene = process("nerfstudio", tmp_path / "room", tmp_path / "scene", wavelengths="610,550,465", scale=1.0)
     assert scene.wavelengths_nm.tolist() == [465.0, 550.0, 610.0]
-    from PIL import Image
-
     pixels = np.asarray(Image.open(tmp_path / "room" / "train" / "frame_00002.png")) / 255
     linear = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(scene.cube(2), linear[..., ::-1], atol=1e-4)

@@ -77,15 +77,16 @@ def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
     np.testing.assert_allclose(mine, wanted, atol=1e-9 if is_exact else 0.5)
 
 
-def test_lenses_too_wide_for_the_model_are_refused(tmp_path):
-    make_model("OPENCV_FISHEYE", (250, 250, 320, 240, 0, 0, 0, 0)).write_binary(tmp_path)
-    with pytest.raises(CaptureError, match=r"OPENCV_FISHEYE.*undistort"):
-        read_poses(tmp_path)
-
-
-def test_models_that_are_not_representable_are_refused_by_name(tmp_path):
-    make_model("FOV", (500, 500, 320, 240, 0.5)).write_text(tmp_path)
-    with pytest.raises(CaptureError, match=r"FOV is not supported; expected one of .*image_undistorter"):
+@pytest.mark.parametrize(
+    ("model", "parameters", "message"),
+    [
+        ("OPENCV_FISHEYE", (250, 250, 320, 240, 0, 0, 0, 0), "OPENCV_FISHEYE.*undistort"),
+        ("FOV", (500, 500, 320, 240, 0.5), "FOV is not supported; expected one of .*image_undistorter"),
+    ],
+)
+def test_lenses_that_ours_cannot_stand_for_are_refused(tmp_path, model, parameters, message):
+    make_model(model, parameters).write_text(tmp_path)
+    with pytest.raises(CaptureError, match=message):
         read_poses(tmp_path)
 
 

@@ -116,29 +116,18 @@ def test_terms_beyond_k2_are_kept(tmp_path):
     assert lens == replace(LENS, higher_radial=(0.02, -0.01))
 
 
-def zeros(pose):
-    return 0 * pose
-
-
-def not_finite(pose):
-    return np.nan * pose
-
-
-def mirrored(pose):
-    return pose * [[-1.0, 1.0, 1.0, 1.0]]
-
-
-def sheared(pose):
-    return pose * [[1.0, 2.0, 1.0, 1.0]]
-
-
 @pytest.mark.parametrize(
-    ("spoil", "message"),
-    [(zeros, "all zeros"), (not_finite, "not finite"), (mirrored, "mirror image"), (sheared, "sheared")],
+    ("factor", "message"),
+    [
+        (0.0, "all zeros"),
+        (np.nan, "not finite"),
+        ([[-1.0, 1.0, 1.0, 1.0]], "mirror image"),
+        ([[1.0, 2.0, 1.0, 1.0]], "sheared"),
+    ],
 )
-def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, spoil, message):
+def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, message):
     poses = ring()
-    poses["images/view_3.png"] = spoil(poses["images/view_3.png"])
+    poses["images/view_3.png"] = factor * poses["images/view_3.png"]
     with pytest.raises(CaptureError, match=rf"1 of 6 .*images/view_3.png: .*{message}"):
         read(tmp_path, transforms(poses))
 
