@@ -69,7 +69,7 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     lenses: dict[str | None, Lens | None] = {}
     for sensor in chunk.iterfind("sensors/sensor"):
         if sensor.get("id") in used:
-            lenses[sensor.get("id")], said = _lens(sensor, str(path))
+            lenses[sensor.get("id")], said = _lens_metashape(sensor, str(path))
             notes += said
     raw = []
     for camera in aligned:
@@ -144,11 +144,11 @@ def _of_one_world(
     return kept
 
 
-def _lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
+def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
     """The lens of a sensor, None without any focal length; and what is not exactly as in the file."""
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
-    calibration, size = _calibration(sensor, where)
+    calibration, size = _calibration_metashape(sensor, where)
     if calibration is None:
         return _from_physical(sensor, size), [f"sensor {name} is not calibrated: nominal focal length"]
     kind = calibration.get("type") or sensor.get("type", "frame")
@@ -184,7 +184,7 @@ def _lens(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[st
     return fitted, [f"sensor {name}: {note}"]
 
 
-def _calibration(
+def _calibration_metashape(
     sensor: ElementTree.Element, where: str
 ) -> tuple[ElementTree.Element | None, tuple[int, int]]:
     """The adjusted calibration, otherwise the first one, and the size of the picture."""
@@ -212,6 +212,8 @@ def _from_physical(sensor: ElementTree.Element, size: tuple[int, int]) -> Lens |
     x, y = (focal / side for side in sides)
     return Lens(*size, (x, y), (size[0] / 2, size[1] / 2))
 
+
+# MicMac.
 
 _PREFIX = "Orientation-"
 _CONVENTION = "eConvApero_DistM2C"
@@ -341,6 +343,8 @@ def _bend(pixels: Points, model: ElementTree.Element, where: str) -> Points:
     bent_y = y * factor + p2 * (squared + 2 * y**2) + 2 * p1 * x * y
     return np.column_stack([bent_x, bent_y]) + middle
 
+
+# OpenSfM and OpenDroneMap.
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYES = ("fisheye", "fisheye_opencv")

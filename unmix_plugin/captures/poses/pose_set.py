@@ -213,6 +213,9 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
     return None
 
 
+# JSON and XML of unknown origin, and numbers in XML.
+
+
 def load_json(path: Path) -> Any:
     """What the file holds.
 
@@ -272,6 +275,8 @@ def number_of(parent: ElementTree.Element, tag: str, where: str, default: float 
     values = numbers_of(parent.find(tag), 1, where)
     return default if values is None else float(values[0])
 
+
+# Which camera took which view, by the names of files.
 
 BY_ORDER = "#"
 """Names of cameras whose source gives none begin with it; they are matched in the order of names."""

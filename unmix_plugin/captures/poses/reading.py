@@ -186,6 +186,8 @@ def _read_llff(path: Path) -> PoseSet:
     return make_pose_set(cameras, f"LLFF's {path.name}", str(path), notes=[note])
 
 
+# transforms.json.
+
 _NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""
 _PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")

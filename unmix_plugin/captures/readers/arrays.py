@@ -507,6 +507,10 @@ def _unpack(path: Path, array: _MatlabArray) -> np.ndarray:
     return numbers.reshape(array.shape, order="F")
 
 
+# HDF5, NetCDF-4 and MATLAB 7.3, read by h5py in slices. A file is opened for each part that is read and closed again,
+# so that many can be in use at a time.
+
+
 def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone.
 

@@ -153,6 +153,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
 
 
+# OpenEXR, whose channels are bands.
+
 _HEADER_BYTES = 2**20
 _MARK = b"channels\0chlist\0"
 _TYPES = (np.dtype("u4"), np.dtype("f2"), np.dtype("f4"))

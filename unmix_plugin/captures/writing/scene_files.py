@@ -251,6 +251,8 @@ def _left_out(sensor: Sensor) -> dict[str, str]:
     }
 
 
+# The contact sheet.
+
 _MOST_VIEWS = 96
 """Views that are shown; of more, as many evenly spaced."""
 _SHEET_PX, _TILE_PX = 1300, (96, 300)

@@ -273,6 +273,8 @@ def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray,
     return float(np.sqrt(np.mean(np.square(differences, dtype=np.float64)))) if inside.any() else 0.0
 
 
+# The unfinished folder, and the files that views are made of.
+
 RECORD_NAME = "process.json"
 _PLAN, _VIEWS, _POSES = "plan.json", "views", "poses"
 
