@@ -81,20 +81,26 @@ def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(
     assert finite_or_none(figures)["psnr"] is None
 
 
-def test_a_real_scene_predicted_by_its_own_truth_has_angle_0_and_miou_1(tmp_path):
-    make_demo_scene(tmp_path, 16, 8, 4)
-    scene = load_scene(tmp_path, SceneOptions())
-    truth = scene_truth(scene)
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """A whole scene from its files."""
+    folder = tmp_path_factory.mktemp("demo")
+    make_demo_scene(folder, 16, 8, 4)
+    return load_scene(folder, SceneOptions())
+
+
+def test_a_real_scene_predicted_by_its_own_truth_has_angle_0_and_miou_1(demo):
+    truth = scene_truth(demo)
     assert truth.endmembers is not None
     evaluation = Evaluation(truth, truth.endmembers)
-    for index in scene.eval_indices:
-        view = view_truth(scene, index)
+    for index in demo.eval_indices:
+        view = view_truth(demo, index)
         evaluation.add(view, perfect(view, list(range(len(truth.endmembers)))))
     figures = evaluation.figures()
     assert figures["sam"] == pytest.approx(0.0, abs=1e-7)
     assert (figures["miou"], figures["accuracy"]) == (1.0, 1.0)
     assert figures["abundance_rmse"] < 2e-3  # true abundances are stored as float16
-    assert figures["views"] == len(scene.eval_indices)
+    assert figures["views"] == len(demo.eval_indices)
 
 
 def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
@@ -209,15 +215,11 @@ def test_images_too_small_for_its_window_have_no_ssim(scene):
     assert finite_or_none(evaluation.figures())["ssim"] is None
 
 
-def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(tmp_path):
-    make_demo_scene(tmp_path, 16, 8, 4)
-    scene = load_scene(tmp_path, SceneOptions())
-    lit = scene_truth(scene).endmembers
-    flat = scene_truth(replace(scene, illuminant=None)).endmembers
-    assert scene.illuminant is not None
+def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(demo):
+    lit = scene_truth(demo).endmembers
+    flat = scene_truth(replace(demo, illuminant=None)).endmembers
     assert lit is not None
-    assert flat is not None
-    torch.testing.assert_close(lit, flat * torch.from_numpy(scene.illuminant), rtol=1e-6, atol=0)
+    torch.testing.assert_close(lit, flat * torch.from_numpy(demo.illuminant), rtol=1e-6, atol=0)
     assert not torch.allclose(lit, flat, rtol=1e-2)
 
 

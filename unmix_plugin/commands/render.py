@@ -18,13 +18,10 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.processes import Processes
-    from unmix_plugin.engine.registry import Output
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
     from unmix_plugin.products.render.files import FormattedOutput
-    from unmix_plugin.products.render.job import Survey
     from unmix_plugin.products.render.pictures import Palette
     from unmix_plugin.trained.open_run import LoadedRun
-    from unmix_plugin.trained.protocol import RenderableScene
 
 
 @dataclass(frozen=True)
@@ -159,14 +156,23 @@ def _render(
     processes: Processes,
 ) -> None:
     """Render block by block, then list what was written."""
-    from unmix_plugin.commands.reporting import follow, say
+    from unmix_plugin.commands.reporting import follow, say, working
     from unmix_plugin.formats.files import refuse_to_overwrite, write_file
-    from unmix_plugin.products.render.job import RenderJob, output_paths
+    from unmix_plugin.products.render.files import file_name, needs_legend
+    from unmix_plugin.products.render.job import RenderJob, Survey, needs_survey, output_paths, take_survey
     from unmix_plugin.products.render.pictures import draw_legend
+    from unmix_plugin.trained.camera_files import camera_file_bytes
 
+    scene, asked = loaded.scene, dict.fromkeys(one.output for one in outputs)
     folder = (options.output or loaded.folder.exports / "render").resolve()
-    legends = _legends(folder, outputs, loaded.scene)
-    camera_path, camera_bytes = _camera_file(folder, options.cameras, loaded, cameras)
+    legends = {
+        folder / f"{file_name(one.output)}_legend.png": one.output
+        for one in outputs
+        if needs_legend(one, scene)
+    }
+    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
+    camera_path = folder / f"cameras-{Path(options.cameras).stem}.json"
+    camera_bytes = camera_file_bytes(cameras.views, frames_per_second, scene.frame)
     paths = [path for one in outputs for path in output_paths(folder, one, cameras)]
     paths += legends
     if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
@@ -176,10 +182,17 @@ def _render(
             refuse_to_overwrite(paths, options.overwrite)
             # First, so that a folder that can't be written is noticed early.
             write_file(camera_path, camera_bytes)
-    say(console, _announcement(cameras, outputs))
+    names, (width, height) = dict.fromkeys(output.name for output in asked), cameras.size
+    say(
+        console,
+        f"{counted(len(cameras.views), 'view')} of {width} x {height} pixels: {', '.join(names)}",
+    )
+    survey = Survey()
     with processes.together():
-        survey = _survey(loaded, cameras, outputs, console)
-    with RenderJob(loaded.scene, cameras, outputs, survey, folder, processes) as job:
+        if needs_survey(asked):
+            with working(console, "looking at all views for what their pictures share"):
+                survey = take_survey(scene, cameras.views, asked)
+    with RenderJob(scene, cameras, outputs, survey, folder, processes) as job:
         for block in follow(console, "rendering", job.blocks()):
             job.render(block)
         job.finish()
@@ -191,47 +204,6 @@ def _render(
     for path in legends:
         print(f"{path}  what the colours mean")
     print(f"{camera_path}  the cameras, to be given to --cameras again")
-
-
-def _survey(
-    loaded: LoadedRun, cameras: RenderCameras, outputs: tuple[FormattedOutput, ...], console: Console
-) -> Survey:
-    from unmix_plugin.commands.reporting import working
-    from unmix_plugin.products.render.job import Survey, needs_survey, take_survey
-
-    asked = dict.fromkeys(one.output for one in outputs)
-    if not needs_survey(asked):
-        return Survey()
-    with working(console, "looking at all views for what their pictures share"):
-        return take_survey(loaded.scene, cameras.views, asked)
-
-
-def _legends(
-    folder: Path, outputs: tuple[FormattedOutput, ...], scene: RenderableScene
-) -> dict[Path, Output]:
-    """Files of legends, each with the output that it explains."""
-    from unmix_plugin.products.render.files import file_name, needs_legend
-
-    return {
-        folder / f"{file_name(one.output)}_legend.png": one.output
-        for one in outputs
-        if needs_legend(one, scene)
-    }
-
-
-def _camera_file(folder: Path, source: str, loaded: LoadedRun, cameras: RenderCameras) -> tuple[Path, bytes]:
-    """Where the cameras are written down, and as what."""
-    from unmix_plugin.trained.camera_files import camera_file_bytes
-
-    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
-    content = camera_file_bytes(cameras.views, frames_per_second, loaded.scene.frame)
-    return folder / f"cameras-{Path(source).stem}.json", content
-
-
-def _announcement(cameras: RenderCameras, outputs: tuple[FormattedOutput, ...]) -> str:
-    names = dict.fromkeys(one.output.name for one in outputs)
-    width, height = cameras.size
-    return f"{counted(len(cameras.views), 'view')} of {width} x {height} pixels: {', '.join(names)}"
 
 
 def _list(

@@ -268,7 +268,9 @@ def _write_ply(
 def _write_obj(
     path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
-    materials = _majority(looks.material_ids.astype(np.int64)[mesh.faces])
+    # The material that most corners of a face have, that of the first where all differ.
+    corners = looks.material_ids.astype(np.int64)[mesh.faces]
+    materials = np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
     return write_obj(
         path.with_suffix(""),
         mesh.vertices,
@@ -300,8 +302,3 @@ def _write_glb(
 
 def _paths(folder: Path, kind: str) -> list[Path]:
     return obj_paths(folder / "mesh") if kind == "obj" else [folder / f"mesh.{kind}"]
-
-
-def _majority(corners: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, " F"]:
-    """The material that most corners of a face have, that of the first where all differ."""
-    return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])

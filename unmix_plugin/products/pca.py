@@ -59,18 +59,13 @@ class _Components:
     """Part of the variance that lies along each."""
 
 
-def _component_values(outputs: dict[str, Tensor], of: _PcaOf) -> Float[Tensor, "N C"]:
-    """What is seen of a view in pixels where something is: spectra, or abundances that sum to 1."""
+def _survey_view(scene: TrainedScene, camera: Cameras, of: _PcaOf) -> Float[Tensor, "N C"]:
+    """What a small render of a view shows where something is: spectra, or abundances that sum to 1."""
+    outputs = scene.render(camera.shrunk(_PIXELS), ("spectral", "abundances", "accumulation"))
     accumulation = outputs["accumulation"]
     seen = accumulation > OCCUPIED_ACCUMULATION
     values = outputs["spectral" if of == "spectra" else "abundances"][seen]
     return (values if of == "spectra" else values / accumulation[seen][:, None]).cpu()
-
-
-def _survey_view(scene: TrainedScene, camera: Cameras, of: _PcaOf) -> Float[Tensor, "N C"]:
-    """What a small render of a view shows, to find components from."""
-    names = ("spectral", "abundances", "accumulation")
-    return _component_values(scene.render(camera.shrunk(_PIXELS), names), of)
 
 
 def _find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Components:

@@ -67,7 +67,12 @@ def _thinned(positions: Float[np.ndarray, "P 3"], count: int) -> Int64[np.ndarra
         edge = (fine + coarse) / 2
         cubes = len(np.unique(_cube_numbers(positions - low, edge)))
         fine, coarse = (fine, edge) if cubes <= count else (edge, coarse)
-    return np.sort(_nearest_to_means(positions, _cube_numbers(positions - low, coarse)))
+    numbers = _cube_numbers(positions - low, coarse)
+    _, group, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(group, weights=column) for column in positions.T], axis=1)
+    off = np.linalg.norm(positions - (sums / counts[:, None])[group], axis=1)
+    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return np.sort(np.lexsort((off, group))[firsts])
 
 
 def _plane_normals(
@@ -77,7 +82,8 @@ def _plane_normals(
 ) -> Float[np.ndarray, "chosen 3"]:
     """Unit normals of the planes through the neighbours of some points."""
     if len(positions) < 3:
-        return _unit(towards[wanted])
+        vectors = towards[wanted]
+        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(min=1e-12)
     from scipy.spatial import KDTree
 
     tree = KDTree(positions)
@@ -99,21 +105,6 @@ def _cube_numbers(offsets: Float[np.ndarray, "P 3"], edge: float) -> Int64[np.nd
     cells = (offsets / edge).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     return (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
-
-
-def _nearest_to_means(
-    positions: Float[np.ndarray, "P 3"], cubes: Int64[np.ndarray, " P"]
-) -> Int64[np.ndarray, " kept"]:
-    _, group, counts = np.unique(cubes, return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(group, weights=column) for column in positions.T], axis=1)
-    off = np.linalg.norm(positions - (sums / counts[:, None])[group], axis=1)
-    order = np.lexsort((off, group))
-    firsts = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return order[firsts]
-
-
-def _unit(vectors: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True).clip(min=1e-12)
 
 
 _LONGEST_COMMENT = 300

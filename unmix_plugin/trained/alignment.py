@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -37,11 +36,7 @@ from unmix_plugin.sensors.views import smooth_terms
 from unmix_plugin.spectral.evidence import is_blown_out
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
 from unmix_plugin.trained.outputs import MaterialView
-
-if TYPE_CHECKING:
-    from unmix_plugin.trained.evaluation import ViewTruth
-    from unmix_plugin.trained.trained_scene import TrainedScene
-
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _NUM_STEPS = 20
 
@@ -120,21 +115,15 @@ def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
         found = _fit(comparison.residuals, start, _FIRST_STEPS, comparison.difference)
         return found, comparison.error(found)
 
-    near = _brought_near(comparison)
+    near = torch.zeros(6)
+    for block, num_moves in _POOLED:
+        pooled = replace(comparison, block=block)
+        near = _fit(pooled.residuals, near, _POOLED_STEPS, pooled.difference, num_moves)
     (stayed, error), apart = fit(torch.zeros(6)), _APART_PX / _DIFFERENCE_PX * comparison.difference
     if float(near.norm()) < apart:
         return stayed
     found, other_error = fit(near)
     return found if other_error < _CLEARLY_BETTER * error else stayed
-
-
-def _brought_near(comparison: _Comparison) -> Float[Tensor, "6"]:
-    """A first step, found on pictures of few pixels."""
-    step = torch.zeros(6)
-    for block, num_moves in _POOLED:
-        pooled = replace(comparison, block=block)
-        step = _fit(pooled.residuals, step, _POOLED_STEPS, pooled.difference, num_moves)
-    return step
 
 
 @dataclass(frozen=True)
@@ -156,7 +145,13 @@ class _Comparison:
         cls, scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
     ) -> _Comparison:
         """In as many pixels as the camera has."""
-        return cls(scene, camera, truth, axes, *_pooled(truth, axes, camera))
+        alpha = truth.opacity.float()[..., None]
+        values = torch.cat([truth.spectra.float() @ axes, alpha], dim=-1) * truth.valid[..., None]
+        both = torch.cat([values, truth.valid[..., None].float()], dim=-1).permute(2, 0, 1)[None]
+        size = (camera.height, camera.width)
+        found = torch.nn.functional.adaptive_avg_pool2d(both, size)[0].flatten(1).T
+        counts = found[:, -1:]
+        return cls(scene, camera, truth, axes, found[:, :-1] / counts.clamp(min=1e-6), counts)
 
     @property
     def difference(self) -> float:
@@ -240,17 +235,6 @@ def _shrunk(camera: Cameras, side: int) -> Cameras:
         height=height,
         key_poses=None if keys is None else replace(keys, heights=keys.heights * scale[1]),
     )
-
-
-def _pooled(
-    truth: ViewTruth, axes: Float[Tensor, "B C"], small: Cameras
-) -> tuple[Float[Tensor, "P D"], Float[Tensor, "P 1"]]:
-    """What was measured in the pixels of a smaller picture, and which share of each counts."""
-    alpha = truth.opacity.float()[..., None]
-    values = torch.cat([truth.spectra.float() @ axes, alpha], dim=-1) * truth.valid[..., None]
-    both = torch.cat([values, truth.valid[..., None].float()], dim=-1).permute(2, 0, 1)[None]
-    found = torch.nn.functional.adaptive_avg_pool2d(both, (small.height, small.width))[0].flatten(1).T
-    return found[:, :-1] / found[:, -1:].clamp(min=1e-6), found[:, -1:]
 
 
 def _shown(

@@ -374,10 +374,9 @@ def _tensor(array: np.ndarray | None) -> Tensor | None:
 
 
 def _means(views: Collection[dict[str, float]]) -> dict[str, float]:
-    return {name: _mean(view[name] for view in views) for name in _VIEW_FIGURES}
-
-
-def _mean(values: Iterable[float]) -> float:
-    """Mean over the views that have the figure; NaN if none does."""
-    known = [value for value in values if not math.isnan(value)]
-    return sum(known) / len(known) if known else math.nan
+    """Each figure's mean over the views that have it; NaN if none does."""
+    means = {}
+    for name in _VIEW_FIGURES:
+        known = [view[name] for view in views if not math.isnan(view[name])]
+        means[name] = sum(known) / len(known) if known else math.nan
+    return means

@@ -1,16 +1,20 @@
 """What a report counts of views, and the sections it makes of them."""
 
+import base64
+import io
 import json
 import math
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests.products.report.page_outline import Outline, assert_self_contained
 from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
 from unmix_plugin.products.report.report import (
     _figure_rows,
+    _png_url,
     _read_metrics,
     _render_page,
     _training_charts,
@@ -196,3 +200,20 @@ def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):
 )
 def test_an_even_choice_has_both_ends(count, expected):
     assert evenly(range(10), count) == expected
+
+
+def decoded(url: str) -> np.ndarray:
+    data = url.removeprefix("data:image/png;base64,")
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        return np.asarray(image)
+
+
+def test_a_picture_holds_its_pixels():
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(decoded(_png_url(pixels)), pixels)
+    np.testing.assert_array_equal(decoded(_png_url(pixels / 255)), pixels)
+
+
+@pytest.mark.parametrize(("size", "expected"), [((10, 1280), (5, 640)), ((2000, 1), (640, 1))])
+def test_a_large_picture_is_shrunk(size, expected):
+    assert decoded(_png_url(np.zeros((*size, 3)))).shape[:2] == expected

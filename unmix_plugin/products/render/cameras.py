@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -67,7 +66,9 @@ def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCame
         ConfigError: an unknown choice, a bad file, an impossible size, or options that contradict each other.
     """
     chosen = _from_source(scene, request)
-    chosen = replace(chosen, views=_only(chosen.views, request.only))
+    if request.only:
+        names = {find_view(chosen.views, one).name for one in request.only}
+        chosen = replace(chosen, views=tuple(view for view in chosen.views if view.name in names))
     if request.frames_per_second is not None:
         frames_per_second = check_frames_per_second(request.frames_per_second, "--fps")
         chosen = replace(chosen, frames_per_second=frames_per_second)
@@ -77,7 +78,13 @@ def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCame
 def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
     source = request.source
     if request.num_frames is not None:
-        _check_frames(source, request.num_frames)
+        if source not in _PATH_CAMERAS:
+            raise ConfigError(
+                f"--frames is for the paths that are made here, {' and '.join(_PATH_CAMERAS)}; "
+                f"--cameras {source} has cameras of its own"
+            )
+        if not 1 <= request.num_frames <= _MOST_FRAMES:
+            raise ConfigError(f"--frames {request.num_frames}: expected 1 to {_MOST_FRAMES}")
     if source in _DATASET_CAMERAS:
         views = views_of(scene.views, "eval" if source == "dataset-eval" else "train")
         return RenderCameras(resized_views(views), False, None)
@@ -87,8 +94,9 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
     if source == "interpolate":
         return _path("interpolate", interpolated(cameras_of(scene.views, "eval"), scene.scene_box, count))
     if not source.endswith(".json") and not Path(source).is_file():
+        hint = did_you_mean(source, _CAMERA_CHOICES, likeness=0.5, form=" ({})")
         raise ConfigError(
-            f"unknown cameras {source!r}{_near(source, _CAMERA_CHOICES)}; known are {', '.join(_CAMERA_CHOICES)}, and "
+            f"unknown cameras {source!r}{hint}; known are {', '.join(_CAMERA_CHOICES)}, and "
             "the path of a camera file (.json)"
         )
     found = read_camera_file(Path(source), scene.frame)
@@ -99,27 +107,6 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
 def _path(name: str, cameras: Cameras) -> RenderCameras:
     views = tuple(RunView(f"{name}_{index:04d}", cameras[index]) for index in range(len(cameras)))
     return RenderCameras(views, True, None)
-
-
-def _check_frames(source: str, num_frames: int) -> None:
-    if source not in _PATH_CAMERAS:
-        raise ConfigError(
-            f"--frames is for the paths that are made here, {' and '.join(_PATH_CAMERAS)}; "
-            f"--cameras {source} has cameras of its own"
-        )
-    if not 1 <= num_frames <= _MOST_FRAMES:
-        raise ConfigError(f"--frames {num_frames}: expected 1 to {_MOST_FRAMES}")
-
-
-def _only(views: Sequence[RunView], wanted: Sequence[str]) -> tuple[RunView, ...]:
-    """The views with these names or numbers, in their own order."""
-    chosen = {find_view(views, one).name for one in wanted}
-    return tuple(view for view in views if not wanted or view.name in chosen)
-
-
-def _near(word: str, known: Sequence[str]) -> str:
-    """The nearest names, as part of a sentence."""
-    return did_you_mean(word, known, likeness=0.5, form=" ({})")
 
 
 def _size(size: tuple[int, int], request: CameraRequest) -> tuple[int, int]:

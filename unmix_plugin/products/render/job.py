@@ -205,7 +205,10 @@ class RenderJob:
         )
         self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
         self._still = [one for one in outputs if one not in self._moving]
-        self._asked = self._asked_of_scene([one.output.name for one in outputs])
+        # What all views share is computed here, from spectra.
+        own = {*survey.scores, *(["pca"] if survey.pca is not None else [])}
+        asked = dict.fromkeys("spectral" if one.output.name in own else one.output.name for one in outputs)
+        self._asked = [name for name in asked if name != "accumulation"]
         self._files, self._view = ExitStack(), ExitStack()
         self._exchange = _FrameExchange(processes, len(self._moving), ())
         self._sinks: list[RowsSink] = []
@@ -301,13 +304,6 @@ class RenderJob:
             )
             for video_index, one in enumerate(self._moving)
         ]
-
-    def _asked_of_scene(self, names: Sequence[str]) -> tuple[str, ...]:
-        """What has to be rendered for `names`: what all views share is computed here, from spectra."""
-        own = {name for name in names if name in self._survey.scores}
-        own |= {"pca"} if self._survey.pca is not None else set()
-        needed = dict.fromkeys([*(name for name in names if name not in own), *(["spectral"] if own else [])])
-        return tuple(name for name in needed if name != "accumulation")
 
     def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
         view = self._scene.look(camera)

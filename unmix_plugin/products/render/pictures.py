@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -179,7 +178,11 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
     figure = Figure(figsize=(_WIDTH, height), facecolor="white")
     top = height - _MARGIN - bar
     if scale is not None:
-        _draw_bar(figure, f"{output.name}: {scale.label}", scale, top, height)
+        box = (_MARGIN / _WIDTH, (top + 0.3) / height, 1 - 2 * _MARGIN / _WIDTH, 0.14 / height)
+        bounds = (scale.low, scale.high)
+        drawn = draw_colour_bar(figure, figure.add_axes(box), scale.colour_map, bounds, "horizontal")
+        drawn.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
+        drawn.ax.set_title(f"{output.name}: {scale.label}", fontsize=_FONT_PT, loc="left", pad=3)
     for index, (name, colour) in enumerate(names):
         row, column = divmod(index, _NAMES_A_ROW)
         left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / _NAMES_A_ROW
@@ -188,11 +191,3 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
         place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
         figure.text(*place, name[:_LONGEST_NAME], fontsize=_FONT_PT, va="bottom")
     return figure_bytes(figure)
-
-
-def _draw_bar(figure: Any, title: str, scale: ColourScale, bottom: float, height: float) -> None:
-    box = (_MARGIN / _WIDTH, (bottom + 0.3) / height, 1 - 2 * _MARGIN / _WIDTH, 0.14 / height)
-    bounds = (scale.low, scale.high)
-    bar = draw_colour_bar(figure, figure.add_axes(box), scale.colour_map, bounds, "horizontal")
-    bar.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
-    bar.ax.set_title(title, fontsize=_FONT_PT, loc="left", pad=3)

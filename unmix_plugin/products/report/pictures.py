@@ -24,7 +24,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import match_endmembers
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, as_numpy, picture
-from unmix_plugin.trained.run_materials import ShownMatch, endmember_colours, shown_matches
+from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 
 SHOWN_VIEWS = 3
 _MAP_COLUMNS = (7, 6, 5)
@@ -206,25 +206,20 @@ def material_cards(
     partners = {} if truth is None else _partners(spectra, truth, wavelengths)
     cards: list[_MaterialCard] = []
     for index, name in enumerate(materials.names):
-        matches = [*_known_lines(known[index], wavelengths), *partners.get(index, ())]
+        matches = [
+            (
+                ChartLine(wavelengths, shown.spectrum, shown.match.name, grey, 1.5, dash),
+                shown.match.angle_rad,
+                shown.match.num_bands,
+            )
+            for shown, (dash, grey) in zip(known[index], _STYLES, strict=False)
+        ]
+        matches += partners.get(index, ())
         own = ChartLine(wavelengths, spectra[index], name, css_colour(colours[index]), 3.0)
         lines = [*(line for line, *_ in matches), own]
         chart = LineChart(lines, "wavelength (nm)", "radiance", from_zero=True, size=(480.0, 240.0))
         cards.append(_MaterialCard(name, colours[index], float(proportions[index]), chart, matches))
     return cards
-
-
-def _known_lines(
-    matches: Sequence[ShownMatch], wavelengths: np.ndarray
-) -> list[tuple[ChartLine, float, int]]:
-    return [
-        (
-            ChartLine(wavelengths, shown.spectrum, shown.match.name, grey, 1.5, dash),
-            shown.match.angle_rad,
-            shown.match.num_bands,
-        )
-        for shown, (dash, grey) in zip(matches, _STYLES, strict=False)
-    ]
 
 
 def _partners(
@@ -298,7 +293,9 @@ class ReportViews:
     def add(self, name: str, view: PredictedView, truth: ViewTruth | None) -> None:
         """Count a view, and make its pictures."""
         self._amounts += as_numpy(view.abundances).sum(axis=(0, 1))
-        shares = self._share_pictures(view) if name in self._with_shares else ()
+        opacity = as_numpy(view.accumulation)
+        maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
+        shares = tuple(_eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
         predicted = _eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
         ids = view.segmentation.numpy()
         if truth is None or self.evaluation is None:
@@ -341,11 +338,6 @@ class ReportViews:
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
         seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
         return _eight_bits(over_neutral(painted, seen.astype(np.float64)))
-
-    def _share_pictures(self, view: PredictedView) -> tuple[_EightBits, ...]:
-        opacity = as_numpy(view.accumulation)
-        maps = np.moveaxis(as_numpy(view.shares), -1, 0)
-        return tuple(_eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
 
 
 def _eight_bits(colours: np.ndarray) -> _EightBits:
