@@ -170,19 +170,12 @@ def require_materials(scene: RenderableScene | None, method_name: str) -> Traine
         ConfigError: it has none.
     """
     if not isinstance(scene, TrainedScene):
-        own = _own_products(method_name)
+        own: list[str] = []
+        with suppress(Exception):  # a third party's module may fail in any way at all
+            make = discover_methods()[0][method_name].products
+            own = [product.name for product in make()] if make is not None else []
         raise ConfigError(
             f"the method {method_name} makes no scene of mixed materials, as unmix-nerf does and this needs"
             + (f"; unmix-export has products of its own for it: {', '.join(own)}" if own else "")
         )
     return scene
-
-
-def _own_products(method_name: str) -> list[str]:
-    """Names of the products that a method brings along."""
-    method = discover_methods()[0].get(method_name)
-    if method is None or method.products is None:
-        return []
-    with suppress(Exception):  # a third party's module may fail in any way at all
-        return [product.name for product in method.products()]
-    return []

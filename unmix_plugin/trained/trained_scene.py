@@ -30,66 +30,6 @@ from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView
 
 
-@torch.no_grad()
-def _probe_pixel(scene: TrainedScene, camera: Cameras, pixel: tuple[int, int]) -> Probe:
-    """What is seen in a pixel (column, row), as a render of the whole view has it: radiance on black."""
-    one = one_pixel(camera, *pixel).to(scene.device)
-    found, materials = scene.look(one).coefficients.flatten(), scene.materials
-    opacity = float(found.accumulation)
-    diffuse, specular = materials.diffuse(found), materials.specular(found)
-    place = None
-    if opacity > 0:
-        rays = one.image_rays(0)
-        place = _row(rays.origins + found.ray_distance[:, None] * rays.directions)
-    return Probe(
-        {
-            "predicted": _row(diffuse + specular),
-            "diffuse": _row(diffuse),
-            "specular": _row(specular),
-            "abundances": _row(found.abundances) / max(opacity, 1e-6),
-            "scaled_abundances": _row(found.scaled_abundances),
-        },
-        opacity,
-        place,
-        None if place is None else scene.frame.to_world(place[None])[0],
-    )
-
-
-@torch.no_grad()
-def _probe_point(scene: TrainedScene, point: tuple[float, float, float]) -> Probe:
-    """What a point of the world is made of: its spectrum, lit squarely where the light moves with the camera, without
-    the view-dependent part.
-    """
-    world = np.array(point, dtype=np.float64)
-    place = scene.frame.to_model(world)
-    inside = torch.from_numpy(place).float()[None].to(scene.device)
-    if not bool(scene.scene_box.contains(inside).all()):
-        corners = np.stack(np.meshgrid(*scene.scene_box.aabb.T.cpu().double().numpy()), -1).reshape(-1, 3)
-        world_corners = scene.frame.to_world(corners)
-        least, greatest = world_corners.min(axis=0), world_corners.max(axis=0)
-        raise ConfigError(
-            f"the point {_text(world)} is outside the scene box, which lies between {_text(least)} and "
-            f"{_text(greatest)} of the world"
-        )
-    density, features = scene.field.get_density(inside)
-    none = torch.zeros(1, dtype=torch.int64, device=scene.device)
-    here = RayBundle(inside, torch.zeros_like(inside), none)
-    normals = scene.renderer.normals(scene.field, here, inside.new_zeros(1))
-    outputs = scene.field.get_outputs(inside, -normals, features)
-    is_there = scene.renderer.is_occupied(inside).to(density)
-    predicted = is_there[:, None] * (outputs["scaled_abundances"] @ scene.materials.endmembers)
-    return Probe(
-        {
-            "predicted": _row(predicted),
-            "abundances": _row(is_there[:, None] * outputs["abundances"]),
-            "scaled_abundances": _row(is_there[:, None] * outputs["scaled_abundances"]),
-        },
-        float(is_there * -torch.expm1(-density * scene.pixel_size)),
-        place,
-        world,
-    )
-
-
 def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
     """A view of one pixel of an image: what is rendered of it is that pixel.
 
@@ -191,21 +131,69 @@ class TrainedScene:
         with torch.no_grad():
             return {name: output.compute(view) for name, output in outputs.items()}
 
+    @torch.no_grad()
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
         """What is seen in a pixel: the same numbers as in a render of the whole view.
 
         Raises:
             ConfigError: the pixel is outside the image.
         """
-        return _probe_pixel(self, camera, (column, row))
+        one = one_pixel(camera, column, row).to(self.device)
+        found, materials = self.look(one).coefficients.flatten(), self.materials
+        opacity = float(found.accumulation)
+        diffuse, specular = materials.diffuse(found), materials.specular(found)
+        place = None
+        if opacity > 0:
+            rays = one.image_rays(0)
+            place = _row(rays.origins + found.ray_distance[:, None] * rays.directions)
+        return Probe(
+            {
+                "predicted": _row(diffuse + specular),
+                "diffuse": _row(diffuse),
+                "specular": _row(specular),
+                "abundances": _row(found.abundances) / max(opacity, 1e-6),
+                "scaled_abundances": _row(found.scaled_abundances),
+            },
+            opacity,
+            place,
+            None if place is None else self.frame.to_world(place[None])[0],
+        )
 
+    @torch.no_grad()
     def probe_point(self, x: float, y: float, z: float) -> Probe:
         """What a point of the world is made of, lit squarely, without the view-dependent part.
 
         Raises:
             ConfigError: the point is outside the scene box.
         """
-        return _probe_point(self, (x, y, z))
+        world = np.array([x, y, z], dtype=np.float64)
+        place = self.frame.to_model(world)
+        inside = torch.from_numpy(place).float()[None].to(self.device)
+        if not bool(self.scene_box.contains(inside).all()):
+            corners = np.stack(np.meshgrid(*self.scene_box.aabb.T.cpu().double().numpy()), -1).reshape(-1, 3)
+            world_corners = self.frame.to_world(corners)
+            least, greatest = world_corners.min(axis=0), world_corners.max(axis=0)
+            raise ConfigError(
+                f"the point {_text(world)} is outside the scene box, which lies between {_text(least)} and "
+                f"{_text(greatest)} of the world"
+            )
+        density, features = self.field.get_density(inside)
+        none = torch.zeros(1, dtype=torch.int64, device=self.device)
+        here = RayBundle(inside, torch.zeros_like(inside), none)
+        normals = self.renderer.normals(self.field, here, inside.new_zeros(1))
+        outputs = self.field.get_outputs(inside, -normals, features)
+        is_there = self.renderer.is_occupied(inside).to(density)
+        predicted = is_there[:, None] * (outputs["scaled_abundances"] @ self.materials.endmembers)
+        return Probe(
+            {
+                "predicted": _row(predicted),
+                "abundances": _row(is_there[:, None] * outputs["abundances"]),
+                "scaled_abundances": _row(is_there[:, None] * outputs["scaled_abundances"]),
+            },
+            float(is_there * -torch.expm1(-density * self.pixel_size)),
+            place,
+            world,
+        )
 
     def to(self, device: torch.device | str) -> TrainedScene:
         """The same scene on another device; `self` stays where it is."""
