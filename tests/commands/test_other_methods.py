@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.commands.running import run
-from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
-from tests.engine.stopped_runs import finished
+from tests.engine.conftest import registered, short_config, trained_once  # noqa: F401 (fixtures)
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -20,10 +19,9 @@ from unmix_plugin.trained.protocol import RenderableScene
 
 
 @pytest.fixture
-def ball_run(short_config: TrainerConfig) -> Path:  # noqa: F811
+def ball_run(short_config: TrainerConfig, trained_once: Path) -> Path:  # noqa: F811
     """A run of the plain RGB method."""
-    trainer = finished(short_config)
-    return trainer.run.path
+    return Path(shutil.copytree(trained_once, short_config.output_dir / "run"))
 
 
 def test_its_run_opens_as_a_scene_with_the_outputs_that_it_names(ball_run):
@@ -53,7 +51,6 @@ def test_it_is_rendered_and_evaluated_from_the_command_line(ball_run, tmp_path):
     assert figures["psnr"] > 3
     assert [image["name"] for image in figures["per_image"]] == ["eval_000", "eval_001"]
     assert (ball_run / "eval" / "rgb" / "eval_001.png").is_file()
-    shutil.rmtree(ball_run / "eval")
 
 
 def test_what_needs_endmembers_is_refused_in_one_sentence(ball_run, tmp_path):

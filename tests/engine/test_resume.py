@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.engine.stopped_runs import call_after_step, newest, quiet_trainer, stop_at
+from tests.engine.stopped_runs import call_after_step, finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
@@ -37,8 +37,7 @@ def test_stopped_and_resumed_equals_straight_to_the_bit(
     short_config: TrainerConfig, number: int, average_decay: float | None
 ):
     config = replace(short_config, average_decay=average_decay)
-    straight = quiet_trainer(config)
-    straight.train()
+    straight = finished(config)
     stopped = stop_at(config, 6, number)
     assert stopped.step == 6
     resumed = quiet_trainer(load_config(stopped.run))
@@ -88,17 +87,14 @@ def train_lines_until_cut(path: Path) -> list[dict]:
 
 
 def test_a_longer_limit_lets_a_finished_run_go_on(short_config: TrainerConfig):
-    first = quiet_trainer(short_config)
-    first.train()
-    longer = quiet_trainer(replace(load_config(first.run.path), max_num_iterations=15))
-    longer.train()
+    first = finished(short_config)
+    finished(replace(load_config(first.run.path), max_num_iterations=15))
     assert newest(first.run.path).step == 15
     assert load_config(first.run.path).max_num_iterations == 15
 
 
 def test_a_finished_run_resumed_is_left_as_it_is(short_config: TrainerConfig):
-    first = quiet_trainer(short_config)
-    first.train()
+    first = finished(short_config)
     before = newest(first.run.path)
     record = quiet_trainer(load_config(first.run.path)).train()
     assert record.steps == 12

@@ -207,11 +207,7 @@ def _prepared(config: TrainerConfig, console: Console, processes: Processes) -> 
 
 
 def _run(trainer: Trainer, console: Console) -> None:
-    """Train, and write what the model has found.
-
-    Raises:
-        SystemExit: 130, after a stop on request.
-    """
+    """Train, and write what the model has found; exits with 130 after a stop on request."""
     from unmix_plugin.commands.reporting import say, spectral_scene
     from unmix_plugin.engine.training.training_control import Interrupted
 
@@ -236,11 +232,7 @@ def _run(trainer: Trainer, console: Console) -> None:
 
 @contextmanager
 def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -> Iterator[None]:
-    """Context in which the training can be watched in the browser, if it is to be.
-
-    Raises:
-        ConfigError: nothing can listen at the address.
-    """
+    """Context in which the training can be watched in the browser, if it is to be."""
     if not viewing.enabled:
         yield
         return
@@ -297,11 +289,7 @@ def _read_remarks(metrics_path: Path) -> list[str]:
 
 
 def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences for whoever trains.
-
-    Args:
-        lines: Of training batches in order, each with `step` and `loss` (None where it was not finite).
-    """
+    """Sentences on lines of training batches in order, each with `step` and `loss` (None: not finite)."""
     known = [line for line in lines if line.get("loss") is not None]
     if len(known) < _FEWEST_LINES:
         return []

@@ -272,10 +272,11 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
     """Run a command in several processes and end this one, unless it is one of them or one is enough.
 
     Args:
-        module, argv: As `_run_processes` takes them.
+        module, argv: Run as `python -m module argv`; only the first process's output is shown.
         count: Processes asked for.
     Raises:
         ConfigError: fewer than one.
+        RunError: a process was killed; by then all have ended.
         SystemExit: the processes have ended; their exit code.
     """
     require_in_range("num-devices", count, 1, MOST_PROCESSES)
@@ -284,13 +285,7 @@ def start_together(module: str, argv: Sequence[str], count: int) -> None:
 
 
 def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
-    """Run `python -m module argv` in `count` processes that find each other; only the first one's output is shown.
-
-    Returns:
-        Exit code of the first process, which has said what went wrong if anything did.
-    Raises:
-        RunError: a process was killed; by then all have ended.
-    """
+    """Run `python -m module argv` in processes that find each other; the exit code of the first, which alone speaks."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])

@@ -138,10 +138,7 @@ def _path_around(
     along: Float64[np.ndarray, "N"],
     at: Float64[np.ndarray, "F"],
 ) -> Float64[np.ndarray, "F 3 4"] | None:
-    """Poses between poses: direction and distance from a centre, what is looked at and what is up each change smoothly.
-
-    None where that fails, since the path meets the centre or what it looks at.
-    """
+    """Poses that change smoothly about a centre; None where the path meets it, or what it looks at."""
     from scipy.interpolate import CubicSpline
 
     away, backs = poses[:, :, 3] - centre, poses[:, :, 2]

@@ -280,7 +280,9 @@ class Trainer:
         keep_freed_memory()
         with processes.together():
             resumed = None if config.load_run is None else open_run_folder(config.load_run)
-            self.config, self.steps = prepare_steps(_with_absolute_data(config), processes)
+            if config.data is not None and config.data.exists():  # found from any working directory then
+                config = replace(config, data=config.data.resolve())
+            self.config, self.steps = prepare_steps(config, processes)
         self.pipeline, self.optimizer = self.steps.pipeline, self.steps.optimizer
         self.callbacks, self.guard = self.steps.callbacks, self.steps.guard
         self.limits = Limits(config.max_num_iterations, config.max_seconds)
@@ -297,7 +299,11 @@ class Trainer:
             if resumed is not None:
                 self._resume()
         self.writer = MetricsWriter(self.run, self.step)
-        self._log_start("started" if resumed is None else "resumed")
+        how = "started" if resumed is None else "resumed"
+        together = f", {processes.count} processes" if processes.count > 1 else ""
+        self.log.write(f"{how} on {self.pipeline.model.device}, torch {torch.__version__}{together}")
+        for line in self.pipeline.reasons.splitlines():
+            self.log.write(line)
 
     @property
     def progress(self) -> float:
@@ -407,10 +413,23 @@ class Trainer:
         if display.is_due or self.progress >= 1.0:
             display.show(self._status(loss, metrics))
         if self._is_time_for(self.config.steps_per_log):
-            self._write_metrics(loss, metrics)
+            numbers = {name: float(value) for name, value in metrics.items()}
+            rates = {f"lr/{name}": rate for name, rate in self.steps.learning_rates.items()}
+            speed = {
+                "rays_per_second": self.record.train_rays_per_second,
+                "skipped_steps": float(self.guard.skipped),
+            }
+            written = {**numbers, "loss": loss, **rates, **speed}
+            self.writer.write(self.step, self.clock.seconds, "train", written)
         if self._is_time_for(self.config.steps_per_save) or self.control.take_save_request():
             self.save()
-        self._evaluate(display)
+        if self._is_time_for(self.config.steps_per_eval_all_images):
+            with nullcontext() if self.average is None else self.average.swapped_in():
+                measured, images = self.pipeline.get_average_eval_image_metrics_and_images()
+            self.writer.write(self.step, self.clock.seconds, "eval_all", measured)
+            self.writer.write_images(self.step, images)
+            found = ", ".join(f"{name} {value:.4g}" for name, value in measured.items())
+            display.message(f"step {self.step}: evaluation views: {found}")
 
     @property
     def _is_at_limit(self) -> bool:
@@ -431,25 +450,6 @@ class Trainer:
             self.log.write(f"step {step} skipped: non-finite loss ({result.loss:g}) or gradient")
         return result
 
-    def _evaluate(self, display: ProgressDisplay) -> None:
-        if not self._is_time_for(self.config.steps_per_eval_all_images):
-            return
-        with nullcontext() if self.average is None else self.average.swapped_in():
-            metrics, images = self.pipeline.get_average_eval_image_metrics_and_images()
-        self.writer.write(self.step, self.clock.seconds, "eval_all", metrics)
-        self.writer.write_images(self.step, images)
-        found = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        display.message(f"step {self.step}: evaluation views: {found}")
-
-    def _write_metrics(self, loss: float, values: Mapping[str, Tensor]) -> None:
-        rates = {f"lr/{name}": rate for name, rate in self.steps.learning_rates.items()}
-        numbers = {name: float(value) for name, value in values.items()}
-        speed = {
-            "rays_per_second": self.record.train_rays_per_second,
-            "skipped_steps": float(self.guard.skipped),
-        }
-        self.writer.write(self.step, self.clock.seconds, "train", {**numbers, "loss": loss, **rates, **speed})
-
     def _status(self, loss: float, metrics: Mapping[str, Tensor]) -> TrainingStatus:
         psnr = float(metrics["psnr"]) if "psnr" in metrics else None
         speed = self.record.train_rays_per_second
@@ -457,13 +457,6 @@ class Trainer:
 
     def _is_time_for(self, interval: int) -> bool:
         return interval > 0 and self.step % interval == 0
-
-    def _log_start(self, how: str) -> None:
-        count = self.processes.count
-        together = f", {count} processes" if count > 1 else ""
-        self.log.write(f"{how} on {self.pipeline.model.device}, torch {torch.__version__}{together}")
-        for line in self.pipeline.reasons.splitlines():
-            self.log.write(line)
 
     def _new_average(self) -> ParameterAverage | None:
         if self.config.average_decay is None:
@@ -497,9 +490,3 @@ class Trainer:
         write_config(self.run, self.config)
         for reason in checkpoint.damaged:
             self.log.write(f"passed over a damaged checkpoint: {reason}")
-
-
-def _with_absolute_data(config: TrainerConfig) -> TrainerConfig:
-    """A run must find its scene from any working directory; a word that names no folder stays as it is."""
-    data: Path | None = config.data
-    return replace(config, data=data.resolve()) if data is not None and data.exists() else config
