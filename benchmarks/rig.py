@@ -96,7 +96,7 @@ def enlarged(data: Path) -> np.ndarray:
     """PSNR of each band in dB of the spectral camera's pictures of the evaluation views, enlarged."""
     from scipy.ndimage import zoom
 
-    from unmix_plugin.scenes import load_scene
+    from unmix_plugin.scenes.reading.loader import load_scene
 
     scene = load_scene(data)
     found = []

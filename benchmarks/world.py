@@ -94,10 +94,10 @@ def measure(run: str, steps: int, place: Path) -> dict[str, float]:
 def look(run: Path, name: str, place: Path) -> tuple[float, float]:
     """PSNR over the pixels of the objects, and fog: means over the evaluation views."""
     from unmix_plugin import open_run
-    from unmix_plugin.scenes import load_scene
     from unmix_plugin.scenes.demo.scene import PLACES
     from unmix_plugin.scenes.demo.shading import THINGS
     from unmix_plugin.scenes.demo.shapes import first_hits
+    from unmix_plugin.scenes.reading.loader import load_scene
     from unmix_plugin.trained.evaluation import render_view
 
     scene: Any = open_run(run)

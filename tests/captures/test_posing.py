@@ -18,7 +18,7 @@ from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _complete_rigs, _place_poses
 from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.writing.scene_files import _write_points
-from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 
 FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 

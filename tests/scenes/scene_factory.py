@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 WIDTH, HEIGHT = 20, 16
 WAVELENGTHS = (450.0, 520.0, 600.0, 680.0)

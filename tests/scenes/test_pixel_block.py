@@ -6,9 +6,11 @@ import torch
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene, pixel_block, pixel_table
+from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.pixel_block import PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable, available_bytes
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 CPU = torch.device("cpu")
 

@@ -6,9 +6,10 @@ import torch
 
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.scenes import load_scene, pixel_table
+from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_block import Projection, _ProjectedPixels
 from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.subspace import find_subspace
 

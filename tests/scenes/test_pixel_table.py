@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from tests.scenes.rig_factory import make_rig
-from unmix_plugin.scenes import SceneOptions, load_scene, pixel_table
+from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 CPU = torch.device("cpu")
 

@@ -14,8 +14,8 @@ from tests.method_factory import BOX, CAMERA, CONFIG, make_model, scene_of
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import RunError, SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene
-from unmix_plugin.settings import PoseConfig
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import PoseConfig, SceneOptions
 from unmix_plugin.trained.open_run import find_scene
 from unmix_plugin.trained.run_views import views_of
 

@@ -19,19 +19,20 @@ from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_pos
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import SceneBox
-from unmix_plugin.scenes import carve, load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
     _foreground_mask,
     _needed_witnesses,
+    carve,
     carve_box,
     foreground_rays,
     mask_warning,
     share_explained,
     share_through,
 )
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
 
 

@@ -16,9 +16,9 @@ from tests.scenes.geometry.ground_views import (
     ground_views,
     strip_cameras,
 )
-from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+from unmix_plugin.scenes.reading.loader import load_scene
 
 
 def read_from(views):

@@ -10,11 +10,11 @@ from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
-from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import _WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
 from unmix_plugin.scenes.demo.shapes import first_hits
+from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.surface_evidence import (
     SurfaceEvidence,
     _seen_through,
@@ -22,6 +22,8 @@ from unmix_plugin.scenes.geometry.surface_evidence import (
     _SweptDepths,
 )
 from unmix_plugin.scenes.pixel_table import PixelTable
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 CPU = torch.device("cpu")

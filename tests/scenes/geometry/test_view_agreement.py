@@ -13,13 +13,13 @@ import torch
 from tests.scenes.scene_factory import look_at, make_scene
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry.view_agreement import (
     check_scene_poses,
     compare_conventions,
     parallax_warning,
 )
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import HyperspectralDataManagerConfig
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -11,12 +11,13 @@ from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, carve, load_scene
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import _ROOM, _TABLE, _WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.geometry.carving import _carve_world
+from unmix_plugin.scenes.geometry.carving import _carve_world, carve
 from unmix_plugin.scenes.geometry.view_agreement import _WorldEvidence
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 

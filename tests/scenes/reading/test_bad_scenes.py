@@ -9,9 +9,10 @@ from PIL import Image
 
 from tests.scenes.scene_factory import HEIGHT, WIDTH, SceneFolder, fault_of, make_scene, set_frame
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.reading.faults import MAX_LISTED, Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 
 @pytest.fixture

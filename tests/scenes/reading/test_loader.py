@@ -9,8 +9,10 @@ import torch
 from PIL import Image
 
 from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene
-from unmix_plugin.scenes import Normalisation, SceneOptions, load_scene
+from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading import loader
+from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 
 
 def test_every_part_of_a_scene_is_what_was_written(tmp_path):

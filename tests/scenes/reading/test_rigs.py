@@ -7,7 +7,7 @@ import pytest
 
 from tests.scenes.rig_factory import RESPONSES, halve, make_rig
 from tests.scenes.scene_factory import fault_of, make_scene, set_frame
-from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
 from unmix_plugin.spectral.sensor import SceneSensor
 

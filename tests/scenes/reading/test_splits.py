@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 
 from tests.scenes.scene_factory import SceneFolder, make_scene
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import SceneOptions, load_scene
 from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
+from unmix_plugin.settings import SceneOptions
 
 
 def entry_of(names: list[str], **lists: list[str]) -> SceneEntry:

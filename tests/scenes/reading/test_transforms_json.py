@@ -7,7 +7,7 @@ import pytest
 
 from tests.scenes.scene_factory import SceneFolder, fault_of, make_scene, set_frame
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from tests.method_factory import make_model, make_scene, scene_of
 from tests.viewer.view_factory import ring
 from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Rename, Retint, Scale, Swap, sample_seen
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes import load_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.outputs import MaterialView

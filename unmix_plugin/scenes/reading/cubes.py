@@ -260,7 +260,7 @@ def _propose_scale(greatest: float, is_integer: bool) -> float:
 
     >>> [_propose_scale(greatest, True) for greatest in (243.0, 4000.0, 9100.0, 12000.0, 40000.0)]
     [255.0, 4095.0, 10000.0, 16383.0, 65535.0]
-    >>> _propose_scale(87.0, False), propose_scale(3.14, False)
+    >>> _propose_scale(87.0, False), _propose_scale(3.14, False)
     (100.0, 3.2)
     """
     bits = sorted([float(2**bits - 1) for bits in _SENSOR_BITS] + [_REFLECTANCE_SCALE])
@@ -274,7 +274,7 @@ def _propose_scale(greatest: float, is_integer: bool) -> float:
 def _describe_scale(scale: float) -> str:
     """What a scale stands for, for messages; empty for one that nothing is known of.
 
-    >>> _describe_scale(4095.0), describe_scale(3.2)
+    >>> _describe_scale(4095.0), _describe_scale(3.2)
     (' (12 bits; reflectances times 10000 need 10000)', '')
     """
     bits = {float(2**bits - 1): bits for bits in _SENSOR_BITS}.get(scale)
