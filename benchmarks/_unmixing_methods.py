@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from unmix_plugin.settings import LossConfig
+from unmix_plugin.losses.abundance_guide import MIXING_PENALTY
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances, sunsal
 from unmix_plugin.spectral.unmixing.endmembers import (
@@ -87,7 +87,7 @@ def _scaled_fcls(pixels: Tensor, endmembers: Tensor) -> Tensor:
 
 def _by_few(training: Tensor, endmembers: Tensor) -> Explain:
     """A pixel is a mixture of few endmembers, as bright as fits best; how few, the training pixels say."""
-    penalty = mixing_penalty(training, endmembers, LossConfig().mixing_penalty)
+    penalty = mixing_penalty(training, endmembers, MIXING_PENALTY)
 
     def explain(pixels: Tensor, spectra: Tensor) -> Tensor:
         shares = sparse_abundances(pixels, spectra, penalty)

@@ -26,7 +26,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "alpha as law": ("--pipeline.datamanager.trust-alpha",),
     "fixed light": ("--pipeline.model.light", "fixed"),
     "plain errors": (
-        *("--pipeline.model.losses.exposure", "1", "--pipeline.model.losses.outlier", "1000"),
+        *("--pipeline.model.losses.exposure", "1"),
         *("--pipeline.model.losses.relative", "0"),
     ),
 }

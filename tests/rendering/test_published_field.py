@@ -102,7 +102,9 @@ def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_choose
     batch = {"spectra": torch.rand(8, NUM_BANDS), "alpha": torch.ones(8), "pixels": torch.arange(8)}
     _, losses, _ = model.get_train_loss_dict(make_rays(8), batch)
     assert set(losses) == {"spectral", "rgb"}
-    gradients = torch.autograd.grad(sum(losses.values()), [*model.field.parameters()], allow_unused=True)
+    gradients = torch.autograd.grad(
+        torch.stack([*losses.values()]).sum(), [*model.field.parameters()], allow_unused=True
+    )
     assert all(x is not None and bool(x.isfinite().all()) for x in gradients)
     scene = scene_of(model)
     view = scene.look(scene.views[0].camera)

@@ -417,6 +417,7 @@ def test_all_that_another_method_names_is_shown_by_its_kind_as_its_scene_renders
         assert all(picture.std() > 4 for picture in pictures)
         assert len(np.unique(pictures[1].reshape(-1, 3), axis=0)) == 2
         (view,) = (session.view for session in viewer._sessions.values())
+        assert view.frame is not None
         assert (view.frame.camera.width, view.frame.camera.height) == (32, 24)
         torch.testing.assert_close(view.frame["direction"], scene.look(view.frame.camera)["direction"])
         page.click(0.5, 0.5)

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 import urllib.request
+from typing import Any
 
 import msgspec
 import pytest
@@ -106,7 +107,7 @@ def test_the_page_has_the_title_of_the_viewer(viewer):
     assert "prefers-color-scheme: dark" in page
 
 
-NO_CAMERAS = (
+NO_CAMERAS: tuple[dict[str, Any], ...] = (
     {"wxyz": (math.nan, 0.0, 0.0, 1.0)},
     {"position": (math.inf, 0.0, 0.0)},
     {"fov": -math.inf},

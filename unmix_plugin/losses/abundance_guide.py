@@ -37,7 +37,7 @@ from unmix_plugin.spectral.unmixing.mixture_guide import (
 
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of margins is followed."""
-_MIXING_PENALTY = 2.0
+MIXING_PENALTY = 2.0
 """By how much a further material must improve the fit of a spectrum, in multiples of the mean angle that mixtures of
 two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""
 
@@ -66,7 +66,7 @@ class AbundanceGuide(nn.Module):
     ) -> None:
         """Unmix with these endmembers, `seen` as the pixels are, from now on."""
         self.endmembers.copy_(endmembers)
-        self.penalty.fill_(mixing_penalty(pixels, seen, _MIXING_PENALTY))
+        self.penalty.fill_(mixing_penalty(pixels, seen, MIXING_PENALTY))
 
     def error(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]

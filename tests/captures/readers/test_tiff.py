@@ -36,9 +36,8 @@ STORAGE = {
 
 def written(folder: Path, image: np.ndarray, **options: Any) -> SpectralFile:
     """An image as tifffile writes it, opened; bands beside each other in each pixel unless options say otherwise."""
-    tifffile.imwrite(
-        folder / "a.tif", image, **{"photometric": "minisblack", "planarconfig": "contig"} | options
-    )
+    given: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "contig"} | options
+    tifffile.imwrite(folder / "a.tif", image, **given)
     return open_spectral_file(folder / "a.tif")
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
 
-from unmix_plugin.engine import Common, Model, ModelConfig, Target, config_from_json, short
+from unmix_plugin.engine import Common, ModelConfig, Target, config_from_json, short
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
@@ -102,17 +102,11 @@ class ObjectRecord:
         return record
 
 
-def _model() -> type[Model]:
-    from unmix_plugin.neumatex.fit.model import NeumatexModel
-
-    return NeumatexModel
-
-
 @dataclass(frozen=True)
 class NeumatexModelConfig(ModelConfig):
     """What is fitted, and how it is rendered meanwhile."""
 
-    _target: Target = field(default_factory=_model)
+    _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
     eval_num_rays_per_chunk: int = 4096
     """Pixels rendered at once for a whole image; fewer take less memory."""
     material: Annotated[MaterialName, Common] = "neural"

@@ -23,7 +23,6 @@ from torch.nn.functional import normalize
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.fit.settings import MaterialName
 from unmix_plugin.neumatex.prior.observations import PosedViews
 from unmix_plugin.neumatex.tracing.families import (
     NUM_GLOSS,
@@ -45,7 +44,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.model import NeumatexModel
-    from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
+    from unmix_plugin.neumatex.fit.settings import MaterialName, NeumatexModelConfig
 
 _PLAIN_GLOSS = (0.5, 0.2)
 """Roughness and specular level of a common dielectric, half rough."""
