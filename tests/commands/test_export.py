@@ -24,7 +24,7 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
-from unmix_plugin.scenes import load_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run, open_run
