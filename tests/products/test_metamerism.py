@@ -2,6 +2,7 @@
 
 import csv
 import io
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ SHORT = SpectraTable(Bands.of([500, 600]), ("own/short",), np.array([[0.4, 0.4]]
 MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
 
 
-def pairs_of(surfaces: str) -> list[set[str]]:
+def pairs_of(surfaces: Literal["run", "library", "all"]) -> list[set[str]]:
     found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, surfaces, *BOTH[1:])
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 

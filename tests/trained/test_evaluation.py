@@ -219,6 +219,7 @@ def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(demo):
     lit = scene_truth(demo).endmembers
     flat = scene_truth(replace(demo, illuminant=None)).endmembers
     assert lit is not None
+    assert flat is not None
     torch.testing.assert_close(lit, flat * torch.from_numpy(demo.illuminant), rtol=1e-6, atol=0)
     assert not torch.allclose(lit, flat, rtol=1e-2)
 
