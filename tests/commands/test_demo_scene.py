@@ -4,68 +4,65 @@ import json
 
 import pytest
 
-from unmix_plugin.commands import demo_scene
+from tests.commands.running import run
+from unmix_plugin.commands.demo_scene import write_demo_scene
 
 SMALL = ["--size", "16", "--bands", "3", "--views", "4"]
 
 
-def run(monkeypatch, *words):
-    """Run the command as the console script does; its exit code."""
-    monkeypatch.setattr("sys.argv", ["unmix-demo-scene", *map(str, words)])
-    with pytest.raises(SystemExit) as stop:
-        demo_scene.main()
-    return stop.value.code
-
-
-def test_it_writes_a_scene_of_the_wanted_size_and_names_what_it_wrote(monkeypatch, capsys, tmp_path):
-    assert run(monkeypatch, tmp_path / "scene", *SMALL) == 0
+def test_it_writes_a_scene_of_the_wanted_size_and_names_what_it_wrote(tmp_path):
+    ended = run(write_demo_scene, tmp_path / "scene", *SMALL)
+    assert ended.status == 0
     transforms = json.loads((tmp_path / "scene" / "transforms.json").read_text())
     assert (transforms["w"], len(transforms["wavelengths"]), len(transforms["frames"])) == (16, 3, 4)
-    printed = capsys.readouterr().out
-    assert "4 views (3 to train on, 1 for evaluation) of 16 x 16 pixels and 3 bands" in printed
+    assert "4 views (3 to train on, 1 for evaluation) of 16 x 16 pixels and 3 bands" in ended.out
     for path in (tmp_path / "scene").iterdir():
-        assert str(path) in printed
+        assert str(path) in ended.out
 
 
-def test_a_folder_with_something_in_it_needs_overwrite(monkeypatch, capsys, tmp_path):
+def test_a_folder_with_something_in_it_needs_overwrite(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    assert run(monkeypatch, tmp_path, *SMALL) == 2
-    assert "--overwrite" in capsys.readouterr().err
+    ended = run(write_demo_scene, tmp_path, *SMALL)
+    assert ended.status == 2
+    assert "--overwrite" in ended.err
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    assert run(monkeypatch, tmp_path, *SMALL, "--overwrite") == 0
+    assert run(write_demo_scene, tmp_path, *SMALL, "--overwrite").status == 0
     assert (tmp_path / "transforms.json").exists()
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize("words", [["--size", "5"], ["--bands", "0"], ["--views", "1"]])
-def test_a_number_out_of_bounds_exits_2_with_the_bounds(monkeypatch, capsys, tmp_path, words):
-    assert run(monkeypatch, tmp_path / "scene", *words) == 2
-    shown = capsys.readouterr().err
-    assert shown.startswith(f"error: {words[0]} of a demo scene must be")
-    assert shown.rstrip().endswith(f"found {words[1]}")
+def test_a_number_out_of_bounds_exits_2_with_the_bounds(tmp_path, words):
+    ended = run(write_demo_scene, tmp_path / "scene", *words)
+    assert ended.status == 2
+    assert ended.err.startswith(f"error: {words[0]} of a demo scene must be")
+    assert ended.err.rstrip().endswith(f"found {words[1]}")
     assert not (tmp_path / "scene").exists()
 
 
-def test_the_light_is_chosen_by_name(monkeypatch, capsys, tmp_path):
-    assert run(monkeypatch, tmp_path / "scene", *SMALL, "--illuminant", "a") == 0
+def test_the_light_is_chosen_by_name(tmp_path):
+    assert run(write_demo_scene, tmp_path / "scene", *SMALL, "--illuminant", "a").status == 0
     powers = (tmp_path / "scene" / "illuminant.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in powers] == ["wavelength", "400", "550", "700"]
     assert powers[-1] == "700,1"
-    assert run(monkeypatch, tmp_path / "other", *SMALL, "--illuminant", "candle") == 2
-    assert "there is no light 'candle'" in capsys.readouterr().err
+    ended = run(write_demo_scene, tmp_path / "other", *SMALL, "--illuminant", "candle")
+    assert ended.status == 2
+    assert "there is no light 'candle'" in ended.err
     assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize("words", [[], ["--size", "large", "scene"]])
-def test_words_that_do_not_parse_exit_2(monkeypatch, capsys, words):
-    assert run(monkeypatch, *words) == 2
-    assert capsys.readouterr().err
+def test_words_that_do_not_parse_exit_2(words):
+    ended = run(write_demo_scene, *words)
+    assert ended.status == 2
+    assert ended.err
 
 
-def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(monkeypatch, capsys, tmp_path):
+def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp_path):
     words = ["--raw", tmp_path / "capture", "--size", "16", "--bands", "10", "--views", "4"]
-    assert run(monkeypatch, *words) == 0
-    printed = capsys.readouterr().out
+    ended = run(write_demo_scene, *words)
+    assert ended.status == 0
+    printed = ended.out
     assert "4 raw views of 16 x 16 pixels and 10 bands, 3 of them bad" in printed
     shown = ("view_000.hdr", "white.hdr", "dark.hdr", "poses-true.json", "truth")
     assert all((tmp_path / "capture" / name).exists() for name in shown)

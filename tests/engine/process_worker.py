@@ -21,9 +21,9 @@ from unmix_plugin.engine.runs import load_run
 from unmix_plugin.engine.training.trainer import (
     Trainer,
     TrainingSteps,
+    _prepare_steps,
     follow_training,
     joined_training,
-    prepare_steps,
 )
 
 STEPS = 12
@@ -58,7 +58,7 @@ def train(folder: Path, config: Any) -> None:
 def gradients(folder: Path, config: Any) -> None:
     """Average the gradients of half a batch in each process; each keeps what it has then."""
     with joined_training(config) as processes:
-        _, steps = prepare_steps(config, processes)
+        _, steps = _prepare_steps(config, processes)
         steps.begin(0)
         rays, batch = fixed_batch(steps.pipeline)
         half = slice(processes.rank, None, processes.count)

@@ -12,12 +12,9 @@ from unmix_plugin.engine.machine import resolve_device, seed_everything, step_ge
 from unmix_plugin.errors import ConfigError
 
 
-def test_auto_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
+def test_auto_is_cuda_where_there_is_one_and_the_cpu_elsewhere(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert resolve_device("auto") == resolve_device("cpu") == torch.device("cpu")
-
-
-def test_auto_is_cuda_where_there_is_one(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
     assert resolve_device("auto") == resolve_device("cuda") == torch.device("cuda", 0)
@@ -42,9 +39,7 @@ integers = st.integers(0, 2**40)
 
 @given(integers, integers, integers)
 def test_a_seed_fits_a_generator_and_repeats(seed: int, step: int, stream: int):
-    found = step_seed(seed, step, stream)
-    assert 0 <= found < 2**63
-    assert found == step_seed(seed, step, stream)
+    assert 0 <= step_seed(seed, step, stream) == step_seed(seed, step, stream) < 2**63
 
 
 def test_neighbouring_seeds_steps_and_streams_are_all_different():

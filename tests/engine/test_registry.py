@@ -66,13 +66,13 @@ def test_an_unknown_method_is_answered_with_the_nearest_names_the_list_and_what_
     assert "skipped the plugin broken-one: ModuleNotFoundError" in message
 
 
-def test_a_name_near_to_none_gets_the_list_alone(registered: list[EntryPoint]):
-    assert len(registered) == 1
+@pytest.mark.usefixtures("registered")
+def test_a_name_near_to_none_gets_the_list_alone():
     with pytest.raises(ConfigError, match="unknown method 'xyz'\ninstalled: rgb-nerf"):
         find_method("xyz")
 
 
-def test_a_found_method_can_be_changed_without_changing_the_registered_one(registered: list[EntryPoint]):
-    assert len(registered) == 1
+@pytest.mark.usefixtures("registered")
+def test_a_found_method_can_be_changed_without_changing_the_registered_one():
     changed = replace(find_method("rgb-nerf").config, seed=1)
     assert changed != find_method("rgb-nerf").config

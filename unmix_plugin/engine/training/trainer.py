@@ -189,7 +189,9 @@ class TrainingSteps:
         return total, None if wanted is None else max(1, int(rays))
 
 
-def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[TrainerConfig, TrainingSteps]:
+def _prepare_steps(
+    config: TrainerConfig, processes: Processes = ALONE
+) -> tuple[TrainerConfig, TrainingSteps]:
     """Read the scene and make the model; settings without `auto`, and what takes the steps.
 
     Raises:
@@ -230,7 +232,7 @@ def follow_training(config: TrainerConfig, processes: Processes) -> TrainingStep
     """
     try:
         with processes.together():
-            _, steps = prepare_steps(config, processes)
+            _, steps = _prepare_steps(config, processes)
         step = 0
         with processes.together():
             if config.load_run is not None:
@@ -282,7 +284,7 @@ class Trainer:
             resumed = None if config.load_run is None else open_run_folder(config.load_run)
             if config.data is not None and config.data.exists():  # found from any working directory then
                 config = replace(config, data=config.data.resolve())
-            self.config, self.steps = prepare_steps(config, processes)
+            self.config, self.steps = _prepare_steps(config, processes)
         self.pipeline, self.optimizer = self.steps.pipeline, self.steps.optimizer
         self.callbacks, self.guard = self.steps.callbacks, self.steps.guard
         self.limits = Limits(config.max_num_iterations, config.max_seconds)
