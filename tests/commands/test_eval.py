@@ -1,9 +1,7 @@
 """`unmix-eval`: the keys of metrics.json, what is drawn, what edits change, and what is refused."""
 
-import errno
 import json
 import math
-import os
 import shutil
 from pathlib import Path
 
@@ -12,6 +10,7 @@ import pytest
 import torch
 
 from tests.commands.running import SMALL_METHOD, picture_size, run
+from tests.formats.cubes import full_disk
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.train import train
 from unmix_plugin.datamanager import HyperspectralDataManager
@@ -118,10 +117,7 @@ def test_no_run_at_all_exits_2(tmp_path):
 
 
 def test_a_full_disk_exits_2_and_leaves_no_part_of_a_file(run_copy, monkeypatch):
-    def full(*_args):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "write", full)
+    full_disk(monkeypatch, after=0)
     ended = run(evaluate, "--run", run_copy)
     assert ended.status == 2
     assert "No space left on device; make room" in ended.err

@@ -1,10 +1,8 @@
 """`unmix-export`: what is written and refused, from a run alone, edited and relit; and products of methods."""
 
 import csv
-import errno
 import importlib.metadata
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -20,6 +18,7 @@ from plyfile import PlyData
 from tests.commands.running import picture_size, run
 from tests.engine.conftest import registered, short_config  # noqa: F401 (fixtures)
 from tests.engine.stopped_runs import finished
+from tests.formats.cubes import full_disk
 from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
@@ -128,10 +127,7 @@ def test_without_run_the_newest_is_exported(run_copy, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("product", ["abundances", "segmentation"])
 def test_a_full_disk_exits_2_says_where_and_leaves_no_part_of_a_file(trained, tmp_path, monkeypatch, product):
-    def full(*_args):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "write", full)
+    full_disk(monkeypatch, after=0)
     ended = run(export, product, "--run", trained.run, "--output", tmp_path)
     assert ended.status == 2
     assert f"can't write {tmp_path / 'eval_002.npy'}: No space left on device" in ended.err

@@ -1,6 +1,5 @@
 """`unmix-train`: the contract of its words, its last line, its exit codes, going on with a run, and its remarks."""
 
-import errno
 import importlib.metadata
 import json
 import os
@@ -15,6 +14,7 @@ import pytest
 import torch
 
 from tests.commands.running import SMALL_METHOD, run
+from tests.formats.cubes import full_disk
 from unmix_plugin.commands import train as train_arguments
 from unmix_plugin.commands.train import _read_remarks, _remarks, parse, train
 from unmix_plugin.engine import registry
@@ -247,11 +247,8 @@ def test_a_run_of_another_method_is_not_gone_on_with(run_copy, monkeypatch):
 
 
 def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeypatch):
-    def full(*_args):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
     def full_from_the_first_step(self):
-        monkeypatch.setattr(os, "write", full)
+        full_disk(monkeypatch, after=0)
         return step(self)
 
     step = Trainer._train_step
