@@ -14,6 +14,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.settings import RendererConfig
+from unmix_plugin.trained.surface import SeenSurface
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 RADIUS, INNER_RADIUS = 0.6, 0.35
@@ -78,6 +79,17 @@ def cameras_around(directions: list[tuple[float, float, float]], side_px: int = 
         poses.append(look_at(3 * away.numpy(), torch.zeros(3, dtype=torch.float64).numpy()))
     cameras = cameras_at(poses, side_px, side_px, focal=1.6 * side_px)
     return [cameras[index] for index in range(len(poses))]
+
+
+def seen_surface(
+    scene: TrainedScene, directions: list[tuple[float, float, float]], num_rays: int
+) -> SeenSurface:
+    """What the cameras along some directions see of a scene."""
+    cameras = cameras_around(directions)
+    surface = SeenSurface(scene, num_rays, cameras)
+    for camera in cameras:
+        surface.look(camera)
+    return surface
 
 
 ALL_ROUND = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.5, 1.5)]

@@ -9,7 +9,7 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from tests.products.ball_model import ALL_ROUND, ball_scene, cameras_around
+from tests.products.ball_model import ALL_ROUND, ball_scene, seen_surface
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME, around
 from unmix_plugin.products.mesh import _TriangleMesh, _write_mesh
@@ -18,7 +18,7 @@ from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView, positions_for_files
-from unmix_plugin.trained.surface import GridPoints, SeenSurface
+from unmix_plugin.trained.surface import GridPoints
 
 SCENE = ball_scene()
 MIDDLE = np.array([-2_499_366.0, -4_256_836.0, 4_029_217.0])
@@ -44,12 +44,9 @@ def columns(path):
 
 
 def test_points_are_where_the_source_says(tmp_path):
-    cameras = cameras_around(ALL_ROUND)
-    surface = SeenSurface(SCENE, 6_000, cameras)
-    for camera in cameras:
-        surface.look(camera)
+    points = seen_surface(SCENE, ALL_ROUND, 6_000).points()
     near, far = (
-        columns(_write_point_cloud(tmp_path / name, surface.points(), 300, SCENE.materials, frame)[0])
+        columns(_write_point_cloud(tmp_path / name, points, 300, SCENE.materials, frame)[0])
         for name, frame in (("near", FRAME), ("far", FAR))
     )
     assert near.dtype == np.float32

@@ -12,7 +12,7 @@ from tests.products.ball_model import (
     INNER_RADIUS,
     RADIUS,
     ball_scene,
-    cameras_around,
+    seen_surface,
 )
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME
@@ -28,7 +28,7 @@ from unmix_plugin.products.mesh import (
     _without_stray_pieces,
     _write_mesh,
 )
-from unmix_plugin.trained.surface import GridPoints, SeenSurface, sample_slice
+from unmix_plugin.trained.surface import GridPoints, sample_slice
 
 SCENE = ball_scene()
 PIXEL = SCENE.pixel_size
@@ -47,17 +47,14 @@ def whole(densities):
     return _extract_mesh(densities, GRID, THRESHOLD, 0.0, PIXEL)
 
 
-def seen(directions):
-    cameras = cameras_around(directions)
-    surface = SeenSurface(SCENE, 20_000, cameras)
-    for camera in cameras:
-        surface.look(camera)
-    return surface
+@pytest.fixture(scope="module")
+def seen_all_round():
+    return seen_surface(SCENE, ALL_ROUND, 20_000)
 
 
 @pytest.fixture(scope="module")
-def outside(whole):
-    return _without_stray_pieces(_trim_unseen(whole, seen(ALL_ROUND)))
+def outside(whole, seen_all_round):
+    return _without_stray_pieces(_trim_unseen(whole, seen_all_round))
 
 
 def radii(mesh):
@@ -88,24 +85,23 @@ def test_insides_that_no_camera_sees_are_trimmed_and_the_rest_stays_whole(outsid
     assert shape.is_watertight
 
 
-def test_what_no_camera_sees_into_is_solid(densities):
+def test_what_no_camera_sees_into_is_solid(densities, seen_all_round):
     """Where nothing is rendered inside the ball there is no second surface, and the outer one stays where it was; what
     stands in the shadow of the ball for the cameras that might see it is cut away later."""
     points = np.stack([GRID.slice_points(index).numpy() for index in range(GRID.shape[0])])
     rendered = np.where(np.linalg.norm(points, axis=-1) < INNER_RADIUS + 0.1, 0, densities)
     rendered[rendered < 1e-3 * THRESHOLD] = 0
     shell = _extract_mesh(rendered, GRID, THRESHOLD, 0.0, PIXEL)
-    surface = seen(ALL_ROUND)
-    solid = _extract_mesh(_filled(rendered, GRID, SCENE, surface), GRID, THRESHOLD, 0.0, PIXEL)
+    solid = _extract_mesh(_filled(rendered, GRID, SCENE, seen_all_round), GRID, THRESHOLD, 0.0, PIXEL)
     assert radii(shell).min() < INNER_RADIUS + 0.15
     assert radii(solid).min() > RADIUS - 0.05
-    seen_from_outside = _trim_unseen(solid, surface)
+    seen_from_outside = _trim_unseen(solid, seen_all_round)
     assert len(seen_from_outside.vertices) == int((radii(shell) > RADIUS - 0.05).sum())
     assert radii(seen_from_outside).max() < RADIUS + 0.05
 
 
 def test_undersides_that_no_camera_sees_are_trimmed(whole):
-    trimmed = _trim_unseen(whole, seen(FROM_ABOVE))
+    trimmed = _trim_unseen(whole, seen_surface(SCENE, FROM_ABOVE, 20_000))
     assert trimmed.vertices[:, 2].max() > 0.55
     assert trimmed.vertices[:, 2].min() > -0.5
     assert radii(trimmed).min() > RADIUS - 0.05
@@ -154,8 +150,8 @@ def test_a_surface_that_reaches_the_box_is_closed_there():
     np.testing.assert_allclose(mesh.vertices.max(axis=0), 0.4, atol=0.1)
 
 
-def test_the_surface_lies_at_the_density_where_rays_end():
-    points = seen(ALL_ROUND).points()
+def test_the_surface_lies_at_the_density_where_rays_end(seen_all_round):
+    points = seen_all_round.points()
     threshold = _surface_density(SCENE, points)
     found, _ = SCENE.field.get_density(points.positions)
     assert (found < threshold).float().mean() == pytest.approx(0.07, abs=0.01)

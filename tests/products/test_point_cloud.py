@@ -9,7 +9,7 @@ from plyfile import PlyData
 from scipy.spatial import KDTree
 
 from tests.method_factory import WAVELENGTHS_NM, make_model
-from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, cameras_around
+from tests.products.ball_model import ALL_ROUND, RADIUS, ball_scene, seen_surface
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.products.point_cloud import (
@@ -23,7 +23,6 @@ from unmix_plugin.products.point_cloud import (
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.trained.surface import SeenSurface
 
 
 def sphere(count: int, seed: int = 0) -> np.ndarray:
@@ -168,11 +167,7 @@ SCENE = ball_scene()
 
 @pytest.fixture(scope="module")
 def points():
-    cameras = cameras_around(ALL_ROUND)
-    surface = SeenSurface(SCENE, 12_000, cameras)
-    for camera in cameras:
-        surface.look(camera)
-    return surface.points()
+    return seen_surface(SCENE, ALL_ROUND, 12_000).points()
 
 
 @pytest.fixture(scope="module")

@@ -8,19 +8,15 @@ from tests.products.ball_model import (
     RADIUS,
     SHADE,
     ball_scene,
-    cameras_around,
+    seen_surface,
 )
-from unmix_plugin.trained.surface import SeenSurface, look_from_above
+from unmix_plugin.trained.surface import look_from_above
 
 SCENE = ball_scene()
 
 
 def seen(directions, model=SCENE, num_rays=12_000):
-    cameras = cameras_around(directions)
-    surface = SeenSurface(model, num_rays, cameras)
-    for camera in cameras:
-        surface.look(camera)
-    return surface
+    return seen_surface(model, directions, num_rays)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import inspect
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
@@ -22,7 +21,6 @@ from unmix_plugin.products.scene_products import PRODUCTS
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
-    from unmix_plugin.trained.open_run import LoadedRun
 
 
 @dataclass(frozen=True)
@@ -125,13 +123,22 @@ def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes)
     from functools import partial
 
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, follow, say, working
+    from unmix_plugin.editing.edited_run import load_edited_run
+    from unmix_plugin.trained.open_run import load_run
 
-    if isinstance(product, Product):
-        _refuse_sensor(product)
+    if isinstance(product, Product) and product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
+        able = ", ".join(one.name for one in PRODUCTS if one.name not in _IN_THE_RUNS_BANDS)
+        raise ConfigError(
+            f"{product.name} compares with what is known in the run's own bands and can't be seen through another "
+            f"sensor; leave out --sensor. It goes with {able}"
+        )
     console = CommandConsole(quiet=not processes.is_first)
     path = chosen_run(product.run, product.output_dir)
     with working(console, f"reading {path}"):
-        loaded = _loaded(path, product)
+        if isinstance(product, Product):
+            loaded = load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
+        else:
+            loaded = load_run(path, product.device)
     if product.name in own:
         own[product.name].require(loaded.config.method_name)
     folder = (product.output or loaded.folder.exports / product.name).resolve()
@@ -146,26 +153,6 @@ def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes)
         partial(follow, console),
         processes,
     )
-
-
-def _loaded(path: Path, product: RunProduct) -> LoadedRun:
-    """The run, edited where the product can be of an edited one."""
-    from unmix_plugin.editing.edited_run import load_edited_run
-    from unmix_plugin.trained.open_run import load_run
-
-    if isinstance(product, Product):
-        return load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
-    return load_run(path, product.device)
-
-
-def _refuse_sensor(product: Product) -> None:
-    """Refuse a sensor where it would mix bands."""
-    if product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
-        able = ", ".join(one.name for one in PRODUCTS if one.name not in _IN_THE_RUNS_BANDS)
-        raise ConfigError(
-            f"{product.name} compares with what is known in the run's own bands and can't be seen through another "
-            f"sensor; leave out --sensor. It goes with {able}"
-        )
 
 
 def main() -> None:

@@ -64,14 +64,16 @@ def export_spectrum(
         facts: dict[str, Any] = {"point": point}
         title = f"point {', '.join(f'{value:g}' for value in point)}"
     elif point_text is None and view_name is not None and pixel_text is not None:
-        pixel = _whole_numbers(pixel_text)
+        if not re.fullmatch(r"\s*\d+\s*,\s*\d+\s*", pixel_text):
+            raise ConfigError(f"--pixel {pixel_text} is not a column and a row from 0, such as 120,80")
+        column, row = map(int, pixel_text.split(","))
         view = find_view(job.views("eval"), view_name, job.views("train"))
-        name = f"{view.name}_x{pixel[0]}_y{pixel[1]}"
+        name = f"{view.name}_x{column}_y{row}"
         job.claim(_spectrum_paths(job.folder, name))
-        probe = job.scene.probe(view.camera, *pixel)
-        facts = {"view": view.name, "pixel": list(pixel)}
-        title = f"{view.name}, column {pixel[0]}, row {pixel[1]}"
-        measured = _measured(job, view, pixel, data)
+        probe = job.scene.probe(view.camera, column, row)
+        facts = {"view": view.name, "pixel": [column, row]}
+        title = f"{view.name}, column {column}, row {row}"
+        measured = _measured(job, view, (column, row), data)
     else:
         raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
     light, matches = job.scene.light_power, []
@@ -202,10 +204,3 @@ def _numbers(text: str, count: int, option: str, example: str) -> list[float]:
     if len(values) != count or not all(abs(value) < float("inf") for value in values):
         raise ConfigError(f"{option} {text} is not {count} numbers with commas between, such as {example}")
     return values
-
-
-def _whole_numbers(text: str) -> tuple[int, int]:
-    if not re.fullmatch(r"\s*\d+\s*,\s*\d+\s*", text):
-        raise ConfigError(f"--pixel {text} is not a column and a row from 0, such as 120,80")
-    column, row = text.split(",")
-    return int(column), int(row)

@@ -134,7 +134,7 @@ def _write_report(
             "figures": None if figures is None else _figure_rows(figures),
             "figures_source": source,
             "training": _training_charts(loaded.folder.metrics_path),
-            "settings": _settings_text(loaded),
+            "settings": json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1),
             "versions": _version_rows(loaded),
             **_view_values(views),
         }
@@ -291,11 +291,6 @@ def _training_charts(path: Path) -> list[LineChart]:
         for label, lines, is_log in charts
         if lines
     ]
-
-
-def _settings_text(loaded: LoadedRun) -> str:
-    """Every setting of the run, as JSON."""
-    return json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1)
 
 
 def _version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
