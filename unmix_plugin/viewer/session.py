@@ -255,13 +255,7 @@ class Session:
         state: _PageState | None = None,
         browser: str = "",
     ) -> None:
-        """
-        Args:
-            client: The page.
-            services: What all pages share.
-            state: What the page showed before it was loaded again, if it was.
-            browser: The name that the page's browser keeps.
-        """
+        """`state` is what the page showed before it was loaded again, if it was; `browser` names its browser."""
         self.client, self.services, self.browser = client, services, browser
         self.history = RecipeHistory(services.first_recipe) if state is None else state.history
         light = LightChoice() if state is None else state.light

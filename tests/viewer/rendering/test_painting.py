@@ -16,7 +16,7 @@ from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linea
 from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.viewer.rendering import painting as layers_module
+from unmix_plugin.viewer.rendering import painting
 from unmix_plugin.viewer.rendering.painting import (
     BACKGROUNDS,
     COLOUR_MAPS,
@@ -308,11 +308,6 @@ def test_depth_lies_between_the_ends_of_its_own_scale(frame, aids):
     assert float(seen.max()) < legend.high
 
 
-def test_an_error_without_a_scene_says_why_there_is_none(frame, aids):
-    with pytest.raises(ConfigError, match="no error to show: the scene is not at hand"):
-        painted(frame, aids, "error")
-
-
 def test_an_error_is_painted_where_it_is_known(frame, aids):
     values = torch.full_like(frame.coefficients.accumulation, 0.05)
     is_known = torch.zeros_like(values, dtype=torch.bool)
@@ -322,11 +317,6 @@ def test_an_error_is_painted_where_it_is_known(frame, aids):
     assert_close(picture[3, 4], _colour_table("viridis")[512], atol=0.01, rtol=0)
     assert_close(picture[0, 0], torch.ones(3))
     assert "train_007" in legend.label
-
-
-def test_an_unknown_layer_is_named_with_the_known_ones(frame, aids):
-    with pytest.raises(ConfigError, match="there is no layer named 'x-ray'; known: rgb, false-colour"):
-        painted(frame, aids, "x-ray")
 
 
 def test_a_single_material_has_every_layer(tmp_path):
@@ -349,7 +339,7 @@ def with_materials(frame, materials):
 def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_undefined(
     frame, aids, light, monkeypatch
 ):
-    monkeypatch.setattr(layers_module, "_CHUNK", 100)  # fewer than there are pixels
+    monkeypatch.setattr(painting, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
     shown = with_materials(frame, lit)
     values = shown[f"index:{FORMULA}"]
@@ -405,19 +395,17 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
     assert "..." in legend.label
 
 
-def test_an_index_that_is_not_chosen_says_what_to_do(frame, aids):
-    with pytest.raises(ConfigError, match=r"type a formula of the wavelengths from 425 to 675 nm.*r650/r450"):
-        painted(frame, aids, "index", index="")
-
-
 @pytest.mark.parametrize(
-    ("index", "error", "message"),
+    ("layer", "index", "error", "message"),
     [
-        ("prri", ConfigError, "nearest: pri"),
-        ("r650/", ConfigError, "r650/"),
-        ("ndvi", SpectrumError, "needs 800 nm"),
+        ("error", "", ConfigError, "no error to show: the scene is not at hand"),
+        ("x-ray", "", ConfigError, "there is no layer named 'x-ray'; known: rgb, false-colour"),
+        ("index", "", ConfigError, r"type a formula of the wavelengths from 425 to 675 nm.*r650/r450"),
+        ("index", "prri", ConfigError, "nearest: pri"),
+        ("index", "r650/", ConfigError, "r650/"),
+        ("index", "ndvi", SpectrumError, "needs 800 nm"),
     ],
 )
-def test_an_index_that_cannot_be_shown_says_why(frame, aids, index, error, message):
+def test_what_cannot_be_shown_says_why(frame, aids, layer, index, error, message):
     with pytest.raises(error, match=message):
-        painted(frame, aids, "index", index=index)
+        painted(frame, aids, layer, index=index)

@@ -326,14 +326,21 @@ def unwanted(*_):
     raise AssertionError("this capture has no end")
 
 
-def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
-    control, model = TrainingControl(), make_model()
+@pytest.fixture
+def training(tmp_path):
+    """A model under training, and a loop that shows it in a thread of its own."""
+    control, model, screen = TrainingControl(), make_model(), Screen()
     source = source_of_model(model, tmp_path, control)
-    with running_loop(source) as loop, control.running():
-        screen = Screen()
+    with running_loop(source) as loop:
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
+        yield control, model, source, loop, screen
+
+
+def test_while_training_runs_pictures_follow_it(training, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
+    control, model, _, loop, screen = training
+    with control.running():
         loop.change(screen.view, pose=some_pose())
         until = time.monotonic() + 120
         while len(screen.shown) < 6:
@@ -346,20 +353,15 @@ def test_while_training_runs_pictures_follow_it(tmp_path, monkeypatch):
     assert not screen.reports
 
 
-def test_when_training_ends_the_finest_picture_shows_its_last_step(tmp_path):
-    control, model = TrainingControl(), make_model()
-    source = source_of_model(model, tmp_path, control)
-    with running_loop(source) as loop:
-        screen = Screen()
-        screen.view.largest_height = LARGEST
-        loop.add(screen.view)
-        with control.running():
-            for _ in range(5):
-                loop.change(screen.view, pose=some_pose())
-                with control.device.training_turn(), torch.no_grad():
-                    model.endmembers.mul_(0.5)
-        version = source.version
-        screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
-        assert isinstance(screen.view.frame, MaterialView)
-        shown = screen.view.frame.materials.endmembers
-        torch.testing.assert_close(shown, model.endmembers.detach())
+def test_when_training_ends_the_finest_picture_shows_its_last_step(training):
+    control, model, source, loop, screen = training
+    with control.running():
+        for _ in range(5):
+            loop.change(screen.view, pose=some_pose())
+            with control.device.training_turn(), torch.no_grad():
+                model.endmembers.mul_(0.5)
+    version = source.version
+    screen.wait_until(lambda: screen.view.frame_version == version and not screen.shown[-1].is_moving)
+    assert isinstance(screen.view.frame, MaterialView)
+    shown = screen.view.frame.materials.endmembers
+    torch.testing.assert_close(shown, model.endmembers.detach())

@@ -95,13 +95,8 @@ class FrameRender:
     def __init__(
         self, camera: Cameras, subpixels: int = 1, before: ModelView | None = None, is_finished: bool = False
     ) -> None:
-        """
-        Args:
-            camera: One camera.
-            subpixels: Rays through a pixel along each of its edges, averaged.
-            before: Estimates of the same view, which the new one is averaged with.
-            is_finished: Whether the view has to be as fine as the scene makes it, rather than an estimate.
-        """
+        """`subpixels` rays along each edge of a pixel are averaged, and the view with estimates of the same, `before`;
+        `is_finished` if it has to be as fine as the scene makes it, rather than an estimate."""
         self.camera = camera
         self._subpixels, self._before, self._is_finished = subpixels, before, is_finished
         centres = [(index + 0.5) / subpixels for index in range(subpixels)]
