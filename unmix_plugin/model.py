@@ -224,15 +224,6 @@ class UnmixModel(Model):
             self.learn_from(step)
         return {"num_samples": torch.tensor(step.rendered.num_samples)}, losses, metrics
 
-    def get_loss_dict(
-        self,
-        outputs: dict[str, Tensor],
-        batch: dict[str, Tensor],
-        metrics_dict: dict[str, Tensor] | None = None,
-    ) -> dict[str, Tensor]:
-        """`get_train_loss_dict` has the losses: they need more than outputs by name."""
-        raise NotImplementedError
-
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
         """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
         corrected = self._pose_training.corrected(ray_bundle)

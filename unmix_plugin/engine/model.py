@@ -198,14 +198,19 @@ class Model(nn.Module, ABC):
         """`get_outputs`."""
         return self.get_outputs(ray_bundle)
 
-    @abstractmethod
     def get_loss_dict(
         self,
         outputs: dict[str, Tensor],
         batch: dict[str, Tensor],
         metrics_dict: dict[str, Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Scalar losses, already weighted; training minimises their sum."""
+        """Scalar losses, already weighted; training minimises their sum. Only a model that writes `get_train_loss_dict`
+        anew does without.
+
+        Raises:
+            ConfigError: the model has neither.
+        """
+        raise ConfigError(f"{type(self).__name__} has neither get_loss_dict nor get_train_loss_dict")
 
     def get_metrics_dict(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Scalars worth following in training; `psnr` (dB) is shown in the progress display."""
