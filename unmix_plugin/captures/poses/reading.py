@@ -15,13 +15,9 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye, require_unfolded
-from unmix_plugin.captures.poses.photogrammetry import (
-    find_orientations,
-    is_reconstruction,
-    read_metashape,
-    read_micmac,
-    read_opensfm,
-)
+from unmix_plugin.captures.poses.metashape import read_metashape
+from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
+from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
 from unmix_plugin.captures.poses.pose_set import (
     BY_ORDER,
     PosedCamera,

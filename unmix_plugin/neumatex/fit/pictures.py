@@ -82,7 +82,7 @@ def _read_display(path: Path) -> Picture:
 
 
 def _read_exr(path: Path) -> Picture:
-    from unmix_plugin.captures.readers.pictures import open_exr
+    from unmix_plugin.captures.readers.exr import open_exr
     from unmix_plugin.captures.spectral_file import ReadOptions
 
     everything = (slice(None), slice(None))

@@ -255,7 +255,7 @@ def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -
 
 def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
     """Channels that are wavelengths, at the bands; None where there are none."""
-    from unmix_plugin.captures.readers.pictures import open_exr
+    from unmix_plugin.captures.readers.exr import open_exr
     from unmix_plugin.captures.spectral_file import ReadOptions
     from unmix_plugin.errors import CaptureError
 

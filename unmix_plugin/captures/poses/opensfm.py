@@ -1,0 +1,149 @@
+"""Poses of OpenSfM and OpenDroneMap: reconstruction.json.
+
+Rotations are axis and angle from world to camera (OpenCV axes); lengths on the picture are in parts of its longer side.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye
+from unmix_plugin.captures.poses.pose_set import (
+    FLIP,
+    PosedCamera,
+    PoseSet,
+    SparsePoints,
+    make_pose_set,
+    name_some,
+)
+from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.faults import describe, read_number
+
+_PLAIN = ("perspective", "simple_radial", "radial", "brown")
+_FISHEYES = ("fisheye", "fisheye_opencv")
+
+
+def is_reconstruction(content: Any) -> bool:
+    """Whether JSON looks like a reconstruction.json: a list of objects with shots, or one."""
+    parts = content if isinstance(content, list) else [content]
+    return any(isinstance(part, dict) and "shots" in part for part in parts)
+
+
+def read_opensfm(path: Path, content: Any) -> PoseSet:
+    """Poses, lenses and points of the reconstruction with the most shots.
+
+    Raises:
+        CaptureError: a shot without a sound pose or camera, or a lens that can't be represented.
+    """
+    parts = [part for part in (content if isinstance(content, list) else [content]) if isinstance(part, dict)]
+    parts = [part for part in parts if isinstance(part.get("shots"), dict)]
+    best = max(parts, key=lambda part: len(part["shots"]), default={})
+    notes = [f"{len(parts)} reconstructions; the one with the most shots was read"] if len(parts) > 1 else []
+    shots: dict[str, Any] = best.get("shots", {})
+    lenses: dict[str, Lens] = {}
+    raw, loose = [], []
+    for name, shot in shots.items():
+        where = f"{path}: shot {name}"
+        pose = _world_to_camera(best, name, shot, where)
+        if pose is None:
+            loose.append(name)
+            continue
+        camera = shot.get("camera")
+        if not isinstance(camera, str) or camera not in _object(best, "cameras"):
+            raise CaptureError(f"{where} names the camera {describe(camera)}; expected one of 'cameras'")
+        if camera not in lenses:
+            lenses[camera], note = _lens_opensfm(best["cameras"][camera], f"{path}: camera {camera}")
+            notes += [] if note is None else [note]
+        rotation = pose[:, :3].T
+        matrix = np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]])
+        raw.append((name, PosedCamera(matrix, lenses[camera])))
+    notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
+    up = np.array([0.0, 0.0, 1.0])
+    return make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
+
+
+def _world_to_camera(
+    content: dict[str, Any], name: str, shot: Any, where: str
+) -> Float64[np.ndarray, "3 4"] | None:
+    """The shot's own pose, otherwise that of its rig: first into the rig, then into its camera. None without either."""
+    if not isinstance(shot, dict):
+        raise CaptureError(
+            f"{where} is {describe(shot)}; expected an object with 'rotation' and 'translation'"
+        )
+    if "rotation" in shot:
+        return _pose(shot, where)
+    for instance in _object(content, "rig_instances").values():
+        members = instance.get("rig_camera_ids") if isinstance(instance, dict) else None
+        if not isinstance(members, dict) or name not in members:
+            continue
+        lens = _object(content, "rig_cameras").get(members[name])
+        if not isinstance(lens, dict):
+            raise CaptureError(
+                f"{where} names the rig camera {describe(members[name])}; expected one of 'rig_cameras'"
+            )
+        outer, inner = _pose(instance, where), _pose(lens, where)
+        return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
+    return None
+
+
+def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
+    from scipy.spatial.transform import Rotation
+
+    vectors = [_vector(values.get(key)) for key in ("rotation", "translation")]
+    if vectors[0] is None or vectors[1] is None:
+        raise CaptureError(f"{where}: 'rotation' and 'translation' have to be 3 finite numbers each")
+    return np.column_stack([Rotation.from_rotvec(vectors[0]).as_matrix(), vectors[1]])
+
+
+def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
+    values = camera if isinstance(camera, dict) else {}
+    numbers = {key: read_number(value) for key, value in values.items()}
+
+    def number(key: str, default: float = 0.0) -> float:
+        value = numbers.get(key)
+        return default if value is None else value
+
+    width, height = int(number("width")), int(number("height"))
+    focal = number("focal_x", number("focal")), number("focal_y", number("focal_x", number("focal")))
+    if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
+        raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
+    kind = values.get("projection_type", "perspective")
+    if kind not in _PLAIN + _FISHEYES:
+        raise CaptureError(
+            f"{where} is {describe(kind)}; expected one of {', '.join(_PLAIN + _FISHEYES)}: undistort with OpenSfM"
+        )
+    side = max(width, height)
+    focal = (side * focal[0], side * focal[1])
+    center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
+    radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
+    tangential = (number("p1"), number("p2"))
+    if kind in _FISHEYES:
+        start = Lens(width, height, focal, center)
+        return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, radial), start, kind, where)
+    return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
+
+
+def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
+    points = list(_object(content, "points").values())
+    positions = [_vector(point.get("coordinates")) if isinstance(point, dict) else None for point in points]
+    if not points:
+        return None
+    if any(position is None for position in positions):
+        raise CaptureError(f"{where}: a point has no 3 finite 'coordinates'; the file is damaged")
+    colours = [_vector(point.get("color")) for point in points]
+    known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
+    return np.array(positions), np.array(known).round().astype(np.uint8)
+
+
+def _object(content: dict[str, Any], key: str) -> dict[str, Any]:
+    value = content.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _vector(value: Any) -> Float64[np.ndarray, "3"] | None:
+    numbers = [read_number(number) for number in value] if isinstance(value, list) else []
+    return None if len(numbers) != 3 or None in numbers else np.array(numbers, dtype=np.float64)
