@@ -10,7 +10,7 @@ import scipy.sparse
 import torch
 
 from tests.captures.file_factory import centres_nm, widths_nm
-from unmix_plugin.captures.readers import arrays as array_files
+from unmix_plugin.captures.readers import matlab
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
@@ -150,7 +150,7 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
 
 
 def test_compressed_variables_of_matlab_are_unpacked_piece_by_piece(tmp_path, monkeypatch):
-    monkeypatch.setattr(array_files, "_PIECE_BYTES", 7)
+    monkeypatch.setattr(matlab, "_PIECE_BYTES", 7)
     scipy.io.savemat(tmp_path / "a.mat", {"cube": CUBE}, do_compression=True)
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "a.mat").read(), CUBE)
 
