@@ -208,8 +208,7 @@ def built_in_scene(run: LoadedRun, folder: Path, illuminant: str) -> Scene:
 
 def view_colour_error(shown: Tensor, true: Tensor, bands: Bands) -> Any:
     """CIEDE2000 of each pixel, as sRGB."""
-    from unmix_plugin.spectral.colour.difference import _srgb_to_lab as srgb_to_lab
-    from unmix_plugin.spectral.colour.difference import ciede2000
+    from unmix_plugin.spectral.colour.difference import ciede2000, srgb_to_lab
 
     first, second = (srgb_to_lab(srgb_of(spectra, bands).numpy()) for spectra in (shown, true))
     return ciede2000(first, second)
@@ -229,8 +228,7 @@ def colour_error(srgb: Tensor, asked: str) -> float:
     """CIEDE2000 of a colour to `#rrggbb`."""
     import numpy as np
 
-    from unmix_plugin.spectral.colour.difference import _srgb_to_lab as srgb_to_lab
-    from unmix_plugin.spectral.colour.difference import ciede2000
+    from unmix_plugin.spectral.colour.difference import ciede2000, srgb_to_lab
 
     wanted = np.array([int(asked[i : i + 2], 16) / 255 for i in (1, 3, 5)])
     return float(ciede2000(srgb_to_lab(srgb.detach().cpu().double().numpy()), srgb_to_lab(wanted)))

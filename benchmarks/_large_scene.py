@@ -18,10 +18,10 @@ from jaxtyping import Float16
 from PIL import Image
 
 from unmix_plugin.scenes.demo.scene import (
-    _frame_name,
-    _radiance_cube,
     demo_cameras,
+    frame_name,
     lens_entries,
+    radiance_cube,
     transform_matrix,
 )
 from unmix_plugin.scenes.demo.shading import band_centers_nm, lamp_power, reflectances, render_view
@@ -44,10 +44,10 @@ def write_large_scene(folder: Path, size: int, bands: int, views: int) -> int:
     coarse = replace(coarse, focal_px=coarse.focal_px * WIDE)
     frames: list[dict[str, Any]] = []
     for index in range(views):
-        view, name = render_view(coarse, index, subpixels=1), _frame_name(index)
+        view, name = render_view(coarse, index, subpixels=1), frame_name(index)
         alpha = (255 * view.alpha.repeat(BLOCK, 0).repeat(BLOCK, 1)).astype(np.uint8)
         Image.fromarray(np.stack([alpha] * 4, axis=-1)).save(folder / f"images/{name}.png", compress_level=1)
-        _write_sparse(folder / f"cubes/{name}.npy", _radiance_cube(view, spectra, lamp).astype(np.float16))
+        _write_sparse(folder / f"cubes/{name}.npy", radiance_cube(view, spectra, lamp).astype(np.float16))
         frames.append(
             {
                 "file_path": f"images/{name}.png",

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
-from unmix_plugin.scenes.demo.scene import _radiance_cube, demo_cameras, label_image, make_demo_scene
+from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, make_demo_scene, radiance_cube
 from unmix_plugin.scenes.demo.shading import band_centers_nm, lamp_power, reflectances, render_view
 
 _TRANSFORMS = "transforms.json"
@@ -227,7 +227,7 @@ def _render_sweeps(
         view = render_view(cameras, index)
         np.save(
             folder / frames[index]["hyperspectral_file_path"],
-            _radiance_cube(view, spectra, lamp).astype(np.float16),
+            radiance_cube(view, spectra, lamp).astype(np.float16),
         )
         rgba = np.repeat(view.alpha[..., None], 4, axis=-1)
         Image.fromarray((rgba * 255).round().astype(np.uint8)).save(folder / frames[index]["file_path"])

@@ -37,6 +37,8 @@ _WHY_LIGHT = {
     "camera": "the light moves with the camera: brightness depends on the direction of view",
     "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
 }
+_LAMP_NUMBERS = 10
+"""Which of the two frames, and three places of three numbers."""
 _WHERE_LAMP = {
     True: "the place of its lamp follows from shadows: training models them, and refines the place",
     False: "no shadows tell the place of its lamp: shadows that move are blurred",
@@ -352,7 +354,7 @@ class UnmixModelConfig(ModelConfig):
             "eval-num-rays-per-chunk of at least 1": self.eval_num_rays_per_chunk >= 1,
             "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
             "a lamp of no or ten numbers, the first 0 or 1, or auto": self.lamp in ("auto", ())
-            or (len(self.lamp) == 10 and self.lamp[0] in (0, 1)),
+            or (len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)),
             "light fixed or per-view: the field as published has no shading": not self.as_published
             or self.light != "camera",
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")

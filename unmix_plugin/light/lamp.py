@@ -21,7 +21,6 @@ _PACE = 0.4
 """Shift of the lamp, in its first distance, for a change of its parameter by 1."""
 LampFrame = Literal["turntable", "camera"]
 _FRAMES: tuple[LampFrame, ...] = ("turntable", "camera")
-NUM_LAMP_NUMBERS = 10
 Triple = tuple[float, float, float]
 
 

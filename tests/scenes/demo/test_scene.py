@@ -16,13 +16,13 @@ from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import (
     _CAMERA_DISTANCE,
-    _frame_name,
-    _radiance_cube,
     demo_cameras,
     demo_scene_path,
+    frame_name,
     is_complete,
     label_image,
     make_demo_scene,
+    radiance_cube,
 )
 from unmix_plugin.scenes.demo.shading import (
     MATERIALS,
@@ -53,7 +53,7 @@ def spectra_of(bands):
 
 def test_a_lit_matt_pixel_of_one_material_is_reflectance_times_lamp_times_shading(view):
     spectra, lamp = spectra_of(31)
-    cube = _radiance_cube(view, spectra, lamp)
+    cube = radiance_cube(view, spectra, lamp)
     for k in range(len(MATERIALS)):
         pure = (view.alpha == 1) & (view.abundances[..., k] > 0.9999) & (view.specular == 0)
         if MATERIALS[k] == "green":  # the glossy apple only: no pixel of it is without a trace of highlight
@@ -189,7 +189,7 @@ def test_an_unknown_light_is_refused_before_anything_is_written(tmp_path):
 
 def test_every_fourth_view_is_for_evaluation_and_has_abundances(folder):
     transforms = json.loads((folder / "transforms.json").read_text())
-    evaluation = [f"images/{_frame_name(i)}.png" for i in (2, 6)]
+    evaluation = [f"images/{frame_name(i)}.png" for i in (2, 6)]
     assert transforms["val_filenames"] == transforms["test_filenames"] == evaluation
     frames = {frame["file_path"]: frame for frame in transforms["frames"]}
     assert set(transforms["train_filenames"]) == set(frames) - set(evaluation)

@@ -181,12 +181,12 @@ def transform_matrix(cameras: Cameras, index: int) -> list[list[float]]:
     return [*cameras.camera_to_world[index].double().tolist(), [0.0, 0.0, 0.0, 1.0]]
 
 
-def _frame_name(index: int) -> str:
+def frame_name(index: int) -> str:
     """`train_000`, `train_001`, `eval_002`, ...: every 4th view is for evaluation."""
     return f"{'eval' if index % 4 == 2 else 'train'}_{index:03d}"
 
 
-def _radiance_cube(
+def radiance_cube(
     view: ViewCoefficients, spectra: Float[np.ndarray, "K B"], lamp: Float[np.ndarray, " B"]
 ) -> Float[np.ndarray, "H W B"]:
     """Spectral radiance of every pixel in [0, 1]: what exceeds 1 saturates, as in a sensor."""
@@ -393,8 +393,8 @@ def _write_scene(
     frames = []
     for index in range(views):
         view = render_view(cameras, index, things=place.things, sky=place.sky)
-        cube = _radiance_cube(view, spectra, lamp)
-        frames.append(_write_view(folder, _frame_name(index), view, cube, to_rgb, place.sky is None))
+        cube = radiance_cube(view, spectra, lamp)
+        frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb, place.sky is None))
         frames[-1]["transform_matrix"] = transform_matrix(cameras, index)
     content = _header(cameras, sampling) | _splits(views) | {"frames": frames}
     (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
@@ -438,7 +438,7 @@ def _header(cameras: Cameras, bands: Bands) -> dict[str, Any]:
 
 
 def _splits(views: int) -> dict[str, list[str]]:
-    names = [_frame_name(index) for index in range(views)]
+    names = [frame_name(index) for index in range(views)]
     train, evaluation = (
         [f"images/{name}.png" for name in names if name.startswith(s)] for s in ("train", "eval")
     )

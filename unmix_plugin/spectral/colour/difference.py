@@ -36,7 +36,7 @@ def reflectance_to_lab(
     return _xyz_to_lab(reflectance @ lit, lit.sum(axis=0))
 
 
-def _srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
+def srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
     """L*a*b* of sRGB colours in [0, 1] on a display whose white is D65."""
     to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
     linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
