@@ -18,6 +18,8 @@ _TRANSFORM_KEY, _SCALE_KEY, _OFFSET_KEY = "applied_transform", "applied_scale", 
 _ROTATION_TOLERANCE = 1e-5
 """Largest element of R^T R - 1 that passes as rounding of printed digits."""
 _SCALE_RANGE = (1e-12, 1e12)
+_OTHER_OFFSETS = ("aabb", "aabb_scale", "from_na", "render_aabb", "scale")
+"""Keys of instant-ngp and NeuS2, whose `offset` leads into a unit cube for rendering and moves no pose."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,10 @@ class Normalisation(_Similarity):
 
 
 def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Placement:
-    """What transforms.json records; the identity where it records none, and with noted faults where it is wrong."""
+    """What transforms.json records; the identity where it records none, and with noted faults where it is wrong.
+
+    `offset` counts beside one of the other two only, and not in files of instant-ngp, where it means something else.
+    """
     transform = _numbers(content.get(_TRANSFORM_KEY), (3, 4))
     if content.get(_TRANSFORM_KEY) is None:
         transform = np.eye(3, 4)
@@ -122,7 +127,11 @@ def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Place
     if scale is None or not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
         faults.add(where, f"'{_SCALE_KEY}' is {describe(content[_SCALE_KEY])}; expected a number above 0")
         scale = 1.0
-    offset = np.zeros(3) if content.get(_OFFSET_KEY) is None else _numbers(content[_OFFSET_KEY], (3,))
+    is_ours = any(content.get(key) is not None for key in (_TRANSFORM_KEY, _SCALE_KEY)) and not any(
+        key in content for key in _OTHER_OFFSETS
+    )
+    has_offset = is_ours and content.get(_OFFSET_KEY) is not None
+    offset = _numbers(content[_OFFSET_KEY], (3,)) if has_offset else np.zeros(3)
     if offset is None:
         faults.add(where, f"'{_OFFSET_KEY}' is {describe(content[_OFFSET_KEY])}; expected 3 finite numbers")
         offset = np.zeros(3)

@@ -1,4 +1,5 @@
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,6 +102,28 @@ def test_of_several_models_the_one_with_the_most_images_is_read(tmp_path):
     found = read_poses(tmp_path)
     assert len(found.cameras) == 6
     assert any("2 COLMAP models" in note for note in found.notes)
+
+
+def test_the_largest_model_is_found_in_deeper_folders_and_the_others_are_named(tmp_path):
+    smaller = make_model()
+    smaller.deregister_frame(1)
+    for place, made in (("0", smaller), ("0/models/0", smaller), ("0/models/1", make_model())):
+        (tmp_path / "colmap/sparse" / place).mkdir(parents=True, exist_ok=True)
+        made.write_binary(tmp_path / "colmap/sparse" / place)
+    found = read_poses(tmp_path)
+    assert_same_poses(found, expected())
+    (note,) = (note for note in found.notes if "3 COLMAP models" in note)
+    assert str(Path("sparse/0/models/0")) in note
+
+
+@pytest.mark.parametrize("second_line", ["", "\n", "10.5 11.5 1 20 21 -1\n"])
+@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
+def test_images_keep_their_poses_whatever_stands_between_their_lines(tmp_path, second_line, line_end):
+    make_model().write_text(tmp_path)
+    path = tmp_path / "images.txt"
+    lines = [line for line in path.read_text().splitlines() if line.endswith(".jpg")]
+    path.write_bytes("".join(f"{line}\n{second_line}" for line in lines).replace("\n", line_end).encode())
+    assert_same_poses(read_poses(tmp_path), expected())
 
 
 def test_an_image_whose_camera_is_missing_is_refused(tmp_path):

@@ -102,6 +102,20 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
     np.testing.assert_allclose(found.up, [0, 0, -1])
 
 
+@pytest.mark.parametrize(
+    "hints",
+    [
+        {},
+        {"aabb_scale": 1, "scale": 0.5, "from_na": True},
+        {"applied_transform": np.eye(4).tolist(), "scale": 1},
+    ],
+)
+def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
+    found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
+    assert_same_poses(found, ring())
+    assert not found.offset.any()
+
+
 def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
     far = np.array([500_123.4, 5_400_321.6, 300.0])
     moved = {name: pose + np.column_stack([np.zeros((3, 3)), far]) for name, pose in ring().items()}
@@ -147,7 +161,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
             "'applied_transform'.*a rotation",
         ),
         ({"applied_scale": 0}, "'applied_scale' is 0"),
-        ({"offset": [1, 2]}, "'offset' is a list of 2; expected 3"),
+        ({"applied_scale": 2, "offset": [1, 2]}, "'offset' is a list of 2; expected 3"),
     ],
 )
 def test_faults_are_told_with_what_was_expected(tmp_path, change, message):

@@ -7,6 +7,7 @@ are little-endian; every count is checked before it is used.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,8 +23,10 @@ from unmix_plugin.errors import CaptureError
 
 _Record = TypeVar("_Record")
 
-_PLACES = (".", "sparse", "colmap", "colmap/sparse", "sparse/*", "colmap/sparse/*", "colmap/*")
-"""Where under a folder a model is looked for."""
+_PLACES = ("sparse", "colmap", "colmap/sparse", "sparse/*", "colmap/sparse/*", "colmap/*")
+"""Where under a folder a model is looked for first."""
+_DEEPEST = 6
+"""Folders below the one that is given in which a model is looked for: hloc writes colmap/sparse/0/models/1."""
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -75,8 +78,14 @@ class _Image:
 
 
 def find_models(folder: Path) -> list[Path]:
-    """Folders with a COLMAP model, as its programs lay them out."""
-    places = [folder] + [place for pattern in _PLACES[1:] for place in sorted(folder.glob(pattern))]
+    """Folders with a COLMAP model: where its programs put one first, then those that lie deeper."""
+    places = [folder] + [place for pattern in _PLACES for place in sorted(folder.glob(pattern))]
+    for parent, folders, _ in os.walk(folder):
+        folders.sort()
+        here = Path(parent)
+        places.append(here)
+        if len(here.relative_to(folder).parts) == _DEEPEST:
+            folders.clear()
     return [place for place in dict.fromkeys(places) if _suffix(place) is not None]
 
 
@@ -270,14 +279,34 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
 
 
 def _text_images(path: Path) -> list[_Image]:
-    """Images with their poses; every second line, where points were seen, is passed over."""
+    """Images with their poses; lines of the points that were seen are told by their form.
 
-    def parse(line: str) -> _Image:
+    COLMAP writes one below every image, which is blank where nothing was seen; other programs leave blank ones out.
+    """
+
+    def parse(line: str) -> _Image | None:
+        if _is_observations(line):
+            return None
         _, *numbers = line.split(maxsplit=9)
         qw, qx, qy, qz, x, y, z = (float(value) for value in numbers[:7])
         return _Image(numbers[8].strip(), int(numbers[7]), (qw, qx, qy, qz), (x, y, z))
 
-    return _parsed(path, parse, "number, quaternion, translation, camera and name", lines_each=2)
+    found = _parsed(path, parse, "number, quaternion, translation, camera and name")
+    return [image for image in found if image is not None]
+
+
+def _is_observations(line: str) -> bool:
+    """Whether a line lists points that an image saw: x, y and the number of the point, again and again.
+
+    >>> _is_observations("10.5 11.5 1 20 21 -1"), _is_observations("1 1 0 0 0 0 0 3 1 17.png")
+    (True, False)
+    """
+    words = line.split()
+    try:
+        _ = [float(word) for word in words], [int(word) for word in words[2::3]]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0
 
 
 def _text_points(path: Path) -> SparsePoints:
@@ -293,11 +322,10 @@ def _text_points(path: Path) -> SparsePoints:
     return positions, np.array([colour for _, colour in found], dtype=np.uint8).reshape(-1, 3)
 
 
-def _parsed(path: Path, parse: Callable[[str], _Record], expected: str, lines_each: int = 1) -> list[_Record]:
-    """Records of a text file, each at the first of so many lines; comments and blank lines between them are nothing."""
+def _parsed(path: Path, parse: Callable[[str], _Record], expected: str) -> list[_Record]:
+    """Records of a text file, one a line; comments and blank lines between them are nothing."""
     records = []
-    lines = iter(enumerate(_bytes_of(path).decode("utf-8", "replace").splitlines(), start=1))
-    for number, line in lines:
+    for number, line in enumerate(_bytes_of(path).decode("utf-8", "replace").splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
@@ -306,8 +334,6 @@ def _parsed(path: Path, parse: Callable[[str], _Record], expected: str, lines_ea
             raise CaptureError(
                 f"{path}, line {number}: found {line.strip()[:80]!r}; expected {expected}: was the file cut short?"
             ) from error
-        for _ in range(lines_each - 1):
-            next(lines, None)
     return records
 
 

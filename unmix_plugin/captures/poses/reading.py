@@ -28,7 +28,7 @@ from unmix_plugin.captures.poses.pose_set import (
     make_pose_set,
     name_some,
 )
-from unmix_plugin.errors import CaptureError, SceneError
+from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
@@ -130,11 +130,20 @@ def _read_folder(folder: Path, given: Mapping[str, _Size]) -> PoseSet:
 
 
 def _greatest_model(models: list[Path]) -> PoseSet:
-    """The model with the most images."""
-    poses = max((read_colmap(model) for model in models), key=lambda found: len(found.cameras))
+    """The model with the most images, the first of several."""
+    found = [read_colmap(model) for model in models]
+    poses = max(found, key=lambda model: len(model.cameras))
     if len(models) == 1:
         return poses
-    note = f"{len(models)} COLMAP models are there; the one with the most images was read"
+    others = [
+        f"{path} ({counted(len(other.cameras), 'image')})"
+        for path, other in zip(models, found, strict=True)
+        if other is not poses
+    ]
+    note = (
+        f"{len(models)} COLMAP models are there; {poses.source} has the most images "
+        f"({len(poses.cameras)}) and was read, not {name_some(others)}"
+    )
     return replace(poses, notes=(*poses.notes, note))
 
 
