@@ -32,6 +32,8 @@ class Page:
     height: int = 240
     origin: str | None = None
     """Of the page, as a browser would say it."""
+    headers: dict[str, str] = field(default_factory=dict)
+    """Others of the request that opens the connection."""
     pictures: list[tuple[float, int]] = field(default_factory=list)
     """When each picture came (monotonic seconds), and its bytes."""
     last_picture: bytes = b""
@@ -53,6 +55,7 @@ class Page:
             self.url,
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
             origin=self.origin,  # type: ignore[arg-type]
+            additional_headers=self.headers,
             max_size=None,
             compression=None,
         )

@@ -1,4 +1,4 @@
-"""Where the viewer listens, what its user reads about that, and who may use it."""
+"""Where the viewer listens, what its user reads about that, and where its token comes from."""
 
 import socket
 
@@ -8,12 +8,9 @@ from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.access import (
-    MOST_WAITING,
-    Gate,
     TrainingViewerOptions,
     ViewerOptions,
     free_port,
-    is_own_page,
     start_notices,
 )
 
@@ -96,87 +93,34 @@ def test_impossible_shares_are_refused(share):
         TrainingViewerOptions(share=share)
 
 
-@given(st.text())
-def test_only_the_token_itself_is_admitted(word):
-    gate = Gate("sésame")
-    gate.enter(1, "10.0.0.1")
-    gate.guess(1, word)
-    assert gate.verdicts() == {1: word == "sésame"}
-    assert gate.verdicts() == {}
-
-
-def test_each_address_has_one_guess_checked_at_a_time_the_oldest_first():
-    gate = Gate("sesame")
-    for page, address in ((1, "10.0.0.1"), (2, "10.0.0.1"), (3, "10.0.0.2")):
-        gate.enter(page, address)
-        gate.guess(page, "barley")
-    assert gate.verdicts() == {1: False, 3: False}
-    gate.guess(1, "barley")
-    assert gate.verdicts() == {2: False}
-    assert gate.verdicts() == {1: False}
-
-
-def test_the_right_token_is_let_in_however_many_guess_wrong():
-    gate = Gate("sesame")
-    for page in range(MOST_WAITING):
-        assert gate.enter(page, "10.0.0.1")
-        gate.guess(page, "sesame" if page == 7 else "barley")
-    admitted = []
-    for _ in range(MOST_WAITING):
-        for page, is_right in gate.verdicts().items():
-            if is_right:
-                admitted.append(page)
-            else:
-                gate.guess(page, "barley")
-    assert admitted == [7]
-
-
-def test_pages_that_leave_do_not_keep_others_waiting():
-    gate = Gate("sesame")
-    for page in range(1000):
-        gate.enter(page, "10.0.0.1")
-        gate.guess(page, "barley")
-        gate.leave(page)
-    gate.enter(1000, "10.0.0.1")
-    gate.guess(1000, "sesame")
-    assert gate.verdicts() == {1000: True}
-
-
-def test_an_address_has_a_limited_number_of_pages_waiting():
-    gate = Gate("sesame")
-    assert all(gate.enter(page, "10.0.0.1") for page in range(MOST_WAITING))
-    assert not gate.enter(100, "10.0.0.1")
-    assert gate.enter(101, "10.0.0.2")
-    gate.leave(0)
-    assert gate.enter(102, "10.0.0.1")
+def test_a_token_is_taken_from_the_flag_a_file_or_the_environment(tmp_path):
+    file = tmp_path / "token"
+    file.write_text("sésame\n", encoding="utf-8")
+    elsewhere = {"UNMIX_VIEWER_TOKEN": "barley"}
+    assert ViewerOptions().secret({}) is None
+    assert ViewerOptions().secret(elsewhere) == "barley"
+    assert ViewerOptions(token="sesame").secret(elsewhere) == "sesame"
+    assert ViewerOptions(token=f"@{file}").secret(elsewhere) == "sésame"
+    assert "with the token" in start_notices(ViewerOptions(host="0.0.0.0"), 7007, elsewhere)[1]
 
 
 @pytest.mark.parametrize(
-    ("headers", "is_own"),
+    ("content", "message"),
     [
-        ({"Origin": "http://127.0.0.1:7007", "Host": "127.0.0.1:7007"}, True),
-        ({"origin": "http://LOCALHOST:7007", "host": "localhost:7007"}, True),
-        ({"Origin": "http://[::1]:7007", "Host": "[::1]:7007"}, True),
-        ({"Origin": "http://192.168.1.5:7007", "Host": "192.168.1.5:7007"}, True),
-        ({"Host": "127.0.0.1:7007"}, True),
-        ({}, True),
-        (None, False),
-        ({"Origin": "https://evil.example", "Host": "127.0.0.1:7007"}, False),
-        ({"Origin": "http://127.0.0.1:8000", "Host": "127.0.0.1:7007"}, False),
-        ({"Origin": "null", "Host": "127.0.0.1:7007"}, False),
-        ({"Origin": "http://rebound.example:7007", "Host": "127.0.0.1:7007"}, False),
-        ({"Origin": "http://rebound.example:7007", "Host": "rebound.example:7007"}, False),
-        ({"Origin": "http://localhost:7007"}, False),
+        (None, "No such file"),
+        (b"", "is empty"),
+        (b"\xff\xfe", "it is no UTF-8 text"),
+        (b"x" * 5000, "has 5,000 bytes, and 4,096 at most are read"),
     ],
 )
-def test_pages_of_other_sites_are_told_by_their_origin_and_host(headers, is_own):
-    assert is_own_page(headers, "127.0.0.1") is is_own
+def test_a_file_that_holds_no_token_is_refused(tmp_path, content, message):
+    file = tmp_path / "token"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(ConfigError, match=message):
+        ViewerOptions(token=f"@{file}").secret({})
 
 
-def test_a_name_is_own_if_the_viewer_listens_there_and_this_machines_name_if_it_listens_everywhere():
-    def page_at(name):
-        return {"Origin": f"http://{name}:7007", "Host": f"{name}:7007"}
-
-    assert is_own_page(page_at("lab.example"), "lab.example")
-    assert not is_own_page(page_at("lab.example"), "0.0.0.0")
-    assert is_own_page(page_at(socket.gethostname()), "0.0.0.0")
+def test_an_empty_variable_is_no_token():
+    with pytest.raises(ConfigError, match="UNMIX_VIEWER_TOKEN is empty"):
+        ViewerOptions().secret({"UNMIX_VIEWER_TOKEN": " "})

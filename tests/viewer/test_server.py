@@ -1,23 +1,32 @@
 """The life of the server; pages that send nonsense, leave, come in crowds or are not allowed in: the others go on."""
 
+import asyncio
+import base64
+import contextlib
 import math
 import socket
 import threading
 import time
+import urllib.error
 import urllib.request
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 import viser
+import websockets
+from hypothesis import given
+from hypothesis import strategies as st
 from viser import infra
+from websockets.exceptions import InvalidStatus
 
 from tests.viewer.pages import has_control, opened, page_of, serving, show_layer
 from tests.viewer.view_factory import make_source
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
-from unmix_plugin.viewer.access import MOST_CLIENTS
-from unmix_plugin.viewer.server import _TokenPrompt
+from unmix_plugin.viewer import connections
+from unmix_plugin.viewer.connections import _Connection, is_heard
 
 
 def test_stopping_frees_the_port_and_every_thread_and_prints_nothing(source, capsys):
@@ -114,7 +123,6 @@ NO_CAMERAS: tuple[dict[str, Any], ...] = (
     {"image_width": 0, "image_height": 0},
     {"image_height": -5},
     {"image_height": 10**9, "image_width": 10**9},
-    {"wxyz": ()},
 )
 
 
@@ -146,7 +154,7 @@ def test_values_that_no_control_would_send_harm_nobody(viewer, label):
 
 def test_a_page_that_sends_nonsense_loses_its_connection_and_others_go_on(viewer):
     words = {"type": "ViewerCameraMessage", "position": ("a", "b", "c")}
-    nonsense = (b"", b"\xff\xff", b"\x81", "text", b"\x81\xa4type\xa4Nope", msgspec.msgpack.encode(words))
+    nonsense = (b"", b"\xff\xff", b"\x81", "text", b"\x81\xa4type", msgspec.msgpack.encode(words))
     with opened(viewer) as good:
         for number, data in enumerate(nonsense):
             with page_of(viewer) as bad:
@@ -172,31 +180,36 @@ def test_pages_that_leave_in_mid_render_are_forgotten(viewer):
 
 
 def test_no_more_pages_are_served_than_there_is_room_for(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.server.MOST_CLIENTS", 1)
-    assert MOST_CLIENTS > 1
-    with opened(viewer), page_of(viewer) as second:
-        second.look_from(0.3)
-        second.wait_until(lambda: "pages are open already" in second.texts)
-        second.wait_until(lambda: second.is_closed)
-        assert second.pictures == []
+    monkeypatch.setattr("unmix_plugin.viewer.gate.MOST_PAGES", 1)
+    monkeypatch.setattr("unmix_plugin.viewer.gate._ROOM_S", 0.1)
+    with opened(viewer):
+        assert refused(viewer) == 503
+    viewer_page = page_of(viewer)
+    with viewer_page:  # which waits until the one before has gone
+        viewer_page.look_from(0.3)
+        viewer_page.wait_until(lambda: bool(viewer_page.pictures))
 
 
-def enter_token(page, token):
-    page.set("token", token)
-    page.set("enter", True)
+def refused(viewer, **settings):
+    """HTTP status with which a page's connection is refused."""
+    with pytest.raises(InvalidStatus) as caught, page_of(viewer, **settings):
+        pass
+    return caught.value.response.status_code
 
 
-def try_a_wrong_token(page):
-    page.look_from(0.3)
-    page.wait_until(lambda: has_control(page, "token"))
-    enter_token(page, "barley")
-    page.wait_until(lambda: "That is not the token" in page.texts)
+def coded(word):
+    return {"Authorization": "Basic " + base64.b64encode(f":{word}".encode()).decode()}
 
 
-@pytest.fixture(autouse=True)
-def brief(monkeypatch):
-    """Pages that are turned away need no time to read why."""
-    monkeypatch.setattr("unmix_plugin.viewer.server._READING_S", 0.2)
+def read(viewer, headers=None):
+    """Status, headers and text of the page that a browser would load."""
+    asking = urllib.request.Request(f"http://127.0.0.1:{viewer.port}/", headers=headers or {})
+    try:
+        answer = urllib.request.urlopen(asking)
+    except urllib.error.HTTPError as error:
+        answer = error
+    with answer:
+        return answer.status, answer.headers, answer.read().decode()
 
 
 @pytest.fixture(scope="module")
@@ -207,81 +220,145 @@ def guarded(tmp_path_factory):
 
 
 def test_a_page_must_give_the_token_before_it_sees_anything(guarded):
-    with page_of(guarded) as page:
-        try_a_wrong_token(page)
-        assert page.pictures == []
-        assert not has_control(page, "layer")
-        assert guarded.num_clients == 0
-        enter_token(page, "sesame")
-        page.wait_until(lambda: bool(page.pictures))
-        assert not has_control(page, "token")
-
-
-def test_a_page_that_answers_at_once_is_heard(guarded, monkeypatch):
-    ask = _TokenPrompt.__init__
-
-    def ask_slowly(*words):
-        ask(*words)
-        time.sleep(1.0)
-
-    monkeypatch.setattr(_TokenPrompt, "__init__", ask_slowly)
-    with page_of(guarded) as page:
-        try_a_wrong_token(page)
+    status, _, text = read(guarded)
+    assert status == 401
+    assert "asks for the token" in text
+    assert "__viser" not in text
+    assert refused(guarded) == 401
+    assert read(guarded, coded("barley"))[0] == 401
+    assert refused(guarded, headers=coded("barley")) == 401
+    assert guarded.num_clients == 0
+    status, headers, _ = read(guarded, coded("sesame"))
+    assert status == 200
+    cookie = {"Cookie": headers["Set-Cookie"].partition(";")[0]}
+    assert "<title>unmix-nerf</title>" in read(guarded, cookie)[2]
+    with opened(guarded, headers=cookie, origin=f"http://127.0.0.1:{guarded.port}"):
+        pass
 
 
 def test_a_page_of_another_site_is_refused_and_one_of_its_own_is_served(source):
     with serving(source) as (viewer, lines):
-        for _ in range(2):
-            with page_of(viewer, origin="http://evil.example") as foreign:
-                foreign.look_from(0.3)
-                foreign.wait_until(lambda: "this page is from another site" in foreign.texts)
-                foreign.wait_until(lambda: foreign.is_closed)
-                assert foreign.pictures == []
-        assert [line for line in lines if "another site (http://evil.example)" in line] == lines[1:]
-        assert len(lines) == 2
+        for _ in range(64):
+            assert refused(viewer, origin="http://evil.example") == 403
+        assert refused(viewer, origin=f"https://127.0.0.1:{viewer.port}") == 403
+        assert [line for line in lines if "another site (http://evil.example)" in line] == lines[1:2]
+        assert len(lines) == 3
         with opened(viewer, origin=f"http://127.0.0.1:{viewer.port}"):
             pass
 
 
-def test_a_page_whose_headers_cannot_be_read_is_refused(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.server._headers_of", lambda _: None)
+def test_a_page_of_another_version_is_refused(viewer, monkeypatch):
+    monkeypatch.setattr("tests.viewer_page.viser", SimpleNamespace(__version__="0.0.1"))
+    assert refused(viewer) == 400
+
+
+def test_a_message_larger_than_any_that_a_page_sends_ends_its_connection(viewer, capfd):
     with page_of(viewer) as page:
         page.look_from(0.3)
-        page.wait_until(lambda: "this page is from another site" in page.texts)
+        page.wait_until(lambda: has_control(page, "formula"))
+        page.set("formula", "x" * 100_000)
+        page.wait_until(lambda: page.is_closed)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_page_that_sends_faster_than_any_is_slowed_down():
+    connection = object.__new__(_Connection)
+    connection._paid_until = 0.0
+
+    async def send(number, size):
+        begun = time.monotonic()
+        for _ in range(number):
+            await connection._keep_pace(size)
+        return time.monotonic() - begun
+
+    burst = int(connections._MESSAGES_PER_S * connections._BURST_S)
+    assert asyncio.run(send(burst, 100)) < 0.5
+    assert 0.2 < asyncio.run(send(connections._MESSAGES_PER_S // 4, 100)) < 2.0
+    assert asyncio.run(send(1, connections._BYTES_PER_S // 4)) > 0.2
+
+
+def test_a_page_that_never_says_anything_loses_its_place(viewer, monkeypatch):
+    monkeypatch.setattr("unmix_plugin.viewer.connections._SILENT_S", 0.2)
+    with page_of(viewer) as page:
         page.wait_until(lambda: page.is_closed)
 
 
-@pytest.mark.parametrize("is_guarded", [False, True])
-def test_what_a_page_uploads_is_not_kept(viewer, guarded, is_guarded):
-    serves = guarded if is_guarded else viewer
-    with page_of(serves) as page:
+HEARD = {
+    "ViewerCameraMessage": {
+        "wxyz": (1, 0, 0, 0),
+        "position": (0.5, 0, 0),
+        "fov": 1,
+        "near": 0.1,
+        "far": 10,
+        "image_height": 20,
+        "image_width": 30.5,
+        "look_at": (0, 0, 0),
+        "up_direction": (0, 0, 1),
+    },
+    "GuiUpdateMessage": {"uuid": "a", "updates": {"value": [1, "x", None]}},
+    "LocalStorageGetItemResponseMessage": {"value": None, "error": None, "request_uuid": "a"},
+    "ScenePointerMessage": {
+        "event_type": "click",
+        "ray_origin": None,
+        "ray_direction": (0, 0, 1),
+        "screen_pos": ((0.5, 0.5),),
+        "modifier": None,
+    },
+}
+
+
+@pytest.mark.parametrize("kind", HEARD)
+def test_what_a_page_sends_is_checked_before_anything_of_it_is_kept(kind):
+    message = {"type": kind, **HEARD[kind]}
+    assert is_heard(msgspec.msgpack.encode(message))
+    for name in HEARD[kind]:
+        with pytest.raises(ValueError, match=r"missing|Expected"):
+            is_heard(msgspec.msgpack.encode({key: value for key, value in message.items() if key != name}))
+        with pytest.raises(ValueError, match="Expected"):
+            is_heard(msgspec.msgpack.encode({**message, name: b"x"}))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {"type": "ShareUrlRequest"},
+        {"type": "GuiFormDirtyMessage", "uuid": "a"},
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"update_cb": 1}},
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {}},
+    ],
+)
+def test_what_no_control_of_the_viewer_needs_is_not_listened_to(message):
+    assert not is_heard(msgspec.msgpack.encode(message))
+
+
+@given(st.binary(max_size=100))
+def test_bytes_of_any_kind_are_a_message_or_none(data):
+    with contextlib.suppress(ValueError):
+        is_heard(data)
+
+
+def test_a_fault_is_said_in_one_short_line_and_once():
+    said = []
+    tell = connections._Faults(said.append)
+    for number in range(1000):
+        tell(None, {"exception": ValueError(f"{number} " + "x" * 10_000)})
+        tell(None, {"message": f"{number}"})
+    assert len(said) <= connections._MOST_FAULTS
+    assert all(len(line) < 400 for line in said)
+
+
+def test_what_a_page_uploads_is_not_kept(viewer):
+    with page_of(viewer) as page:
         page.look_from(0.3)
-        box = "token" if is_guarded else "formula"
-        page.wait_until(lambda: has_control(page, box))
-        upload = {"source_component_uuid": page.control(box), "transfer_uuid": "some"}
+        page.wait_until(lambda: has_control(page, "formula"))
+        upload = {"source_component_uuid": page.control("formula"), "transfer_uuid": "some"}
         start = {"filename": "a", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2000}
         page.send("FileTransferStartUpload", **upload, **start)
         page.send("FileTransferPart", **upload, part_index=0, content=bytes(1000))
-        page.look_from(0.4)
-        if is_guarded:
-            try_a_wrong_token(page)
-        else:
-            page.wait_until(lambda: bool(page.pictures))
-        apis = [serves._server.gui, *(client.gui for client in serves._server.get_clients().values())]
+        show_layer(page, "depth")
+        apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
         assert len(apis) >= 2
         assert all(not api._current_file_upload_states for api in apis)
-
-
-@pytest.mark.slow
-def test_there_is_a_limit_to_connections_that_are_not_served(viewer, monkeypatch):
-    monkeypatch.setattr("unmix_plugin.viewer.server._MOST_CONNECTIONS", 2)
-    with page_of(viewer) as first, page_of(viewer) as second:
-        for page in (first, second):
-            page.look_from(0.3)
-            page.wait_until(lambda page=page: bool(page.pictures))
-        with page_of(viewer) as third:
-            third.wait_until(lambda: third.is_closed)
-        assert not first.is_closed
 
 
 @pytest.mark.slow
@@ -296,18 +373,17 @@ def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
 
 def test_the_private_parts_are_those_of_the_version_that_they_were_taken_from(viewer):
     assert viser.__version__.startswith("1.1."), (
-        "read server.py beside the source of this viser, then name it here"
+        "read connections.py beside the source of this viser, then name it here"
     )
     server = viewer._server
+    assert server._websock_server._background_event_loop is server._event_loop
+    assert isinstance(server._websock_server, connections._PageServer)
     with opened(viewer):
-        (client,) = server.get_clients().values()
-        connection = client._viser_server._websock_server._live_connections[client.client_id]
-        assert connection.request.headers["Host"].endswith(str(viewer.port))
-        assert connection.remote_address[0] == "127.0.0.1"
-        assert client._viser_server._event_loop is server._event_loop
-    assert server._websock_server._incoming_handlers
+        (connection,) = server._websock_server._live_connections.values()
+        assert isinstance(connection, _Connection)
 
 
 @pytest.mark.usefixtures("viewer")
 def test_viser_itself_is_left_as_it_is():
     assert infra.WebsockServer.__module__.startswith("viser")
+    assert infra._infra.websockets is websockets

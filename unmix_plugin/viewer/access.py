@@ -1,20 +1,24 @@
-"""How the viewer is served, as flags of commands; where it listens and how it is reached; who may use it."""
+"""How the viewer is served, as flags of commands; where it listens and how it is reached."""
 
 from __future__ import annotations
 
 import errno
-import hmac
 import ipaddress
 import os
 import socket
-import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.limits import read_bounded
+from unmix_plugin.viewer.gate import ANYWHERE, is_address
+
+TOKEN_VARIABLE = "UNMIX_VIEWER_TOKEN"
+
+_LONGEST_TOKEN = 4096
+"""Bytes of a file that holds one."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,8 @@ class ViewerOptions:
     port: int = 7007
     """Port to listen at; if it is taken the next free one is used, and said."""
     token: str | None = None
-    """Word that the page asks for before it shows anything."""
+    """Word that the page asks for before it shows anything. Others on this machine can read words of a command: rather
+    put it in the environment variable UNMIX_VIEWER_TOKEN, or give the file that holds it as @PATH."""
     environments: tuple[Path, ...] = ()
     """Environment maps (.exr, .hdr) to offer beside the built-in ones, for methods that know light and material
     apart."""
@@ -38,6 +43,33 @@ class ViewerOptions:
             raise ConfigError("--viewer.host is empty; leave it out to listen on this machine only")
         if self.token is not None and not self.token.strip():
             raise ConfigError("--viewer.token is empty; leave it out or give a word that others can't guess")
+
+    def secret(self, environment: Mapping[str, str]) -> str | None:
+        """The token itself, from wherever it is given; None without one.
+
+        Args:
+            environment: Variables of the process.
+        Raises:
+            ConfigError: its file can't be read, or is no text of one word; the variable is empty.
+        """
+        if self.token is None:
+            word = environment.get(TOKEN_VARIABLE)
+            if word is not None and not word.strip():
+                raise ConfigError(
+                    f"{TOKEN_VARIABLE} is empty; unset it or give a word that others can't guess"
+                )
+            return word
+        if not self.token.startswith("@"):
+            return self.token
+        path = Path(self.token[1:])
+        try:
+            word = read_bounded(path, _LONGEST_TOKEN).decode().strip()
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or "it is no UTF-8 text"
+            raise ConfigError(f"can't read the token of --viewer.token {self.token}: {reason}") from error
+        if not word:
+            raise ConfigError(f"{path} is empty; --viewer.token @PATH names a file that holds the token")
+        return word
 
 
 @dataclass(frozen=True)
@@ -60,8 +92,6 @@ class TrainingViewerOptions(ViewerOptions):
 
 
 _PORTS_TRIED = 100
-_ANYWHERE = ("0.0.0.0", "::", "")
-"""Hosts that mean every address of this machine."""
 
 
 def free_port(host: str, port: int) -> int:
@@ -107,15 +137,15 @@ def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, s
         environment: Variables of the process.
     """
     host = options.host
-    shown = "localhost" if host in _ANYWHERE else host
+    shown = "localhost" if host in ANYWHERE else host
     lines = [f"viewer: http://[{shown}]:{port}" if ":" in shown else f"viewer: http://{shown}:{port}"]
     if options.port not in (0, port):
         lines.append(f"port {options.port} is taken, hence {port}")
-    if host != "localhost" and not (_is_address(host) and ipaddress.ip_address(host).is_loopback):
+    if host != "localhost" and not (is_address(host) and ipaddress.ip_address(host).is_loopback):
         reach = f"{socket.gethostname()}:{port}"
         protected = (
             "with the token; it travels unencrypted"
-            if options.token
+            if options.token is not None or TOKEN_VARIABLE in environment
             else "and change, render and save files in the run folder: give --viewer.token to ask for a word first"
         )
         lines.append(f"warning: everyone who reaches {reach} can use the viewer {protected}")
@@ -129,87 +159,3 @@ def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, s
         command += f" {user}@{server}" if user else f" {server}"
         lines.append(f"from your own machine: {command}, then open the address there")
     return lines
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
-
-
-MOST_CLIENTS = 16
-"""Pages that are served at once."""
-
-MOST_WAITING = 16
-"""Pages from one address that may be asked for the token at once."""
-
-
-class Gate:
-    """Checks tokens, one at a time for each address, so that nobody gets through a dictionary.
-
-    A page's guess waits for its turn; the right token is never turned down because others guessed wrong.
-    """
-
-    def __init__(self, token: str) -> None:
-        self._token = token
-        self._lock = threading.Lock()
-        self._address_of: dict[int, str] = {}
-        self._guesses: dict[int, str] = {}
-
-    def enter(self, page: int, address: str) -> bool:
-        """Note a page that is asked for the token; False if too many from its address are already."""
-        with self._lock:
-            if list(self._address_of.values()).count(address) >= MOST_WAITING:
-                return False
-            self._address_of[page] = address
-            return True
-
-    def leave(self, page: int) -> None:
-        """Forget a page and its guess."""
-        with self._lock:
-            self._address_of.pop(page, None)
-            self._guesses.pop(page, None)
-
-    def guess(self, page: int, word: str) -> None:
-        """Queue a page's guess; a later one of the same page replaces it in its place."""
-        with self._lock:
-            if page in self._address_of:
-                self._guesses[page] = word
-
-    def verdicts(self) -> dict[int, bool]:
-        """Check the oldest guess from each address: whether it is right, by page. To be called at a steady pace."""
-        with self._lock:
-            chosen: dict[str, int] = {}
-            for page in self._guesses:
-                chosen.setdefault(self._address_of[page], page)
-            token = self._token.encode()
-            return {
-                page: hmac.compare_digest(self._guesses.pop(page).encode(), token) for page in chosen.values()
-            }
-
-
-def is_own_page(headers: Mapping[str, str] | None, host: str) -> bool:
-    """Whether a connection comes from a page that this server sent, and not from one of another site.
-
-    Browsers let any page connect, and a site can let its own name point here (DNS rebinding), so the name must be one
-    that only this machine has: a loopback name, an IP address, or that of `host`.
-
-    Args:
-        headers: Of the request that opened the connection, names in any case; None where they can't be read.
-        host: Where the server listens.
-    """
-    if headers is None:
-        return False
-    known = {name.lower(): value.lower() for name, value in headers.items()}
-    if "origin" not in known:
-        return True  # not a browser: those always send it
-    asked = known.get("host", "")
-    name = urlsplit(f"//{asked}").hostname
-    if name is None or urlsplit(known["origin"]).netloc != asked:
-        return False
-    own = {"localhost", host.lower()}
-    if host in _ANYWHERE:
-        own |= {socket.gethostname().lower(), socket.getfqdn().lower()}
-    return name in own or _is_address(name)

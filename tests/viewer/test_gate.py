@@ -1,0 +1,168 @@
+"""Who is let in: by the token, and by what a browser says of the page that asks."""
+
+import asyncio
+import base64
+import socket
+from http import HTTPStatus
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from unmix_plugin.viewer import gate as gates
+from unmix_plugin.viewer.gate import MOST_PAGES, Gate, is_own_page
+
+HERE = {"host": "127.0.0.1:7007"}
+OPENING = {**HERE, "upgrade": "websocket"}
+
+
+def lowered(headers):
+    return {name.lower(): value for name, value in headers.items()}
+
+
+def with_word(word, headers=HERE):
+    return {**headers, "authorization": "Basic " + base64.b64encode(f":{word}".encode()).decode()}
+
+
+@pytest.fixture
+def ask(monkeypatch):
+    """Asks a gate, which then answers in no time."""
+    monkeypatch.setattr(gates, "_GUESS_S", 0.001)
+    monkeypatch.setattr(gates, "_ROOM_S", 0.0)
+    return asked
+
+
+def asked(gate, headers=HERE, page=0, address="10.0.0.1", port=7007):
+    return asyncio.run(gate.judge(page, headers, address, port))
+
+
+@given(st.text().filter(lambda word: word != "sésame"))
+@settings(max_examples=30)
+def test_only_the_token_itself_is_admitted(word):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gates, "_GUESS_S", 0.001)
+        gate = Gate("127.0.0.1", "sésame")
+        assert asked(gate, with_word(word)).status == HTTPStatus.UNAUTHORIZED
+        assert asked(gate, with_word("sésame", OPENING)) is None
+
+
+def test_the_token_is_asked_for_once_and_a_cookie_stands_for_it(ask):
+    gate = Gate("127.0.0.1", "sesame")
+    asking = ask(gate)
+    assert (asking.status, "asks for the token" in asking.text) == (HTTPStatus.UNAUTHORIZED, True)
+    assert ask(gate, OPENING).status == HTTPStatus.UNAUTHORIZED
+    cookie = ask(gate, with_word("sesame")).headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    assert "sesame" not in cookie
+    given = {"cookie": cookie.partition(";")[0]}
+    assert ask(gate, {**HERE, **given}) is None
+    assert ask(gate, {**OPENING, **given}) is None
+    assert ask(gate, {**OPENING, **given}, port=7008).status == HTTPStatus.UNAUTHORIZED
+    assert ask(Gate("127.0.0.1", "sesame"), {**HERE, **given}).status == HTTPStatus.UNAUTHORIZED
+    assert ask(gate, {**OPENING, **given, "origin": "http://127.0.0.1:8000"}).status == HTTPStatus.FORBIDDEN
+
+
+@pytest.mark.parametrize("given", ["", "Basic", "Basic ?", "Basic c2VzYW1l", "Bearer OnNlc2FtZQ==", "\xff"])
+def test_headers_that_hold_no_token_are_wrong_ones(ask, given):
+    gate = Gate("127.0.0.1", "sesame")
+    assert ask(gate, {**HERE, "authorization": given}).status == HTTPStatus.UNAUTHORIZED
+
+
+def test_each_address_has_one_guess_checked_at_a_time_and_a_limited_number_waiting(monkeypatch):
+    monkeypatch.setattr(gates, "_GUESS_S", 0.02)
+    gate, ended = Gate("127.0.0.1", "sesame"), []
+
+    async def guess(number, word, address):
+        refusal = await gate.judge(number, with_word(word), address, 7007)
+        ended.append((number, refusal.status))
+
+    async def crowd():
+        many = [guess(number, "barley", "10.0.0.1") for number in range(30)]
+        await asyncio.gather(*many, guess(100, "sesame", "10.0.0.2"))
+
+    asyncio.run(crowd())
+    refused = [number for number, status in ended if status == HTTPStatus.TOO_MANY_REQUESTS]
+    assert len(refused) == 30 - gates._MOST_WAITING
+    assert ended.index((100, HTTPStatus.OK)) <= len(refused) + 1
+    waited = [number for number, _ in ended if number not in (*refused, 100)]
+    assert waited == sorted(waited)
+
+
+def test_places_are_limited_and_given_back(ask):
+    gate = Gate("127.0.0.1", None)
+    assert all(ask(gate, OPENING, page) is None for page in range(MOST_PAGES))
+    for headers in (OPENING, HERE):
+        refusal = ask(gate, headers, 100)
+        assert refusal.status == HTTPStatus.SERVICE_UNAVAILABLE
+        assert "16 pages are open already" in refusal.text
+    gate.leave(3)
+    gate.leave(3)
+    assert ask(gate) is None  # what is only read takes no place
+    assert ask(gate, OPENING, 100) is None
+    assert ask(gate, OPENING, 101) is not None
+
+
+def test_foreign_pages_take_no_place_and_their_site_is_said_once(ask):
+    said = []
+    gate = Gate("127.0.0.1", None, said.append)
+    for page in range(64):
+        refusal = ask(gate, {**OPENING, "origin": "http://evil.example\x1b[2J"}, page)
+        assert refusal.status == HTTPStatus.FORBIDDEN
+    assert len(said) == 1
+    assert "another site (http://evil.example[2J)" in said[0]
+    for number in range(100):
+        ask(gate, {**OPENING, "origin": f"http://{number}.example"})
+    assert len(said) == gates._MOST_SITES_NAMED
+    assert ask(gate, OPENING) is None
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_own"),
+    [
+        ({"Origin": "http://127.0.0.1:7007", "Host": "127.0.0.1:7007"}, True),
+        ({"origin": "http://LOCALHOST:7007", "host": "localhost:7007"}, True),
+        ({"Origin": "http://[::1]:7007", "Host": "[::1]:7007"}, True),
+        ({"Origin": "http://192.168.1.5:7007", "Host": "192.168.1.5:7007"}, True),
+        ({"Host": "127.0.0.1:7007"}, True),
+        ({}, True),
+        ({"Origin": "https://127.0.0.1:7007", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "ftp://127.0.0.1:7007", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "http://[::1", "Host": "[::1"}, False),
+        ({"Host": "rebound.example:7007"}, False),
+        ({"Origin": "https://evil.example", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "http://127.0.0.1:8000", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "null", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "http://rebound.example:7007", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "http://rebound.example:7007", "Host": "rebound.example:7007"}, False),
+        ({"Origin": "http://localhost:7007"}, False),
+    ],
+)
+def test_pages_of_other_sites_are_told_by_their_origin_and_host(headers, is_own):
+    assert is_own_page(lowered(headers), "127.0.0.1") is is_own
+
+
+@pytest.mark.parametrize(
+    ("headers", "is_own"),
+    [
+        ({"Origin": "https://lab.example", "Host": "lab.example"}, True),
+        (
+            {"Origin": "https://lab.example", "Host": "127.0.0.1:7007", "X-Forwarded-Host": "lab.example"},
+            True,
+        ),
+        ({"Origin": "https://lab.example", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "http://127.0.0.1:8000", "Host": "127.0.0.1:7007"}, False),
+        ({"Origin": "null", "Host": "127.0.0.1:7007"}, False),
+    ],
+)
+def test_with_the_token_a_page_may_come_through_a_proxy_but_not_from_elsewhere(headers, is_own):
+    assert is_own_page(lowered(headers), "127.0.0.1", has_token=True) is is_own
+
+
+def test_a_name_is_own_if_the_viewer_listens_there_and_this_machines_name_if_it_listens_everywhere():
+    def page_at(name):
+        return lowered({"Origin": f"http://{name}:7007", "Host": f"{name}:7007"})
+
+    assert is_own_page(page_at("lab.example"), "lab.example")
+    assert not is_own_page(page_at("lab.example"), "0.0.0.0")
+    assert is_own_page(page_at(socket.gethostname()), "0.0.0.0")

@@ -1,0 +1,96 @@
+"""What one file of a stranger may cost, asked before anything of it is decoded: one set of bounds for all readers.
+
+A file may lie about itself, lead nowhere (a pipe that nobody writes to), or hold far more than its size says.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO, NoReturn
+
+from unmix_plugin.errors import UnmixError
+
+MOST_PARTS = 10_000
+"""Parts of one file: members of an archive, pages, groups, variables. Instruments write some hundred bands as pages."""
+
+DEEPEST = 32
+"""Levels of parts within parts."""
+
+MOST_TEXT_BYTES = 1 << 24
+"""Bytes of a text that is read whole: headers, lists of poses, settings, records."""
+
+_FREE_BYTES = 1 << 28
+"""Decoded bytes that any file may have, however small it is."""
+
+_MOST_RATIO = 100
+"""Decoded bytes a stored byte of larger ones. Spectra compress by less than ten; masks by more, but these are small."""
+
+_LARGEST_ARRAY = 1 << 46
+"""Bytes beyond which a size is no size but damage."""
+
+
+def refuse(path: Path, found: str, expected: str, kind: type[UnmixError]) -> NoReturn:
+    """The one message of a file that asks for too much.
+
+    Raises:
+        UnmixError: of this kind, always.
+    """
+    raise kind(f"{path}: {found}; expected {expected}: the file is damaged, or not made by an instrument")
+
+
+def allow_parts(path: Path, number: int, noun: str, kind: type[UnmixError]) -> None:
+    """Ask before parts are read one after the other.
+
+    Raises:
+        UnmixError: of this kind: there are too many.
+    """
+    if number > MOST_PARTS:
+        refuse(path, f"{number} {noun}", f"at most {MOST_PARTS}", kind)
+
+
+def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int | None = None) -> None:
+    """Ask before something compressed is decoded.
+
+    Args:
+        decoded: Bytes that it will take.
+        stored: Bytes that it has in the file; by default those of the whole file.
+    Raises:
+        UnmixError: of this kind: small in the file and huge in memory.
+    """
+    size = path.stat().st_size if stored is None else stored
+    if decoded > _LARGEST_ARRAY or decoded > max(_FREE_BYTES, _MOST_RATIO * size):
+        refuse(
+            path,
+            f"{size:,} bytes decode to {decoded:,}",
+            f"at most {_FREE_BYTES:,}, or {_MOST_RATIO} times what is stored",
+            kind,
+        )
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading that is one: opening a pipe or a device may wait for ever.
+
+    Raises:
+        OSError: it can't be opened, or is no regular file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(None, "is no regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+    """All bytes of a regular file that is read whole.
+
+    Raises:
+        OSError: it can't be read, is no regular file, or has more than `most` bytes.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        data = b"" if size > most else file.read(most + 1)
+    if size > most or len(data) > most:
+        raise OSError(None, f"has {max(size, len(data)):,} bytes, and {most:,} at most are read", str(path))
+    return data

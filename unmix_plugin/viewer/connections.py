@@ -1,0 +1,292 @@
+"""viser's server as the viewer needs it: our title, no public tunnel, a gate at the handshake, bounded messages.
+
+viser has no setting for these. All that this package uses of its private parts is here, as in viser 1.1; what comes
+from websockets is public.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import io
+import logging
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, TypeAlias
+
+import msgspec
+import viser
+import websockets.asyncio.server
+import websockets.datastructures
+import websockets.exceptions
+from viser import infra
+from viser.infra import _infra
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+
+from unmix_plugin.viewer.gate import Gate
+
+LABEL = "unmix-nerf"
+
+_HEAD = f"""<title>{LABEL}</title>
+<script>
+  const asked = new URLSearchParams(location.search);
+  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {{
+    asked.set("darkMode", "");
+    history.replaceState(null, "", "?" + asked);
+  }}
+</script>"""
+
+_LARGEST_MESSAGE = 1 << 16
+"""Bytes. The longest that a page says is the text of a box."""
+
+_MOST_FRAGMENTS = 64
+"""Of one message; browsers send one."""
+
+_MESSAGES_PER_S, _BYTES_PER_S = 200, 1 << 19
+"""What a page may send for long: browsers send cameras and sliders some tens of times a second."""
+
+_BURST_S = 2.0
+"""How much of that may come at once."""
+
+_SILENT_S = 60.0
+"""How long a page may say nothing at first: its browser loads the parts that it draws with."""
+
+_SENDING_S = 0.2
+_LONGEST_FAULT = 200
+_MOST_FAULTS = 16
+
+
+class _Camera(msgspec.Struct, tag="ViewerCameraMessage", tag_field="type"):
+    wxyz: tuple[float, float, float, float]
+    position: tuple[float, float, float]
+    fov: float
+    near: float
+    far: float
+    image_height: float
+    image_width: float
+    look_at: tuple[float, float, float]
+    up_direction: tuple[float, float, float]
+
+
+class _Update(msgspec.Struct, tag="GuiUpdateMessage", tag_field="type"):
+    uuid: str
+    updates: dict[str, Any]
+
+
+class _Stored(msgspec.Struct, tag="LocalStorageGetItemResponseMessage", tag_field="type"):
+    value: str | None
+    error: str | None
+    request_uuid: str
+
+
+class _Pointer(msgspec.Struct, tag="ScenePointerMessage", tag_field="type"):
+    event_type: str
+    ray_origin: tuple[float, float, float] | None
+    ray_direction: tuple[float, float, float] | None
+    screen_pos: tuple[tuple[float, float], ...]
+    modifier: str | None
+
+
+_Known: TypeAlias = _Camera | _Update | _Stored | _Pointer
+_DECODER = msgspec.msgpack.Decoder(_Known)
+
+
+class _Any(msgspec.Struct):
+    type: str
+
+
+_ANY_DECODER = msgspec.msgpack.Decoder(_Any)
+_KINDS = {kind.__struct_config__.tag for kind in (_Camera, _Update, _Stored, _Pointer)}
+
+
+def is_heard(data: bytes) -> bool:
+    """Whether a message is one that the viewer listens to; others, such as uploads and requests for a tunnel, are not.
+
+    Raises:
+        ValueError: it is no message of a page.
+    """
+    try:
+        if _ANY_DECODER.decode(data).type not in _KINDS:
+            return False
+        message = _DECODER.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(str(error)) from error
+    return not isinstance(message, _Update) or set(message.updates) == {"value"}
+
+
+class _Connection(ServerConnection):
+    """A page's connection: what comes is bounded in size and pace before anything of it is kept."""
+
+    gate: Gate | None = None
+    _paid_until = 0.0
+    _has_spoken = False
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message that the viewer listens to; a page that sends what none sends loses its connection."""
+        while True:
+            data = await self._next_message()
+            await self._keep_pace(len(data))
+            try:
+                if is_heard(data):
+                    return data
+            except ValueError:
+                await self.close(1007, "not a message of a page")
+
+    async def _next_message(self) -> bytes:
+        try:
+            # Cut short it could not go on with the next message; there is none after the first is missing.
+            data = await asyncio.wait_for(self._joined(), None if self._has_spoken else _SILENT_S)
+        except asyncio.TimeoutError:
+            data = None
+        self._has_spoken = True
+        if data is not None:
+            return data
+        await self.close(1008, "too many parts, or silent for too long")
+        return await super().recv(decode=False)  # raises, since it is closed
+
+    async def _joined(self) -> bytes | None:
+        """A message from its parts; None if it has too many."""
+        parts: list[bytes] = []
+        async for part in self.recv_streaming(decode=False):
+            parts.append(part)
+            if len(parts) > _MOST_FRAGMENTS:
+                return None
+        return b"".join(parts)
+
+    async def _keep_pace(self, size: int) -> None:
+        """Wait where a page sends too fast: it then can't send either."""
+        now = time.monotonic()
+        cost = max(1 / _MESSAGES_PER_S, size / _BYTES_PER_S)
+        self._paid_until = max(self._paid_until, now - _BURST_S) + cost
+        if self._paid_until > now:
+            await asyncio.sleep(self._paid_until - now)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Give back the page's place."""
+        super().connection_lost(exc)
+        if self.gate is not None:
+            self.gate.leave(self)
+
+
+class _PageServer(infra.WebsockServer):
+    """Sends viser's page under our title, dark where the browser's user prefers that."""
+
+    def __init__(self, *, http_server_root: Path, **options: Any) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        page = (http_server_root / "index.html").read_text(encoding="utf-8")
+        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1), encoding="utf-8")
+        super().__init__(http_server_root=folder, **options)
+
+
+class _LocalServer(viser.ViserServer):
+    """Never opens a public tunnel."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+def open_server(host: str, port: int, gate: Gate, say: Callable[[str], None]) -> viser.ViserServer:
+    """A server that listens, and lets in what the gate does.
+
+    Args:
+        say: Told of what pages caused that should not have happened, in a short line each.
+    """
+    names = vars(_infra)
+    before = infra.WebsockServer, names["websockets"]
+    infra.WebsockServer = _PageServer
+    # viser asks websockets for its server in this module's name of it, once, while it starts.
+    names["websockets"] = SimpleNamespace(
+        asyncio=SimpleNamespace(server=SimpleNamespace(serve=_serve_through(gate, say))),
+        datastructures=websockets.datastructures,
+        exceptions=websockets.exceptions,
+    )
+    try:
+        with quiet():
+            return _LocalServer(host=host, port=port, label=LABEL, verbose=False)
+    finally:
+        infra.WebsockServer, names["websockets"] = before
+
+
+def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., websockets.asyncio.server.serve]:
+    """websockets' own `serve`, with the gate before what else answers requests, and our bounds."""
+    logger = logging.Logger(
+        "unmix_plugin.viewer"
+    )  # of nobody: strangers' requests are not for the user's log
+    logger.addHandler(logging.NullHandler())
+
+    class GatedConnection(_Connection):
+        pass
+
+    GatedConnection.gate = gate
+
+    def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
+        async def judge(connection: ServerConnection, request: Request) -> Response | None:
+            refusal = await _judged(gate, connection, request)
+            return process_request(connection, request) if refusal is None else refusal
+
+        asyncio.get_running_loop().set_exception_handler(_Faults(say))
+        ours = {
+            "create_connection": GatedConnection,
+            "max_size": _LARGEST_MESSAGE,
+            "max_queue": 4,
+            "logger": logger,
+        }
+        return websockets.asyncio.server.serve(
+            handler, host, port, process_request=judge, **{**options, **ours}
+        )
+
+    return serve
+
+
+async def _judged(gate: Gate, connection: ServerConnection, request: Request) -> Response | None:
+    headers = {name.lower(): value for name, value in request.headers.raw_items()}
+    opens = headers.get("upgrade", "").lower() == "websocket"
+    words = [word.strip() for word in headers.get("sec-websocket-protocol", "").split(",")]
+    if opens and f"viser-v{viser.__version__}" not in words:
+        return connection.respond(HTTPStatus.BAD_REQUEST, "this page is of another version: load it again")
+    remote, local = connection.remote_address, connection.local_address
+    refusal = await gate.judge(connection, headers, remote[0] if remote else "", local[1] if local else 0)
+    if refusal is None:
+        return None
+    response = connection.respond(refusal.status, refusal.text)
+    for name, value in refusal.headers.items():
+        response.headers.pop(name, None)
+        response.headers[name] = value
+    return response
+
+
+class _Faults:
+    """Says what went wrong in handling a message, once for each kind: a traceback for each would fill the disk."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say = say
+        self._said: set[str] = set()
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        kind = type(error).__name__ if error else str(context.get("message", ""))[:_LONGEST_FAULT]
+        if kind not in self._said and len(self._said) < _MOST_FAULTS:
+            self._said.add(kind)
+            text = "" if error is None else str(error)[:_LONGEST_FAULT]
+            self._say(f"warning: the viewer could not take something that a page sent ({kind}: {text!r})")
+
+
+def send_what_is_queued(server: viser.ViserServer) -> None:
+    """Send pages what is queued for them, before a server is stopped."""
+    server.flush()
+    asyncio.run_coroutine_threadsafe(asyncio.sleep(_SENDING_S), server._event_loop).result()
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Context without viser's own banner and farewell; ours name the real host and port."""
+    with redirect_stdout(io.StringIO()):
+        yield

@@ -1,0 +1,228 @@
+"""Who may use the viewer, judged when a request comes in and before a page can send anything.
+
+A page is let in by the token, where there is one, and always only if it is this server's own: browsers let any page of
+any site connect, so `Origin` and `Host` tell pages apart. The token is given once, to a small page that asks for it; a
+cookie stands for it from then on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+import hmac
+import html
+import ipaddress
+import secrets
+import socket
+import time
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import urlsplit
+
+ANYWHERE = ("0.0.0.0", "::", "")
+"""Hosts that mean every address of this machine."""
+
+MOST_PAGES = 16
+"""Pages that are served at once."""
+
+_GUESS_S = 0.5
+"""Time that a guess of the token takes its address, so that nobody gets through a dictionary."""
+
+_MOST_WAITING = 16
+"""Guesses from one address that may wait for their turn at once."""
+
+_ROOM_S = 2.0
+"""How long a page waits for a place: one that is loaded again comes before its old connection has gone."""
+
+_MOST_SITES_NAMED = 16
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What is answered in place of the page or the connection that was asked for."""
+
+    status: HTTPStatus
+    text: str
+    headers: Mapping[str, str] = field(default_factory=lambda: {"Content-Type": "text/plain; charset=utf-8"})
+
+
+class Gate:
+    """Judges requests and counts pages; used by the server's event loop alone."""
+
+    def __init__(self, host: str, token: str | None, say: Callable[[str], None] = lambda _: None) -> None:
+        """`host` is where the server listens."""
+        self._host, self._say = host, say
+        self._token = None if token is None else token.encode()
+        self._cookie_value = secrets.token_urlsafe(32)
+        self._pages: set[Hashable] = set()
+        self._sites_warned_of: set[str] = set()
+        self._turns: dict[str, float] = {}
+
+    async def judge(
+        self, page: Hashable, headers: Mapping[str, str], address: str, port: int
+    ) -> Refusal | None:
+        """What to answer to a request instead of what it asks for; None if it is let in.
+
+        A connection that is let in takes a place, to be given back by `leave`.
+
+        Args:
+            page: Stands for the connection.
+            headers: Of the request, names in lower case.
+            address: Where it comes from.
+            port: Where the server listens; the cookie's name has it, since browsers share cookies between ports.
+        """
+        opens = headers.get("upgrade", "").lower() == "websocket"
+        cookie = f"unmix-nerf-{port}"
+        if self._token is not None and not self._is_known(headers, cookie):
+            if "authorization" in headers:
+                refusal = await self._check(headers["authorization"], address)
+                if refusal is not None:
+                    return refusal
+            elif opens:
+                return Refusal(HTTPStatus.UNAUTHORIZED, "load this page again and give the viewer's token")
+            else:
+                return Refusal(HTTPStatus.UNAUTHORIZED, _ASKING, _HTML)
+            if not opens:
+                value = f"{cookie}={self._cookie_value}; Path=/; HttpOnly; SameSite=Strict"
+                return Refusal(HTTPStatus.OK, "welcome", {"Set-Cookie": value})
+        if not is_own_page(headers, self._host, self._token is not None):
+            return self._foreign(headers.get("origin", headers.get("host", "unknown")), opens)
+        if not await self._has_room(page, opens):
+            reason = f"{MOST_PAGES} pages are open already: close one and load this page again"
+            return Refusal(HTTPStatus.SERVICE_UNAVAILABLE, reason if opens else _page(reason), _HTML)
+        return None
+
+    def leave(self, page: Hashable) -> None:
+        """Give back the place of a connection, if it has one."""
+        self._pages.discard(page)
+
+    def _is_known(self, headers: Mapping[str, str], cookie: str) -> bool:
+        try:
+            found = SimpleCookie(headers.get("cookie", "")).get(cookie)
+        except CookieError:
+            return False
+        return found is not None and hmac.compare_digest(found.value.encode(), self._cookie_value.encode())
+
+    async def _check(self, given: str, address: str) -> Refusal | None:
+        """Check the token, in turn for each address; why it is turned down, None if it is right."""
+        now = time.monotonic()
+        self._turns = {known: turn for known, turn in self._turns.items() if turn > now}
+        turn = self._turns[address] = max(self._turns.get(address, now), now) + _GUESS_S
+        if turn - now > _MOST_WAITING * _GUESS_S:
+            self._turns[address] = turn - _GUESS_S
+            return Refusal(
+                HTTPStatus.TOO_MANY_REQUESTS, "Too many guesses are waiting: try again in some seconds."
+            )
+        await asyncio.sleep(turn - now)
+        assert self._token is not None
+        is_right = hmac.compare_digest(_given_word(given), self._token)
+        return None if is_right else Refusal(HTTPStatus.UNAUTHORIZED, "That is not the token.")
+
+    def _foreign(self, site: str, opens: bool) -> Refusal:
+        site = "".join(character for character in site[:100] if character.isprintable())
+        if site not in self._sites_warned_of and len(self._sites_warned_of) < _MOST_SITES_NAMED:
+            self._sites_warned_of.add(site)
+            self._say(
+                f"warning: a page of another site ({site}) tried to use the viewer and was refused; if it is yours, "
+                "start the viewer with --viewer.token"
+            )
+        reason = "this page is from another site; the viewer must be started with --viewer.token to serve it"
+        return Refusal(HTTPStatus.FORBIDDEN, reason if opens else _page(reason), _HTML)
+
+    async def _has_room(self, page: Hashable, opens: bool) -> bool:
+        until = time.monotonic() + _ROOM_S
+        while len(self._pages) >= MOST_PAGES:
+            if time.monotonic() > until:
+                return False
+            await asyncio.sleep(0.05)
+        if opens:
+            self._pages.add(page)
+        return True
+
+
+def _given_word(authorization: str) -> bytes:
+    """The password of an `Authorization: Basic` header; empty if there is none."""
+    scheme, _, coded = authorization.partition(" ")
+    try:
+        word = base64.b64decode(coded.strip(), validate=True)
+    except (binascii.Error, ValueError):
+        return b""
+    return word.partition(b":")[2] if scheme.lower() == "basic" else b""
+
+
+def is_own_page(headers: Mapping[str, str], host: str, has_token: bool = False) -> bool:
+    """Whether a request comes from a page that this server sent, and not from one of another site.
+
+    A site can let its own name point here (DNS rebinding), so without a token the name must be one that only this
+    machine has: a loopback name, an IP address, or that of `host`. With a token the viewer may stand behind a proxy,
+    under any name and with TLS; but the page must still be of the host that it connects to.
+
+    Args:
+        headers: Of the request, names in lower case.
+        host: Where the server listens.
+        has_token: The token was given.
+    """
+    asked = headers.get("host", "").lower()
+    origin = headers.get("origin")
+    try:
+        name = urlsplit(f"//{asked}").hostname
+        site = None if origin is None else urlsplit(origin.lower())
+        place = None if site is None else site.netloc
+    except ValueError:  # no address of anything
+        return False
+    if has_token:
+        hosts = {asked, headers.get("x-forwarded-host", "").lower()} - {""}
+        return site is None or (site.scheme in ("http", "https") and place in hosts)
+    if not asked:
+        return site is None  # not a browser: those always say where they ask
+    if site is not None and (site.scheme != "http" or place != asked):
+        return False
+    own = {"localhost", host.lower()}
+    if host in ANYWHERE:
+        own |= {socket.gethostname().lower(), socket.getfqdn().lower()}
+    return name is not None and (name in own or is_address(name))
+
+
+def is_address(host: str) -> bool:
+    """Whether a host is given as an IP address."""
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+_HTML = {"Content-Type": "text/html; charset=utf-8", "Cache-Control": "no-store"}
+
+
+def _page(text: str) -> str:
+    return (
+        '<!doctype html><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        "<title>unmix-nerf</title><style>:root{color-scheme:light dark}"
+        "body{font:1.1em system-ui;max-width:30em;margin:20vh auto;padding:0 1em}input,button{font:inherit}</style>"
+        f"<p>{html.escape(text)}</p>"
+    )
+
+
+_ASKING = (
+    _page("This viewer asks for the token that it was started with.")
+    + """<form><label>token <input type="password" autofocus autocomplete="current-password"></label>
+<button>enter</button></form><p role="status"></p>
+<script>
+document.querySelector("form").onsubmit = async (event) => {
+  event.preventDefault();
+  const said = document.querySelector("[role=status]"), word = document.querySelector("input").value;
+  const coded = btoa(String.fromCharCode(...new TextEncoder().encode(":" + word)));
+  said.textContent = "checking";
+  try {
+    const answer = await fetch(location.pathname, {headers: {Authorization: "Basic " + coded}});
+    if (answer.ok) location.reload(); else said.textContent = await answer.text();
+  } catch (error) {
+    said.textContent = "The viewer does not answer.";
+  }
+};
+</script>"""
+)
