@@ -4,6 +4,7 @@ import asyncio
 import base64
 import socket
 from http import HTTPStatus
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -32,7 +33,7 @@ def ask(monkeypatch):
     return asked
 
 
-def asked(gate, headers=HERE, page=0, address="10.0.0.1", port=7007):
+def asked(gate, headers=HERE, page=0, address="10.0.0.1", port=7007) -> Any:
     return asyncio.run(gate.judge(page, headers, address, port))
 
 
@@ -74,7 +75,7 @@ def test_each_address_has_one_guess_checked_at_a_time_and_a_limited_number_waiti
     gate, ended = Gate("127.0.0.1", "sesame"), []
 
     async def guess(number, word, address):
-        refusal = await gate.judge(number, with_word(word), address, 7007)
+        refusal: Any = await gate.judge(number, with_word(word), address, 7007)
         ended.append((number, refusal.status))
 
     async def crowd():

@@ -193,26 +193,30 @@ class _LocalServer(viser.ViserServer):
         return None
 
 
+_NAME = "websockets"
+
+
 def open_server(host: str, port: int, gate: Gate, say: Callable[[str], None]) -> viser.ViserServer:
     """A server that listens, and lets in what the gate does.
 
     Args:
         say: Told of what pages caused that should not have happened, in a short line each.
     """
-    names = vars(_infra)
-    before = infra.WebsockServer, names["websockets"]
+    before = infra.WebsockServer, getattr(_infra, _NAME)
     infra.WebsockServer = _PageServer
     # viser asks websockets for its server in this module's name of it, once, while it starts.
-    names["websockets"] = SimpleNamespace(
+    gated = SimpleNamespace(
         asyncio=SimpleNamespace(server=SimpleNamespace(serve=_serve_through(gate, say))),
         datastructures=websockets.datastructures,
         exceptions=websockets.exceptions,
     )
+    setattr(_infra, _NAME, gated)
     try:
         with quiet():
             return _LocalServer(host=host, port=port, label=LABEL, verbose=False)
     finally:
-        infra.WebsockServer, names["websockets"] = before
+        infra.WebsockServer = before[0]
+        setattr(_infra, _NAME, before[1])
 
 
 def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., websockets.asyncio.server.serve]:
