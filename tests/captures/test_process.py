@@ -209,11 +209,11 @@ class _Writer:
     def __init__(self, stop_at: int | None = None) -> None:
         self.stop_at, self.written = stop_at, []
 
-    def __call__(self, view, recipe, folder):
+    def __call__(self, view, recipe, folder, resampling=None):
         if len(self.written) == self.stop_at:
             raise KeyboardInterrupt
         self.written.append(view.name)
-        return write_view(view, recipe, folder)
+        return write_view(view, recipe, folder, resampling)
 
 
 @pytest.fixture

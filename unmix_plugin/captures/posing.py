@@ -162,9 +162,16 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         for view in posed
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
+    own = {view.sensor: view.lens for view in posed if cameras[view.name].lens in (None, view.lens)}
+    resampled = [
+        f"lens {sensor}: {lens.resampled_from.said}"
+        for sensor, lens in own.items()
+        if lens and lens.resampled_from
+    ]
     placed = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     keys = placed.placement.to_json() if poses.has_world else {}
-    return PosedViews(posed, placed.poses, keys, (*poses.notes, *matched, *completed, *placed.notes))
+    notes = (*poses.notes, *matched, *completed, *resampled, *placed.notes)
+    return PosedViews(posed, placed.poses, keys, notes)
 
 
 def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
@@ -185,13 +192,7 @@ def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
             f"{lens.height}; expected the same shape: give the poses of these images"
             f"{turned if 'orientation' in view.cube.metadata else ''}"
         )
-    return replace(
-        lens,
-        width=width,
-        height=height,
-        focal_px=(lens.focal_px[0] * across, lens.focal_px[1] * down),
-        center_px=(lens.center_px[0] * across, lens.center_px[1] * down),
-    )
+    return lens.seen_as(width, height, (0.0, 0.0), (across, down))
 
 
 def _complete_rigs(

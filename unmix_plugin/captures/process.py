@@ -10,11 +10,13 @@ import numpy as np
 from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import input_files, make_plan
-from unmix_plugin.captures.posing import ESTIMATE, estimated_poses, given_poses, pose_views
+from unmix_plugin.captures.plan import Plan, input_files, make_plan
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.posing import ESTIMATE, PosedViews, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, WorkFolder, hashes, refuse_output, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
@@ -51,13 +53,16 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     for note in plan.notes:
         say(f"note: {note}")
     folder = WorkFolder(options.output_dir)
-    if folder.begin(plan.fingerprint(options)):
+    resampled = {} if posed is None else _resampled_lenses(plan, posed)
+    if folder.begin({**plan.fingerprint(options), "lenses": sorted(map(_numbers_of, resampled.values()))}):
         say(f"going on with {folder.path}")
     records: dict[str, ViewRecord] = {}
     for view in follow("writing views", plan.views):
         record = folder.done(view.name)
         if record is None:
-            record = write_view(view, plan.recipes[view.sensor], folder.path)
+            lens = resampled.get(view.name)
+            into = None if lens is None else Resampling.into(lens)
+            record = write_view(view, plan.recipes[view.sensor], folder.path, into)
             record = replace(record, sources=hashes(input_files(view)))
             folder.note(record)
         records[view.name] = record
@@ -69,6 +74,24 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     findings = write_scene_files(folder.path, plan, posed, records, options)
     folder.finish(options.overwrite)
     return findings
+
+
+def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, Lens]:
+    """Lenses of the views whose pixels are brought into another lens, as the scene has them."""
+    found = {}
+    for view in posed.views:
+        lens = posed.poses.cameras[view.name].lens
+        if lens is not None and lens.resampled_from is not None:
+            found[view.name] = plan.recipes[view.sensor].calibration.raster.lens(lens)
+    return found
+
+
+def _numbers_of(lens: Lens) -> list[float]:
+    """What tells a resampled lens from others."""
+    assert lens.resampled_from is not None
+    probe = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [-0.3, 0.2]])
+    seen = lens.resampled_from.project(probe).ravel().tolist()
+    return [*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen]
 
 
 def _check(options: ProcessOptions) -> None:

@@ -369,12 +369,16 @@ def fisheye_by_hand(x, y):
     )
 
 
-def test_a_fisheye_becomes_the_nearest_lens_and_the_distance_is_said():
-    lens, notes = lens_of(file_with(FISHEYE))
+def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
+    lens, _ = lens_of(file_with(FISHEYE))
     assert lens is not None
     worst = worst_px(lens, fisheye_by_hand)
-    assert worst < 4.0
-    said = float(next(note for note in notes if "fisheye" in note).split("at most ")[1].split()[0])
+    assert 0.3 < worst < 4.0
+    assert lens.resampled_from is not None
+    ideal = np.random.default_rng(0).uniform([-0.45, -0.35], [0.45, 0.35], (50, 2))
+    by_hand = [fisheye_by_hand(x, y) for x, y in ideal]
+    np.testing.assert_allclose(lens.resampled_from.project(ideal), by_hand, atol=0.01)
+    said = float(lens.resampled_from.said.split("nearer than ")[1].split()[0])
     assert said == pytest.approx(worst, rel=0.3)
 
 

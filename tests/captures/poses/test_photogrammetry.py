@@ -84,8 +84,12 @@ def test_skew_is_fitted_and_its_effect_said(tmp_path):
     found = read_metashape(tmp_path, ring(), terms="<b2>0.3</b2><k3>0.01</k3>")
     assert any("replaced by the nearest" in note and "px" in note for note in found.notes)
     assert lens_of(found).distortion != (0, 0, 0, 0)
-    with pytest.raises(CaptureError, match=r"sensor lens: .*by up to [\d.]+ px"):
-        read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
+    sheared = read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
+    assert any("pixels are interpolated" in note for note in sheared.notes)
+    seen = lens_of(sheared).resampled_from.project(np.array([[0.3, 0.2]]))
+    x, y = 0.3, 0.2
+    plain = lens_of(read_metashape(tmp_path, ring())).pixels_of(np.array([[x, y]]))
+    np.testing.assert_allclose(seen - plain, [[80 * y, 0.0]], atol=0.5)
 
 
 def test_a_sensor_without_calibration_has_its_nominal_focal_length(tmp_path):
@@ -114,8 +118,8 @@ def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_pat
         (lambda text: text.replace("<document", "<!DOCTYPE d><document", 1), "DOCTYPE"),
         (lambda text: text.replace("<transform>", "<transform>nan "), "expected 16 finite numbers"),
         (
-            lambda text: text.replace('type="frame"', 'type="spherical"'),
-            "spherical; expected frame or fisheye",
+            lambda text: text.replace('type="frame"', 'type="cylindrical"'),
+            "cylindrical; expected frame, fisheye or spherical",
         ),
         (lambda text: text.replace('width="640"', 'width="-1"'), "has no resolution"),
         (lambda text: text.replace("<f>500", "<f>0"), "focal length 0"),
@@ -248,7 +252,7 @@ def test_poses_of_a_rig_are_composed(tmp_path):
     ("change", "message"),
     [
         ({"cameras": {}}, "names the camera"),
-        ({"cameras": {"c": {**PERSPECTIVE, "projection_type": "spherical"}}}, "spherical.*expected one of"),
+        ({"cameras": {"c": {**PERSPECTIVE, "projection_type": "omni"}}}, "omni.*expected one of"),
         ({"cameras": {"c": {**PERSPECTIVE, "focal": 0}}}, "not above 0"),
         ({"shots": {}}, "has no camera"),
         ({"shots": {"a": {"rotation": [1, 2], "translation": [0, 0, 0], "camera": "c"}}}, "3 finite numbers"),

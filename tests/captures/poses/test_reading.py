@@ -155,7 +155,9 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
         ({"w": 0.5}, "'w' is 0.5; expected a whole number"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR.*undistort"),
+        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO.*undistort"),
+        ({"ftheta_p0": "steep"}, "'ftheta_p0' to 'ftheta_p5' are .*expected numbers"),
+        ({"camera_model": "FISHEYE624", "distortion_params": [0] * 6}, "has 6 numbers; FISHEYE624 has 12"),
         (
             {"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},
             "'applied_transform'.*a rotation",

@@ -11,7 +11,7 @@ bands of the result.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -294,25 +294,13 @@ class Raster:
 
     def lens(self, lens: Lens) -> Lens:
         """The intrinsics of the result from those of the whole image in the file."""
-        n = self.binning
-        return replace(
-            lens,
-            width=self.width,
-            height=self.height,
-            focal_px=(lens.focal_px[0] / n, lens.focal_px[1] / n),
-            center_px=((lens.center_px[0] - self.left) / n, (lens.center_px[1] - self.top) / n),
-        )
+        scale = 1.0 / self.binning
+        return lens.seen_as(self.width, self.height, (self.left, self.top), (scale, scale))
 
     def lens_of_file(self, lens: Lens, height: int, width: int) -> Lens:
         """The inverse of `lens`: intrinsics of the whole image, of this size, from those of the result."""
         n = self.binning
-        return replace(
-            lens,
-            width=width,
-            height=height,
-            focal_px=(lens.focal_px[0] * n, lens.focal_px[1] * n),
-            center_px=(lens.center_px[0] * n + self.left, lens.center_px[1] * n + self.top),
-        )
+        return lens.seen_as(width, height, (-self.left / n, -self.top / n), (n, n))
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ import numpy as np
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
 from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.layouts.transforms import Split
-from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
+from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
+from unmix_plugin.captures.poses.lens_models import Points
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
@@ -51,8 +52,6 @@ _MM_OF_UNIT: dict[float, float] = {2.0: 25.4, 3.0: 10.0, 4.0: 1.0, 5.0: 1e-3}
 _TAGS = "lens in the XMP"
 _LONGEST_MM = 50.0
 """Focal length without a unit from which it is in pixels; these cameras have about 5 mm."""
-_LIMIT_PX = 10.0
-"""By how much the lens with k1, k2, p1, p2 may differ from the camera's; poses usually bring a better one."""
 
 
 def find_rig(root: Path, options: ReadOptions) -> Capture:
@@ -275,7 +274,9 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
             lens, note = _fit_fisheye((width, height), tuple(fisheye), tuple(matrix), centre)
         except CaptureError as error:
             raise CaptureError(f"{file.path}, {error}") from error
-        return lens, (note,)
+        return lens, () if lens.resampled_from else (
+            note,
+        )  # said where it is used: poses may bring a better one
     focal = tag_numbers(tags, "PerspectiveFocalLength")
     if focal is None or focal[0] <= 0.0:
         raise _NoLensError("PerspectiveFocalLength is absent")
@@ -334,4 +335,4 @@ def _fit_fisheye(
 
     focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
     start = Lens(*size, (float(focal[0]), float(focal[1])), centre)
-    return fit_lens(project, start, "fisheye of Pix4D", _TAGS, _LIMIT_PX)
+    return fit_lens(project, start, "fisheye of Pix4D", _TAGS)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,7 +17,18 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, project_fisheye, project_opencv
+from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses.lens_models import (
+    Points,
+    bend_division,
+    bend_eucm,
+    bend_fisheye_624,
+    bend_fov,
+    bend_thin_prism,
+    project_equirectangular,
+    project_fisheye,
+    project_opencv,
+)
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError
 
@@ -49,10 +60,17 @@ _MODELS = {
 }
 """Name and number of parameters by COLMAP's number."""
 _PARAMETER_COUNTS = dict(_MODELS.values())
-_EXACT = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 _FISHEYES = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"}
-_SUPPORTED = _EXACT | _FISHEYES | {"FULL_OPENCV"}
-_TWO_FOCALS = {"PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FISHEYE"}
+_ONE_FOCAL = {name for name in _PARAMETER_COUNTS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
+_BENT: dict[str, Callable[[Points, Sequence[float]], Points]] = {
+    "FOV": lambda ideal, terms: bend_fov(ideal, *terms),
+    "THIN_PRISM_FISHEYE": bend_thin_prism,
+    "RAD_TAN_THIN_PRISM_FISHEYE": bend_fisheye_624,
+    "SIMPLE_DIVISION": lambda ideal, terms: bend_division(ideal, *terms),
+    "DIVISION": lambda ideal, terms: bend_division(ideal, *terms),
+    "EUCM": lambda ideal, terms: bend_eucm(ideal, *terms),
+}
+"""Models that bend ideal points, which focal length and centre bring to pixels."""
 _CAMERA, _IMAGE, _POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
 _LONGEST_NAME = 4096
@@ -158,22 +176,23 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
         raise CaptureError(
             f"{where} is {width} x {height} with {parameters}; expected a size and finite numbers: the file is damaged"
         )
-    if model not in _SUPPORTED:
-        raise CaptureError(
-            f"{where}: the camera model {model} is not supported; expected one of {', '.join(sorted(_SUPPORTED))}: run "
-            "COLMAP's image_undistorter and give its model and images"
-        )
-    fx, fy, cx, cy, *terms = parameters if model in _TWO_FOCALS else (parameters[0], *parameters)
+    if model == "EQUIRECTANGULAR":
+        start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
+        return fit_lens(lambda ideal: project_equirectangular(ideal, *parameters), start, model, where)
+    fx, fy, cx, cy, *terms = (parameters[0], *parameters) if model in _ONE_FOCAL else parameters
     if min(fx, fy) <= 0:
         raise CaptureError(
             f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0: run COLMAP again"
         )
     focal, center = (fx, fy), (cx, cy)
+    start = Lens(width, height, focal, center)
     if model in _FISHEYES:
-        start = Lens(width, height, focal, center)
         return fit_lens(
             lambda ideal: project_fisheye(ideal, focal, center, tuple(terms)), start, model, where
         )
+    if model in _BENT:
+        bend = _BENT[model]
+        return fit_lens(lambda ideal: bend(ideal, terms) * focal + center, start, model, where)
     k1, k2, p1, p2, k3, *below = (*terms, *[0.0] * (8 - len(terms)))
     lens = Lens(width, height, focal, center, (k1, k2, p1, p2), (k3, 0.0))
     if not any(below):
@@ -187,7 +206,7 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
         divisor = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(below))
         return (bent / divisor + slanted) * focal + center
 
-    return fit_lens(full_opencv, Lens(width, height, focal, center), model, where)
+    return fit_lens(full_opencv, start, model, where)
 
 
 def _binary_cameras(path: Path) -> dict[int, _Camera]:

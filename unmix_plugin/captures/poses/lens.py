@@ -1,23 +1,31 @@
-"""The lens of a camera, and the nearest one of its kind to lenses of models that we do not have.
+"""The lens of a camera. Lenses of models that we do not have are replaced by one of ours: by the nearest, where that is
+as good as the same, otherwise by one that pictures are resampled into while they are written.
 
 Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
+from unmix_plugin.captures.poses.lens_models import Points, Project, project_opencv
 from unmix_plugin.errors import CaptureError
 
-Points = Float64[np.ndarray, "P 2"]
-_Project: TypeAlias = Callable[[Points], Points]
-"""From ideal coordinates to pixels."""
+
+@dataclass(frozen=True)
+class FileLens:
+    """The lens that the pixels of a file were taken through, of a model that scenes do not have."""
+
+    model: str
+    project: Project
+    """From ideal coordinates to pixels of the picture that the `Lens` beside it has."""
+    said: str
+    """What becomes of the picture, for people."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,8 @@ class Lens:
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
     higher_radial: tuple[float, float] = (0.0, 0.0)
     """k3, k4: radial terms of the sixth and eighth power."""
+    resampled_from: FileLens | None = None
+    """Where the file has another one: its pixels are to be brought into this lens."""
 
     @property
     def radial(self) -> tuple[float, float, float, float]:
@@ -49,66 +59,106 @@ class Lens:
         """Where ideal points are seen."""
         return project_opencv(ideal, self.focal_px, self.center_px, self.radial, self.tangential)
 
+    def file_pixels(self) -> Float64[np.ndarray, "H W 2"]:
+        """Where the middle of each pixel lies in the file; NaN where the file's lens does not see it."""
+        columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        pixels = np.column_stack([columns.ravel(), rows.ravel()])
+        if self.resampled_from is not None:
+            ideal = _invert(self.pixels_of, pixels, self)
+            assert ideal is not None  # it was chosen so
+            pixels = self.resampled_from.project(ideal)
+        return pixels.reshape(self.height, self.width, 2)
 
-_LARGEST_ERROR_PX = 0.5
-"""Of a fitted lens anywhere in the image; beyond, the images have to be undistorted."""
+    def seen_as(
+        self, width: int, height: int, corner: tuple[float, float], scale: tuple[float, float]
+    ) -> Lens:
+        """The lens of a picture cut out of this one and scaled.
+
+        Args:
+            width, height: Of the result.
+            corner: Where its upper left corner lies in this picture, x and y.
+            scale: Its pixels over those of this picture, along x and y.
+        """
+        from_file = self.resampled_from
+        if from_file is not None:
+            project = from_file.project
+            from_file = replace(from_file, project=lambda ideal: (project(ideal) - corner) * scale)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal_px=(self.focal_px[0] * scale[0], self.focal_px[1] * scale[1]),
+            center_px=(
+                (self.center_px[0] - corner[0]) * scale[0],
+                (self.center_px[1] - corner[1]) * scale[1],
+            ),
+            resampled_from=from_file,
+        )
+
+
+_LARGEST_ERROR_PX = 0.3
+"""Of a lens anywhere in the image that stands for another one as it is: about what poses are off. Beyond, pixels are
+moved, which costs sharpness."""
+_WIDEST_DEG = 75.0
+"""From the axis: where the nearest OPENCV lens is looked for. Beyond, pixels grow without end."""
+_WIDEST_PINHOLE_DEG = 60.0
+"""From the axis to the corners of the pinhole that a wider lens is cut down to."""
+_LEAST_INSIDE = 0.97
+"""Share of such a pinhole's picture that the file must show."""
+_MOST_OUTSIDE = 0.95
+"""Share of the file's picture that a pinhole may leave out; one of all directions loses 86 %."""
 _GRID = 21
 _STEP = 1e-6
 
 
-def project_opencv(
-    ideal: Points,
-    focal_px: tuple[float, float],
-    center_px: tuple[float, float],
-    radial: tuple[float, ...],
-    tangential: tuple[float, float] = (0.0, 0.0),
-) -> Points:
-    """Pixels of ideal points through a lens with radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
-    x, y = ideal.T
-    squared = x**2 + y**2
-    factor = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(radial))
-    p1, p2 = tangential
-    bent_x = x * factor + 2 * p1 * x * y + p2 * (squared + 2 * x**2)
-    bent_y = y * factor + 2 * p2 * x * y + p1 * (squared + 2 * y**2)
-    return np.column_stack([focal_px[0] * bent_x + center_px[0], focal_px[1] * bent_y + center_px[1]])
-
-
-def project_fisheye(
-    ideal: Points, focal_px: tuple[float, float], center_px: tuple[float, float], terms: tuple[float, ...]
-) -> Points:
-    """Pixels of ideal points through an equidistant lens with terms of theta^2, theta^4, ... (OPENCV_FISHEYE)."""
-    radius = np.linalg.norm(ideal, axis=1)
-    theta = np.arctan(radius)
-    bent = theta * (1.0 + sum(k * theta ** (2 * power + 2) for power, k in enumerate(terms)))
-    ratio = np.divide(bent, radius, out=np.ones_like(radius), where=radius > 1e-12)
-    return ideal * ratio[:, None] * np.array(focal_px) + np.array(center_px)
-
-
-def fit_lens(
-    project: _Project, start: Lens, model: str, where: str, limit_px: float = _LARGEST_ERROR_PX
-) -> tuple[Lens, str]:
-    """The OPENCV lens that is nearest to another model.
+def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
+    """The OPENCV lens that stands for one of another model.
 
     Args:
         project: The other model.
         start: Size of the image and a first guess of focal length and centre.
         model: What the other model is called.
         where: The file, for messages.
-        limit_px: How far it may be off.
     Returns:
-        The lens, and a sentence that says how far it is off.
+        The nearest lens; if it is not near enough, pixels are to be resampled into it. Of a lens too wide for it, a
+        pinhole that shows its middle. And a sentence that says what was done.
     Raises:
-        CaptureError: it is off by more than the limit somewhere in the image, or the model does not cover it.
+        CaptureError: the model is not to be followed even in the middle of the image.
     """
-    from scipy.optimize import least_squares
-
     pixels = _pixel_grid(start.width, start.height)
     ideal = _invert(project, pixels, start)
-    advice = "undistort the images and export the poses with a pinhole or OPENCV lens"
-    if ideal is None:
+    if ideal is not None and np.linalg.norm(ideal, axis=1).max() < np.tan(np.radians(_WIDEST_DEG)):
+        lens, worst = _nearest_opencv(pixels, ideal, start)
+        if worst <= _LARGEST_ERROR_PX:
+            return (
+                lens,
+                f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px",
+            )
+        if not _folds(lens):
+            note = (
+                f"lens model {model}: no OPENCV lens comes nearer than {worst:.2g} px, so pixels are interpolated into "
+                "that one"
+            )
+            return replace(lens, resampled_from=FileLens(model, project, note)), note
+    found = _widest_pinhole(project, start)
+    if found is None:
         raise CaptureError(
-            f"{where}: the lens model {model} can't be followed to the corners of the image; {advice}"
+            f"{where}: the lens model {model} can't be followed even in the middle of the image; calibrate the camera "
+            "again, or undistort the images and export the poses with a pinhole lens"
         )
+    pinhole, outside = found
+    corner = np.hypot(pinhole.width, pinhole.height) / 2 / pinhole.focal_px[0]
+    note = (
+        f"lens model {model} sees too much for an OPENCV lens, so pixels are interpolated into a pinhole that reaches "
+        f"{np.degrees(np.arctan(corner)):.0f} degrees from the axis to its corners; {outside:.0%} of the picture lies "
+        "outside and is left out"
+    )
+    return replace(pinhole, resampled_from=FileLens(model, project, note)), note
+
+
+def _nearest_opencv(pixels: Points, ideal: Points, start: Lens) -> tuple[Lens, float]:
+    """The lens that maps the ideal points best to the pixels, and by how many of these it is off at most."""
+    from scipy.optimize import least_squares
 
     def lens_of(values: np.ndarray) -> Lens:
         fx, fy, cx, cy, p1, p2, k1, k2, k3, k4 = values.tolist()
@@ -120,15 +170,30 @@ def fit_lens(
     first = np.array([*start.focal_px, *start.center_px, *start.tangential, *start.radial])
     scales = np.array([*start.focal_px, *start.focal_px, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
     found = least_squares(errors, first, x_scale=scales).x
-    worst = float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
-    if worst > limit_px:
-        raise CaptureError(
-            f"{where}: the lens model {model} differs from the nearest OPENCV lens by up to "
-            f"{worst:.3g} px; expected at most {limit_px:g} px: {advice}"
-        )
-    return lens_of(
-        found
-    ), f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
+    return lens_of(found), float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
+
+
+def _widest_pinhole(project: Project, start: Lens) -> tuple[Lens, float] | None:
+    """The widest pinhole whose picture the model fills, and the share of the model's picture outside of it."""
+    corner = np.hypot(start.width, start.height) / 2
+    middle = (start.width / 2, start.height / 2)
+    for degrees in np.arange(_WIDEST_PINHOLE_DEG, 4.0, -2.0):
+        focal = corner / np.tan(np.radians(degrees))
+        pinhole = Lens(start.width, start.height, (focal, focal), middle)
+        ideal = (_pixel_grid(start.width, start.height) - middle) / focal
+        # The way from the axis to each point must not fold, or two directions would share a pixel.
+        if not all(_is_sound(project, ideal * part).all() for part in np.linspace(0.1, 1.0, 10)):
+            continue
+        seen = project(ideal)
+        inside = ((seen >= 0) & (seen <= (start.width, start.height))).all(axis=1)
+        if inside.mean() >= _LEAST_INSIDE:
+            seen = np.clip(seen, 0, (start.width, start.height)).reshape(_GRID, _GRID, 2)
+            rim = np.concatenate([seen[0], seen[1:, -1], seen[-1, -2::-1], seen[-2:0:-1, 0]])
+            x, y = rim.T
+            area = 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+            outside = max(0.0, 1.0 - area / (start.width * start.height))
+            return None if outside > _MOST_OUTSIDE else (pinhole, outside)
+    return None
 
 
 def require_unfolded(lens: Lens, where: str) -> None:
@@ -155,7 +220,7 @@ def _pixel_grid(width: int, height: int) -> Points:
     return np.column_stack([columns.ravel(), rows.ravel()])
 
 
-def _invert(project: _Project, pixels: Points, start: Lens) -> Points | None:
+def _invert(project: Project, pixels: Points, start: Lens) -> Points | None:
     """Ideal points that `project` maps to the pixels, by Newton's method; None if there are none."""
     ideal = (pixels - np.array(start.center_px)) / np.array(start.focal_px)
     with np.errstate(all="ignore"):
@@ -163,11 +228,24 @@ def _invert(project: _Project, pixels: Points, start: Lens) -> Points | None:
             missing = pixels - project(ideal)
             if not np.isfinite(missing).all():
                 return None
-            steps = _STEP * np.eye(2)
-            along = [(project(ideal + step) - project(ideal - step)) / (2 * _STEP) for step in steps]
-            jacobian = np.stack(along, axis=-1)
+            if np.abs(missing).max() < 1e-9:
+                break
+            jacobian = np.stack(list(_slopes(project, ideal)), axis=-1)
             determinant = np.linalg.det(jacobian)
             if not np.isfinite(determinant).all() or (determinant <= 0).any():
                 return None
             ideal = ideal + np.linalg.solve(jacobian, missing[..., None])[..., 0]
         return ideal if np.abs(pixels - project(ideal)).max() < 1e-3 else None
+
+
+def _slopes(project: Project, ideal: Points) -> Iterator[Points]:
+    """Pixels that a step along x and along y moves each point by, over the step."""
+    for step in _STEP * np.eye(2):
+        yield (project(ideal + step) - project(ideal - step)) / (2 * _STEP)
+
+
+def _is_sound(project: Project, ideal: Points) -> Bool[np.ndarray, " P"]:
+    """Whether the model is finite at points and keeps their surroundings the right way round."""
+    with np.errstate(all="ignore"):
+        determinant = np.linalg.det(np.stack(list(_slopes(project, ideal)), axis=-1))
+        return np.isfinite(determinant) & (determinant > 0)

@@ -15,7 +15,13 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, project_fisheye, project_opencv
+from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses.lens_models import (
+    Points,
+    bend_brown_fisheye,
+    project_equirectangular,
+    project_opencv,
+)
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -141,11 +147,17 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
     if calibration is None:
         return _from_physical(sensor, size), [f"sensor {name} is not calibrated: nominal focal length"]
     kind = calibration.get("type") or sensor.get("type", "frame")
-    if kind not in ("frame", "fisheye"):
+    if kind not in ("frame", "fisheye", "spherical"):
         raise CaptureError(
-            f"{where} is of the type {kind}; expected frame or fisheye: export undistorted photos"
+            f"{where} is of the type {kind}; expected frame, fisheye or spherical: export undistorted photos"
         )
     width, height = size
+    if kind == "spherical":
+        start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
+        around, said = fit_lens(
+            lambda ideal: project_equirectangular(ideal, width, height), start, "Metashape spherical", where
+        )
+        return around, [f"sensor {name}: {said}"]
     values = {
         tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
     }
@@ -163,7 +175,7 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
 
     def project(ideal: Points) -> Points:
         if kind == "fisheye":
-            bent = project_fisheye(ideal, (1.0, 1.0), (0.0, 0.0), radial)
+            bent = bend_brown_fisheye(ideal, radial, tangential)
         else:
             bent = project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
         return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center

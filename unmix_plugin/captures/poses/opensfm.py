@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye
+from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses.lens_models import (
+    Points,
+    bend_dual,
+    bend_opensfm_624,
+    project_equirectangular,
+    project_fisheye,
+)
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -25,6 +32,9 @@ from unmix_plugin.scenes.reading.faults import describe, read_number
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
 _FISHEYES = ("fisheye", "fisheye_opencv")
+_SIX_TERMS = ("fisheye62", "fisheye624")
+_SPHERICAL = ("spherical", "equirectangular")
+_KNOWN = (*_PLAIN, *_FISHEYES, *_SIX_TERMS, "dual", *_SPHERICAL)
 
 
 def is_reconstruction(content: Any) -> bool:
@@ -108,23 +118,36 @@ def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
         return default if value is None else value
 
     width, height = int(number("width")), int(number("height"))
-    focal = number("focal_x", number("focal")), number("focal_y", number("focal_x", number("focal")))
+    kind = values.get("projection_type", "perspective")
+    usual = 1 / (2 * np.pi) if kind in _SPHERICAL else 0.0
+    focal = number("focal_x", number("focal", usual))
+    focal = focal, number("focal_y", focal)
     if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
         raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
-    kind = values.get("projection_type", "perspective")
-    if kind not in _PLAIN + _FISHEYES:
+    if kind not in _KNOWN:
         raise CaptureError(
-            f"{where} is {describe(kind)}; expected one of {', '.join(_PLAIN + _FISHEYES)}: undistort with OpenSfM"
+            f"{where} is {describe(kind)}; expected one of {', '.join(_KNOWN)}: undistort with OpenSfM"
         )
     side = max(width, height)
     focal = (side * focal[0], side * focal[1])
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
     radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
     tangential = (number("p1"), number("p2"))
-    if kind in _FISHEYES:
-        start = Lens(width, height, focal, center)
-        return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, radial), start, kind, where)
-    return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
+    if kind in _PLAIN:
+        return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
+    keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
+    terms, transition = [number(key) for key in keys], number("transition", 1.0)
+
+    def project(ideal: Points) -> Points:
+        if kind in _FISHEYES:
+            return project_fisheye(ideal, focal, center, radial)
+        if kind in _SPHERICAL:
+            middle = np.array([(width - side) / 2, height / 2 - side / 4])
+            return project_equirectangular(ideal, side, side / 2) + middle
+        bent = bend_dual(ideal, transition, radial[:2]) if kind == "dual" else bend_opensfm_624(ideal, terms)
+        return bent * focal + center
+
+    return fit_lens(project, Lens(width, height, focal, center), kind, where)
 
 
 def _points(content: dict[str, Any], where: str) -> SparsePoints | None:

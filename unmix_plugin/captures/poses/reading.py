@@ -14,7 +14,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.poses.colmap import find_models, read_colmap
-from unmix_plugin.captures.poses.lens import Lens, fit_lens, project_fisheye, require_unfolded
+from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
+from unmix_plugin.captures.poses.lens_models import (
+    Points,
+    bend_fisheye_624,
+    project_equirectangular,
+    project_fisheye,
+    project_ftheta,
+)
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
@@ -196,6 +203,8 @@ def _read_llff(path: Path) -> PoseSet:
 _NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""
 _PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_RESAMPLED_MODELS = ("OPENCV_FISHEYE", "FISHEYE624", "EQUIRECTANGULAR")
+_NUM_TERMS_624 = 12
 
 
 def _has_frames(content: Any) -> bool:
@@ -253,16 +262,18 @@ def _read_frames(
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
         names = [text.removeprefix("./") for text in texts] or [f"#{index:04d}"]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
-        given = read_lens(top, frame, f"frames[{index}]", faults)
+        model, terms, read_from = _other_model(top, frame, where)
+        given = read_lens(*read_from, f"frames[{index}]", faults)
         lens = None
         if given is not None:
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)
             else:
                 size = _size_of(path.parent, names[0], sizes)
-            key = repr((given, size))  # many frames share a lens, which takes long to fit
+            key = repr((given, size, terms))  # many frames share a lens, which takes long to fit
             if key not in lenses:
-                lenses[key] = (None, None) if size is None else _make_lens(given, size, where)
+                model = model or given.model
+                lenses[key] = (None, None) if size is None else _make_lens(given, model, terms, size, where)
                 notes += [note for note in lenses[key][1:] if note is not None]
             lens = lenses[key][0]
         read.append((names, matrix, lens))
@@ -302,23 +313,70 @@ def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | Non
         return None
 
 
-def _make_lens(given: Intrinsics, size: _Size, where: str) -> tuple[Lens | None, str | None]:
+def _other_model(
+    top: dict[str, Any], frame: dict[str, Any], where: str
+) -> tuple[str | None, tuple[float, ...], tuple[dict[str, Any], dict[str, Any]]]:
+    """Name and terms of a lens model that keys of its own describe, and the objects to read the rest of the lens from.
+
+    instant-ngp's `ftheta_p0` to `ftheta_p4`, nerfstudio's FISHEYE624 with twelve `distortion_params`.
+    """
+    values = {**top, **frame}
+    if values.get("ftheta_p0") is not None:
+        listed = [values.get(f"ftheta_p{power}", 0.0) for power in range(6)]
+        return "ftheta", _terms(listed, "'ftheta_p0' to 'ftheta_p5'", where), (top, frame)
+    if values.get("camera_model") != "FISHEYE624":
+        return None, (), (top, frame)
+    listed = values.get("distortion_params")
+    terms = _terms(listed if isinstance(listed, list) else [], "'distortion_params' of FISHEYE624", where)
+    if len(terms) != _NUM_TERMS_624:
+        raise CaptureError(
+            f"{where}: 'distortion_params' has {len(terms)} numbers; FISHEYE624 has {_NUM_TERMS_624}"
+        )
+    top, frame = (
+        {key: values[key] for key in values if key != "distortion_params"} for values in (top, frame)
+    )
+    return "FISHEYE624", terms, (top, frame)
+
+
+def _terms(listed: list[Any], what: str, where: str) -> tuple[float, ...]:
+    numbers = [read_number(value) for value in listed]
+    if None in numbers:
+        raise CaptureError(f"{where}: {what} are {describe(listed)}; expected numbers")
+    return tuple(number for number in numbers if number is not None)
+
+
+def _make_lens(
+    given: Intrinsics, model: str, terms: tuple[float, ...], size: _Size, where: str
+) -> tuple[Lens | None, str | None]:
     """The lens, None without a focal length, and a note if it is not exactly the one of the file."""
+    width, height = size
+    x, y = given.center_px
+    center = (width / 2 if x is None else x, height / 2 if y is None else y)
     focal = given.focal_at(*size)
+    if model == "ftheta" and len(terms) > 1 and terms[1] > 0:
+        focal = (1.0 / terms[1], 1.0 / terms[1])
+    if model == "EQUIRECTANGULAR":
+        focal = (width / (2 * math.pi), height / math.pi)
     if focal is None:
         return None, None
-    x, y = given.center_px
-    center = (size[0] / 2 if x is None else x, size[1] / 2 if y is None else y)
-    if given.model == "OPENCV_FISHEYE":
-        terms = (*given.distortion[:2], *given.higher_radial)
-        start = Lens(*size, focal, center)
-        return fit_lens(lambda ideal: project_fisheye(ideal, focal, center, terms), start, given.model, where)
-    if given.model not in _PLAIN_MODELS:
+    if model in _PLAIN_MODELS:
+        return Lens(*size, focal, center, given.distortion, given.higher_radial), None
+    if model not in (*_RESAMPLED_MODELS, "ftheta"):
         raise CaptureError(
-            f"{where}: camera_model {describe(given.model)} is not supported; expected one of "
-            f"{', '.join((*_PLAIN_MODELS, 'OPENCV_FISHEYE'))}: undistort the images first"
+            f"{where}: camera_model {describe(model)} is not known; expected one of "
+            f"{', '.join((*_PLAIN_MODELS, *_RESAMPLED_MODELS))}: undistort the images first"
         )
-    return Lens(*size, focal, center, given.distortion, given.higher_radial), None
+
+    def project(ideal: Points) -> Points:
+        if model == "ftheta":
+            return project_ftheta(ideal, center, terms, math.hypot(*size))
+        if model == "EQUIRECTANGULAR":
+            return project_equirectangular(ideal, width, height)
+        if model == "FISHEYE624":
+            return bend_fisheye_624(ideal, terms) * focal + center
+        return project_fisheye(ideal, focal, center, (*given.distortion[:2], *given.higher_radial))
+
+    return fit_lens(project, Lens(*size, focal, center), model, where)
 
 
 def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from unmix_plugin.captures.masks import (
     read_view_masks,
 )
 from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.engine.runs.atomic_files import (
     make_folder,
     remove_stale_temporaries,
@@ -47,8 +49,12 @@ FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
 _BLOCK_VALUES = 1 << 22
 """Values of a file that are calibrated together: 16 MiB as float32."""
+_WEIGHTS_A_PIXEL = 64
+"""What the weights of a resampled pixel take, in values."""
 _BRIGHT_PERCENTILE = 99.0
 """Of sampled pixels; shown as white."""
+UNLABELLED = 255
+"""In pictures of true materials."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +127,22 @@ class ViewRecipe:
     """Whether files of the capture say what is matter."""
 
 
-def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecord:
+def write_view(
+    view: CaptureView, recipe: ViewRecipe, folder: Path, resampling: Resampling | None = None
+) -> ViewRecord:
     """Write cube, picture and mask of a view.
 
+    Args:
+        resampling: Where its pixels are brought into another lens.
     Raises:
         CaptureError: a file of the view can't be read.
         RunError: the folder can't be written.
     """
     raster = recipe.calibration.raster
-    masks = read_view_masks(view, raster, recipe.use_opacity)
+    masks, labels = read_view_masks(view, raster, recipe.use_opacity), read_labels(view, raster)
+    if resampling is not None:
+        masks = _resampled_masks(masks, resampling)
+        labels = None if labels is None else resampling.nearest(labels, outside=UNLABELLED)
     paths = {"file_path": f"images/{view.name}.png", "hyperspectral_file_path": f"cubes/{view.name}.npy"}
     tally = _Tally(raster.height, raster.width, recipe.calibration.num_bands, masks)
     path = folder / paths["hyperspectral_file_path"]
@@ -139,9 +152,12 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
             described = {"descr": "<u2", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(file, described)
             start = file.tell()
-            file_bands = len(recipe.calibration.bands)
-            for first, last in raster.blocks(file_bands, _BLOCK_VALUES):
-                part = recipe.calibration.rows(view.cube, first, last)
+            read = partial(recipe.calibration.rows, view.cube)
+            values_a_pixel = len(recipe.calibration.bands)
+            if resampling is not None:
+                values_a_pixel = max(values_a_pixel, _WEIGHTS_A_PIXEL)
+            for first, last in raster.blocks(values_a_pixel, _BLOCK_VALUES):
+                part = read(first, last) if resampling is None else resampling.rows(first, last, read)
                 file.write(_stored(tally.add(first, part, recipe), part).data)
         is_shown = tally.finish_masks(recipe) > 0
         if not is_shown.all():
@@ -157,12 +173,17 @@ def write_view(view: CaptureView, recipe: ViewRecipe, folder: Path) -> ViewRecor
         paths["mask_path"] = f"masks/{view.name}.png"
         grey = np.where(tally.missing, 0, 255).astype(np.uint8)
         write_file(folder / paths["mask_path"], rgba_png_bytes(np.dstack([grey] * 3)))
-    labels = read_labels(view, raster)
     if labels is not None:
         paths["seg_file_path"] = f"labels/{view.name}.png"
         greys = np.repeat(np.arange(256)[:, None] / 255.0, 3, axis=1)
         write_file(folder / paths["seg_file_path"], indexed_png_bytes(labels, greys))
     return tally.record(view, paths)
+
+
+def _resampled_masks(masks: ViewMasks, resampling: Resampling) -> ViewMasks:
+    """Masks in another lens; a pixel is valid where all are that it is made of."""
+    valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
+    return ViewMasks(valid, None if masks.opacity is None else resampling.smooth(masks.opacity))
 
 
 class _Tally:

@@ -159,7 +159,7 @@ def read_intrinsics(
         faults.add(
             where if "camera_model" in frame else FILE_NAME,
             f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
-            "undistort first",
+            "unmix-process brings such pictures into an OPENCV lens",
         )
     if all(source.get(key) is None for source in (frame, content) for key in ("fl_x", "camera_angle_x")):
         faults.add(
