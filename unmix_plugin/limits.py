@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import os
 import stat
+import zipfile
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 
 from unmix_plugin.errors import UnmixError
 
-MOST_PARTS = 10_000
+MOST_PARTS = 4096
 """Parts of one file: members of an archive, pages, groups, variables. Instruments write some hundred bands as pages."""
 
 DEEPEST = 32
@@ -21,11 +22,17 @@ DEEPEST = 32
 MOST_TEXT_BYTES = 1 << 24
 """Bytes of a text that is read whole: headers, lists of poses, settings, records."""
 
+MOST_TABLE_BYTES = 1 << 28
+"""Bytes of a text or table that has an entry for each view, row or point."""
+
 _FREE_BYTES = 1 << 28
 """Decoded bytes that any file may have, however small it is."""
 
 _MOST_RATIO = 100
 """Decoded bytes a stored byte of larger ones. Spectra compress by less than ten; masks by more, but these are small."""
+
+_ZIP_END_BYTES, _ZIP_ENTRY_BYTES = 1 << 17, 512
+"""Where an archive says how long its list of members is; the longest that is usual for one."""
 
 _LARGEST_ARRAY = 1 << 46
 """Bytes beyond which a size is no size but damage."""
@@ -48,6 +55,43 @@ def allow_parts(path: Path, number: int, noun: str, kind: type[UnmixError]) -> N
     """
     if number > MOST_PARTS:
         refuse(path, f"{number} {noun}", f"at most {MOST_PARTS}", kind)
+
+
+def allow_depth(path: Path, levels: int, kind: type[UnmixError]) -> None:
+    """Ask before parts within parts are read.
+
+    Raises:
+        UnmixError: of this kind: they lie too deep.
+    """
+    if levels > DEEPEST:
+        refuse(path, f"parts in parts, {levels} levels deep", f"at most {DEEPEST}", kind)
+
+
+def open_zip(path: Path, kind: type[UnmixError]) -> zipfile.ZipFile:
+    """Open an archive whose list of members, which is read whole, is no longer than that of as many as are allowed.
+
+    Raises:
+        UnmixError: of this kind: it has too many members.
+        zipfile.BadZipFile: it is no archive.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        file.seek(max(0, size - _ZIP_END_BYTES))
+        tail = file.read()
+    at = tail.rfind(b"PK\x05\x06")
+    if at >= 0 and len(tail) - at >= 22:
+        number = int.from_bytes(tail[at + 10 : at + 12], "little")
+        listed = int.from_bytes(tail[at + 12 : at + 16], "little")
+        long = tail.rfind(b"PK\x06\x06", 0, at)
+        is_long = number == 0xFFFF or 0xFFFFFFFF in (
+            listed,
+            int.from_bytes(tail[at + 16 : at + 20], "little"),
+        )
+        if is_long and long >= 0:
+            number = int.from_bytes(tail[long + 32 : long + 40], "little")
+            listed = int.from_bytes(tail[long + 40 : long + 48], "little")
+        allow_parts(path, max(number, listed // _ZIP_ENTRY_BYTES), "members", kind)
+    return zipfile.ZipFile(path)
 
 
 def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int | None = None) -> None:

@@ -24,6 +24,7 @@ from jaxtyping import Float, Float32, Float64, Int
 
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import DEEPEST
 
 FactorOf: TypeAlias = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
 """Factor at rows y and columns x."""
@@ -42,6 +43,8 @@ _SATURATED_12_BITS, _SATURATED_10_BITS_OF_16, _SATURATED_10_BITS = 65520.0, 6547
 _FAULTY_EXPOSURE_S, _TRUE_EXPOSURE_S = 1.0 / 6329.0, 0.000274
 """What old firmware of the RedEdge wrote, and what it meant."""
 _GREATEST_POWER = 20
+_LARGEST_PACKET = 1 << 20
+"""Characters of XMP; cameras write some thousand."""
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
@@ -56,14 +59,22 @@ def parse_xmp(packet: bytes | str) -> XmpTags:
     start = opening if 0 <= opening < start else start
     if start < 0 or end < 0 or "<!DOCTYPE" in text[:end] or "<!ENTITY" in text[:end]:
         return {}
+    if end - start > _LARGEST_PACKET:
+        return {}
     body = text[start:end] + "</rdf:RDF>" + ("</x:xmpmeta>" if start == opening else "")
     prefixes: dict[str, str] = {}
     tags: XmpTags = {}
+    level = 0
     try:
-        for event, item in ElementTree.iterparse(io.BytesIO(body.encode()), events=("start-ns", "end")):
+        for event, item in ElementTree.iterparse(
+            io.BytesIO(body.encode()), events=("start-ns", "start", "end")
+        ):
+            level += {"start": 1, "end": -1}.get(event, 0)
+            if level > DEEPEST:
+                return {}
             if event == "start-ns":
                 prefixes[item[1]] = item[0]
-            elif item.tag == f"{_RDF}Description":
+            elif event == "end" and item.tag == f"{_RDF}Description":
                 tags.update(_tags_of(item, prefixes))
     except ElementTree.ParseError:
         return {}
@@ -163,7 +174,7 @@ def band_of(tags: XmpTags) -> BandTable | None:
         centres = [float(number[0]) for number in found if number]
         if not found or len(centres) < len(found) or not all(100 < centre < 20_000 for centre in centres):
             continue
-        halves = [re.search(rf"\+\s*/?\s*-\s*({_NUMBER})", item) for item in items]
+        halves = [re.search(rf"\+\s*(?:/\s*)?-\s*({_NUMBER})", item) for item in items]
         widths = tag_numbers(tags, "Camera:WavelengthFWHM") or []
         if all(halves):
             widths = [2.0 * float(half[1]) for half in halves if half]

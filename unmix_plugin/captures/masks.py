@@ -23,6 +23,8 @@ from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
 
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP")
+"""Pillow reads more, some of them with other programs."""
 _Background = Literal["white", "black"]
 
 HALF, OPAQUE = 127, 255
@@ -285,7 +287,7 @@ def _alpha_picture(view: CaptureView) -> Path | None:
     if picture is None:
         return None
     try:
-        with Image.open(picture) as opened:
+        with Image.open(picture, formats=_FORMATS) as opened:
             has_alpha = "A" in opened.getbands() or "transparency" in opened.info
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise CaptureError(f"{picture} can't be read as a picture ({error}); mend or remove it") from error
@@ -302,7 +304,7 @@ def _read(path: Path, mode: str | None, view: CaptureView) -> np.ndarray:
 
     height, width, _ = view.cube.shape
     try:
-        with Image.open(path) as picture:
+        with Image.open(path, formats=_FORMATS) as picture:
             if picture.size != (width, height):
                 raise CaptureError(
                     f"{path} has {picture.size[0]} x {picture.size[1]} pixels (width x height); expected "

@@ -6,6 +6,7 @@ Notation: `B` bands; wavelengths in nm.
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,12 +17,15 @@ from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.spectral_file import BandTable
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
 
 _NUMBER = re.compile(r"(?<![\d.,])(\d+(?:[.,]\d+)?)")
 _WITH_UNIT = re.compile(
     _NUMBER.pattern + r"[ _-]?(nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])", re.I
 )
+_LONGEST_NAME = 1000
+"""Longer texts are no names, and looking for counters in them takes long."""
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
 """What precedes a number that counts instead of measuring."""
 _USUAL_NM = (200.0, 3000.0)
@@ -141,12 +145,14 @@ def wavelengths_in_names(names: Sequence[str]) -> tuple[Float64[np.ndarray, " B"
     def number(text: str) -> float:
         return float(text.replace(",", "."))
 
+    if not names or max(map(len, names)) > _LONGEST_NAME:
+        return None
     with_unit = [_WITH_UNIT.findall(name) for name in names]
-    if names and all(len(found) == 1 for found in with_unit):
+    if all(len(found) == 1 for found in with_unit):
         pairs = [found[0] for found in with_unit]
         centres = [number(text) * (nm_per_unit(unit) or 1.0) for text, unit in pairs]
         return np.array(centres), f"with the unit {pairs[0][1]}"
-    plain = [_varying_numbers(name, names) for name in names]
+    plain = _varying_numbers(names)
     if any(len(found) != 1 for found in plain):
         return None
     centres = np.array([number(found[0]) for found in plain])
@@ -156,8 +162,8 @@ def wavelengths_in_names(names: Sequence[str]) -> tuple[Float64[np.ndarray, " B"
     return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm"
 
 
-def _varying_numbers(name: str, names: Sequence[str]) -> list[str]:
-    """Numbers outside of what all names begin with and end in, except counters."""
+def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
+    """Of each name the numbers outside of what all names begin with and end in, except counters."""
 
     def common_begin(texts: Sequence[str]) -> str:
         first, last = min(texts), max(texts)
@@ -166,10 +172,16 @@ def _varying_numbers(name: str, names: Sequence[str]) -> list[str]:
 
     begin = len(common_begin(names).rstrip("0123456789.,"))
     end = len(common_begin([other[::-1] for other in names])[::-1].lstrip("0123456789.,"))
-    inside = [
-        match for match in _NUMBER.finditer(name) if begin <= match.start() and match.end() <= len(name) - end
-    ]
-    return [match[1] for match in inside if not _COUNTER.search(name[: match.start()])]
+
+    def varying(name: str) -> list[str]:
+        inside = [
+            match
+            for match in _NUMBER.finditer(name)
+            if begin <= match.start() and match.end() <= len(name) - end
+        ]
+        return [match[1] for match in inside if not _COUNTER.search(name, 0, match.start())]
+
+    return [varying(name) for name in names]
 
 
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
@@ -238,7 +250,7 @@ def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.n
 
 def _read_words(path: Path) -> list[str]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(io.BytesIO(read_bounded(path)), "utf-8-sig", newline="") as file:
             rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         reason = getattr(error, "strerror", None) or error

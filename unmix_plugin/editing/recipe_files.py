@@ -28,6 +28,7 @@ import yaml
 from unmix_plugin.editing.recipe import OPERATIONS, Colour, Endmember, Light, LightName, Operation, Recipe
 from unmix_plugin.errors import ConfigError, UnmixError, did_you_mean
 from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.colour.conversion import parse_light
 
 _MOST_CHARACTERS = 100_000
@@ -52,7 +53,7 @@ def read_recipe(path: str | Path) -> Recipe:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bounded(path, 4 * _MOST_CHARACTERS).decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"can't read the recipe {path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

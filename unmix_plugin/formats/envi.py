@@ -23,6 +23,7 @@ from jaxtyping import Float, Float32
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.files import RowSink, raw_rows
+from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
 
@@ -33,7 +34,6 @@ _FLOAT32 = 4
 _COMPLEX_TYPES = (6, 9)
 _AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
-_LARGEST_HEADER = 2**24
 _OTHER_HEADERS = {
     "#?R": "a Radiance picture",
     "BYTEORDER": "an ESRI (ArcGIS) band file",
@@ -93,9 +93,9 @@ def read_header(path: Path) -> dict[str, str]:
         OSError: it can't be read.
     """
     size = path.stat().st_size
-    if size > _LARGEST_HEADER:
+    if size > MOST_TEXT_BYTES:
         raise ValueError(f"no ENVI header: {size} bytes; expected a text of a few kB")
-    data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    data = read_bounded(path).removeprefix(b"\xef\xbb\xbf")
     try:
         text = data.decode()
     except UnicodeDecodeError:

@@ -27,6 +27,7 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from unmix_plugin import __version__
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 _TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "int"}
 _FLOAT, _UNSIGNED_INT = 5126, 5125
@@ -81,7 +82,7 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
         ValueError: it is not a PLY, is cut short, or its vertices are not numbers x, y, z.
         OSError: it can't be read.
     """
-    data = path.read_bytes()
+    data = read_bounded(path, MOST_TABLE_BYTES)
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise ValueError("no PLY header")

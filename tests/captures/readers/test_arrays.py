@@ -211,6 +211,8 @@ def test_files_of_terabytes_open_at_once(tmp_path, name):
     if name == "big.h5":
         with h5py.File(tmp_path / name, "w") as file:
             file.create_dataset("cube", shape, "u2", chunks=(1, 100, 500))
+        with (tmp_path / name).open("r+b") as opened:  # as large as such a file would be
+            opened.truncate(10**12)
     else:
         header = np.lib.format.open_memmap(tmp_path / name, "w+", np.uint16, (1, 1, 1))
         del header

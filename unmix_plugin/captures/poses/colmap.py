@@ -31,6 +31,7 @@ from unmix_plugin.captures.poses.lens_models import (
 )
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 _Record = TypeVar("_Record")
 
@@ -358,6 +359,6 @@ def _parsed(path: Path, parse: Callable[[str], _Record], expected: str) -> list[
 
 def _bytes_of(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bounded(path, MOST_TABLE_BYTES)
     except OSError as error:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error

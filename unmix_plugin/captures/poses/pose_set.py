@@ -19,6 +19,7 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.limits import read_bounded
 from unmix_plugin.scenes.reading.faults import UnreadableJsonError, read_json_file
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -237,7 +238,7 @@ def load_xml(path: Path) -> ElementTree.Element:
         CaptureError: it can't be read, is no XML, or declares entities, which could grow without end.
     """
     try:
-        data = path.read_bytes()
+        data = read_bounded(path)
     except OSError as error:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:

@@ -37,9 +37,11 @@ from unmix_plugin.captures.poses.pose_set import (
 )
 from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.formats.meshes import read_ply_points
+from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
+from unmix_plugin.scenes.reading.images import FORMATS
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, read_lens
 
 _KNOWN = (
@@ -156,7 +158,7 @@ def _greatest_model(models: list[Path]) -> PoseSet:
 
 def _first_bytes(path: Path) -> bytes:
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return file.read(512)
     except OSError as error:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
@@ -307,7 +309,7 @@ def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | Non
     if len(set(given.values())) == 1:
         return next(iter(given.values()))
     try:
-        with Image.open(folder / name) as picture:
+        with Image.open(folder / name, formats=FORMATS) as picture:
             return picture.size
     except (OSError, ValueError, Image.DecompressionBombError):
         return None

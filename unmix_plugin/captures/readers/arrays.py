@@ -29,6 +29,7 @@ from unmix_plugin.captures.spectral_file import (
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_parts, open_zip
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
     UnreadableArrayError,
@@ -271,7 +272,7 @@ def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
     Raises:
         CaptureError: a member is damaged or holds objects, or none can be the image.
     """
-    with zipfile.ZipFile(path) as archive:
+    with open_zip(path, CaptureError) as archive:
         arrays = [_npz_member(path, archive, info) for info in archive.infolist()]
     return image_of_arrays(path, "npy", arrays, options)
 
@@ -290,6 +291,7 @@ def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         raise CaptureError(
             f"{path}: {info.filename} holds {info.file_size} bytes; its header promises {needed}"
         )
+    allow_decoded(path, info.file_size, CaptureError, info.compress_size)
     name = info.filename.removesuffix(".npy")
     return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
 
@@ -329,6 +331,10 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
         tensor = tensor.detach()
         return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
 
+    found = tensors()
+    allow_parts(path, len(found), "tensors", CaptureError)
+    for tensor in found.values():  # of which many numbers can be one in the file
+        allow_decoded(path, tensor.numel() * tensor.element_size(), CaptureError)
     arrays = [
         FoundArray(
             name,
@@ -336,7 +342,7 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
             numbers(tensor[:0] if tensor.ndim else tensor).dtype,
             lambda name=name: numbers(tensors()[name]),
         )
-        for name, tensor in tensors().items()
+        for name, tensor in found.items()
     ]
     return image_of_arrays(path, "torch", arrays, options)
 
@@ -368,5 +374,6 @@ def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
         return FoundArray(name, variable.shape, kind, whole, take, attributes, variable.dimensions)
 
     with netcdf_file(str(path), "r", mmap=True) as file:
+        allow_parts(path, len(file.variables), "variables", CaptureError)
         arrays = [found(name, variable) for name, variable in file.variables.items()]
     return image_of_arrays(path, "netcdf", arrays, options)

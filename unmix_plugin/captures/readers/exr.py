@@ -26,6 +26,7 @@ from unmix_plugin.captures.spectral_file import (
     loaded,
 )
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_parts
 
 _HEADER_BYTES = 2**20
 _MARK = b"channels\0chlist\0"
@@ -81,6 +82,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         channels = _list_channels(begin)
     except ValueError as error:
         raise CaptureError(f"{path}: no OpenEXR image: {error}; copy the file again") from error
+    allow_parts(path, len(channels), "channels", CaptureError)
     bands, notes = _choose(path, [channel.name for channel in channels], options.dataset)
     names = bands.names or ()
     chosen = [channel for channel in channels if channel.name in names]
@@ -90,6 +92,9 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         )
     header = _opened(path, header_only=True).header()
     (left, top), (right, bottom) = header["dataWindow"]
+    a_pixel = sum(channel.dtype.itemsize for channel in channels)  # the library decodes all of them
+    size = (int(bottom) - int(top) + 1) * (int(right) - int(left) + 1) * a_pixel
+    allow_decoded(path, size, CaptureError)
     if not np.array_equal(header["dataWindow"], header["displayWindow"]):
         notes += ("the image is a part of a larger picture: its data window is not its display window",)
     others = [channel.name for channel in channels if channel.name not in names]

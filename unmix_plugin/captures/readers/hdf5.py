@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from unmix_plugin.captures.spectral_file import (
     import_extra,
 )
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_depth, allow_parts
 
 
 def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
@@ -34,8 +36,17 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
         is_matlab = begin.read(10) == b"MATLAB 7.3"
     arrays: list[FoundArray] = []
     with h5py.File(path, "r") as file:
-        file.visititems(lambda name, item: arrays.extend(_found(path, name, item, is_matlab)))
-        root = _attributes(file)
+        visited = 0
+
+        def visit(name: str, item: Any) -> None:
+            nonlocal visited
+            visited += 1
+            allow_parts(path, visited, "groups and data sets", CaptureError)
+            allow_depth(path, name.count("/") + 1, CaptureError)
+            arrays.extend(_found(path, name, item, is_matlab))
+
+        file.visititems(visit)
+        root = _attributes(path, file)
     # Attributes of the file hold for its images where these have none of that name.
     arrays = [
         replace(array, attributes={**root, **array.attributes}) if len(array.shape) == 3 else array
@@ -44,8 +55,11 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
     name = opened.metadata.get("dataset") or arrays[0].name
     with h5py.File(path, "r") as file:
-        if file[name].external or file[name].is_virtual:
+        image = file[name]
+        if image.external or image.is_virtual:
             raise CaptureError(f"{path}: the numbers of {name} lie in other files; write them into this one")
+        of_chunk = prod(image.chunks) if image.chunks else 0
+        allow_decoded(path, max(image.size, of_chunk) * image.dtype.itemsize, CaptureError)
     return opened
 
 
@@ -79,13 +93,16 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
         names.append((scales[0] or "") if scales else dimension.label)
     dimensions = tuple(names) if any(names) else None
     return [
-        FoundArray(name, shape, item.dtype, whole, take if is_cube else None, _attributes(item), dimensions)
+        FoundArray(
+            name, shape, item.dtype, whole, take if is_cube else None, _attributes(path, item), dimensions
+        )
     ]
 
 
-def _attributes(item: Any) -> dict[str, Any]:
+def _attributes(path: Path, item: Any) -> dict[str, Any]:
     """Attributes that h5py can read; files of other programs hold types that it has no word for."""
     attributes = {}
+    allow_parts(path, len(item.attrs), "attributes", CaptureError)
     for name in item.attrs:
         with suppress(OSError, TypeError, ValueError, RuntimeError):
             attributes[name] = item.attrs[name]

@@ -27,6 +27,7 @@ from unmix_plugin.captures.spectral_file import (
     take_part,
 )
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_parts
 
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
@@ -60,6 +61,10 @@ def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
     """
 
     def found(array: _MatlabArray) -> FoundArray:
+        if array.packed is not None:
+            size = max(array.stored.itemsize, array.dtype.itemsize)
+            allow_decoded(path, prod(array.shape) * size, CaptureError, array.packed[1])
+
         def stored() -> np.ndarray:
             if array.packed is not None:
                 return loaded(_unpack, path, array)
@@ -76,7 +81,10 @@ def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
             order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:128])
             if order is None:
                 raise ValueError("the header is damaged")
-            arrays = [_matlab_array(file, order, *element) for element in _elements(file, order, size)]
+            arrays = []
+            for element in _elements(file, order, size):
+                arrays.append(_matlab_array(file, order, *element))
+                allow_parts(path, len(arrays), "variables", CaptureError)
     except (ValueError, zlib.error) as error:
         raise CaptureError(f"{path}: a damaged MATLAB file: {error}; copy it again") from error
     return image_of_arrays(path, "matlab", [found(array) for array in arrays if array is not None], options)

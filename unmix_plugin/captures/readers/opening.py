@@ -27,6 +27,7 @@ from unmix_plugin.captures.spectral_file import (
     unreadable,
 )
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import open_regular, open_zip
 
 _BEGINNINGS = {
     b"II*\0": "tiff",
@@ -103,7 +104,7 @@ def _file_kind(path: Path) -> str:
         return "folder"
     if not path.is_file():
         raise CaptureError(f"{path}: no such file")
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         begin = file.read(4096 + 8)
     if not begin:
         raise CaptureError(f"{path}: the file is empty; copy it again")
@@ -124,7 +125,7 @@ def _by_content(path: Path, begin: bytes) -> str | None:
     if any(begin[start : start + 8] == b"\x89HDF\r\n\x1a\n" for start in _HDF5_STARTS):
         return "hdf5"
     if begin.startswith(b"PK\x03\x04") and zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path, CaptureError) as archive:
             names = archive.namelist()
         if any(name.endswith("/data.pkl") for name in names):
             return "torch"

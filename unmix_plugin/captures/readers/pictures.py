@@ -25,6 +25,7 @@ from unmix_plugin.captures.spectral_file import (
 )
 from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_parts
 
 _GREY = {"1": "u1", "L": "u1", "LA": "u1", "I;16": "u2", "I;16B": "u2", "I": "u2"}
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
@@ -45,6 +46,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
 
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         mode, (width, height), info = picture.mode, picture.size, dict(picture.info)
+        num_bands = 1 if mode in _GREY else 3
+        allow_decoded(path, width * height * num_bands, CaptureError)  # Exif of a PNG is read by decoding it
         orientation = picture.getexif().get(_ORIENTATION, 1)
     with path.open("rb") as file:
         begin = file.read(_KIND_AT + 1)
@@ -52,8 +55,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     is_deep = begin[:4] == b"\x89PNG" and begin[_DEPTH_AT] == 16 and begin[_KIND_AT] in _WITH_COLOURS
     if mode not in _GREY and mode not in _COLOUR:
         raise CaptureError(f"{path}: a picture of mode {mode}; expected grey or RGB")
-    num_bands = 1 if mode in _GREY else 3
     dtype = np.dtype("u2") if is_deep else np.dtype(_GREY.get(mode, "u1"))
+    allow_decoded(path, width * height * num_bands * dtype.itemsize, CaptureError)
     alpha = mode in ("RGBA", "LA", "PA") or "transparency" in info
     xmp = parse_xmp(info.get("xmp") or b"")
     bands = band_of(xmp)
@@ -110,6 +113,7 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     if not kinds:
         raise CaptureError(f"{folder}: no band files in this folder; expected one {', '.join(_KINDS)} a band")
     kind, number = kinds.most_common(1)[0]
+    allow_parts(folder, number, "band files", CaptureError)
     files = sorted((path for path in found if _KINDS.get(path.suffix.lower()) == kind), key=_natural)
     bands = [open_band(path) for path in files]
     for band in bands:

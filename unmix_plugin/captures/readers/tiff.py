@@ -12,6 +12,7 @@ import json
 import logging
 import math
 import re
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -35,6 +36,7 @@ from unmix_plugin.captures.spectral_file import (
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
 if TYPE_CHECKING:
@@ -44,9 +46,12 @@ _OPACITY = (1, 2)
 """Kinds of extra numbers of a pixel. Programs give it to fourth bands that are none, so that nothing is dropped."""
 _GDAL_METADATA, _GDAL_NODATA, _DESCRIPTION, _PAGE_NAME = 42112, 42113, 270, 285
 _CENTRES = ("wavelength", "wavelengths", "center_wavelength", "central_wavelength", "centre_wavelength")
+_MOST_TAGS = 4096
+"""What TIFF libraries take."""
 _UNITS = ("wavelength_units", "wavelength_unit")
 _LIST = re.compile(
-    r"""["']?wavelengths?(?: ?\(?(?P<unit>[a-zµμ]+)\)?)?["']?\s*[=:]\s*[\[{(]?(?P<list>[\d.,;\s]+)""", re.I
+    r"""["']?wavelengths?(?: ?\(?(?P<unit>[a-zµμ]{1,20})\)?)?["']?\s{0,9}[=:]\s*[\[{(]?(?P<list>[\d.,;\s]+)""",
+    re.I,
 )
 
 
@@ -82,6 +87,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     Raises:
         CaptureError: pages contradict each other, or the file is cut short.
     """
+    _check_directories(path)
     with _logged() as messages, import_extra("tifffile").TiffFile(path) as file:
         stack = _find_stack(path, file)
         if any("page offset" in message for message in messages):
@@ -121,6 +127,32 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     )
 
 
+def _check_directories(path: Path) -> None:
+    """Refuse pages without end before any is read: each directory says where the next one lies, perhaps at itself."""
+    with path.open("rb") as file:
+        begin = file.read(16)
+        order = "<" if begin[:2] == b"II" else ">"
+        is_big = begin[2:4] in (b"+\0", b"\0+")
+        count_type, offset_type, entry_bytes = ("Q", "Q", 20) if is_big else ("H", "I", 12)
+        count_bytes, offset_bytes = struct.calcsize(count_type), struct.calcsize(offset_type)
+        at = begin[8 : 8 + offset_bytes] if is_big else begin[4 : 4 + offset_bytes]
+        seen: set[int] = set()
+        while len(at) == offset_bytes and (offset := struct.unpack(order + offset_type, at)[0]):
+            if offset in seen:
+                refuse(path, f"page {len(seen)} leads back to an earlier one", "each page once", CaptureError)
+            seen.add(offset)
+            allow_parts(path, len(seen), "pages", CaptureError)
+            file.seek(offset)
+            count = file.read(count_bytes)
+            if len(count) < count_bytes:
+                return
+            tags = struct.unpack(order + count_type, count)[0]
+            if tags > _MOST_TAGS:
+                refuse(path, f"{tags} tags in page {len(seen)}", f"at most {_MOST_TAGS}", CaptureError)
+            file.seek(tags * entry_bytes, 1)
+            at = file.read(offset_bytes)
+
+
 @contextmanager
 def _logged() -> Iterator[list[str]]:
     """Context in which warnings and errors of tifffile's log are collected for notes, and shown nowhere."""
@@ -152,6 +184,9 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
     for page in like:
         _check_page(path, page, size)
         _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
+    compressed = [page for page in like if not _is_mappable(page)]
+    of_strip = max((math.prod(page.chunks) * page.dtype.itemsize for page in compressed), default=0)  # type: ignore[union-attr]
+    allow_decoded(path, max(of_strip, sum(page.nbytes for page in compressed)), CaptureError)
     left_out = len(file.pages) - len(like)
     notes = (f"{left_out} pages of other sizes, previews or masks are left out",) if left_out else ()
     planes, _, height, width, samples = first.shaped
@@ -326,7 +361,7 @@ def _from_description(page: TiffPage) -> StatedBands | None:
     text = str(page.tags.valueof(_DESCRIPTION) or "")[: 2**20]
     if "wavelength" not in text.lower():
         return None
-    if listed := re.findall(r'<Channel\b[^>]*?\bEmissionWavelength="([^"]+)"', text):
+    if listed := re.findall(r'<Channel\b[^<>]*?\bEmissionWavelength="([^"]+)"', text):
         unit = re.search(r'EmissionWavelengthUnit="([^"]+)"', text)
         return StatedBands("OME-XML, EmissionWavelength", listed, unit[1] if unit else "nm")
     try:

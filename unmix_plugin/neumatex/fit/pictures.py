@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.limits import allow_decoded
 from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
@@ -73,6 +74,9 @@ def _read_display(path: Path) -> Picture:
     try:
         with Image.open(path, formats=FORMATS) as image:
             size = (image.height, image.width)
+            allow_decoded(path, image.height * image.width * 16, SceneError)  # becomes float32
+    except SceneError:
+        raise
     except Exception as error:
         raise UnreadableImageError(
             f"cannot be read as a PNG, JPEG or TIFF picture ({type(error).__name__})"

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SceneError, SpectrumError, counted
 from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.limits import MOST_TABLE_BYTES, allow_decoded, read_bounded
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
@@ -104,8 +105,12 @@ def _read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
     Raises:
         SceneError: the file is damaged, holds XYZ instead of RGB, or stores its pixels in another order.
     """
-    data = path.read_bytes()
+    try:
+        data = read_bounded(path, MOST_TABLE_BYTES)
+    except OSError as error:
+        raise SceneError(f"{path}: can't be read ({error.strerror})") from error
     height, width, start = _header(path, data)
+    allow_decoded(path, height * width * 4, SceneError)
     rgbe = np.empty((height, width, 4), dtype=np.uint8)
     row = 0
     try:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
@@ -82,7 +83,7 @@ def read_json_file(path: Path) -> Any:
         UnreadableJsonError: it is not UTF-8, not JSON, nested too deeply, or has text that is not Unicode.
         OSError: it cannot be opened.
     """
-    data = path.read_bytes()
+    data = read_bounded(path, MOST_TABLE_BYTES)
     if not data.strip(b"\xef\xbb\xbf\t\r\n "):
         raise UnreadableJsonError("is empty; expected JSON")
     try:

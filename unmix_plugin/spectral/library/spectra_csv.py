@@ -17,6 +17,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands, require_nanometres
 
 TOLERANCE_NM = 1e-6
@@ -146,7 +147,9 @@ def write_spectra_csv(path: Path, table: SpectraTable) -> None:
 def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Header, and each row with its line number; blank lines left out."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(
+            io.BytesIO(read_bounded(path, MOST_TABLE_BYTES)), "utf-8-sig", newline=""
+        ) as file:
             reader = csv.reader(file)
             rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except OSError as error:

@@ -1,0 +1,260 @@
+"""Small files that would take endless work or memory: refused before anything of them is decoded, in one message."""
+
+from __future__ import annotations
+
+import io
+import resource
+import struct
+import time
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+import tifffile
+import torch
+from PIL import Image
+
+from tests.captures.file_factory import header_text
+from unmix_plugin import limits
+from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
+from unmix_plugin.errors import CaptureError
+
+CUBE = np.arange(60, dtype=np.uint16).reshape(5, 4, 3)
+_MATLAB_BEGIN = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x100) + b"IM"
+
+
+def _element(kind: int, data: bytes) -> bytes:
+    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
+
+
+def looping_pages(path: Path) -> None:
+    """A TIFF whose second page leads back to the first."""
+    with tifffile.TiffWriter(path) as file:
+        for _ in range(2):
+            file.write(CUBE[..., 0], metadata=None, contiguous=False)
+    data = bytearray(path.read_bytes())
+    first = struct.unpack("<I", data[4:8])[0]
+    tags = struct.unpack("<H", data[first : first + 2])[0]
+    second = struct.unpack("<I", data[first + 2 + 12 * tags :][:4])[0]
+    tags = struct.unpack("<H", data[second : second + 2])[0]
+    data[second + 2 + 12 * tags : second + 6 + 12 * tags] = struct.pack("<I", first)
+    path.write_bytes(data)
+
+
+def looping_big_pages(path: Path) -> None:
+    """A BigTIFF whose page leads to itself."""
+    tifffile.imwrite(path, CUBE[..., 0], metadata=None, bigtiff=True)
+    data = bytearray(path.read_bytes())
+    first = struct.unpack("<Q", data[8:16])[0]
+    tags = struct.unpack("<Q", data[first : first + 8])[0]
+    data[first + 8 + 20 * tags : first + 16 + 20 * tags] = struct.pack("<Q", first)
+    path.write_bytes(data)
+
+
+def many_pages(path: Path) -> None:
+    with tifffile.TiffWriter(path) as file:
+        for _ in range(limits.MOST_PARTS + 1):
+            file.write(CUBE[..., 0], metadata=None, contiguous=False)
+
+
+def many_tags(path: Path) -> None:
+    path.write_bytes(b"II*\0" + struct.pack("<IH", 8, 60_000) + bytes(12 * 60_000 + 4))
+
+
+def packed_strip(path: Path) -> None:
+    tifffile.imwrite(path, np.zeros((900, 900), np.uint8), compression="zlib", rowsperstrip=900)
+
+
+def packed_picture(path: Path) -> None:
+    Image.new("L", (900, 900)).save(path, format="PNG")
+
+
+def many_members(path: Path) -> None:
+    file = io.BytesIO()
+    np.save(file, np.zeros(1))
+    with zipfile.ZipFile(path, "w") as archive:
+        for index in range(limits.MOST_PARTS + 1):
+            archive.writestr(f"{index}.npy", file.getvalue())
+
+
+def packed_member(path: Path) -> None:
+    np.savez_compressed(path.with_suffix(".npz"), cube=np.zeros((900, 900, 1), np.uint8))
+    path.with_suffix(".npz").rename(path)
+
+
+def nested_groups(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        group: h5py.Group = file
+        for _ in range(2 * limits.DEEPEST):
+            group = group.create_group("g")
+        file["cube"] = CUBE
+
+
+def many_groups(path: Path) -> None:
+    with h5py.File(path, "w", libver="latest") as file:
+        for index in range(limits.MOST_PARTS + 1):
+            file.create_group(str(index))
+        file["cube"] = CUBE
+
+
+def many_attributes(path: Path) -> None:
+    with h5py.File(path, "w", libver="latest") as file:
+        file["cube"] = CUBE
+        for index in range(limits.MOST_PARTS + 1):
+            file["cube"].attrs[str(index)] = index
+
+
+def packed_chunk(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        options = {"chunks": (900, 900, 3), "maxshape": (None, None, 3), "compression": "gzip"}
+        file.create_dataset("cube", (5, 4, 3), "u1", **options)[:] = 1
+
+
+def empty_numbers(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("cube", (10**4, 10**4, 100), "f8", chunks=(10, 10, 10))
+
+
+def packed_variable(path: Path) -> None:
+    size = 900 * 900
+    head = _element(6, struct.pack("<II", 9, 0)) + _element(5, struct.pack("<3i", 900, 900, 1))
+    head += _element(1, b"cube") + struct.pack("<II", 2, size)
+    packed = zlib.compress(struct.pack("<II", 14, len(head) + size) + head + bytes(size))
+    path.write_bytes(_MATLAB_BEGIN + struct.pack("<II", 15, len(packed)) + packed)
+
+
+def many_variables(path: Path) -> None:
+    head = _element(6, struct.pack("<II", 6, 0)) + _element(5, struct.pack("<2i", 1, 1))
+    one = _element(14, head + _element(1, b"x") + _element(9, bytes(8)))
+    path.write_bytes(_MATLAB_BEGIN + one * (limits.MOST_PARTS + 1))
+
+
+def packed_channels(path: Path) -> None:
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, {"S0.450,0nm": np.zeros((900, 900), np.float32)}).write(str(path))
+
+
+def expanded_tensor(path: Path) -> None:
+    torch.save(torch.zeros(1).expand(2000, 2000, 500), path)
+
+
+HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "loop.tif": (looping_pages, "page 2 leads back to an earlier one"),
+    "big-loop.tif": (looping_big_pages, "page 1 leads back to an earlier one"),
+    "pages.tif": (many_pages, "4097 pages; expected at most 4096"),
+    "tags.tif": (many_tags, "60000 tags in page 1"),
+    "strip.tif": (packed_strip, "decode to 810,000"),
+    "picture.png": (packed_picture, "decode to 810,000"),
+    "members.npz": (many_members, "4097 members; expected at most 4096"),
+    "packed.npz": (packed_member, "decode to 810,128"),
+    "nested.h5": (nested_groups, "33 levels deep; expected at most 32"),
+    "groups.h5": (many_groups, "4097 groups and data sets"),
+    "attributes.h5": (many_attributes, "4097 attributes"),
+    "chunk.h5": (packed_chunk, "decode to 2,430,000"),
+    "empty.h5": (empty_numbers, "decode to 80,000,000,000"),
+    "packed.mat": (packed_variable, "decode to 810,000"),
+    "variables.mat": (many_variables, "4097 variables"),
+    "packed.exr": (packed_channels, "decode to 3,240,000"),
+    "expanded.pt": (expanded_tensor, "decode to 8,000,000,000"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_would_take_endless_work_is_refused_before_it_is_decoded(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(limits, "_FREE_BYTES", 1 << 19)
+    monkeypatch.setattr(limits, "_MOST_RATIO", 1)
+    write, message = HOSTILE[name]
+    write(tmp_path / name)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    begun = time.process_time()
+    with pytest.raises(CaptureError, match=message) as refused:
+        open_spectral_file(tmp_path / name)
+    assert time.process_time() - begun < 2
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    assert name in str(refused.value)
+    assert "expected" in str(refused.value)
+
+
+def many_names(count: int) -> str:
+    return "{" + ",".join(f"{450 + index}" for index in range(count)) + "}"
+
+
+LONG = 100_000
+SLOW: dict[str, str] = {
+    "spaces": "note = a" + " " * LONG + "b",
+    "units": "wavelength units = a" + " " * LONG + "b",
+    "a long name": "band names = {" + "b" * LONG + "1, " + "-" * LONG + "2, " + "1 " * LONG + "}",
+    "empty lines": "note =" + "\n" * LONG,
+    "entries": "a =\n" * LONG,
+    "braces": "description = {" + "{" * LONG + "}",
+    "descriptions": "description = {\n" * (LONG // 4) + "}",
+    "commas": "wavelength = {" + "," * LONG + "}",
+}
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_a_long_header_takes_time_in_proportion_to_its_length(tmp_path, name):
+    (tmp_path / "a.img").write_bytes(CUBE.tobytes())
+    (tmp_path / "a.hdr").write_text(header_text(CUBE, "bip", {}) + SLOW[name] + "\n")
+    begun = time.process_time()
+    inspect_file(tmp_path / "a.hdr")
+    assert time.process_time() - begun < 2
+
+
+def test_many_names_of_bands_take_time_in_proportion_to_their_number(tmp_path):
+    count = 20_000
+    (tmp_path / "a.img").write_bytes(bytes(count))
+    (tmp_path / "a.hdr").write_text(
+        f"ENVI\nsamples = 1\nlines = 1\nbands = {count}\ndata type = 1\ninterleave = bip\n"
+        f"band names = {many_names(count)}\n"
+    )
+    begun = time.process_time()
+    open_spectral_file(tmp_path / "a.hdr")
+    assert time.process_time() - begun < 2
+
+
+DESCRIPTIONS = {
+    "one word": ("wavelength" * LONG, 270),
+    "unclosed": ("wavelength <Channel " * (LONG // 4), 270),
+    "spaces": ("wavelength = " + " " * LONG + "x", 270),
+    "nested": (
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        + "<rdf:Description>" * 20_000
+        + "</rdf:Description>" * 20_000
+        + "</rdf:RDF>",
+        700,
+    ),
+    "half a width": (
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#" xmlns:Camera="c"><rdf:Description '
+        + f'Camera:CentralWavelength="560+{" " * LONG}x"/></rdf:RDF>',
+        700,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DESCRIPTIONS)
+def test_a_long_description_takes_time_in_proportion_to_its_length(tmp_path, name):
+    text, code = DESCRIPTIONS[name]
+    tag = (code, "B" if code == 700 else "s", len(text) if code == 700 else 0, text.encode(), True)
+    tifffile.imwrite(tmp_path / "a.tif", CUBE, photometric="minisblack", metadata=None, extratags=[tag])
+    begun = time.process_time()
+    open_spectral_file(tmp_path / "a.tif")
+    assert time.process_time() - begun < 2
+
+
+def test_what_is_no_regular_file_is_not_opened(tmp_path):
+    with pytest.raises(OSError, match="is no regular file"):
+        limits.open_regular(tmp_path)
+    with pytest.raises(OSError, match="and 3 at most are read"):
+        limits.read_bounded(_written(tmp_path / "a", b"long"), 3)
+    assert limits.read_bounded(_written(tmp_path / "a", b"long"), 4) == b"long"
+
+
+def _written(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
