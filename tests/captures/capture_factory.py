@@ -93,8 +93,9 @@ def write_poses(path: Path, names: list[str], width: int = WIDTH, height: int = 
 
 
 def process(capture: Path, output: Path, **options: Any) -> list[str]:
-    """Make the scene of a capture of the layout `cubes`; gives what looks wrong."""
-    given = {"poses": "transforms.json", **options}
+    """Make the scene of a capture of the layout `cubes`, with all of each image unless a mask is asked for; gives what
+    looks wrong."""
+    given = {"poses": "transforms.json", "mask": "none", **options}
     asked = ProcessOptions(layout="cubes", data=capture, output_dir=output, **given)
     return process_capture(asked, lambda _: None, lambda _, views: views)
 

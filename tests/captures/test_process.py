@@ -344,13 +344,52 @@ def test_poses_of_turned_pictures_name_the_orientation(tmp_path: Path):
         notes_of(tmp_path / "capture", tmp_path / "scene")
 
 
-@pytest.mark.parametrize(("ground", "is_white"), [(254, True), (160, False), (20, False)])
-def test_a_white_background_suggests_its_mask(tmp_path: Path, ground: int, is_white: bool):
-    write_views(tmp_path / "capture", ground)
-    assert ("--mask white leaves it out" in notes_of(tmp_path / "capture", tmp_path / "scene")) == is_white
+def test_a_backdrop_that_nobody_named_is_cut_out_and_said(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", noise=4.0)
+    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
+
+    process(capture.root, tmp_path / "scene", mask="auto", **references)
+
+    scene = load_scene(tmp_path / "scene")
+    square = np.zeros((HEIGHT, WIDTH), bool)
+    square[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = True
+    for index, frame in enumerate(scene.frames):
+        alpha = scene.alpha(index)
+        assert alpha is not None
+        np.testing.assert_array_equal(alpha > 0.5, square)
+        assert scene.cube(index)[~square].max() == 0.0
+        np.testing.assert_allclose(
+            scene.cube(index)[square], capture.reflectance[frame.name][square], atol=0.02
+        )
+    report = (tmp_path / "scene" / "report.txt").read_text()
+    assert "backdrop found, black (0.020): 25% of the pixels are matter" in report
+    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    assert record["decisions"]["mask"] == "auto"
+    assert record["decisions"]["sensors"]["all views"]["background"]["kind"] == "found"
+    mean = np.mean(record["views"][0]["mean_spectrum"])
+    assert mean == pytest.approx(capture.reflectance["view_00"][square].mean(), rel=0.02)
 
 
-def test_a_white_background_needs_no_hint_where_a_mask_is_chosen(tmp_path: Path):
-    write_views(tmp_path / "capture", 254)
-    for mask in ("white", "none"):
-        assert "leaves it out" not in notes_of(tmp_path / "capture", tmp_path / mask, mask=mask)
+def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    generator = np.random.default_rng(0)
+    for name in capture.reflectance:
+        counts = generator.integers(200, 3000, (HEIGHT, WIDTH, 1)) * np.linspace(
+            0.5, 1.0, len(WAVELENGTHS_NM)
+        )
+        write_cube(capture.root, name, counts.astype(np.uint16))
+
+    process(capture.root, tmp_path / "scene", mask="auto")
+
+    assert not load_scene(tmp_path / "scene").has_alpha
+    report = " ".join((tmp_path / "scene" / "report.txt").read_text().split())
+    assert "no mask of matter: all of each image belongs to the scene" in report
+
+
+def test_a_capture_of_nothing_but_background_is_refused(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", noise=4.0)
+    generator = np.random.default_rng(0)
+    for name in capture.reflectance:
+        write_cube(capture.root, name, generator.integers(98, 104, (HEIGHT, WIDTH, 9)).astype(np.uint16))
+    with pytest.raises(CaptureError, match="no view shows anything but background"):
+        process(capture.root, tmp_path / "scene", mask="auto", scale=4000.0)

@@ -1,4 +1,5 @@
-"""Matter and background of each view: from files of the capture, from a background that is white or black, or unknown.
+"""Matter and background of each view: from files of the capture, from a background that is white or black, or unknown;
+backdrops.py finds those that nobody has named.
 
 The border of the views tells how bright a background is and how much it varies; a threshold between it and the rest
 follows from that. Specks are then removed and small holes are filled.
@@ -9,9 +10,9 @@ Notation: `H x W` pixels, `B` bands; values in [0, 1] as they are written.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -41,23 +42,17 @@ _BORDER_SHARE = 0.02
 """Width of the border that a background is judged by, as a share of the view's."""
 _MOST_BORDER_PIXELS = 20000
 _BRIGHT_PERCENTILE = 99.0
-_LOOKED_AT = 12
-"""Views whose border is looked at for a white background that nobody has named."""
-_ALMOST_WHITE = 0.9
-"""Brightness of such a background, as a share of full reflectance or, where none is known, of the brightest pixels."""
-_WHITE_BORDER = 0.75
-"""Share of the border that such a background covers."""
 
 
-def choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> tuple[MaskKind, list[str]]:
-    """What tells matter from background, and what a user should know of it.
+def choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind, list[str]]:
+    """What tells matter from background, `auto` where files don't, and what a user should know of it.
 
     Raises:
         CaptureError: opacity is asked of files that some views don't have.
     """
-    if asked not in (None, "files"):
+    if asked not in ("auto", "files"):
         return asked, []
-    found = [has_opacity(view, alpha_only=asked is None) for view in views]
+    found = [has_opacity(view, alpha_only=asked == "auto") for view in views]
     missing = [view.name for view, has_it in zip(views, found, strict=True) if not has_it]
     if not missing:
         return "files", []
@@ -67,13 +62,13 @@ def choose_mask(views: Sequence[CaptureView], asked: MaskKind | None) -> tuple[M
             "white where matter is, for every view"
         )
     if len(missing) == len(views):
-        return "none", []
+        return "auto", []
     has = "has" if len(missing) == 1 else "have"
     note = (
         f"{len(missing)} of {len(views)} views {has} no alpha channel ({name_some(missing)}), so that of the others is "
         "not used: give all views one, or choose --mask"
     )
-    return "none", [note]
+    return "auto", [note]
 
 
 @dataclass(frozen=True)
@@ -87,6 +82,11 @@ class BackgroundRule:
     """Median of the border."""
     deviation: float
     """Robust standard deviation of the border."""
+
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """For the record."""
+        return asdict(self)
 
     def matter(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
         """Pixels that are not background."""
@@ -143,22 +143,6 @@ def background_rule(
     """
     pixels = _border(sensor, views, scale)
     return _find_background(kind, pixels, _brightest(kind, sample, pixels))
-
-
-def white_background_note(
-    sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N c"]
-) -> list[str]:
-    """A hint at `--mask white` if the border of most views is almost white; arguments as `background_rule` has them."""
-    pixels = _border(sensor, views[:: max(1, -(-len(views) // _LOOKED_AT))], scale)
-    least = _ALMOST_WHITE * (1.0 if sensor.is_absolute else _brightest("white", sample, pixels))
-    share = float(np.mean(_brightness("white", pixels) >= least)) if len(pixels) else 0.0
-    if least <= 0 or share < _WHITE_BORDER:
-        return []
-    note = (
-        f"{share:.0%} of the border of the views is almost white, and no view has a mask: if this is background, "
-        "--mask white leaves it out"
-    )
-    return [note]
 
 
 def _brightest(

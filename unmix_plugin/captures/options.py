@@ -11,7 +11,7 @@ import tyro
 from unmix_plugin.captures.layouts.registry import LAYOUTS
 from unmix_plugin.captures.spectral_file import Axes
 
-MaskKind = Literal["files", "white", "black", "none"]
+MaskKind = Literal["auto", "files", "white", "black", "none"]
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,10 @@ class ProcessOptions:
     and width in pixels."""
     white_reflectance: str = "1"
     """Reflectance of the white panel: a number, or a CSV file (wavelength,reflectance)."""
-    mask: MaskKind | None = None
+    mask: MaskKind = "auto"
     """What separates matter from background: pictures of the capture (files), a white or a black background, or
-    nothing; without it, the alpha channel of the capture's pictures where they have one."""
+    nothing (none); auto takes the alpha channel of the capture's pictures where they have one, otherwise a plain
+    backdrop that all views show, if there is one."""
     drop_bands: str | None = None
     """Bands to leave out, as wavelengths and ranges in nm: 1350-1450,1900."""
     max_noise: float = 0.5

@@ -9,15 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.calibration import is_srgb
 from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
-from unmix_plugin.captures.masks import background_rule, choose_mask, has_opacity, white_background_note
+from unmix_plugin.captures.masks import BackgroundRule, background_rule, choose_mask
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe, stamps
+from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.spectral.bands import Bands
+
+_LOOKED_AT, _ROWS_LOOKED_AT = 12, 96
+"""Views that a backdrop is looked for in, and rows of each."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +74,19 @@ def make_plan(
         sensors[name] = prepare_sensor(name, same, options, replace(references, views=all_of_it))
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = choose_mask(views, options.mask)
+    backdrops: dict[str, Backdrop | None] = {}
+    if mask == "auto":
+        for name, sensor in sensors.items():
+            sample = sensor.sample / np.float32(scale)
+            backdrops[name] = _find_backdrop(sensor, by_sensor[name], scale, sample)
+        if not all(backdrops.values()):  # frames with alpha and without don't go together
+            backdrops, mask = {}, "none"
     recipes: dict[str, ViewRecipe] = {}
     evidence: dict[str, dict[str, Any]] = {}
     for name, sensor in sensors.items():
         raster, sample = sensor.calibration.raster, sensor.sample / np.float32(scale)
-        colours, rule = Colours.of(Bands(sensor.centers_nm), sample), None
+        colours = Colours.of(Bands(sensor.centers_nm), sample)
+        rule: BackgroundRule | Backdrop | None = backdrops.get(name)
         if mask in ("white", "black"):
             rule = background_rule(sensor, by_sensor[name], scale, mask, sample)
         recipes[name] = ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
@@ -83,15 +96,17 @@ def make_plan(
             "size": [raster.height, raster.width],
             "colours": colours.description,
             **sensor.evidence,
-            "background": None if rule is None else asdict(rule),
+            "background": None if rule is None else rule.evidence,
         }
     decisions = {"scale": {"calibrated": scale, "evidence": why}, "mask": mask, "sensors": evidence}
     said = [note for sensor in sensors.values() for note in sensor.notes]
     said += said_of_mask
-    if options.mask is None and not any(map(has_opacity, views)):
-        name, sensor = next(iter(sensors.items()))
-        sample = sensor.sample / np.float32(scale)
-        said += white_background_note(sensor, by_sensor[name], scale, sample)
+    found = [backdrop for backdrop in backdrops.values() if backdrop is not None]
+    if found:
+        said.append(
+            f"a backdrop was found that all views share, {', '.join(each.in_words for each in found)}, and is cut out: "
+            "look at contact-sheet.png; --mask none keeps it"
+        )
     said += _notes_on_pictures([view.cube for view in views])
     said += [note for view in views[:1] for note in view.cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
@@ -106,6 +121,21 @@ def make_plan(
         (*capture.notes, *said),
         tuple(path for file in opened for path in file.files),
     )
+
+
+def _find_backdrop(
+    sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N B"]
+) -> Backdrop | None:
+    """The backdrop of a sensor's views, judged by some rows of some of them; the sample is of all, divided by scale."""
+    raster = sensor.calibration.raster
+    rows = np.unique(np.linspace(0, raster.height - 1, min(raster.height, _ROWS_LOOKED_AT)).astype(int))
+    images, known = [], []
+    for index in np.unique(np.linspace(0, len(views) - 1, min(len(views), _LOOKED_AT)).round().astype(int)):
+        parts = [sensor.calibration.rows(views[index].cube, row, row + 1) for row in rows.tolist()]
+        values = np.concatenate([np.where(x.saturated, np.float32(scale), x.values) for x in parts])
+        images.append(np.clip(values / np.float32(scale), 0.0, 1.0))
+        known.append(~np.concatenate([part.missing for part in parts]))
+    return judge_backdrop(images, known, sample)
 
 
 def input_files(view: CaptureView) -> list[Path]:

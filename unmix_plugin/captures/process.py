@@ -66,6 +66,11 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
             record = replace(record, sources=hashes(input_files(view)))
             folder.note(record)
         records[view.name] = record
+    if all(record.matter_share == 0.0 for record in records.values()):
+        raise CaptureError(
+            f"{capture.root}: no view shows anything but background, by its mask ({plan.mask}); look at "
+            f"{folder.path / 'images'} and choose another --mask, or none"
+        )
     if posed is None:
         say("estimating poses ...")
         posed = pose_views(plan.views, estimated_poses(plan, records, folder.path, folder.poses))

@@ -120,7 +120,7 @@ def _write_capture(options: DemoSceneOptions) -> None:
     )
     print(
         f"make a scene of it: unmix-process cubes --data {folder} --output-dir SCENE --white {folder / 'white.hdr'} "
-        f"--dark {folder / 'dark.hdr'} --mask black --poses estimate"
+        f"--dark {folder / 'dark.hdr'} --poses estimate"
     )
 
 

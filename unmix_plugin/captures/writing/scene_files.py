@@ -20,6 +20,7 @@ from jaxtyping import Float64, UInt8
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks import SeenView, check_views, report_text
+from unmix_plugin.captures.masks import BackgroundRule
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.pose_set import PoseSet
@@ -31,6 +32,7 @@ from unmix_plugin.errors import counted
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
@@ -226,14 +228,21 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         f"{counted(total('missing_pixels'), 'pixel')} masked, as nothing was measured there"
     )
     share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are matter"
-    if plan.mask == "none":
-        lines.append("no mask of matter")
+    found = [recipe.background for recipe in plan.recipes.values() if isinstance(recipe.background, Backdrop)]
+    changed = f"{total('specks')} specks removed, {total('holes')} holes filled"
+    if found:
+        whole = sum(view.matter_share == 1.0 for view in views)
+        lines.append(
+            f"backdrop found, {', '.join(each.in_words for each in found)}: {share}, the rest is cut out with soft "
+            f"edges; {changed}" + (f"; {counted(whole, 'view')} without any of it" if whole else "")
+        )
+    elif plan.mask == "none":
+        lines.append("no mask of matter: all of each image belongs to the scene")
     elif plan.mask == "files":
         lines.append(f"masks from files; {share}")
     else:
-        rules = [recipe.background for recipe in plan.recipes.values() if recipe.background is not None]
+        rules = [r.background for r in plan.recipes.values() if isinstance(r.background, BackgroundRule)]
         levels = ", ".join(f"{rule.level:.3f} (threshold {rule.threshold:.3f})" for rule in rules)
-        changed = f"{total('specks')} specks removed, {total('holes')} holes filled"
         lines.append(f"{plan.mask} background at {levels}; {share}; {changed}")
     return [*lines, *posed.notes, *plan.notes]
 

@@ -42,6 +42,7 @@ from unmix_plugin.engine.runs.atomic_files import (
 )
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
+from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
 
@@ -122,7 +123,7 @@ class ViewRecipe:
     scale: float
     """Calibrated value that is written as 1."""
     colours: Colours
-    background: BackgroundRule | None = None
+    background: BackgroundRule | Backdrop | None = None
     use_opacity: bool = False
     """Whether files of the capture say what is matter."""
 
@@ -159,10 +160,10 @@ def write_view(
             for first, last in raster.blocks(values_a_pixel, _BLOCK_VALUES):
                 part = read(first, last) if resampling is None else resampling.rows(first, last, read)
                 file.write(_stored(tally.add(first, part, recipe), part).data)
-        is_shown = tally.finish_masks(recipe) > 0
-        if not is_shown.all():
+        tally.finish_masks(recipe)
+        if (tally.opacity < OPAQUE).any():
             with write_errors_as(path):
-                _blacken(temporary, start, is_shown, recipe.calibration.num_bands)
+                _cut_out(temporary, start, tally, recipe)
     light = np.clip(tally.rgb, 0.0, 1.0)
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
     pixels = np.rint(srgb * 255).astype(np.uint8)
@@ -200,6 +201,8 @@ class _Tally:
         self.counts = np.zeros(2, dtype=np.int64)
         self.sum: Float64[np.ndarray, " B"] = np.zeros(bands)
         self.num_summed = 0
+        self.features: Float32[np.ndarray, "H W k"] | None = None
+        """That a backdrop is known by; of the backdrop, once masks are finished."""
         self.specks, self.holes = 0, 0
 
     def add(self, first: int, part: CalibratedRows, recipe: ViewRecipe) -> Float32[np.ndarray, "h W B"]:
@@ -212,7 +215,12 @@ class _Tally:
         if values.min() < 0.0:
             self.counts[1] += (values < 0.0).sum()
         self.saturated[rows] = part.saturated.any(axis=-1)
-        if recipe.background is not None:
+        if isinstance(recipe.background, Backdrop):
+            features = recipe.background.features(np.where(part.saturated, np.float32(1.0), values))
+            if self.features is None:
+                self.features = np.zeros((*self.missing.shape, features.shape[-1]), np.float32)
+            self.features[rows] = features
+        elif recipe.background is not None:
             self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
         self.rgb[rows] = recipe.colours.linear_rgb(values)
         self.brightness[rows] = values.mean(axis=-1)
@@ -221,13 +229,19 @@ class _Tally:
         self.num_summed += int(counted.sum())
         return values
 
-    def finish_masks(self, recipe: ViewRecipe) -> UInt8[np.ndarray, "H W"]:
+    def finish_masks(self, recipe: ViewRecipe) -> None:
         """Opacity without specks and holes; full for pixels without a measurement, as nothing is known there."""
-        if recipe.background is not None:
+        if isinstance(recipe.background, Backdrop):
+            assert self.features is not None
+            seen = recipe.background.find(self.features, ~self.missing)
+            if seen is not None:
+                matter, self.specks, self.holes = clean(~seen.shown)
+                self.opacity = np.rint(seen.opacity(matter) * OPAQUE).astype(np.uint8)
+                self.features = seen.behind
+        elif recipe.background is not None:
             matter, self.specks, self.holes = clean(self.opacity > 0)
             self.opacity = np.where(matter, OPAQUE, 0).astype(np.uint8)
         self.opacity[self.missing] = OPAQUE
-        return self.opacity
 
     def record(self, view: CaptureView, paths: dict[str, str]) -> ViewRecord:
         seen = (self.opacity > HALF) & ~self.missing
@@ -258,16 +272,36 @@ def _stored(values: Float32[np.ndarray, "h W B"], part: CalibratedRows) -> UInt1
     return stored
 
 
-def _blacken(path: Path, start: int, is_shown: Bool[np.ndarray, "H W"], bands: int) -> None:
-    """Set background to 0 in a cube that is written, row by row: cubes are as seen over black."""
-    row_bytes = is_shown.shape[1] * bands * 2
+def _cut_out(path: Path, start: int, tally: _Tally, recipe: ViewRecipe) -> None:
+    """Take the background out of a cube that is written, row by row: cubes are as seen over black.
+
+    Where a backdrop is known, its light is taken off pixels that it shows through; their spectra are summed anew, as
+    its mask is not known while rows stream by.
+    """
+    num_bands, backdrop = recipe.calibration.num_bands, recipe.background
+    row_bytes = tally.opacity.shape[1] * num_bands * 2
+    if isinstance(backdrop, Backdrop):
+        tally.sum[:], tally.num_summed = 0, 0
     with path.open("r+b") as file:
-        for row in np.flatnonzero(~is_shown.all(axis=1)).tolist():
+        for row, opacity in enumerate(tally.opacity):
+            is_opaque = opacity == OPAQUE
+            if is_opaque.all() and not isinstance(backdrop, Backdrop):
+                continue
             file.seek(start + row * row_bytes)
-            values = np.frombuffer(file.read(row_bytes), "<u2").reshape(-1, bands).copy()
-            values[~is_shown[row]] = 0
-            file.seek(start + row * row_bytes)
-            file.write(values.data)
+            values = np.frombuffer(file.read(row_bytes), "<u2").reshape(-1, num_bands).copy()
+            values[opacity == 0] = 0
+            if isinstance(backdrop, Backdrop):
+                soft = np.flatnonzero((opacity > 0) & ~is_opaque)
+                assert tally.features is not None
+                through = backdrop.spectra(tally.features[row, soft])
+                through *= FULL_SCALE * (1 - opacity[soft, None] / np.float32(OPAQUE))
+                values[soft] = np.rint(np.clip(values[soft] - through, 0, FULL_SCALE)).astype("<u2")
+                counted = (opacity > HALF) & ~tally.missing[row]
+                tally.sum += values[counted].sum(axis=0, dtype=np.float64) / FULL_SCALE
+                tally.num_summed += int(counted.sum())
+            if not is_opaque.all():
+                file.seek(start + row * row_bytes)
+                file.write(values.data)
 
 
 def _detail(brightness: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray, "H W"]) -> float:

@@ -1,0 +1,170 @@
+"""Backdrops that are much alike within and over views: found and cut out with soft edges, and not seen in rooms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
+
+HEIGHT, WIDTH, BANDS, VIEWS = 90, 120, 6, 5
+ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
+COLOUR = np.linspace(1.0, 0.8, BANDS)
+STRIPES = 0.01 * np.random.default_rng(7).standard_normal((WIDTH, BANDS))
+
+Light = Callable[[int, np.random.Generator], np.ndarray]
+
+
+def grey(level: float) -> Light:
+    return lambda *_: np.full((HEIGHT, WIDTH, BANDS), level)
+
+
+def shaded_with_a_seam(view: int, _: np.random.Generator) -> np.ndarray:
+    """A wall and a floor, both brighter to the right, that meet at a height that changes from view to view."""
+    side = np.where(40 + 2 * view + 0.1 * COLUMNS > ROWS, 0.35, 0.5)
+    return (side * (0.7 + 0.3 * COLUMNS / WIDTH))[..., None] * COLOUR
+
+
+BACKDROPS: dict[str, Light] = {
+    "black": grey(0.02),
+    "grey": grey(0.2),
+    "white": grey(0.95),
+    "a gradient": lambda *_: (0.2 + 0.5 * ROWS / HEIGHT)[..., None] * COLOUR,
+    "stripes of the sensor": lambda *_: np.broadcast_to(0.1 + STRIPES, (HEIGHT, WIDTH, BANDS)),
+    "a shaded wall and floor": shaded_with_a_seam,
+}
+
+
+def textured(generator: np.random.Generator, low: float, high: float) -> np.ndarray:
+    """Patches of six pixels a side."""
+    shape = (HEIGHT // 6, WIDTH // 6, BANDS)
+    return np.kron(generator.uniform(low, high, shape), np.ones((6, 6, 1)))
+
+
+def walls(_: int, generator: np.random.Generator) -> np.ndarray:
+    """Plain walls of a room: other colours in every view."""
+    return np.broadcast_to(generator.uniform(0.1, 0.9, BANDS), (HEIGHT, WIDTH, BANDS))
+
+
+def landscape(_: int, generator: np.random.Generator) -> np.ndarray:
+    """A plain sky above grass."""
+    sky = np.broadcast_to(0.9 * COLOUR[::-1], (HEIGHT, WIDTH, BANDS))
+    return np.where((ROWS < 45)[..., None], sky, textured(generator, 0.1, 0.4))
+
+
+def corner(_: int, generator: np.random.Generator) -> np.ndarray:
+    """Four plain sides of a room around its back wall."""
+    colours = generator.permutation(np.linspace(0.15, 0.9, 4))[:, None] * np.random.default_rng(1).uniform(
+        0.3, 1, (4, BANDS)
+    )
+    across, down = COLUMNS / WIDTH - 0.5, ROWS / HEIGHT - 0.5
+    side = np.where(np.abs(across) > np.abs(down), 2 * (across > 0), 1 + 2 * (down > 0))
+    return colours[side]
+
+
+NO_BACKDROP: dict[str, Light] = {
+    "a texture": lambda _, generator: textured(generator, 0.2, 0.6),
+    "walls of many colours": walls,
+    "a landscape": landscape,
+    "a room": corner,
+}
+
+
+def disc(view: int) -> np.ndarray:
+    """How much of each pixel a disc covers, that moves from view to view."""
+    fine = np.arange(4) / 4 + 0.125
+    rows, columns = ROWS[..., None, None] + fine[:, None], COLUMNS[..., None, None] + fine
+    return (np.hypot(rows - 46, columns - 55 - 4 * view) < 25).mean(axis=(2, 3))
+
+
+def pictures(light: Light, matter: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Views and how much of each pixel is matter."""
+    generator, images, covers = np.random.default_rng(3), [], []
+    for view in range(VIEWS):
+        cover = disc(view) if matter else np.zeros((HEIGHT, WIDTH))
+        thing = textured(generator, 0.35, 0.75) * np.linspace(0.3, 1.0, BANDS)
+        image = cover[..., None] * thing + (1 - cover[..., None]) * light(view, generator)
+        noisy = image + 0.002 * generator.standard_normal(image.shape)
+        images.append(noisy.clip(0, 1).astype(np.float32))
+        covers.append(cover)
+    return images, covers
+
+
+def judge(images: list[np.ndarray]) -> Backdrop | None:
+    sample = np.concatenate([image[::5, ::3].reshape(-1, BANDS) for image in images])
+    return judge_backdrop(images, [np.ones((HEIGHT, WIDTH), bool)] * len(images), sample)
+
+
+@pytest.mark.parametrize("name", BACKDROPS)
+def test_a_plain_backdrop_is_found_and_cut_out_with_soft_edges(name: str):
+    images, covers = pictures(BACKDROPS[name])
+    backdrop = judge(images)
+    assert backdrop is not None
+    for image, cover in zip(images, covers, strict=True):
+        seen = backdrop.find(backdrop.features(image), np.ones((HEIGHT, WIDTH), bool))
+        assert seen is not None
+        opacity = seen.opacity(~seen.shown)
+        assert ((opacity > 0.5) != (cover > 0.5)).mean() < 0.012
+        edge = (cover > 0.2) & (cover < 0.8)
+        assert np.abs(opacity - cover)[edge].mean() < 0.2
+        assert np.abs(opacity - (cover > 0.5))[edge].mean() > 0.2  # not a step
+
+
+def test_what_the_backdrop_looks_like_is_known_where_matter_hides_it():
+    images, covers = pictures(BACKDROPS["a gradient"])
+    backdrop = judge(images)
+    assert backdrop is not None
+    seen = backdrop.find(backdrop.features(images[0]), np.ones((HEIGHT, WIDTH), bool))
+    assert seen is not None
+    hidden = covers[0] == 1
+    expected = BACKDROPS["a gradient"](0, np.random.default_rng(0))[hidden]
+    np.testing.assert_allclose(backdrop.spectra(seen.behind[hidden]), expected, atol=0.03)
+
+
+@pytest.mark.parametrize("name", NO_BACKDROP)
+def test_rooms_and_landscapes_have_none(name: str):
+    assert judge(pictures(NO_BACKDROP[name])[0]) is None
+
+
+def test_a_view_that_matter_fills_keeps_all_of_it():
+    images, _ = pictures(BACKDROPS["grey"])
+    backdrop = judge(images)
+    assert backdrop is not None
+    close = textured(np.random.default_rng(0), 0.35, 0.75).astype(np.float32)
+    seen = backdrop.find(backdrop.features(close), np.ones((HEIGHT, WIDTH), bool))
+    assert seen is None or not seen.shown.any()
+
+
+def test_matter_that_reaches_the_border_stays():
+    images, _ = pictures(BACKDROPS["white"])
+    stand = textured(np.random.default_rng(4), 0.3, 0.6).astype(np.float32)
+    for image in images:
+        image[50:, 40:70] = stand[50:, 40:70]
+    backdrop = judge(images)
+    assert backdrop is not None
+    seen = backdrop.find(backdrop.features(images[0]), np.ones((HEIGHT, WIDTH), bool))
+    assert seen is not None
+    assert not seen.shown[50:, 41:69].any()
+
+
+def test_pixels_without_a_measurement_are_not_the_backdrop():
+    images, _ = pictures(BACKDROPS["black"])
+    known = np.ones((HEIGHT, WIDTH), bool)
+    known[:, :4] = False
+    sample = np.concatenate([image[::5, ::3].reshape(-1, BANDS) for image in images])
+    backdrop = judge_backdrop(images, [known] * VIEWS, sample)
+    assert backdrop is not None
+    seen = backdrop.find(backdrop.features(images[0]), known)
+    assert seen is not None
+    assert not seen.shown[:, :4].any()
+    assert seen.shown[:, 4:8].all()
+
+
+def test_its_colour_is_said():
+    named = {"black": "black", "grey": "grey", "white": "white"}
+    for name, word in named.items():
+        backdrop = judge(pictures(BACKDROPS[name])[0])
+        assert backdrop is not None
+        assert backdrop.in_words.startswith(word)
