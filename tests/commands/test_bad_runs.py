@@ -1,8 +1,11 @@
 """Run folders that no command can use: one message, exit code 2, nothing written."""
 
+import hashlib
 import json
+import os
 
 import pytest
+import safetensors.torch
 import torch
 
 from tests.commands.running import run
@@ -51,7 +54,60 @@ def without_checkpoints(path):
         file.unlink()
 
 
+def spoilt_tensors(value):
+    """One parameter of the newest checkpoint is that number, with the right hash as only malice makes it."""
+
+    def change(path):
+        tensors_path = path / "checkpoints" / "step-000020.safetensors"
+        tensors = safetensors.torch.load(tensors_path.read_bytes())
+        for name, tensor in tensors.items():
+            if name.startswith(("model/", "average/")) and tensor.is_floating_point() and "peak" not in name:
+                tensor.view(-1)[:1] = value
+        data = safetensors.torch.save(tensors)
+        tensors_path.write_bytes(data)
+        record = tensors_path.with_suffix(".json")
+        values = json.loads(record.read_text())
+        record.write_text(json.dumps({**values, "sha256": hashlib.sha256(data).hexdigest()}))
+
+    return change
+
+
+def piped(name):
+    """A pipe that nobody writes to, in place of a file."""
+
+    def change(path):
+        (path / name).unlink()
+        os.mkfifo(path / name)
+
+    return change
+
+
+def circle(path):
+    (path / "notes").symlink_to("notes")
+
+
+def camera_of_another_size(path):
+    values = json.loads((path / "scene.json").read_text())
+    values["eval_cameras"]["width"] *= 2
+    (path / "scene.json").write_text(json.dumps(values))
+
+
+def in_config(path):
+    values = json.loads((path / "config.json").read_text())
+    values["config"]["pipeline"]["model"]["eval_num_rays_per_chunk"] = 1
+    (path / "config.json").write_text(json.dumps(values))
+
+
 SPOILT = {
+    "tensors of NaN": (spoilt_tensors(float("nan")), "has values that are not finite"),
+    "tensors of infinity": (spoilt_tensors(float("inf")), "has values that are not finite"),
+    "piped config.json": (piped("config.json"), "config.json missing"),
+    "piped checkpoint": (piped("checkpoints/step-000020.json"), "is no regular file"),
+    "piped tensors": (piped("checkpoints/step-000020.safetensors"), "is no regular file"),
+    "light beyond numbers": (in_scene("metadata", illuminant=[1e308] * 8), "the number 1e+308"),
+    "world of no size": (in_scene("metadata", pixel_size=1e-300), "a pixel_size above 0"),
+    "single rays": (in_config, "eval_num_rays_per_chunk must be from 256"),
+    "circle of links": (circle, "can't open the run folder"),
     "missing config.json": (removed("config.json"), "config.json missing"),
     "missing scene.json": (removed("scene.json"), "scene.json missing"),
     "config.json cut off": (cut_off("config.json"), "can't read"),
@@ -88,6 +144,61 @@ def test_a_spoilt_run_folder_is_refused_by_every_command_and_left_alone(run_copy
     after.pop(run_copy / "run.log")
     before.pop(run_copy / "run.log")
     assert after == before
+
+
+BESIDE = {
+    "piped metrics": (piped("metrics.jsonl"), train, ["unmix-nerf", "--load-run"], "is no regular file"),
+    "piped log": (piped("run.log"), train, ["unmix-nerf", "--load-run"], "run.log"),
+    "metrics in a report": (piped("metrics.jsonl"), export, ["report", "--run"], "is no regular file"),
+    "camera of another size": (camera_of_another_size, evaluate, ["--run"], "is not the one that"),
+}
+
+
+@pytest.mark.parametrize("spoil", BESIDE)
+def test_what_lies_beside_config_and_scene_is_read_with_the_same_care(run_copy, spoil):
+    change, command, words, said = BESIDE[spoil]
+    change(run_copy)
+    ended = run(command, *words, run_copy)
+    assert (ended.status, said in ended.err) == (2, True), ended.err
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        "[" * 60 + "]" * 60,
+        '{"psnr": "high"}',
+        '{"psnr": 1' + "0" * 400 + "}",
+        "\udcff",
+        '{"psnr": NaN}',
+        "[]",
+    ],
+)
+def test_figures_that_no_evaluation_wrote_are_refused_by_the_report(run_copy, found):
+    (run_copy / "eval").mkdir(exist_ok=True)
+    (run_copy / "eval" / "metrics.json").write_text(found, encoding="utf-8", errors="surrogateescape")
+    ended = run(export, "report", "--run", run_copy)
+    assert (ended.status, "metrics.json" in ended.err) == (2, True), ended.err
+
+
+def test_lines_of_metrics_that_no_training_wrote_are_passed_over(run_copy):
+    with (run_copy / "metrics.jsonl").open("ab") as file:
+        for line in (b"\xff", b"[" * 9000, b'{"step": 1' + b"0" * 400 + b"}", b'{"step": "x"}', b"{}", b"3"):
+            file.write(line + b"\n")
+    ended = run(export, "report", "--run", run_copy)
+    assert ended.status == 0, ended.err
+
+
+def test_names_that_are_no_step_are_no_checkpoints(run_copy):
+    for name in ("step-².json", "step-٣.json", "step-.json"):
+        (run_copy / "checkpoints" / name).write_text("{}", encoding="utf-8")
+    ended = run(export, "endmembers", "--run", run_copy)
+    assert ended.status == 0, ended.err
+
+
+@pytest.mark.parametrize(("command", "words"), COMMANDS)
+def test_a_name_too_long_for_the_system_is_refused(tmp_path, command, words):
+    ended = run(command, *words, tmp_path / ("x" * 300))
+    assert (ended.status, "too long" in ended.err) == (2, True), ended.err
 
 
 @pytest.mark.parametrize(("command", "words"), COMMANDS)

@@ -23,8 +23,16 @@ from unmix_plugin.errors import UnmixError
 
 DONE, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, BROKEN_PIPE = 0, 1, 2, 130, 141
 
-_MACHINE_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM})
-"""System errors that a user can mend: disk full, quota reached, read-only or forbidden place."""
+_MACHINE_ERRORS = frozenset(
+    getattr(errno, name)
+    for name in (
+        *("ENOSPC", "EDQUOT", "EFBIG", "EROFS", "EACCES", "EPERM", "EIO", "ESTALE", "EMFILE", "ENFILE"),
+        *("ENAMETOOLONG", "ELOOP", "ENOTDIR", "EISDIR", "EILSEQ", "ENXIO", "ENODEV", "EBUSY", "ENOTEMPTY"),
+    )
+    if hasattr(errno, name)
+)
+"""System errors that a user can mend: a disk that is full or fails, a place that is forbidden, a name that is too long
+or leads in a circle, and what is no file or no folder."""
 
 _OUT_OF_MEMORY = (
     "OutOfMemoryError",
@@ -125,6 +133,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError) and error.errno in _MACHINE_ERRORS:
         return f"error: {error}", USER_ERROR
     text = f"{type(error).__name__}: {error}"
+    if isinstance(error, RuntimeError) and "Symlink loop" in text:  # so Python says it before 3.13
+        return f"error: {error}", USER_ERROR
     if isinstance(error, MemoryError) or any(sign in text for sign in _OUT_OF_MEMORY):
         reason = str(error).strip().splitlines() or ["no more to be had"]
         return f"error: out of memory: {reason[0]}. {_MEMORY_ADVICE}", USER_ERROR

@@ -6,7 +6,6 @@ of the loss is told in words: whether it settled, and what to try where it did n
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -280,12 +279,10 @@ _STILL_FALLS = 0.3
 
 
 def _read_remarks(metrics_path: Path) -> list[str]:
-    """Remarks on a training's `metrics.jsonl`; none where it can't be read."""
-    try:
-        lines = [json.loads(line) for line in metrics_path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, ValueError):
-        return []
-    return _remarks([line for line in lines if line.get("split") == "train"])
+    """Remarks on a training's `metrics.jsonl`."""
+    from unmix_plugin.engine.training.progress import read_metrics
+
+    return _remarks([line for line in read_metrics(metrics_path) if line.get("split") == "train"])
 
 
 def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:

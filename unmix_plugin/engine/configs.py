@@ -119,7 +119,7 @@ class ModelConfig(InstantiateConfig):
 
     def __post_init__(self) -> None:
         """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
-        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 1, 2**22)
+        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 256, 2**22)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator

@@ -244,6 +244,10 @@ class _RecordedScene:
     options: SceneOptions = SceneOptions()
 
 
+_LEAST_SIZE = 1e-12
+"""Sizes below are none: what is divided by them leaves float32."""
+
+
 def check_recorded_scene(values: Mapping[str, Any]) -> None:
     """Refuse metadata or a summary that no data manager wrote.
 
@@ -262,7 +266,7 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         or (len(scene.illuminant) == bands and min(scene.illuminant, default=0) >= 0),
         "endmembers with a value a band": all(len(row) == bands for row in scene.endmembers or ()),
         "a grid_resolution of 8 to 512": 8 <= scene.grid_resolution <= 512,
-        "a pixel_size above 0": scene.pixel_size > 0,
+        "a pixel_size above 0": scene.pixel_size > _LEAST_SIZE,
         "subpixels of 1 to 8": 1 <= scene.subpixels <= 8,
         "num_train_views of at least 1": scene.num_train_views >= 1,
         "num_train_pixels of at least 0": scene.num_train_pixels >= 0,
@@ -271,7 +275,10 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         "a name for each endmember": None in (scene.material_names, scene.endmembers)
         or len(scene.material_names or ()) == len(scene.endmembers or ()),
         "a rotation of 3 x 3 and a scale above 0": scene.normalisation is None
-        or (scene.normalisation.scale > 0 and all(len(row) == 3 for row in scene.normalisation.rotation)),
+        or (
+            scene.normalisation.scale > _LEAST_SIZE
+            and all(len(row) == 3 for row in scene.normalisation.rotation)
+        ),
     }
     broken = [rule for rule, holds in rules.items() if not holds]
     for sensor in values.get("sensors", ()):

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import RunError
 from unmix_plugin.figures.pictures import Picture, premultiplied_over_neutral
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
@@ -246,7 +247,17 @@ class Evaluation:
         self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
 
     def add(self, view: ViewTruth, predicted: PredictedView) -> dict[str, float]:
-        """Count one view; its figures."""
+        """Count one view; its figures.
+
+        Raises:
+            RunError: what was measured has another size than the run's camera of that view.
+        """
+        measured, rendered = tuple(view.spectra.shape[:2]), tuple(predicted.spectra.shape[:2])
+        if measured != rendered:
+            raise RunError(
+                f"view {view.name} was measured with {measured[1]} x {measured[0]} pixels; its camera in the run has "
+                f"{rendered[1]} x {rendered[0]}; name the scene that the run was trained on with --data"
+            )
         valid = None if bool(view.valid.all()) else view.valid
         spectra = view.seen(predicted.spectra)
         blown_out = is_blown_out(view.spectra)

@@ -269,7 +269,7 @@ def test_json_that_no_run_writes_is_refused(trained: RunFolder, name: str, value
 def test_a_setting_out_of_its_range_is_refused_by_name(trained: RunFolder, rays: int):
     change = {"eval_num_rays_per_chunk": rays}
     rewrite(trained.config_path, lambda values: values["config"]["pipeline"]["model"].update(change))
-    with pytest.raises(RunError, match="eval_num_rays_per_chunk must be from 1"):
+    with pytest.raises(RunError, match="eval_num_rays_per_chunk must be from 256"):
         load_model(trained.path, "cpu")
 
 

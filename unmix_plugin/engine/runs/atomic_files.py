@@ -6,7 +6,6 @@ The JSON files of a run have one format version for all of them, and nothing is 
 import contextlib
 import errno
 import json
-import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import RunError
+from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, read_bounded
 
 _CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
@@ -129,8 +129,9 @@ def _sync(path: Path, flags: int) -> None:
 RUN_FORMAT = 3
 """Version of everything in a run folder; raised when an older version of this package could not read it."""
 
-_DEEPEST = 32
 _LARGEST_INTEGER = 2**63
+_LARGEST_NUMBER = 1e18
+"""Of scenes, poses and lights none comes near; what is computed from larger ones would leave float32."""
 
 
 class OtherFormatError(RunError):
@@ -157,14 +158,11 @@ def read_run_json(path: Path) -> dict[str, Any]:
         OtherFormatError: another version of this package wrote it.
     """
     try:
-        values = json.loads(path.read_bytes())
-        _require_plain(values, _DEEPEST)
+        values = read_plain_json(path)
     except FileNotFoundError as error:
         raise RunError(
             f"{path} is missing: the run is half-written or was moved in part; train again"
         ) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise RunError(f"can't read {path}: {error}; the run is damaged") from error
     version = values.get("format_version") if isinstance(values, dict) else None
     if type(version) is not int:
         raise RunError(f"{path} is not a file of a run: it has no format_version")
@@ -181,10 +179,41 @@ def read_run_json(path: Path) -> dict[str, Any]:
     return values
 
 
+def read_plain_json(path: Path) -> Any:
+    """The value in any JSON file that lies in a run folder, with nothing in it that no run writes.
+
+    Raises:
+        FileNotFoundError: there is none.
+        RunError: it is no regular file, too long, cut off, or holds what no run writes.
+    """
+    try:
+        return parse_plain_json(read_bounded(path, MOST_TABLE_BYTES))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise RunError(f"can't read {path}: {error.strerror or error}; the run is damaged") from error
+    except ValueError as error:
+        raise RunError(f"can't read {path}: {error}; the run is damaged") from error
+
+
+def parse_plain_json(data: bytes) -> Any:
+    """The value in a text of JSON.
+
+    Raises:
+        ValueError: it is none, or holds what no run writes.
+    """
+    try:
+        value = json.loads(data)
+        _require_plain(value, DEEPEST)
+    except RecursionError as error:
+        raise ValueError(f"nested more than {DEEPEST} levels deep") from error
+    return value
+
+
 def _require_plain(value: Any, depth: int) -> None:
     """Refuse what Python's JSON reader accepts and no run writes."""
     if depth == 0:
-        raise ValueError(f"nested more than {_DEEPEST} levels deep")
+        raise ValueError(f"nested more than {DEEPEST} levels deep")
     if isinstance(value, dict):
         for key, entry in value.items():
             _require_plain(key, depth - 1)
@@ -196,7 +225,7 @@ def _require_plain(value: Any, depth: int) -> None:
         os.fsencode(value)  # may become a path; raises for a lone surrogate
         if "\0" in value:
             raise ValueError(f"text with a null character: {value[:40]!r}")
-    elif isinstance(value, float) and not math.isfinite(value):
+    elif isinstance(value, float) and not abs(value) <= _LARGEST_NUMBER:
         raise ValueError(f"the number {value}")
     elif isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
         raise ValueError("an integer beyond 64 bits")

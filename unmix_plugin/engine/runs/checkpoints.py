@@ -28,6 +28,13 @@ from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.engine.training.optimizers import ParameterAverage
 from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.limits import read_bounded
+
+_MOST_BYTES = 1 << 33
+"""Of a checkpoint's tensors; the largest grids that settings allow take some gigabytes with the optimiser's state."""
+
+
+_MODEL, _OPTIMIZER, AVERAGE, _DATAMANAGER = "model/", "optimizer/", "average/", "datamanager/"
 
 
 @dataclass(frozen=True)
@@ -87,7 +94,19 @@ def newest_complete_checkpoint(folder: Path) -> Checkpoint | None:
     Raises:
         OtherFormatError: another version of this package wrote a record.
     """
+    return _newest(folder, damaged=[])
+
+
+def reason_for_none(folder: Path) -> str:
+    """Why there is no complete checkpoint: what is wrong with the newest one, or that there is none."""
     damaged: list[str] = []
+    _newest(folder, damaged)
+    if not damaged:
+        return "training ended before the first was saved"
+    return f"the files there are damaged or cut short ({damaged[0]}); copy the run again, or train anew"
+
+
+def _newest(folder: Path, damaged: list[str]) -> Checkpoint | None:
     for step in checkpoint_steps(folder):
         found = _read(folder / f"{_stem(step)}.json")
         if not isinstance(found, str):
@@ -100,14 +119,26 @@ def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
     """Tensors and record of a checkpoint, or what is wrong with it."""
     try:
         record = read_run_json(record_path)
-        data = record_path.with_suffix(".safetensors").read_bytes()
+        data = read_bounded(record_path.with_suffix(".safetensors"), _MOST_BYTES)
         if hashlib.sha256(data).hexdigest() != record.get("sha256"):
             return "the tensors do not have the hash of the record"
-        return safetensors.torch.load(data), record
+        tensors = safetensors.torch.load(data)
+        broken = next((name for name, tensor in tensors.items() if not _is_sound(name, tensor)), None)
+        if broken is not None:
+            return f"{broken} has values that are not finite"
+        return tensors, record
     except OtherFormatError:
         raise
     except (OSError, RunError, SafetensorError, ValueError, KeyError) as error:
         return str(error)
+
+
+def _is_sound(name: str, tensor: Tensor) -> bool:
+    """Whether a tensor holds numbers; what a model keeps beside its parameters may be infinite."""
+    is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
+    values = tensor.float() if is_small else tensor
+    is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
+    return bool(is_sound.all())
 
 
 def _stem(step: int) -> str:
@@ -140,9 +171,6 @@ def _remove_others(folder: Path, step: int, keep: int) -> None:
     for other in set(steps) - set(kept):
         (folder / f"{_stem(other)}.json").unlink(missing_ok=True)  # the record first: never a record alone
         (folder / f"{_stem(other)}.safetensors").unlink(missing_ok=True)
-
-
-_MODEL, _OPTIMIZER, AVERAGE, _DATAMANAGER = "model/", "optimizer/", "average/", "datamanager/"
 
 
 @dataclass(frozen=True)
@@ -248,6 +276,9 @@ def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: boo
         raise RunError(
             f"the checkpoint does not fit the model that the run's config and scene describe: {error}"
         ) from error
+    for name, param in model.named_parameters():
+        if not param.isfinite().all():
+            raise RunError(f"the checkpoint is damaged: {name} has values that are not finite; train again")
 
 
 def part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -13,10 +13,11 @@ from unmix_plugin.engine.runs.checkpoints import (
     Checkpoint,
     TrainingRecord,
     newest_complete_checkpoint,
+    reason_for_none,
     restore_model,
 )
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
-from unmix_plugin.engine.runs.run_folder import RunFolder, checkpoint_steps, open_run_folder
+from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, read_scene_record
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
@@ -120,12 +121,7 @@ def require_checkpoint(run: RunFolder) -> Checkpoint:
     """
     checkpoint = newest_complete_checkpoint(run.checkpoints)
     if checkpoint is None:
-        reason = (
-            "the files there are damaged or cut short; copy the run again, or train anew"
-            if any(checkpoint_steps(run.checkpoints))
-            else "training ended before the first was saved"
-        )
-        raise RunError(f"no complete checkpoint in {run.checkpoints}: {reason}")
+        raise RunError(f"no complete checkpoint in {run.checkpoints}: {reason_for_none(run.checkpoints)}")
     return checkpoint
 
 

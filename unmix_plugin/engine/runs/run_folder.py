@@ -85,11 +85,14 @@ def open_run_folder(path: Path) -> RunFolder:
     Raises:
         RunError: it is missing, is not a run folder, is half-written, or has a link that leads out of it.
     """
-    if not path.is_dir():
-        raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
-    run = RunFolder(path.resolve())
-    _refuse_links_out(run.path)
-    missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
+    try:
+        if not path.is_dir():
+            raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
+        run = RunFolder(path.resolve())
+        _refuse_links_out(run.path)
+        missing = [file.name for file in (run.config_path, run.scene_path) if not file.is_file()]
+    except (OSError, RuntimeError) as error:  # names too long, links in a circle
+        raise RunError(f"can't open the run folder {path}: {error}") from error
     if missing:
         raise RunError(f"{path} is not a run folder, or a half-written one: {' and '.join(missing)} missing")
     return run
@@ -117,7 +120,7 @@ def newest_run(output_dir: Path) -> RunFolder:
 def checkpoint_steps(folder: Path) -> list[int]:
     """Steps of the checkpoints in `folder`, newest first, complete or not."""
     stems = (path.stem.removeprefix("step-") for path in folder.glob("step-*.json"))
-    return sorted((int(stem) for stem in stems if stem.isdigit()), reverse=True)
+    return sorted((int(stem) for stem in stems if stem.isascii() and stem.isdigit()), reverse=True)
 
 
 def _refuse_links_out(root: Path) -> None:
@@ -153,7 +156,7 @@ class RunLock:
             RunError: another process has it, or the file can't be made.
         """
         self._descriptor: int | None = None
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         try:
             self._descriptor = os.open(path, flags, 0o666)
             if fcntl is not None:
@@ -166,8 +169,11 @@ class RunLock:
                 raise RunError(
                     f"another training writes to {path.parent} (process {holder}); stop it first, or wait for its end"
                 ) from error
-        os.ftruncate(self._descriptor, 0)
-        os.write(self._descriptor, str(os.getpid()).encode())
+        try:
+            os.ftruncate(self._descriptor, 0)
+            os.write(self._descriptor, str(os.getpid()).encode())
+        except OSError as error:  # a pipe, or a full disk
+            raise RunError(f"can't write {path}: {error.strerror or error}") from error
 
     def release(self) -> None:
         """Let others train the run."""

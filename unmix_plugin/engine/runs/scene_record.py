@@ -83,12 +83,19 @@ def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolde
     kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary)}
     summary = datamanager.summary()
     found = {**datamanager.metadata(), "scene_box": other_box, **datamanager.identity(summary)}
+    kept |= {"image sizes": _sizes(scene.train_cameras, scene.eval_cameras)}
+    found |= {"image sizes": _sizes(datamanager.train_cameras, datamanager.eval_cameras)}
     differing = differences(kept, found)
     if differing:
         raise RunError(
             f"the scene at {datamanager.data} is not the one that {run.path} was trained on: "
             f"{name_differences(differing)}; name the right one with --data"
         )
+
+
+def _sizes(*cameras: Cameras) -> list[list[list[int]]]:
+    """Width and height of the image of each camera."""
+    return [[list(some.size(index)) for index in range(len(some))] for some in cameras]
 
 
 def _dictionary(values: dict[str, Any], name: str) -> dict[str, Any]:

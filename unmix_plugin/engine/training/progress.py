@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
+import stat
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -22,9 +24,10 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from unmix_plugin.engine.runs.atomic_files import write_file
+from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -259,7 +262,7 @@ class RunLog:
 
 def _append(path: Path, line: str) -> None:
     try:
-        with path.open("a", encoding="utf-8", errors="backslashreplace") as file:
+        with open(path, "a", encoding="utf-8", errors="backslashreplace", opener=_open_regular) as file:
             file.write(line + "\n")
     except OSError as error:
         raise RunError(
@@ -267,19 +270,52 @@ def _append(path: Path, line: str) -> None:
         ) from error
 
 
+def _open_regular(path: str, flags: int) -> int:
+    """Open for writing what is a regular file: a pipe that nobody reads would wait for ever."""
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(None, "is no regular file", path)
+    return descriptor
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    """Lines of a run's `metrics.jsonl`, each with its `step`; those that a killed run left incomplete are passed over.
+
+    Raises:
+        RunError: it is no regular file, or longer than a training writes.
+    """
+    return [record for line in _lines(path) if (record := _record(line)) is not None]
+
+
+def _lines(path: Path) -> list[bytes]:
+    try:
+        return read_bounded(path, MOST_TABLE_BYTES).splitlines()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RunError(f"can't read {path}: {error.strerror or error}; the run is damaged") from error
+
+
+def _record(line: bytes) -> dict[str, Any] | None:
+    """The object in a line; None where it is not one that `MetricsWriter` wrote."""
+    try:
+        record = parse_plain_json(line)
+    except ValueError:
+        return None
+    is_known = isinstance(record, dict) and type(record.get("step")) is int
+    numbers = [value for key, value in record.items() if key != "split"] if is_known else []
+    is_known = is_known and all(value is None or type(value) in (int, float) for value in numbers)
+    return record if is_known else None
+
+
 def _keep_until(path: Path, step: int) -> None:
     """Rewrite a JSON-lines file without later steps' lines and without one cut off by a kill."""
     if not path.exists():
         return
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    write_file(path, "".join(line + "\n" for line in lines if _is_of_step(line, step)).encode())
-
-
-def _is_of_step(line: str, step: int) -> bool:
-    try:
-        return bool(json.loads(line)["step"] <= step)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return False
+    records = [(line, _record(line)) for line in _lines(path)]
+    kept = [line for line, record in records if record is not None and record["step"] <= step]
+    write_file(path, b"".join(line + b"\n" for line in kept))
 
 
 def _tensorboard(folder: Path, resumed_step: int) -> Any | None:
@@ -290,4 +326,7 @@ def _tensorboard(folder: Path, resumed_step: int) -> Any | None:
         warnings.simplefilter("ignore")  # a third party's deprecations are not our user's concern
         from torch.utils.tensorboard import SummaryWriter
 
-        return SummaryWriter(str(folder), purge_step=resumed_step + 1 if resumed_step else None)
+        try:
+            return SummaryWriter(str(folder), purge_step=resumed_step + 1 if resumed_step else None)
+        except OSError as error:
+            raise cannot_write(folder, error.strerror or str(error)) from error

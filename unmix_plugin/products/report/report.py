@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from unmix_plugin import __version__
+from unmix_plugin.engine.runs.atomic_files import read_plain_json
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.engine.training.progress import read_metrics
+from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.figures.plotting import ChartLine, LineChart, css_colour, draw_chart
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.abundances import SHARE_SCALE
@@ -98,12 +100,16 @@ def _stored_figures(job: Job) -> dict[str, Any] | None:
     """What `unmix-eval` found, if it was run."""
     path = job.loaded.folder.eval / "metrics.json"
     try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError):
+        found = read_plain_json(path)
+    except FileNotFoundError:
         return None
-    return found if isinstance(found, dict) else None
+    words = found.get("definitions", {}) if isinstance(found, dict) else None
+    if not isinstance(words, dict) or not all(isinstance(found.get(name), _FIGURE) for name in DEFINITIONS):
+        raise RunError(f"{path} is not what unmix-eval writes; run it again, or remove the file")
+    return found
 
 
+_FIGURE = (int, float, type(None))
 _WORST_VIEWS = 3
 
 
@@ -267,7 +273,7 @@ def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def _training_charts(path: Path) -> list[LineChart]:
     """Loss, PSNR, learning rates and speed over training, from a run's `metrics.jsonl`; none without a record."""
-    records = _read_metrics(path)
+    records = read_metrics(path)
     train = [record for record in records if record.get("split") == "train"]
     if len(train) < 2:
         return []
@@ -305,23 +311,6 @@ def _version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
         ("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
         *((name, version) for name in _PACKAGES if (version := _version(name)) is not None),
     ]
-
-
-def _read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Lines of a run's `metrics.jsonl`; those that a killed run left incomplete are passed over."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return []
-    records: list[dict[str, Any]] = []
-    for line in lines:
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(record, dict):
-            records.append(record)
-    return records
 
 
 def _line(records: Sequence[Mapping[str, Any]], key: str, label: str, colour: str) -> ChartLine:
