@@ -7,15 +7,16 @@ DEMO_SECONDS := 45
 BENCHMARKS := $(sort $(wildcard benchmarks/[a-z]*.py))
 
 MINIMUM := .venv-minimum
-MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py
+MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum lint format bench clean help
+.PHONY: demo test test-all test-minimum audit lint format bench clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
 	@echo "make test    run the tests, less the slow ones"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
+	@echo "make audit   look for known holes in what is pinned (needs the network)"
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
 	@echo "make bench   run every benchmark, results into benchmarks/results"
@@ -56,8 +57,12 @@ test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 test-minimum:
 	$(PYTHON) -m venv $(MINIMUM)
 	$(MINIMUM)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-minimum.txt \
-	  --editable . hypothesis imageio plyfile pytest spectral trimesh
+	  --editable '.[captures]' hypothesis imageio plyfile pytest spectral trimesh
 	$(MINIMUM)/bin/python -m pytest -W default --override-ini addopts=--import-mode=importlib $(MINIMUM_TESTS)
+
+audit: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
+	$(BIN)/python -m pip_audit --no-deps --disable-pip --requirement constraints.txt
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .

@@ -29,7 +29,7 @@ from tests.fuzz.readers import READERS
 
 CHUNK = 500
 """Cases that a process does in one go."""
-SLOWEST_S = 8.0
+SLOWEST_S, MOST_BYTES = 5.0, 10**9
 """What no single case may take."""
 
 
@@ -106,11 +106,14 @@ def run_chunk(chunk: tuple[str, int, int, int, float | None]) -> Outcome:
 def joined(a: Outcome, b: Outcome) -> Outcome:
     """Both together."""
     slowest = a if a.slowest_s >= b.slowest_s else b
+    largest = a if a.most_bytes >= b.most_bytes else b
     return Outcome(
         a.cases + b.cases,
         a.accepted + b.accepted,
         slowest.slowest_s,
         slowest.slowest_case,
+        largest.most_bytes,
+        largest.largest_case,
         a.foreign + b.foreign,
     )
 
@@ -119,9 +122,11 @@ def judge(outcomes: dict[str, Outcome], cases: int, done: int) -> list[_common.F
     """Foreign exceptions, the slowest case, and how many cases there were."""
     foreign = sum(len(outcome.foreign) for outcome in outcomes.values())
     slowest = max(outcome.slowest_s for outcome in outcomes.values())
+    largest = max(outcome.most_bytes for outcome in outcomes.values())
     return [
         _common.Limit(0, is_upper=True).judge("exceptions that no reader promises", foreign),
         _common.Limit(SLOWEST_S, is_upper=True, unit=" s").judge("slowest case", slowest),
+        _common.Limit(MOST_BYTES / 1e6, is_upper=True, unit=" MB").judge("memory of a case", largest / 1e6),
         _common.Limit(cases).judge("cases", done),
     ]
 
@@ -129,10 +134,13 @@ def judge(outcomes: dict[str, Outcome], cases: int, done: int) -> list[_common.F
 def tables(outcomes: dict[str, Outcome]) -> tuple[_common.DetailTable, ...]:
     """Every reader, and the first foreign exceptions if there are any."""
     rows = [
-        (name, str(o.cases), str(o.accepted), f"{o.slowest_s:.3f}", str(o.slowest_case), str(len(o.foreign)))
+        (
+            *(name, str(o.cases), str(o.accepted), f"{o.slowest_s:.3f}", str(o.slowest_case)),
+            *(f"{o.most_bytes / 1e6:.0f}", str(len(o.foreign))),
+        )
         for name, o in outcomes.items()
     ]
-    headers = ("reader", "cases", "accepted", "slowest, s", "slowest case", "foreign exceptions")
+    headers = ("reader", "cases", "accepted", "slowest, s", "slowest case", "most MB", "foreign exceptions")
     found = [(name, str(case), error) for name, o in outcomes.items() for case, error in o.foreign[:10]]
     every = _common.DetailTable("Every reader", headers, rows)
     return (

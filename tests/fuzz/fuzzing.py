@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import resource
+import sys
 import time
 import zlib
 from dataclasses import dataclass, field
@@ -21,6 +23,9 @@ class Outcome:
     """Cases that were read without an error."""
     slowest_s: float = 0.0
     slowest_case: int = 0
+    most_bytes: int = 0
+    """By which the process grew in one case."""
+    largest_case: int = 0
     foreign: list[tuple[int, str]] = field(default_factory=list)
     """Case and error of each exception that the reader does not promise."""
 
@@ -39,6 +44,11 @@ def prepare(reader: Reader, folder: Path) -> Path:
     return folder / reader.file_name
 
 
+def _peak_bytes() -> int:
+    """The most memory that this process ever had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     """Run cases of a reader.
 
@@ -53,7 +63,7 @@ def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     for case in cases:
         path.unlink(missing_ok=True)  # some file systems flush a file that is truncated and written again
         path.write_bytes(case_bytes(name, reader, seed, case))
-        started = time.perf_counter()
+        size, started = _peak_bytes(), time.perf_counter()
         try:
             reader.read(path)
             outcome.accepted += 1
@@ -64,5 +74,7 @@ def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
         seconds = time.perf_counter() - started
         if seconds > outcome.slowest_s:
             outcome.slowest_s, outcome.slowest_case = seconds, case
+        if (grown := _peak_bytes() - size) > outcome.most_bytes:
+            outcome.most_bytes, outcome.largest_case = grown, case
         outcome.cases += 1
     return outcome

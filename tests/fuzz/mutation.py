@@ -163,7 +163,16 @@ def _span(data: bytes | bytearray, generator: random.Random, longest: int = 200)
     return first, min(len(data), first + generator.randint(0, longest))
 
 
-_EDITS = (_flip, _set, _cut, _truncate, _repeat, _splice, _insert, _insert, _replace, _replace)
+def _grow(data: bytearray, _: Sequence[bytes], generator: random.Random) -> None:
+    """A few bytes repeated until they are many: what takes time or memory out of proportion shows itself."""
+    if generator.random() < _GROWN:
+        first, last = _span(data, generator, longest=16)
+        part = bytes(data[first:last]) or generator.choice(TOKENS)
+        data[first:first] = part * (_MOST_GROWTH // len(part))
+
+
+_GROWN, _MOST_GROWTH = 0.1, 1 << 17
+_EDITS = (_flip, _set, _cut, _truncate, _repeat, _splice, _insert, _insert, _replace, _replace, _grow)
 
 
 @dataclass(frozen=True)

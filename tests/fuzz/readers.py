@@ -61,6 +61,7 @@ READERS: dict[str, Callable[[], Reader]] = {
     "checkpoint tensors": run_readers.checkpoint_tensors_reader,
     "run metrics": run_readers.metrics_reader,
     "recipe": run_readers.recipe_reader,
+    "viewer message": run_readers.viewer_message_reader,
     "poses transforms.json": partial(_poses, "transforms.json", pose_samples.transforms_samples, mutate_json),
     "poses OpenSfM": partial(_poses, "reconstruction.json", pose_samples.opensfm_samples, mutate_json),
     "poses Metashape": partial(_poses, "cameras.xml", pose_samples.metashape_samples),

@@ -7,9 +7,11 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import safetensors.torch
 import torch
+from viser._messages import Message
 
 from tests.fuzz.mutation import Reader, mutate_json
 from tests.scenes.scene_factory import look_at
@@ -28,6 +30,7 @@ from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.run_views import recorded_views, world_frame
+from unmix_plugin.viewer.connections import is_heard
 
 
 def config_reader() -> Reader:
@@ -163,3 +166,32 @@ def _read_recipe(path: Path) -> None:
     written = recipe_to_yaml(recipe)
     written.encode()
     assert recipe_from_yaml(written, folder=path.parent) == recipe
+
+
+def viewer_message_reader() -> Reader:
+    camera = {
+        "wxyz": (1.0, 0.0, 0.0, 0.0),
+        "position": (0.5, 0.0, 2.0),
+        "fov": 0.8,
+        "near": 0.1,
+        "far": 10.0,
+        "image_height": 20,
+        "image_width": 30,
+        "look_at": (0, 0, 0),
+        "up_direction": (0, 0, 1),
+    }
+    pointer = {"event_type": "click", "ray_origin": None, "ray_direction": (0, 0, 1)}
+    messages = (
+        {"type": "ViewerCameraMessage", **camera},
+        {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": "r650/r550"}},
+        {"type": "LocalStorageGetItemResponseMessage", "value": None, "error": None, "request_uuid": "a"},
+        {"type": "ScenePointerMessage", **pointer, "screen_pos": ((0.5, 0.5),), "modifier": None},
+    )
+    samples = tuple(map(msgspec.msgpack.encode, messages))
+    return Reader(samples, "message", lambda path: _read_message(path.read_bytes()), (ValueError,))
+
+
+def _read_message(data: bytes) -> None:
+    """What the viewer listens to is a message that viser reads."""
+    if is_heard(data):
+        Message.deserialize(data)

@@ -7,7 +7,7 @@ from tests.fuzz.readers import READERS
 
 CASES = 200
 """A reader, for a few seconds in all; `python benchmarks/fuzz.py` runs many more."""
-SLOWEST_S = 5.0
+SLOWEST_S, MOST_BYTES = 5.0, 10**9
 WITH_REFUSED_SAMPLES = ("picture", "label picture")
 """Some of their samples are of a format or a mode that isn't accepted."""
 
@@ -31,4 +31,5 @@ def test_damaged_files_raise_only_what_the_reader_promises(name, tmp_path):
     assert outcome.cases == CASES
     assert outcome.foreign == []
     assert outcome.slowest_s < SLOWEST_S, f"case {outcome.slowest_case}"
+    assert outcome.most_bytes < MOST_BYTES, f"case {outcome.largest_case}"
     assert outcome.accepted < CASES

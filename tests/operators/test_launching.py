@@ -1,5 +1,8 @@
 """How work items are handed out to threads."""
 
+import os
+import subprocess
+import sys
 from typing import no_type_check
 
 import pytest
@@ -38,6 +41,23 @@ def threads():
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+@pytest.mark.slow
+def test_where_kernels_cannot_be_kept_they_are_compiled_in_a_temporary_folder(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    code = (
+        "from unmix_plugin.operators.launching import warp\n"
+        "from pathlib import Path\n"
+        "print(Path(warp().config.kernel_cache_dir, 'x').write_bytes(b'x'), warp().config.kernel_cache_dir)"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "file" / "cache"), "TMPDIR": str(tmp_path)}
+    ended = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert ended.stdout.startswith(f"1 {tmp_path}/unmix-kernels-")
+    assert ended.stderr.count("compiled anew for this command") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize("size", [0, 1, 511, 1025, 10_000])

@@ -6,6 +6,7 @@ memory); 130 Ctrl-C; 141 broken pipe (as after `| head`); 129 and 143 SIGHUP and
 
 from __future__ import annotations
 
+import codecs
 import errno
 import io
 import os
@@ -63,8 +64,7 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     is_debug = "--debug" in argv
     interrupts: list[int] = []
     try:
-        if isinstance(sys.stdout, io.TextIOWrapper):
-            sys.stdout.reconfigure(errors="surrogateescape")  # names of files need not be text
+        _ready_streams()
         with _signals_as_exits(interrupts):
             command([argument for argument in argv if argument != "--debug"])
             sys.stdout.flush()
@@ -79,6 +79,31 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
         _say(message, is_debug)
         sys.exit(status)
     sys.exit(DONE)
+
+
+def _ready_streams() -> None:
+    """Streams that take any text: names of files need not be text, and a terminal may know no more than ASCII.
+
+    A stream that was closed before the command began, as by `>&-`, takes what is written and drops it.
+    """
+    codecs.register_error(_AS_BYTES, _as_bytes)
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115 - for the whole process
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=_AS_BYTES)
+
+
+_AS_BYTES = "unmix-nerf"
+
+
+def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
+    """The bytes that a part of a file's name had; other letters that a stream doesn't know by their numbers."""
+    try:
+        return codecs.lookup_error("surrogateescape")(error)
+    except UnicodeError:
+        return codecs.lookup_error("backslashreplace")(error)
 
 
 @contextmanager

@@ -10,8 +10,11 @@ to the same address, which is why a caller may say where the range is cut.
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
@@ -44,8 +47,28 @@ def warp() -> Any:
     settings.log_level = getattr(wp, "LOG_ERROR", None)
     # Without a GPU the native library warns on standard error that there is no driver.
     with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
-        wp.init()
+        is_kept = _is_initialised(wp)
+    if not is_kept:
+        folder = tempfile.mkdtemp(prefix="unmix-kernels-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        settings.kernel_cache_dir = folder
+        sys.stderr.write(
+            "Warp's folder of compiled kernels can't be written, so they are compiled anew for this command; name one "
+            "that can in the environment variable WARP_CACHE_PATH\n"
+        )
+        with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
+            wp.init()
     return wp
+
+
+def _is_initialised(wp: Any) -> bool:
+    """Initialise Warp; False if its cache of kernels can't be written, as where the home folder is read-only."""
+    try:
+        wp.init()
+        with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir):
+            return True
+    except OSError:
+        return False
 
 
 @contextmanager

@@ -11,11 +11,11 @@ import torch
 from PIL import Image
 
 from tests.products.report.page_outline import Outline, assert_self_contained
+from unmix_plugin.engine.training.progress import read_metrics
 from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
 from unmix_plugin.products.report.report import (
     _figure_rows,
     _png_url,
-    _read_metrics,
     _render_page,
     _training_charts,
     _view_values,
@@ -179,7 +179,9 @@ def test_a_training_is_drawn_with_its_evaluations(tmp_path):
     path = tmp_path / "metrics.jsonl"
     train = {"split": "train", "loss": 0.1, "psnr": 20, "lr/field": 0.01}
     evaluated = {"split": "eval_all", "psnr": 19}
-    records = [{**kind, "seconds": second} for kind in (train, evaluated) for second in (1, 2)]
+    records = [
+        {"step": second, **kind, "seconds": second} for kind in (train, evaluated) for second in (1, 2)
+    ]
     path.write_text("\n".join(map(json.dumps, records)))
     charts = _training_charts(path)
     assert [chart.y_label for chart in charts] == ["loss", "PSNR (dB)", "learning rate", "rays a second"]
@@ -191,8 +193,8 @@ def test_a_training_is_drawn_with_its_evaluations(tmp_path):
 def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1, "loss": 0.5}\n[1]\n{"step": 2, "lo')
-    assert _read_metrics(path) == [{"step": 1, "loss": 0.5}]
-    assert _read_metrics(tmp_path / "none") == []
+    assert read_metrics(path) == [{"step": 1, "loss": 0.5}]
+    assert read_metrics(tmp_path / "none") == []
 
 
 @pytest.mark.parametrize(

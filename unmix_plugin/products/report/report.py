@@ -145,7 +145,7 @@ def _write_report(
             **_view_values(views),
         }
     )
-    return write_file(folder / "report.html", page.encode())
+    return write_file(folder / "report.html", page.encode("utf-8", "backslashreplace"))
 
 
 def _view_values(views: ReportViews) -> dict[str, Any]:
