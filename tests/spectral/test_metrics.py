@@ -164,6 +164,10 @@ def test_sam_is_the_mean_angle_over_masked_pixels_that_are_not_dark():
     assert sam(pred, target, mask) == pytest.approx((math.pi / 4 + 0) / 2)
 
 
+def test_numbers_of_a_single_band_have_no_angle():
+    assert math.isnan(sam(torch.full((2, 2, 1), 0.5), torch.full((2, 2, 1), 0.3)))
+
+
 @pytest.mark.parametrize(("value", "counts"), [(0.0049, False), (0.0051, True)])
 def test_sam_calls_dark_what_is_below_0005_root_mean_square(value, counts):
     target = torch.full((1, 1, 100), value)

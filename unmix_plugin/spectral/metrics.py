@@ -101,11 +101,13 @@ def sam(
     target_image: Float[Tensor, "H W B"],
     mask: Bool[Tensor, "H W"] | None = None,
 ) -> float:
-    """Spectral angle mapper: mean angle in radians over the pixels that count; NaN if none does.
+    """Spectral angle mapper: mean angle in radians over the pixels that count; NaN if none does, or of a single band.
 
     Pixels whose true spectrum is dark (root mean square over bands at most 0.005) never count.
     """
     total, count = 0.0, 0
+    if target_image.shape[-1] < 2:  # numbers have no angle between them
+        return math.nan
     for pred, target, counts in _rows(pred_image, target_image, mask):
         counts = counts & (target.norm(dim=-1) > DARK_RMS * math.sqrt(target.shape[-1]))
         total += float(spectral_angle(pred[counts], target[counts]).sum())

@@ -111,5 +111,5 @@ def test_numbers_out_of_range_are_refused():
 def test_no_pixels_and_black_ones_are_refused():
     with pytest.raises(SpectrumError, match="non-zero length"):
         two_material_endmembers(torch.zeros(0, 4), 2, seeded())
-    with pytest.raises(SpectrumError, match="non-zero length; found 1 zero ones"):
+    with pytest.raises(SpectrumError, match="non-zero length; found 1 that are zero"):
         two_material_endmembers(torch.tensor([[0.0, 0.0], [0.1, 0.2], [0.2, 0.1]]), 2, seeded())

@@ -40,6 +40,7 @@ from unmix_plugin.engine.runs.atomic_files import (
     write_errors_as,
     write_file,
 )
+from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import CaptureError, ConfigError
 from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.scenes.backdrops import Backdrop
@@ -331,7 +332,7 @@ def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray,
 # The unfinished folder, and the files that views are made of.
 
 RECORD_NAME = "process.json"
-_PLAN, _VIEWS, _POSES = "plan.json", "views", "poses"
+_PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
 
 
 class WorkFolder:
@@ -341,6 +342,7 @@ class WorkFolder:
         self.output = output.resolve()
         self.path = self.output.with_name(f"{self.output.name}.unfinished")
         """Where files are written until the scene is complete."""
+        self._lock: RunLock | None = None
         self.poses = self.path / _POSES
         """Where files of the estimation of poses lie while it runs, or after it failed."""
 
@@ -356,6 +358,8 @@ class WorkFolder:
             RunError: it can't be written.
         """
         plan_file, text = self.path / _PLAN, _json(plan)
+        if plan_file.is_file():
+            self._hold()
         if self.path.exists():
             if not plan_file.is_file() and any(self.path.iterdir()):
                 raise ConfigError(
@@ -369,8 +373,19 @@ class WorkFolder:
             with write_errors_as(self.path):
                 shutil.rmtree(self.path)
         make_folder(self.path)
+        self._hold()
         write_file(plan_file, text)
         return False
+
+    def _hold(self) -> None:
+        """Let no other process write the same scene, until this one ends.
+
+        Raises:
+            RunError: another one does.
+        """
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = RunLock(self.path / _LOCK, "unmix-process")
 
     def done(self, name: str) -> ViewRecord | None:
         """What is recorded of a view that is written; None if it is not."""
@@ -390,6 +405,9 @@ class WorkFolder:
             RunError: it can't be moved.
         """
         with write_errors_as(self.output):
+            if self._lock is not None:
+                self._lock.release()
+            (self.path / _LOCK).unlink(missing_ok=True)
             old = self.output.with_name(f"{self.output.name}.old")
             if overwrite and self.output.exists():
                 self.output.rename(old)

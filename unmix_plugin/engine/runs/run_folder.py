@@ -149,8 +149,8 @@ except ImportError:  # Windows: there the lock guards nothing
 class RunLock:
     """Held from its making to `release`, or to the end of the process, however it ends."""
 
-    def __init__(self, path: Path) -> None:
-        """Take the lock; the same process may take it again.
+    def __init__(self, path: Path, holder: str = "training") -> None:
+        """Take the lock; the same process may take it again. `holder` is what takes such locks.
 
         Raises:
             RunError: another process has it, or the file can't be made.
@@ -165,9 +165,9 @@ class RunLock:
             if self._descriptor is None:
                 raise RunError(f"can't write {path}: {error.strerror or error}") from error
             if error.errno in (errno.EAGAIN, errno.EACCES):  # others: no locks here
-                holder = os.read(self._descriptor, 20).decode(errors="replace")
+                other = os.read(self._descriptor, 20).decode(errors="replace")
                 raise RunError(
-                    f"another training writes to {path.parent} (process {holder}); stop it first, or wait for its end"
+                    f"another {holder} writes to {path.parent} (process {other}); stop it first, or wait for its end"
                 ) from error
         try:
             os.ftruncate(self._descriptor, 0)

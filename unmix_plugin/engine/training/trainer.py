@@ -222,13 +222,17 @@ def joined_training(config: TrainerConfig) -> Iterator[Processes]:
         yield processes
 
 
+_STOPPED = 130
+"""Exit code of a process that was asked to stop, as after Ctrl-C."""
+
+
 def follow_training(config: TrainerConfig, processes: Processes) -> TrainingSteps:
     """Train along with the first process, which has a `Trainer`, until it says that training is over.
 
     Returns:
         What took the steps, with the model as it is then.
     Raises:
-        Follower: the training fails, which the first process says.
+        Follower: the training fails, or is stopped on request, which the first process says.
     """
     try:
         with processes.together():
@@ -244,6 +248,8 @@ def follow_training(config: TrainerConfig, processes: Processes) -> TrainingStep
             while (progress := processes.announce(None)) is not None:
                 steps.take(step, progress)
                 step += 1
+            if processes.announce(None) is None:
+                raise Follower(_STOPPED)
     except UnmixError as error:
         raise Follower(2) from error
     return steps
@@ -379,7 +385,9 @@ class Trainer:
         try:
             save_checkpoint(self.run.checkpoints, self.step, tensors, record, kept)
         except RunError as error:
-            raise RunError(f"{error}. What was saved before is whole: go on with --load-run") from error
+            before = "What was saved before is whole: go on with --load-run"
+            is_first = not checkpoint_steps(self.run.checkpoints)
+            raise RunError(f"{error}. {'Nothing was saved before' if is_first else before}") from error
         self._saved_step = self.step
         self.log.write(f"saved step {self.step}")
 
@@ -400,6 +408,7 @@ class Trainer:
         self.processes.announce(None)
         with self.control.device.training_turn():
             self.save()
+        self.processes.announce(1.0 if self._is_at_limit else None)
         if not self._is_at_limit:
             self.control.request_stop()  # also where a signal asked for it: pages show what has become of the training
             reason = "its output is closed" if display.is_closed else "on request"

@@ -54,9 +54,8 @@ def normalised_kmeans(
     """
     lengths = pixels.norm(dim=1)
     if len(pixels) == 0 or not bool((lengths > 0).all()):
-        raise SpectrumError(
-            f"k-means needs spectra of non-zero length; found {int((lengths == 0).sum())} zero ones"
-        )
+        found = f"{int((lengths == 0).sum())} that are zero" if len(pixels) else "no pixels"
+        raise SpectrumError(f"k-means needs spectra of non-zero length; found {found}")
     shapes = pixels / lengths[:, None]
     runs = [_cluster(shapes, num_clusters, generator, max_iterations) for _ in range(restarts)]
     inertia, centres, ids = min(runs, key=lambda run: run[0])
