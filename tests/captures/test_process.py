@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +28,7 @@ from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
@@ -231,6 +233,22 @@ def writer(interrupted, monkeypatch: pytest.MonkeyPatch) -> _Writer:  # noqa: AR
     writer = _Writer()
     monkeypatch.setattr(process_module, "write_view", writer)
     return writer
+
+
+def test_two_processes_do_not_write_one_scene(interrupted, writer, tmp_path: Path):
+    lock = tmp_path / "scene.unfinished" / "process.lock"
+    code = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock\n"
+    code += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    words = [sys.executable, "-c", code, str(lock)]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(RunError, match="another unmix-process writes to"):
+            process(interrupted.root, tmp_path / "scene")
+        assert writer.written == []
+        other.communicate()
+    process(interrupted.root, tmp_path / "scene")
+    assert not (tmp_path / "scene" / "process.lock").exists()
 
 
 def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path: Path):

@@ -179,3 +179,28 @@ def test_an_interrupt_while_a_command_is_imported_is_no_traceback(script):
 @pytest.mark.parametrize("status", [0, 2])
 def test_the_parsers_own_exit_passes_through(status):
     assert end_of(raising(SystemExit(status))) == status
+
+
+def as_process(command, *, redirect="", **environment):
+    """A command in a process of its own, with the streams that a shell gives it."""
+    code = f"from unmix_plugin.commands.entry import run_command; run_command({command}, [])"
+    words = ["sh", "-c", f'exec "$0" -c "$1" {redirect}', sys.executable, code]
+    return subprocess.run(words, capture_output=True, env={**os.environ, **environment}, check=False)
+
+
+@pytest.mark.parametrize("redirect", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_change_no_exit_code(redirect):
+    assert as_process("lambda _: print('line')", redirect=redirect).returncode == 0
+    failing = "lambda _: (_ for _ in ()).throw(__import__('unmix_plugin.errors').errors.SceneError('none'))"
+    assert as_process(failing, redirect=redirect).returncode == 2
+
+
+def test_text_that_a_stream_has_no_letters_for_is_written_in_another_way():
+    ended = as_process("lambda _: print('\u00b5m', '\\udcff')", PYTHONIOENCODING="ascii", PYTHONUTF8="0")
+    assert (ended.returncode, ended.stdout) == (0, b"\\xb5m \xff\n"), ended.stderr
+
+
+@pytest.mark.parametrize("number", [errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EIO])
+def test_what_the_system_says_of_names_and_disks_is_for_the_user_to_mend(number, capsys):
+    assert end_of(raising(OSError(number, os.strerror(number), "some/file"))) == 2
+    assert "some/file" in capsys.readouterr().err
