@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from unmix_plugin.captures.masks import _find_background, clean
+from unmix_plugin.captures.calibration.calibration import Raster
+from unmix_plugin.captures.masks import _find_background, clean, read_labels
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
 
 GENERATOR = np.random.default_rng(0)
@@ -40,3 +44,13 @@ def test_large_holes_and_parts_stay():
     cleaned, specks, holes = clean(mask)
     np.testing.assert_array_equal(cleaned, mask)
     assert (specks, holes) == (0, 0)
+
+
+@pytest.mark.parametrize("pixels", [np.zeros((4, 5, 3), np.uint8), np.full((4, 5), 300, np.uint16)])
+def test_pictures_that_hold_no_labels_are_refused(tmp_path, pixels):
+    np.save(tmp_path / "cube.npy", np.ones((4, 5, 3), np.float32))
+    Image.fromarray(pixels).save(tmp_path / "labels.png")
+    cube = open_spectral_file(tmp_path / "cube.npy")
+    view = CaptureView("a", cube, labels=tmp_path / "labels.png")
+    with pytest.raises(CaptureError, match="expected labels of 0 to 255 in one channel"):
+        read_labels(view, Raster(0, 0, 4, 5, 1))

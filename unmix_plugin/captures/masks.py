@@ -22,7 +22,7 @@ from unmix_plugin.captures.calibration.sensor import Sensor, sampled_rows
 from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import CaptureView
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP")
 """Pillow reads more, some of them with other programs."""
@@ -248,7 +248,18 @@ def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] |
     """
     if view.labels is None or raster.binning > 1:
         return None
-    return _cut(_read(view.labels, None, view), raster).astype(np.uint8)
+    labels = _read(view.labels, None, view)
+    if (
+        labels.ndim != 2
+        or labels.dtype.kind not in "bui"
+        or not 0 <= int(labels.min()) <= int(labels.max()) <= 255
+    ):
+        channels = 1 if labels.ndim == 2 else labels.shape[2]
+        raise CaptureError(
+            f"{view.labels}: {counted(channels, 'channel')} of {labels.dtype.name}; expected labels of 0 to 255 in one "
+            "channel, grey or by palette: write them so, or leave them out"
+        )
+    return _cut(labels, raster).astype(np.uint8)
 
 
 def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
