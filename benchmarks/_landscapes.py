@@ -24,7 +24,12 @@ SIZE = 56
 NUM_LANDSCAPES = 60
 
 Array = np.ndarray
-_SENSORS = {"visible": (405.0, 715.0), "vnir": (400.0, 1000.0), "full": (400.0, 2450.0), "swir": (1000.0, 2450.0)}
+_SENSORS = {
+    "visible": (405.0, 715.0),
+    "vnir": (400.0, 1000.0),
+    "full": (400.0, 2450.0),
+    "swir": (1000.0, 2450.0),
+}
 _RANDOM_FIELD_SMOOTHNESS = (2.0, 8.0)
 _LEAST_ANGLE = 0.08
 """Between two materials, in radians, unless they are meant to be near twins."""
@@ -68,11 +73,15 @@ def landscape(number: int) -> Landscape:
     shade = float(rng.choice([0.0, 0.2, 0.4, 0.6]))
     haze = float(rng.choice([0.0, 0.0, 0.01, 0.03]))
     snr_db = float(rng.uniform(25, 45))
-    image = _varied_mixture(rng, abundances, spectra, varied)
-    light = 1 - shade * _unit_field(rng, _random_scale(rng))
+    glint = float(rng.choice([0.0, 0.01, 0.03]))
+    skylight = float(rng.choice([0.0, 0.15]))
+    image, endmembers = _varied_mixture(rng, abundances, spectra, names, varied, glint)
+    blue = (wavelengths / wavelengths[0]) ** -2.0
+    shadow = shade * _unit_field(rng, _random_scale(rng))[..., None]
+    image = image * (1 - shadow + skylight * shadow * blue)
     path_light = haze * (wavelengths / wavelengths[0]) ** -float(rng.uniform(1, 4))
     veil = 1 + 0.3 * (_unit_field(rng, 12.0) - 0.5)
-    image = image * light[..., None] + path_light * veil[..., None]
+    image = image + path_light * veil[..., None]
     image = _noisy(rng, image, wavelengths, snr_db)
     traits: dict[str, float | str] = {
         "sensor": str(sensor),
@@ -84,10 +93,12 @@ def landscape(number: int) -> Landscape:
         "variability": varied,
         "shade": shade,
         "haze": haze,
+        "glint": glint,
+        "skylight": skylight,
         "snr_db": round(snr_db),
     }
     flat = abundances.reshape(-1, num_materials)
-    return Landscape(image.reshape(-1, num_bands), flat, spectra + path_light, names, traits)
+    return Landscape(image.reshape(-1, num_bands), flat, endmembers + path_light, names, traits)
 
 
 # What the ground is made of
@@ -136,7 +147,9 @@ def _water(rng: np.random.Generator, nm: Array) -> Array:
 
 
 def _asphalt(rng: np.random.Generator, nm: Array) -> Array:
-    return rng.uniform(0.06, 0.16) * (1 + rng.uniform(0.05, 0.5) * (nm - 400) / 1000 * (1 - (nm - 400) / 5000))
+    return rng.uniform(0.06, 0.16) * (
+        1 + rng.uniform(0.05, 0.5) * (nm - 400) / 1000 * (1 - (nm - 400) / 5000)
+    )
 
 
 def _concrete(rng: np.random.Generator, nm: Array) -> Array:
@@ -158,7 +171,9 @@ def _metal(rng: np.random.Generator, nm: Array) -> Array:
 def _mineral(rng: np.random.Generator, nm: Array) -> Array:
     base = rng.uniform(0.3, 0.7) * (1 - rng.uniform(0.3, 0.8) * np.exp(-(nm - 350) / rng.uniform(100, 400)))
     for _ in range(rng.integers(2, 5)):
-        base = base * (1 - rng.uniform(0.15, 0.5) * _bell(nm, rng.uniform(nm[0], nm[-1]), rng.uniform(20, 90)))
+        base = base * (
+            1 - rng.uniform(0.15, 0.5) * _bell(nm, rng.uniform(nm[0], nm[-1]), rng.uniform(20, 90))
+        )
     return base
 
 
@@ -247,8 +262,9 @@ def _blurred(abundances: Array, radius: float) -> Array:
 
 
 def _covering(rng: np.random.Generator, scores: Callable[[], Array]) -> Array:
-    """Scores (SIZE, SIZE, K) of which each material wins somewhere."""
+    """Scores (SIZE, SIZE, K) of which each material wins somewhere, some more often than others."""
     found = scores()
+    found = found + rng.normal(scale=0.5, size=found.shape[-1])
     for _ in range(200):
         cover = np.bincount(found.argmax(axis=-1).ravel(), minlength=found.shape[-1]) / SIZE**2
         if cover.min() >= _LEAST_COVER:
@@ -304,23 +320,44 @@ _LAYOUTS = {"smooth": _smooth, "patches": _patches, "edges": _edges, "roads": _r
 # What the sensor sees
 
 
-def _varied_mixture(rng: np.random.Generator, abundances: Array, spectra: Array, strength: float) -> Array:
-    """Mixtures of spectra, each of which varies over the image in brightness and in slow changes along the bands."""
+def _varied_mixture(
+    rng: np.random.Generator,
+    abundances: Array,
+    spectra: Array,
+    names: tuple[str, ...],
+    strength: float,
+    glint: float,
+) -> tuple[Array, Array]:
+    """Mixtures of spectra, and these as they are in the mean, (K, B). Each varies over the image in brightness and
+    in slow changes along the bands. Water is deeper here and shallower there, and reflects the sky (`glint`, a
+    reflectance at most).
+    """
     num_bands = spectra.shape[1]
-    image = np.zeros((SIZE, SIZE, num_bands))
-    for share, spectrum in zip(np.moveaxis(abundances, -1, 0), spectra, strict=True):
+    image, means = np.zeros((SIZE, SIZE, num_bands)), []
+    for name, share, spectrum in zip(names, np.moveaxis(abundances, -1, 0), spectra, strict=True):
         changes = np.zeros_like(image)
         for _ in range(3):
             along = np.cos(np.pi * rng.uniform(0.5, 4) * np.linspace(0, 1, num_bands) + rng.uniform(0, 6.3))
             changes += _field(rng, _random_scale(rng))[..., None] * along
         brightness = 1 + 2 * strength * _field(rng, 1.0)
-        image += (share * np.clip(brightness, 0.3, 2))[..., None] * spectrum * np.exp(strength * changes / 2)
-    return image
+        varied = np.clip(brightness, 0.3, 2)[..., None] * spectrum * np.exp(strength * changes / 2)
+        if name == "water":
+            depth = 1 + 0.3 * _field(rng, _random_scale(rng))[..., None]
+            shape = spectrum / spectrum.max()
+            varied = varied * shape ** (np.clip(depth, 0.3, 2) - 1)
+            varied = varied + glint * _unit_field(rng, _random_scale(rng))[..., None] ** 2
+        image += share[..., None] * varied
+        means.append((share[..., None] * varied).sum(axis=(0, 1)) / share.sum())
+    return image, np.stack(means)
 
 
 def _noisy(rng: np.random.Generator, image: Array, wavelengths: Array, snr_db: float) -> Array:
     """With shot noise and noise of the sensor, more where air absorbs, and sometimes dead bands; 0 or above."""
-    weak = 1 - 0.9 * (_bell(wavelengths, 1400, 45) + _bell(wavelengths, 1890, 55)) - 0.5 * _bell(wavelengths, 2450, 100)
+    weak = (
+        1
+        - 0.9 * (_bell(wavelengths, 1400, 45) + _bell(wavelengths, 1890, 55))
+        - 0.5 * _bell(wavelengths, 2450, 100)
+    )
     weak = np.clip(weak * (1 - 0.4 * _bell(wavelengths, 400, 30)), 0.08, 1)
     level = 10 ** (-snr_db / 20) * np.sqrt(np.mean(image**2))
     shot = np.sqrt(np.clip(image, 0, None) / image.mean())
