@@ -72,7 +72,7 @@ def landscape(number: int) -> Landscape:
     varied = float(rng.choice([0.01, 0.03, 0.06, 0.1]))
     shade = float(rng.choice([0.0, 0.2, 0.4, 0.6]))
     haze = float(rng.choice([0.0, 0.0, 0.01, 0.03]))
-    snr_db = float(rng.uniform(25, 45))
+    snr_db = float(rng.uniform(28, 45))
     glint = float(rng.choice([0.0, 0.01, 0.03]))
     skylight = float(rng.choice([0.0, 0.15]))
     image, endmembers = _varied_mixture(rng, abundances, spectra, names, varied, glint)
@@ -82,7 +82,11 @@ def landscape(number: int) -> Landscape:
     path_light = haze * (wavelengths / wavelengths[0]) ** -float(rng.uniform(1, 4))
     veil = 1 + 0.3 * (_unit_field(rng, 12.0) - 0.5)
     image = image + path_light * veil[..., None]
+    endmembers = endmembers + path_light
     image = _noisy(rng, image, wavelengths, snr_db)
+    if rng.random() < 0.3:
+        dead = rng.integers(0, num_bands, max(1, num_bands // 60))
+        image[..., dead] = endmembers[:, dead] = 0
     traits: dict[str, float | str] = {
         "sensor": str(sensor),
         "bands": num_bands,
@@ -98,7 +102,7 @@ def landscape(number: int) -> Landscape:
         "snr_db": round(snr_db),
     }
     flat = abundances.reshape(-1, num_materials)
-    return Landscape(image.reshape(-1, num_bands), flat, endmembers + path_light, names, traits)
+    return Landscape(image.reshape(-1, num_bands), flat, endmembers, names, traits)
 
 
 # What the ground is made of
@@ -143,7 +147,7 @@ def _soil(rng: np.random.Generator, nm: Array) -> Array:
 def _water(rng: np.random.Generator, nm: Array) -> Array:
     clear = rng.uniform(0.02, 0.05) * np.exp(-np.clip(nm - 480, 0, None) / rng.uniform(60, 140))
     mud = rng.uniform(0, 0.06) * _bell(nm, 570, 60) + rng.uniform(0, 0.02) * _bell(nm, 705, 20)
-    return clear + mud + rng.uniform(0.002, 0.006)
+    return clear + mud + rng.uniform(0.006, 0.015)
 
 
 def _asphalt(rng: np.random.Generator, nm: Array) -> Array:
@@ -352,7 +356,7 @@ def _varied_mixture(
 
 
 def _noisy(rng: np.random.Generator, image: Array, wavelengths: Array, snr_db: float) -> Array:
-    """With shot noise and noise of the sensor, more where air absorbs, and sometimes dead bands; 0 or above."""
+    """With shot noise and noise of the sensor, more where air absorbs; 0 or above."""
     weak = (
         1
         - 0.9 * (_bell(wavelengths, 1400, 45) + _bell(wavelengths, 1890, 55))
@@ -361,9 +365,6 @@ def _noisy(rng: np.random.Generator, image: Array, wavelengths: Array, snr_db: f
     weak = np.clip(weak * (1 - 0.4 * _bell(wavelengths, 400, 30)), 0.08, 1)
     level = 10 ** (-snr_db / 20) * np.sqrt(np.mean(image**2))
     shot = np.sqrt(np.clip(image, 0, None) / image.mean())
-    noise = rng.normal(size=image.shape) * level * np.sqrt(0.5 + 0.5 * shot**2) / weak
+    noise = rng.normal(size=image.shape) * level * np.sqrt(0.2 + 0.8 * shot**2) / weak
     noisy = image + noise
-    if rng.random() < 0.3:
-        dead = rng.integers(0, image.shape[-1], max(1, image.shape[-1] // 60))
-        noisy[..., dead] = rng.choice([0.0, 1.0]) * level * np.abs(rng.normal(size=(SIZE, SIZE, len(dead))))
     return np.clip(noisy, 0, None)

@@ -30,8 +30,8 @@ from unmix_plugin.spectral.unmixing.mixture_guide import mixing_penalty
 Explain = Callable[[Tensor, Tensor], Tensor]
 """From pixels (N, B) and endmembers (K, B) to amounts (N, K)."""
 
-OURS = "pairs, NNLS"
-"""The row of `unmix_pixels`, with its defaults."""
+OURS = "pooled, NNLS"
+"""The row of `unmix_image`, with its defaults."""
 
 _RESTARTS = 5
 _LARGEST_SAMPLE = 20_000
@@ -142,7 +142,8 @@ _FOUND: dict[str, EndmemberMethod | Literal["truth"]] = {
     "VCA": "vca",
     "N-FINDR": "nfindr",
     "minimum volume": "minimum-volume",
-    "pairs": "pooled-pairs",
+    "pairs": "pairs",
+    "pooled": "pooled",
     "oracle": "truth",
 }
 METHODS: dict[str, PixelMethod] = {"k-means of raw spectra": PixelMethod("raw k-means", _by_distance)} | {

@@ -88,10 +88,10 @@ def best_pixel_row(rows: dict[str, Seeds], finder: Literal["theirs", "ours"] = "
     """The 2-D row of largest mIoU that is not an oracle.
 
     Args:
-        finder: Whether endmembers are found by known methods or by `pairs`, which is half of what is judged.
+        finder: Whether endmembers are found by known methods or by searches of ours, which are half of what is judged.
     """
     fair = [name for name in rows if name.startswith("2d:") and "oracle" not in name]
-    fair = [name for name in fair if name.startswith("2d:pairs") == (finder == "ours")]
+    fair = [name for name in fair if name.startswith(("2d:pairs", "2d:pooled")) == (finder == "ours")]
     return max(fair, key=lambda name: median(rows[name]), default=None)
 
 

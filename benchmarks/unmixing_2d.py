@@ -7,8 +7,8 @@ A .mat file holds `Y` (B, N) or (H, W, B), the pixels, `A` (K, N), their true ab
 endmembers, any of them transposed. Y may be in any unit, M of any brightness. All methods get the same draws, pixels
 and brightness; endmembers are matched to the true ones by spectral angle. Printed are, over seeds, the median, the
 spread (largest less smallest) and the standard deviation of the abundance RMSE over all pixels and materials and of the
-mean endmember angle in radians; of scene folders, which need labels and true spectra, mIoU too. The row `pairs, NNLS`
-is the product's own: `unmix_pixels` with its defaults. Bad input ends with one message and exit
+mean endmember angle in radians; of scene folders, which need labels and true spectra, mIoU too. The row `pooled, NNLS`
+is the product's own: `unmix_image` with its defaults. Bad input ends with one message and exit
 code 2.
 """
 

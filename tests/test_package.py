@@ -60,6 +60,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
         "unmix-eval": "unmix_plugin.commands.scripts:evaluate",
         "unmix-export": "unmix_plugin.commands.scripts:export",
         "unmix-render": "unmix_plugin.commands.scripts:render",
+        "unmix-image": "unmix_plugin.commands.scripts:image",
         "unmix-demo-scene": "unmix_plugin.commands.scripts:demo_scene",
         "unmix-process": "unmix_plugin.commands.scripts:process",
         "unmix-view": "unmix_plugin.commands.scripts:view",

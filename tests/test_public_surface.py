@@ -23,6 +23,7 @@ COMMANDS = {
     "unmix-demo-scene": ("demo_scene", "write_demo_scene"),
     "unmix-eval": ("eval", "evaluate"),
     "unmix-export": ("export", "export"),
+    "unmix-image": ("image", "image"),
     "unmix-process": ("process", "process"),
     "unmix-render": ("render", "render"),
     "unmix-train": ("train", "train"),

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from unmix_plugin.editing.recipe_files import read_recipe
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.products.save import save
+    from unmix_plugin.spectral.unmixing.image import unmix_image
     from unmix_plugin.trained.open_run import open_run
     from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.protocol import Probe
@@ -30,6 +31,7 @@ __all__ = [
     "open_run",
     "read_recipe",
     "save",
+    "unmix_image",
 ]
 
 _MODULES = {
@@ -43,6 +45,7 @@ _MODULES = {
     "open_run": "trained.open_run",
     "read_recipe": "editing.recipe_files",
     "save": "products.save",
+    "unmix_image": "spectral.unmixing.image",
 }
 
 

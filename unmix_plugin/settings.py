@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import torch
 
 Light = Literal["fixed", "camera", "per-view"]
-EndmemberInit = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs", "file"]
+EndmemberInit = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled", "file"]
 T = TypeVar("T")
 Ours = Annotated[T, Hidden]
 

@@ -11,6 +11,7 @@ from tests.docs.pages import ROOT, blocks_of, text_of
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
+from unmix_plugin.commands.image import image
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
@@ -28,6 +29,7 @@ COMMANDS = {
     "unmix-render": render,
     "unmix-export": export,
     "unmix-demo-scene": write_demo_scene,
+    "unmix-image": image,
 }
 SHORTER = {
     "--max-seconds 600": "--max-num-iterations 40",

@@ -21,6 +21,11 @@ def export() -> NoReturn:
     _run("export", "export")
 
 
+def image() -> NoReturn:
+    """`unmix-image`."""
+    _run("image", "image")
+
+
 def process() -> NoReturn:
     """`unmix-process`."""
     _run("process", "process")

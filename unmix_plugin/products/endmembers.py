@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
@@ -45,28 +47,44 @@ def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
 
 
 def _draw_endmembers(materials: Materials) -> bytes:
-    """The spectra as lines in the endmembers' colours; from the ninth on, dashes tell near colours apart too."""
+    """The spectra in the endmembers' colours."""
+    labels = ("wavelength (nm)", "radiance under the scene's light (1 = full scale)")
+    spectra = materials.endmembers.detach().cpu().numpy()
+    return draw_spectra(
+        spectra, materials.bands.centers_nm, materials.names, endmember_colours(materials), labels
+    )
+
+
+def draw_spectra(
+    spectra: Float[np.ndarray, "K B"],
+    x: Shaped[np.ndarray, " B"],
+    names: Sequence[str],
+    colours: Float[np.ndarray, "K 3"],
+    labels: tuple[str, str],
+) -> bytes:
+    """Endmembers as lines, as a PNG; from the ninth on, dashes tell near colours apart too.
+
+    Args:
+        x: Wavelengths or numbers of the bands.
+        labels: Of both axes.
+    """
     from matplotlib.figure import Figure
 
-    colours = endmember_colours(materials)
     legend_columns = -(-len(colours) // _LEGEND_ROWS)
     figure = Figure(figsize=(7.2 + 1.5 * legend_columns, 4.6), layout="constrained", facecolor="white")
     axes = figure.add_subplot()
-    wavelengths = materials.bands.centers_nm
-    for index, (spectrum, colour) in enumerate(
-        zip(materials.endmembers.detach().cpu(), colours, strict=True)
-    ):
+    for index, (spectrum, colour) in enumerate(zip(spectra, colours, strict=True)):
         axes.plot(
-            wavelengths,
-            spectrum.numpy(),
+            x,
+            spectrum,
             color=tuple(colour),
             linestyle=_LINE_STYLES[index // 8 % len(_LINE_STYLES)],
             linewidth=2.0,
-            marker="o" if len(wavelengths) <= 40 else None,
+            marker="o" if len(x) <= 40 else None,
             markersize=3.5,
-            label=materials.names[index],
+            label=names[index],
         )
-    axes.set(xlabel="wavelength (nm)", ylabel="radiance under the scene's light (1 = full scale)")
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.set_ylim(bottom=0.0)
     axes.set_title("Endmembers", loc="left", fontweight="bold")
     plain_axes(axes)

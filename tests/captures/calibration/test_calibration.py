@@ -12,7 +12,7 @@ from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
     WhiteReference,
-    _find_missing,
+    find_missing,
     open_reference,
     panel_reference,
 )
@@ -134,12 +134,12 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
 def test_a_no_data_value_of_zero_has_to_stand_in_every_band(no_data: float, expected: list[bool]):
     value = 7 if no_data == 7.0 else 0
     stored = np.array([[[value, 5], [value, value]]], np.uint16)
-    np.testing.assert_array_equal(_find_missing(stored, no_data)[0], expected)
+    np.testing.assert_array_equal(find_missing(stored, no_data)[0], expected)
 
 
 def test_a_pixel_without_a_number_in_some_band_is_missing():
     stored = np.array([[[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]]], np.float32)
-    np.testing.assert_array_equal(_find_missing(stored, None)[0], [True, False, True])
+    np.testing.assert_array_equal(find_missing(stored, None)[0], [True, False, True])
 
 
 @given(st.integers(0, 5), st.integers(0, 5), st.integers(1, 3), st.floats(5.0, 500.0), st.floats(-20.0, 40.0))

@@ -14,7 +14,7 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (
-    _distances_to_pairs,
+    distances_to_pairs,
     two_material_endmembers,
     two_material_fits,
 )
@@ -52,7 +52,7 @@ def test_a_mixture_that_fills_more_pixels_than_a_material_is_no_endmember():
 def test_distances_are_those_of_least_squares_on_each_pair(seed):
     spectra = normalize(torch.rand(12, 6, dtype=torch.float64, generator=seeded(seed)), dim=1)
     candidates, shapes = spectra[:4], spectra[4:]
-    distances = _distances_to_pairs(shapes, candidates)
+    distances = distances_to_pairs(shapes, candidates)
     for first in range(4):
         for second in range(4):
             pair = candidates[sorted({first, second})]
@@ -64,7 +64,7 @@ def test_the_search_finds_the_best_set_that_brute_force_finds():
     generator = seeded(3)
     pixels = torch.rand(9, 5, dtype=torch.float64, generator=generator)
     shapes = normalize(pixels, dim=1)
-    distances = _distances_to_pairs(shapes, shapes)
+    distances = distances_to_pairs(shapes, shapes)
     best = min(
         float(distances[list(ids)][:, list(ids)].flatten(0, 1).amin(0).mean())
         for ids in combinations(range(9), 3)

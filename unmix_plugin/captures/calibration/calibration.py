@@ -348,7 +348,7 @@ class Calibration:
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
-        missing = _find_missing(stored, file.no_data)
+        missing = find_missing(stored, file.no_data)
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
         values = self._values(file, whole, rows)
         sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so
@@ -390,7 +390,7 @@ class Calibration:
         return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
-def _find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
+def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
     """Pixels without a measurement: no number in some band, or the file's no-data value.
 
     A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.

@@ -24,10 +24,8 @@ from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
 from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
-from unmix_plugin.spectral.unmixing.two_material_mixtures import (
-    pooled_pair_endmembers,
-    two_material_endmembers,
-)
+from unmix_plugin.spectral.unmixing.pooled_search import pooled_search
+from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_endmembers
 from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
 _ROUNDING = 0.01
@@ -125,7 +123,7 @@ def _minimise(
     return torch.linalg.inv(torch.cat([free, unit - free.sum(dim=1, keepdim=True)], dim=1))
 
 
-EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"]
+EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled"]
 
 
 def initialise_endmembers(
@@ -143,19 +141,23 @@ def initialise_endmembers(
             `vca` and `nfindr` take extreme pixels, which serves mixtures of which pure pixels exist;
             `minimum-volume` takes the corners of the smallest simplex around nearly all pixels, which serves mixtures
             without pure pixels; `pairs` takes the mean shapes that explain the pixels best as mixtures of two, which
-            serves surfaces whose materials meet.
+            serves surfaces whose materials meet; `pooled` chooses among the sets that several of these searches find.
         generator: On the CPU; the only source of randomness.
         max_pixels: More are thinned out at random to this number.
     Raises:
         SpectrumError: NaN or infinite values, more endmembers than bands or than distinct pixels neither dark nor
             saturated, pixels that span too few dimensions, or more than 64 endmembers for `pairs`.
     """
-    usable = _usable_pixels(pixels, num_endmembers, generator, max_pixels)
+    usable = usable_pixels(pixels, num_endmembers, generator, max_pixels)
     if method == "kmeans" or num_endmembers == 1:
         return normalised_kmeans(usable, num_endmembers, generator).endmembers.clamp(0, 1)
-    spectra = _shapes(usable, num_endmembers, method, generator)
-    most_similar = (usable @ torch.nn.functional.normalize(spectra, dim=1).T).argmax(dim=1)
-    return scale_to_lit_pixels(spectra, usable, most_similar).clamp(0, 1)
+    return as_lit_pixels(_shapes(usable, num_endmembers, method, generator), usable)
+
+
+def as_lit_pixels(spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"]) -> Float[Tensor, "K B"]:
+    """The spectra, in [0, 1], as bright as the well-lit pixels that look like them."""
+    most_similar = (pixels @ torch.nn.functional.normalize(spectra, dim=1).T).argmax(dim=1)
+    return scale_to_lit_pixels(spectra, pixels, most_similar).clamp(0, 1)
 
 
 def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "kept B"]:
@@ -180,7 +182,7 @@ def has_spectral_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
 def _shapes(
     usable: Float[Tensor, "N B"],
     num_endmembers: int,
-    method: Literal["vca", "nfindr", "minimum-volume", "pairs", "pooled-pairs"],
+    method: Literal["vca", "nfindr", "minimum-volume", "pairs", "pooled"],
     generator: torch.Generator,
 ) -> Float[Tensor, "K B"]:
     """Endmembers of any brightness."""
@@ -189,8 +191,8 @@ def _shapes(
         return max(draws, key=_log_volume)
     if method == "minimum-volume":
         return minimum_volume_simplex(usable, num_endmembers, generator)
-    if method == "pooled-pairs":
-        return pooled_pair_endmembers(usable, num_endmembers, generator)
+    if method == "pooled":
+        return pooled_search(usable, num_endmembers, generator).endmembers
     if method == "pairs":
         return two_material_endmembers(usable, num_endmembers, generator)
     # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.
@@ -204,9 +206,14 @@ def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
     return float(torch.linalg.slogdet(edges @ edges.T).logabsdet)
 
 
-def _usable_pixels(
-    pixels: Tensor, num_endmembers: int, generator: torch.Generator, max_pixels: int
-) -> Tensor:
+def usable_pixels(
+    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator, max_pixels: int
+) -> Float[Tensor, "kept B"]:
+    """At most so many of the pixels that show a spectral shape.
+
+    Raises:
+        SpectrumError: NaN or infinite values, or more endmembers than bands or than these pixels are distinct.
+    """
     num_bands = pixels.shape[1]
     if not 1 <= num_endmembers <= num_bands:
         raise SpectrumError(
@@ -339,35 +346,19 @@ def given_endmembers(
     return radiance * _brightness_factor(radiance, pixels, generator)
 
 
-def unmix_pixels(
-    pixels: Float[Tensor, "N B"],
-    num_endmembers: int,
-    generator: torch.Generator,
-    method: EndmemberMethod = "pooled-pairs",
-) -> tuple[Float[Tensor, "K B"], Float[Tensor, "N K"]]:
-    """Endmembers of these pixels, and their abundances, at least 0 with sum 1; zeros for black pixels.
-
-    Shading is ignored: abundances are shares of the non-negative least squares amounts.
-
-    Args:
-        pixels: In [0, 1]; saturated ones (1 or above) do not decide the endmembers.
-        generator: On the CPU; the only source of randomness.
-    Raises:
-        SpectrumError: as `initialise_endmembers`.
-    """
-    endmembers = comparable_brightness(initialise_endmembers(pixels, num_endmembers, method, generator))
-    amounts = nnls(pixels, endmembers)
-    return endmembers, amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)
-
-
 def comparable_brightness(endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
     """The endmembers; all with the largest peak of any if one is less than a quarter as long as the longest.
 
     Amounts are in units of their endmember. In units of one that is nearly black, such as water in the near infrared,
     haze, glint and light from the neighbourhood become large amounts, so shares are then counted between spectra of
-    one peak, as the reference maps of Samson count them.
+    one peak. Of artificial landscapes those with so dark a material come no nearer to their areas with endmembers of
+    their own brightness, the others do (benchmarks/results/tried.md).
     """
-    lengths, peaks = endmembers.norm(dim=1), endmembers.amax(dim=1, keepdim=True)
-    if bool(lengths.min() >= _DARK_MATERIAL * lengths.max()):
-        return endmembers
+    lengths = endmembers.norm(dim=1)
+    return endmembers if bool(lengths.min() >= _DARK_MATERIAL * lengths.max()) else equal_peaks(endmembers)
+
+
+def equal_peaks(endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:
+    """The endmembers, all with the largest peak of any."""
+    peaks = endmembers.amax(dim=1, keepdim=True)
     return endmembers * (peaks.max() / peaks.clamp(min=1e-12))

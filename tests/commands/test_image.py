@@ -1,0 +1,87 @@
+"""`unmix-image`: what it prints, writes and refuses."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from tests.commands.running import picture_size, run
+from tests.spectral.mixtures import smooth_endmembers
+from tests.spectral.unmixing.test_image import image_of
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.commands.image import image
+from unmix_plugin.formats.envi import write_envi_cube
+from unmix_plugin.spectral.bands import Bands
+
+
+@pytest.fixture
+def cube():
+    return image_of(smooth_endmembers(3)).astype(np.float32)
+
+
+def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
+    bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
+    write_envi_cube(tmp_path / "field", cube, bands, None, "a field")
+    words = (tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
+    ended = run(image, *words)
+    assert ended.status == 0, ended.err
+    assert "40 x 40 pixels, 24 bands" in ended.out
+    assert ended.out.count("% of the area") == 3
+    folder = tmp_path / "out" / "field"
+    with (folder / "endmembers.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["wavelength", "material 1", "material 2", "material 3"]
+    assert float(rows[1][0]) == 450
+    abundances = open_spectral_file(folder / "abundances.hdr").read()
+    assert abundances.shape == (40, 40, 3)
+    np.testing.assert_allclose(abundances.reshape(-1, 3)[1:].sum(axis=1), 1, atol=1e-5)
+    for name in ("endmembers.png", "maps.png"):
+        assert min(picture_size(folder / name)) > 200
+    again = run(image, *words)
+    assert again.status == 2
+    assert "exist already; give --overwrite" in again.err
+    assert run(image, *words, "--overwrite").status == 0
+
+
+def test_bands_without_wavelengths_are_numbered_and_pixels_without_measurement_left_out(cube, tmp_path):
+    cube[:4] = np.nan
+    np.save(tmp_path / "plain.npy", cube)
+    ended = run(image, tmp_path / "plain.npy", "--endmembers", 3, "--axes", "yxb", "--output-dir", tmp_path)
+    assert ended.status == 0, ended.err
+    assert "160 pixels without a measurement" in ended.out
+    with (tmp_path / "plain" / "endmembers.csv").open() as file:
+        assert next(csv.reader(file))[0] == "band"
+    assert not open_spectral_file(tmp_path / "plain" / "abundances.hdr").read()[:4].any()
+
+
+def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
+    savemat(tmp_path / "list.mat", {"Y": cube.reshape(-1, 24, order="F").T})
+    ended = run(image, tmp_path / "list.mat", "--size", 40, 40, "--endmembers", 3, "--output-dir", tmp_path)
+    assert ended.status == 0, ended.err
+    assert "40 x 40 pixels, 24 bands" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "message"),
+    [
+        (lambda cube: 0 * cube, (), "the image is black"),
+        (lambda cube: np.full_like(cube, np.nan), (), "no pixel holds a measurement in all bands"),
+        (lambda cube: cube[5:6, 5:6], (), "only 1 distinct pixels"),
+        (lambda cube: cube, ("--endmembers", 30), "between 1 and the number of bands, 24; found 30"),
+    ],
+)
+def test_what_cannot_be_unmixed_ends_with_one_message(change, words, message, cube, tmp_path):
+    np.save(tmp_path / "bad.npy", change(cube))
+    ended = run(
+        image,
+        tmp_path / "bad.npy",
+        "--axes",
+        "yxb",
+        "--output-dir",
+        tmp_path,
+        *(words or ("--endmembers", 3)),
+    )
+    assert ended.status == 2
+    assert message in ended.err
+    assert len(ended.err.strip().splitlines()) == 1

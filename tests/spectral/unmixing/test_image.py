@@ -1,0 +1,172 @@
+"""One image alone."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.image import unmix_image
+
+
+def image_of(materials, size=40, seed=0, noise=0.002):
+    """Left half pure, right half mixtures, all shaded; a shadow without light in a corner."""
+    num = size * size
+    pure = materials[torch.arange(num // 2) % len(materials)]
+    pixels = torch.cat([pure, mixed_pixels(materials, num - num // 2, seed=seed)])
+    pixels = pixels * (0.3 + 0.7 * torch.rand(num, 1, dtype=torch.float64, generator=seeded(seed)))
+    pixels = pixels + noise * torch.randn(pixels.shape, dtype=torch.float64, generator=seeded(seed + 1))
+    pixels[0] = 0
+    return pixels.clamp(min=0).numpy().reshape(size, size, -1)
+
+
+def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
+    materials = smooth_endmembers(3)
+    cube = image_of(materials)
+    found = unmix_image((cube * 4000).astype(np.uint16), 3)
+    angles = spectral_angle(materials[:, None].float(), torch.from_numpy(found.endmembers)[None])
+    assert float(angles.amin(1).max()) < 0.03
+    assert found.endmembers.max() > 400  # in the image's unit
+    shares = found.abundances.reshape(-1, 3)
+    assert shares.min() >= 0
+    assert np.allclose(shares[1:].sum(axis=1), 1, atol=1e-5)
+    assert not shares[0].any()
+    assert found.confidence[0, 0] == 0
+    pure = shares[1:800].argmax(axis=1)
+    assert (pure == angles.argmin(1).numpy()[np.arange(1, 800) % 3]).all()
+    assert found.misfit.max() < 0.2
+
+
+def test_confidence_is_high_where_a_pixel_is_pure_and_low_at_a_tie():
+    materials = smooth_endmembers(2)
+    share = torch.cat([torch.ones(700), torch.zeros(700), 0.5 * torch.ones(200)])[:, None].double()
+    noise = 0.002 * torch.randn(1600, materials.shape[1], dtype=torch.float64, generator=seeded())
+    cube = (share * materials[0] + (1 - share) * materials[1] + noise).clamp(min=0).reshape(40, 40, -1)
+    found = unmix_image(cube.numpy(), 2, shares="light").confidence.ravel()
+    assert found[:1400].min() > 0.99
+    assert np.median(found[1400:]) < 0.9
+
+
+def test_shares_of_area_and_of_light_differ_by_the_brightness_of_materials():
+    bright, dark = smooth_endmembers(2)
+    share = torch.linspace(0, 1, 1600, dtype=torch.float64)[:, None]
+    cube = (share * bright + (1 - share) * 0.1 * dark).reshape(40, 40, -1).numpy()
+    area, light, auto = (unmix_image(cube, 2, shares=shares) for shares in ("area", "light", "auto"))
+    assert auto.shares == "light"
+    np.testing.assert_array_equal(auto.abundances, light.abundances)
+    # Where each covers half, nearly all light comes from the bright one.
+    own, shone = (found.abundances.reshape(-1, 2)[800] for found in (area, light))
+    assert abs(own[0] - 0.5) < 0.2  # how bright a material is, mixed pixels tell too
+    assert shone.max() > own.max() + 0.2
+
+
+def test_the_number_of_materials_is_proposed_with_its_evidence():
+    found = unmix_image(image_of(smooth_endmembers(4)))
+    assert len(found.endmembers) == 4
+    assert "proposed" in found.evidence
+
+
+def test_pixels_outside_of_the_mask_take_no_part():
+    cube = image_of(smooth_endmembers(3))
+    mask = np.ones((40, 40), bool)
+    mask[:5] = False
+    spoilt = cube.copy()
+    spoilt[:5] = np.nan
+    found = unmix_image(spoilt, 3, mask=mask)
+    assert not found.abundances[:5].any()
+    np.testing.assert_array_equal(found.abundances[5:], unmix_image(cube, 3, mask=mask).abundances[5:])
+
+
+def test_the_seed_decides():
+    cube = image_of(smooth_endmembers(3))
+    first, again = (unmix_image(cube, 3, seed=4) for _ in range(2))
+    np.testing.assert_array_equal(first.abundances, again.abundances)
+
+
+@pytest.mark.parametrize(
+    ("change", "count", "message"),
+    [
+        (lambda cube: cube[:, :, 0], 3, "rows, columns and bands"),
+        (lambda cube: cube + 1j, 3, "real numbers; found complex128"),
+        (lambda cube: 0 * cube, 3, "the image is black"),
+        (lambda cube: -cube, 3, "the image is black"),
+        (
+            lambda cube: np.where(cube > cube.max() * 0.9, np.nan, cube),
+            3,
+            "hold NaN or infinite values; leave them",
+        ),
+        (lambda cube: np.full_like(cube, 0.3), 3, "only 1 distinct pixels .* ask for at most 1"),
+        (lambda cube: cube[3:4, 3:4], 2, "only 1 distinct pixels"),
+        (lambda cube: cube[:, :, :2], 3, "between 1 and the number of bands, 2; found 3"),
+        (lambda cube: cube, 0, "between 1 and the number of bands"),
+        (lambda cube: cube, 12, "at most [3-5] materials can be told apart; 12 were asked for"),
+    ],
+)
+def test_what_cannot_be_unmixed_is_refused_with_one_message(change, count, message):
+    with pytest.raises(SpectrumError, match=message):
+        unmix_image(change(image_of(smooth_endmembers(3))), count)
+
+
+def test_a_mask_that_does_not_fit_is_refused():
+    cube = image_of(smooth_endmembers(3))
+    with pytest.raises(SpectrumError, match="mask must be 40 x 40"):
+        unmix_image(cube, 3, mask=np.ones((3, 3), bool))
+    with pytest.raises(SpectrumError, match="leaves no pixel"):
+        unmix_image(cube, 3, mask=np.zeros((40, 40), bool))
+
+
+def test_one_material_and_a_constant_image_are_unmixed():
+    cube = np.full((6, 6, 5), 0.4, np.float32) * np.linspace(0.2, 1, 5, dtype=np.float32)
+    found = unmix_image(cube, 1)
+    assert np.allclose(found.abundances, 1)
+    assert len(unmix_image(cube, "auto").endmembers) == 1
+
+
+def unmixed(pixels, seed=0):
+    found = unmix_image(pixels[None].numpy(), 3, seed=seed)
+    return torch.from_numpy(found.endmembers), torch.from_numpy(found.abundances[0])
+
+
+def landscape(dark, seed=0):
+    """Shaded mixtures of three materials, the last of them dimmed; and the materials."""
+    materials = smooth_endmembers(3, 24)
+    generator = seeded(seed)
+    shares = torch.rand(1500, 3, dtype=torch.float64, generator=generator) ** 6 + 1e-3
+    shares = shares / shares.sum(dim=1, keepdim=True)
+    dimmed = materials * torch.tensor([[1.0], [0.8], [dark]], dtype=torch.float64)
+    shading = 0.5 + 0.4 * torch.rand(1500, 1, dtype=torch.float64, generator=generator)
+    noise = 0.001 * torch.randn(1500, 24, dtype=torch.float64, generator=generator)
+
+    return (shading * (shares @ dimmed) + noise).clamp(min=0).float(), dimmed
+
+
+def matched(found, materials):
+    angles = spectral_angle(materials[:, None].double(), found[None].double())
+    order = angles.argmin(dim=1)
+    assert sorted(order.tolist()) == [0, 1, 2]
+    return order, angles.amin(dim=1)
+
+
+def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
+    pixels, materials = landscape(dark=0.6)
+    truth = torch.linalg.lstsq(materials.T, pixels.double().T).solution.T.clamp(min=0)
+    truth = truth / truth.sum(dim=1, keepdim=True)
+    found = []
+    for seed in range(2):
+        endmembers, abundances = unmixed(pixels, seed)
+        order, angles = matched(endmembers, materials)
+        assert float(angles.max()) < 0.06
+        assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.08
+        found.append(abundances[:, order])
+    assert float((found[0] - found[1]).square().mean().sqrt()) < 0.02
+
+
+def test_a_nearly_black_material_is_counted_between_spectra_of_one_peak():
+    pixels, materials = landscape(dark=0.05)
+    endmembers, abundances = unmixed(pixels)
+    order, _ = matched(endmembers, materials)
+    of_one_peak = materials / materials.amax(dim=1, keepdim=True)
+    truth = torch.linalg.lstsq(of_one_peak.T, pixels.double().T).solution.T.clamp(min=0)
+    truth = truth / truth.sum(dim=1, keepdim=True)
+    assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.06

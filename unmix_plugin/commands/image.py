@@ -1,0 +1,114 @@
+"""`unmix-image FILE`: the materials of one image, without a scene: spectra, and maps of how much each pixel shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from unmix_plugin.captures.spectral_file import Axes, ReadOptions
+from unmix_plugin.commands.entry import run_command
+from unmix_plugin.errors import CaptureError, counted
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from unmix_plugin.captures.spectral_file import SpectralFile
+
+_CONFIDENT = 0.9
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """Find the materials of one spectral image: spectra, abundances and how far to trust them, as files and figures."""
+
+    file: Annotated[Path, tyro.conf.Positional]
+    """An image of any format that unmix-process reads, or a folder with one picture a band."""
+    endmembers: int | Literal["auto"] = "auto"
+    """How many materials to find; auto proposes a number and prints why."""
+    shares: Literal["auto", "area", "light"] = "auto"
+    """What abundances are shares of: the area that a pixel shows, or the light between spectra of one peak, as
+    reference maps of images from the air count. Auto is area, but light where a material is less than a quarter as
+    bright as the brightest."""
+    output_dir: Path = Path("unmixed")
+    """Results go to a folder in it, named like the file."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace earlier results."""
+    seed: int = 0
+    """Everything random follows from it."""
+    dataset: str | None = None
+    """Variable, data set, layer or channel to take from a file that holds several."""
+    axes: Axes | None = None
+    """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
+    size: tuple[int, int] | None = None
+    """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
+
+
+def image(argv: list[str]) -> None:
+    """Parse the arguments, unmix, write, and say what was found.
+
+    Raises:
+        CaptureError: the file can't be read.
+        ConfigError: results are there already.
+        SpectrumError: the image can't be unmixed so.
+        RunError: the results can't be written.
+    """
+    options = tyro.cli(ImageOptions, prog="unmix-image", args=argv)
+
+    from unmix_plugin.captures.calibration.calibration import find_missing
+    from unmix_plugin.captures.readers.opening import open_spectral_file
+    from unmix_plugin.formats.files import refuse_to_overwrite
+    from unmix_plugin.products.unmixed_image import BandAxis, unmixed_image_paths, write_unmixed_image
+    from unmix_plugin.spectral.unmixing.image import unmix_image
+
+    folder = options.output_dir / (options.file.stem or "image")
+    refuse_to_overwrite(unmixed_image_paths(folder), options.overwrite)
+    opened = open_spectral_file(options.file, _reading(options))
+    bands, wavelengths = _good_bands(opened)
+    cube = opened.read(bands=bands)
+    mask = ~find_missing(cube, opened.no_data)
+    if not mask.any():
+        raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
+    height, width, num_bands = cube.shape
+    print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
+    if not mask.all():
+        print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
+    found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
+    if found.evidence:
+        print(found.evidence)
+    axis = BandAxis(wavelengths, bands + 1)
+    names = write_unmixed_image(folder, found, axis)
+    counts = found.abundances[mask].mean(axis=0)
+    for name, share in zip(names, counts, strict=True):
+        print(f"  {name:12s} {share:6.1%} of the {found.shares}")
+    sure = float((found.confidence[mask] > _CONFIDENT).mean())
+    misfit = float(found.misfit[mask].mean())
+    print(f"{sure:.0%} of the pixels are at least {_CONFIDENT:.0%} sure of their main material")
+    print(f"mean angle between a pixel and its mixture: {misfit:.4f} rad")
+    for path in unmixed_image_paths(folder):
+        print(f"  {path}")
+
+
+def _reading(options: ImageOptions) -> ReadOptions:
+    return ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
+
+
+def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
+    """Indices of the bands that the file does not mark as bad, by wavelength where that is known; and wavelengths."""
+    import numpy as np
+
+    table = opened.bands
+    kept = np.arange(opened.shape[2]) if table.bad is None else np.flatnonzero(~table.bad)
+    if len(kept) == 0:
+        raise CaptureError(f"{opened.path}: the file marks all of its bands as bad")
+    if table.wavelengths_nm is None:
+        return kept, None
+    kept = kept[np.argsort(table.wavelengths_nm[kept], kind="stable")]
+    return kept, table.wavelengths_nm[kept]
+
+
+def main() -> None:
+    """Console script."""
+    run_command(image)

@@ -1,0 +1,106 @@
+"""Files of an unmixed image: spectra as a table and a plot, abundances and confidence as ENVI cubes and as maps.
+
+Notation: `H x W` pixels, `B` bands, `K` materials.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int
+
+from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels, in_rows, paint
+from unmix_plugin.figures.plotting import distinct_colours, own_colours
+from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
+from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.products.endmembers import draw_spectra
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.unmixing.image import UnmixedImage
+
+_FIRST_COLOURS = np.array(
+    [[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.2, 0.4, 0.8], [0.8, 0.6, 0.1], [0.6, 0.3, 0.7]]
+)
+
+
+@dataclass(frozen=True)
+class BandAxis:
+    """What a file says of its bands."""
+
+    wavelengths_nm: Float64[np.ndarray, " B"] | None
+    """Strictly increasing; None where they are not known."""
+    numbers: Int[np.ndarray, " B"]
+    """Of the bands in the file, from 1."""
+
+
+def unmixed_image_paths(folder: Path) -> list[Path]:
+    """Files that `write_unmixed_image` makes."""
+    cubes = [path for name in ("abundances", "confidence") for path in envi_cube_paths(folder / name)]
+    return [*(folder / name for name in ("endmembers.csv", "endmembers.png", "maps.png")), *cubes]
+
+
+def write_unmixed_image(folder: Path, found: UnmixedImage, axis: BandAxis) -> list[str]:
+    """Write everything, and return the materials' names.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    table, plot, maps, *_ = unmixed_image_paths(make_folder(folder))
+    names = [f"material {number}" for number in range(1, len(found.endmembers) + 1)]
+    bands = None if axis.wavelengths_nm is None else Bands.of(axis.wavelengths_nm)
+    spectra = found.endmembers.astype(np.float64)
+    if bands is None:
+        write_file(table, _numbered_table(names, spectra, axis.numbers))
+    else:
+        write_spectra_csv(table, SpectraTable(bands, tuple(names), spectra))
+    colours = _colours(found, bands)
+    x = axis.numbers if bands is None else bands.centers_nm
+    x_label = "band" if bands is None else "wavelength (nm)"
+    write_file(plot, draw_spectra(spectra, x, names, colours, (x_label, "value in the image's unit")))
+    write_file(maps, _maps(found, names, colours))
+    about = f"abundances: shares of {found.shares}, 0 to 1"
+    write_envi_cube(folder / "abundances", found.abundances, None, names, about)
+    trust = np.stack([found.confidence, found.misfit], axis=-1)
+    about = (
+        "probability that the largest abundance is the largest in truth; angle between pixel and mixture, rad"
+    )
+    write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about)
+    return names
+
+
+def _numbered_table(names: list[str], spectra: np.ndarray, numbers: np.ndarray) -> bytes:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["band", *names])
+    writer.writerows(
+        [number, *(f"{value:.9g}" for value in row)] for number, row in zip(numbers, spectra.T, strict=True)
+    )
+    return text.getvalue().encode()
+
+
+def _colours(found: UnmixedImage, bands: Bands | None) -> np.ndarray:
+    """As the materials look, where wavelengths are known."""
+    count = len(found.endmembers)
+    if bands is None:
+        return distinct_colours(np.resize(_FIRST_COLOURS, (count, 3)))
+    spectra = torch.from_numpy(found.endmembers / max(float(found.endmembers.max()), 1e-12))
+    return distinct_colours(own_colours(spectra, bands))
+
+
+def _maps(found: UnmixedImage, names: list[str], colours: np.ndarray) -> bytes:
+    """A map of each material, the main materials in their colours, and confidence."""
+    scale = ColourScale("viridis", 0.0, 1.0, f"share of {found.shares}, or probability")
+    panels = [
+        TitledPicture(paint(found.abundances[..., index], scale), name, colours[index])
+        for index, name in enumerate(names)
+    ]
+    shown = found.abundances.sum(axis=-1, keepdims=True) > 0
+    main = np.where(shown, colours[found.abundances.argmax(axis=-1)], 0.9)
+    panels.append(TitledPicture(main, "main material"))
+    panels.append(TitledPicture(paint(found.confidence, scale), "confidence"))
+    return draw_panels(in_rows(panels), "Abundances", scale, list(zip(names, colours, strict=True)))

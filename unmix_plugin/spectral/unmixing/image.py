@@ -1,0 +1,204 @@
+"""One image alone: its endmembers, what each pixel is made of, and how far to trust that.
+
+Notation: `H x W` pixels, `N` of them in use, `B` bands, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Shaped
+from torch import Tensor
+
+from unmix_plugin.errors import SpectrumError, counted
+from unmix_plugin.spectral.unmixing.abundances import nnls
+from unmix_plugin.spectral.unmixing.endmembers import (
+    as_lit_pixels,
+    comparable_brightness,
+    drop_uninformative_pixels,
+    equal_peaks,
+    usable_pixels,
+)
+from unmix_plugin.spectral.unmixing.num_materials import hysime, propose_num_materials
+from unmix_plugin.spectral.unmixing.pooled_search import PooledEndmembers, pooled_search
+
+_LIT = 0.9
+"""Value that the 99.9th percentile of the pixels' peaks is scaled to, so that few count as saturated."""
+_LIT_QUANTILE = 0.999
+_MOST_PIXELS = 20_000
+"""Pixels that endmembers are searched in; more are thinned out at random."""
+_LEAST_MARGIN_ERROR = 0.02
+"""Standard error of a margin where all sets agree."""
+
+Shares = Literal["auto", "area", "light"]
+"""What abundances are shares of.
+
+Area: endmembers are as bright as their well-lit pixels, so a dark material covers more than it shines. Light: all have
+the same peak, as reference maps of images from the air count. Auto is area, but light where one material is less than
+a quarter as bright as the brightest: haze, glint and noise would then become large areas of it.
+"""
+
+
+@dataclass(frozen=True)
+class UnmixedImage:
+    """What an image is made of."""
+
+    endmembers: Float32[np.ndarray, "K B"]
+    """Spectra in the image's unit, as bright as the well-lit pixels that look like them, the most frequent first."""
+    abundances: Float32[np.ndarray, "H W K"]
+    """Shares of each pixel, at least 0 with sum 1; zeros for black pixels and those left out."""
+    confidence: Float32[np.ndarray, "H W"]
+    """Estimated probability that a pixel's largest abundance is its largest in truth, by how far the best searches
+    agree; 0 where there are no abundances."""
+    misfit: Float32[np.ndarray, "H W"]
+    """Angle in radians between a pixel and its mixture; 0 where there are no abundances."""
+    shares: Literal["area", "light"]
+    """What abundances are shares of."""
+    evidence: str
+    """Why so many materials, in a few lines; empty where the number was given."""
+
+
+def unmix_image(
+    cube: Shaped[np.ndarray, "H W B"],
+    endmembers: int | Literal["auto"] = "auto",
+    *,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    shares: Shares = "auto",
+    seed: int = 0,
+) -> UnmixedImage:
+    """Find the spectra of an image's materials, and how much of each every pixel shows.
+
+    Args:
+        cube: Radiance or reflectance in any unit, in whole numbers too; negative values count as 0.
+        endmembers: How many materials to find; auto proposes a number.
+        mask: Pixels to use; None takes all.
+        shares: What abundances are shares of.
+        seed: Everything random follows from it.
+    Raises:
+        SpectrumError: no cube, no light, NaN or infinite values in pixels to use, or more materials than bands, than
+            distinct pixels or than the pixels hold above their noise.
+
+    >>> materials = np.array([[0.1, 0.2, 0.6, 0.7], [0.6, 0.5, 0.2, 0.1]])
+    >>> share = np.linspace(0, 1, 400)[:, None]
+    >>> cube = (share * materials[0] + (1 - share) * materials[1]).reshape(20, 20, 4)
+    >>> unmix_image(cube, 2).abundances.shape
+    (20, 20, 2)
+    """
+    used = _used_pixels(cube, mask)
+    spectra = torch.from_numpy(np.ascontiguousarray(cube[used], dtype=np.float32)).clamp(min=0)
+    peaks = spectra.amax(dim=1)
+    brightest = float(peaks.kthvalue(max(1, round(_LIT_QUANTILE * len(peaks)))).values)
+    brightest = brightest or float(peaks.max())
+    if not brightest > 0:
+        raise SpectrumError("the image is black: no pixel to use holds a value above 0")
+    pixels = spectra * (_LIT / brightest)
+    generator = torch.Generator().manual_seed(seed)
+    count, evidence = _proposed(pixels, generator) if endmembers == "auto" else (endmembers, "")
+    usable = usable_pixels(pixels, count, generator, _MOST_PIXELS)
+    _require_signal(usable, count)
+    found = pooled_search(usable, count, generator)
+    lit = as_lit_pixels(found.endmembers, usable)
+    compared = {"auto": comparable_brightness, "area": lambda bright: bright, "light": equal_peaks}[shares](
+        lit
+    )
+    amounts = nnls(pixels, compared)
+    order = _shares(amounts).sum(dim=0).argsort(descending=True)
+    own = _shares(amounts[:, order])
+    certain = _confidence(pixels, own, found, compared, order)
+    explained = amounts @ compared
+    cosines = torch.nn.functional.cosine_similarity(pixels, explained, dim=1)
+    is_lit = amounts.sum(dim=1) > 0
+    misfit = torch.where(is_lit, cosines.clamp(-1, 1).arccos(), 0.0)
+    return UnmixedImage(
+        (lit[order] * (brightest / _LIT)).numpy(),
+        _placed(own, used),
+        _placed(torch.where(is_lit, certain, 0.0), used),
+        _placed(misfit, used),
+        "area" if torch.equal(compared, lit) else "light",
+        evidence,
+    )
+
+
+def _used_pixels(cube: np.ndarray, mask: np.ndarray | None) -> Bool[np.ndarray, "H W"]:
+    if cube.ndim != 3 or cube.dtype.kind not in "iuf" or 0 in cube.shape:
+        raise SpectrumError(
+            f"an image to unmix is an array of rows, columns and bands of real numbers; found {cube.dtype} of shape "
+            f"{cube.shape}"
+        )
+    used = np.ones(cube.shape[:2], bool) if mask is None else np.asarray(mask)
+    if used.shape != cube.shape[:2] or used.dtype != bool:
+        raise SpectrumError(
+            f"the mask must be {cube.shape[0]} x {cube.shape[1]} of True and False; found {used.dtype} of shape "
+            f"{used.shape}"
+        )
+    if not used.any():
+        raise SpectrumError("the mask leaves no pixel to unmix")
+    broken = used & ~np.isfinite(cube).all(axis=-1)
+    if broken.any():
+        raise SpectrumError(
+            f"{int(broken.sum())} of {int(used.sum())} pixels hold NaN or infinite values; leave them out with a mask"
+        )
+    return used
+
+
+def _proposed(pixels: Float[Tensor, "N B"], generator: torch.Generator) -> tuple[int, str]:
+    """A number of materials, and why."""
+    informative = drop_uninformative_pixels(pixels)
+    if len(informative) == 0:
+        raise SpectrumError("no pixel is neither dark nor saturated: there is nothing to count materials by")
+    some = informative[torch.randperm(len(informative), generator=generator)[:_MOST_PIXELS]]
+    proposed = propose_num_materials(some, generator)
+    dimensions = proposed.signal_dimensions
+    if dimensions is None or proposed.number <= max(1, dimensions):
+        return proposed.number, proposed.evidence()
+    # Where most pixels mix more than two materials, pairs need more of them than there are.
+    return max(1, dimensions), f"{proposed.evidence()}\nso {dimensions} are taken: mixtures of two need more"
+
+
+def _require_signal(usable: Float[Tensor, "N B"], count: int) -> None:
+    """Refuse more materials than the pixels can tell apart: K of them, one among the others, span K - 1 dimensions."""
+    num_pixels, num_bands = usable.shape
+    if num_bands <= 2 or num_pixels <= num_bands:
+        return
+    dimensions = hysime(usable)
+    if count > dimensions + 1:
+        raise SpectrumError(
+            f"the pixels hold {counted(dimensions, 'dimension')} above their noise, by which at most {dimensions + 1} "
+            f"materials can be told apart; {count} were asked for; ask for at most {dimensions + 1}"
+        )
+
+
+def _shares(amounts: Float[Tensor, "N K"]) -> Float[Tensor, "N K"]:
+    return amounts / amounts.sum(dim=1, keepdim=True).clamp(min=1e-12)
+
+
+def _confidence(
+    pixels: Float[Tensor, "N B"],
+    own: Float[Tensor, "N K"],
+    found: PooledEndmembers,
+    compared: Float[Tensor, "K B"],
+    order: Tensor,
+) -> Float[Tensor, "N"]:
+    """Probability that the largest share is the largest in truth: of its margin, if the spread of the margin over the
+    best sets of endmembers is the margin's error."""
+    if own.shape[1] == 1:
+        return torch.ones(len(own))
+    largest = own.topk(2, dim=1)
+    margins = largest.values[:, 0] - largest.values[:, 1]
+    squares = torch.zeros_like(margins)
+    for other in found.others:
+        shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
+        first, second = shares.gather(1, largest.indices).unbind(1)
+        squares += (margins - first + second).square()
+    error = (squares / len(found.others) + _LEAST_MARGIN_ERROR**2).sqrt()
+    return torch.special.ndtr(margins / error)
+
+
+def _placed(values: Tensor, used: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W *rest"]:
+    """Values of the pixels in use in the image, 0 elsewhere."""
+    placed = np.zeros((*used.shape, *values.shape[1:]), np.float32)
+    placed[used] = values.numpy()
+    return placed
