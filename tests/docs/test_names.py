@@ -10,6 +10,7 @@ from tests.docs.pages import ROOT, text_of
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export, own_products
+from unmix_plugin.commands.image import image
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.commands.render import render
@@ -42,7 +43,7 @@ OF_LAUNCHERS = {
 @pytest.fixture(scope="module")
 def flags():
     """Every flag of every command."""
-    asked = [(command, ["--help"]) for command in (evaluate, render, view, write_demo_scene)]
+    asked = [(command, ["--help"]) for command in (evaluate, image, render, view, write_demo_scene)]
     asked += [(process, ["--help"]), (inspect_command, ["--help"])]
     asked += [
         (train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published", "neumatex")
