@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tests.products.ball_model import ALL_ROUND, ball_scene, seen_surface
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME, around
-from unmix_plugin.products.mesh import _TriangleMesh, _write_mesh
+from unmix_plugin.products.mesh import TriangleMesh, _write_mesh
 from unmix_plugin.products.point_cloud import _write_point_cloud
 from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.scenes.placement import Placement
@@ -55,7 +55,7 @@ def test_points_are_where_the_source_says(tmp_path):
 
 def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
-    mesh = _TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
+    mesh = TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
     ply, obj, _, glb = _write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR)
     expected = source_of(FRAME.to_world(mesh.vertices))
     assert_close(columns(ply), expected)

@@ -18,12 +18,13 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import (
+    TriangleMesh,
     _extract_mesh,
     _filled,
     _mesh_paths,
+    _not_empty,
     _require_sound,
     _surface_density,
-    _TriangleMesh,
     _trim_unseen,
     _without_stray_pieces,
     _write_mesh,
@@ -125,11 +126,11 @@ def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_st
     two_faces = two_faces + len(large) + len(middle)
     two_faces[0, 0] = len(large) - 1  # the last vertex of the large piece
     faces = np.concatenate([large_faces, middle_faces + len(large), two_faces])
-    kept = _without_stray_pieces(_TriangleMesh(vertices, faces))
+    kept = _without_stray_pieces(TriangleMesh(vertices, faces))
     assert len(kept.faces) == 120 + 20
     assert len(kept.vertices) == len(large) + len(middle)
-    assert len(_without_stray_pieces(_TriangleMesh(*ribbon(2, 0.0))).faces) == 2
-    empty = _TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    assert len(_without_stray_pieces(TriangleMesh(*ribbon(2, 0.0))).faces) == 2
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     assert len(_without_stray_pieces(empty).faces) == 0
 
 
@@ -206,10 +207,10 @@ def test_a_density_that_nothing_reaches_is_refused(densities):
         _extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
 
 
-def test_a_mesh_without_faces_is_not_written(tmp_path):
-    empty = _TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+def test_a_mesh_without_faces_is_refused():
+    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
-        _write_mesh(tmp_path, ("ply",), empty, SCENE, FRAME)
+        _not_empty(empty)
 
 
 @pytest.mark.parametrize(

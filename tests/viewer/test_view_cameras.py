@@ -11,6 +11,7 @@ from torch.testing import assert_close
 
 from tests.viewer.view_factory import ring, some_pose
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.view_cameras import (
     _checked_pose,
     _quaternion,
@@ -18,7 +19,6 @@ from unmix_plugin.viewer.view_cameras import (
     camera_of,
     path_poses,
     pose_of,
-    up_direction,
 )
 
 components = st.floats(-1, 1, allow_nan=False)

@@ -49,17 +49,17 @@ _LEAST_FACES = 8
 
 
 @dataclass(frozen=True)
-class _TriangleMesh:
+class TriangleMesh:
     """Triangles that are seen from the side on which their corners go round counter-clockwise."""
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
 
-    def select(self, chosen: Bool[np.ndarray, " F"]) -> _TriangleMesh:
+    def select(self, chosen: Bool[np.ndarray, " F"]) -> TriangleMesh:
         """Some of the faces, and the vertices that they have."""
         faces = self.faces[chosen]
         used, renumbered = np.unique(faces, return_inverse=True)
-        return _TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
+        return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
 
     @property
     def normals(self) -> Float[np.ndarray, "V 3"]:
@@ -90,7 +90,7 @@ def _extract_mesh(
     threshold: float,
     softness: float,
     pixel_size: float,
-) -> _TriangleMesh:
+) -> TriangleMesh:
     """Marching cubes where the density passes a threshold.
 
     The cubes go through the opacity of a pixel's length rather than the density itself, which differs by many orders
@@ -113,7 +113,7 @@ def _extract_mesh(
         )
     vertices, faces, _, _ = marching_cubes(opacities, level, gradient_direction="ascent")
     # The padding put the grid's first point at index 1.
-    return _TriangleMesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
+    return TriangleMesh((vertices.astype(np.float64) - 1) * grid.cell + grid.origin, faces.astype(np.int64))
 
 
 def _filled(
@@ -130,7 +130,7 @@ def _filled(
     return result
 
 
-def _trim_unseen(mesh: _TriangleMesh, surface: SeenSurface) -> _TriangleMesh:
+def _trim_unseen(mesh: TriangleMesh, surface: SeenSurface) -> TriangleMesh:
     """The parts of a mesh that the cameras see, with small gaps left whole."""
     seen = surface.shows(torch.from_numpy(mesh.vertices).float()).numpy()
     links = _links(mesh)
@@ -139,7 +139,7 @@ def _trim_unseen(mesh: _TriangleMesh, surface: SeenSurface) -> _TriangleMesh:
     return mesh.select(np.all(seen[mesh.faces], axis=1, keepdims=False))
 
 
-def _without_stray_pieces(mesh: _TriangleMesh) -> _TriangleMesh:
+def _without_stray_pieces(mesh: TriangleMesh) -> TriangleMesh:
     """The pieces of a mesh, each joined by common edges, that have a hundredth of the faces of the largest or more."""
     if len(mesh.faces) == 0:
         return mesh
@@ -158,7 +158,7 @@ def _without_stray_pieces(mesh: _TriangleMesh) -> _TriangleMesh:
     return mesh.select(np.asarray(sizes[piece[:count]] >= smallest))
 
 
-def _links(mesh: _TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
+def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, which is imported here only
     """Symmetric matrix (V, V) that is not 0 where an edge joins two vertices."""
     from scipy.sparse import coo_matrix
 
@@ -193,22 +193,49 @@ def export_mesh(
     """
     _require_sound(density, smoothing)
     job.claim(_mesh_paths(job.folder, formats))
-    scene, surface = job.scene, job.surface(_NUM_RAYS)
-    grid = GridPoints.over(scene.scene_box.aabb, resolution)
-    slices = job.follow("sampling the density", range(grid.shape[0]))
-    densities = np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices])
+    mesh, threshold = find_surface(job, resolution, density, smoothing, keeps_unseen)
     with job.working("making the mesh"):
-        ends = surface.points()
-        threshold = _surface_density(scene, ends) if density is None else density / job.frame.scale
-        solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
-        mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
-        mesh = _without_stray_pieces(mesh if keeps_unseen else _trim_unseen(mesh, surface))
-        written = _write_mesh(job.folder, formats, mesh, scene, job.frame)
+        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame)
     job.say(
         f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
         f"at a density of {threshold * job.frame.scale:.4g} per world unit"
     )
     return written
+
+
+def find_surface(
+    job: Job,
+    resolution: int,
+    density: float | None = None,
+    smoothing: float = 1.0,
+    keeps_unseen: bool = False,
+) -> tuple[TriangleMesh, float]:
+    """The surface in model space, and the density per model unit at which it lies; arguments as in `export_mesh`.
+
+    Raises:
+        ConfigError: nothing is as dense as was asked for.
+        RunError: no camera of the run sees a surface.
+    """
+    scene, surface = job.scene, job.surface(_NUM_RAYS)
+    grid = GridPoints.over(scene.scene_box.aabb, resolution)
+    slices = job.follow("sampling the density", range(grid.shape[0]))
+    densities = np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices])
+    with job.working("finding the surface"):
+        ends = surface.points()
+        threshold = _surface_density(scene, ends) if density is None else density / job.frame.scale
+        solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
+        mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
+        mesh = _without_stray_pieces(mesh if keeps_unseen else _trim_unseen(mesh, surface))
+    return _not_empty(mesh), threshold
+
+
+def _not_empty(mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh; a RunError where nothing is left of it."""
+    if len(mesh.faces) == 0:
+        raise RunError(
+            "nothing is left of the surface: no camera of the run sees it; keep it with --unseen keep"
+        )
+    return mesh
 
 
 def _mesh_paths(folder: Path, formats: Sequence[str]) -> list[Path]:
@@ -227,7 +254,7 @@ def _require_sound(density: float | None, smoothing: float) -> None:
 def _write_mesh(
     folder: Path,
     formats: Sequence[str],
-    mesh: _TriangleMesh,
+    mesh: TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
 ) -> list[Path]:
@@ -237,15 +264,11 @@ def _write_mesh(
     normals, colours (sRGB) and the material of each face. Large coordinates are float64 in PLY and OBJ; glTF has them
     less `offset` in the extras of its mesh.
     """
-    if len(mesh.faces) == 0:
-        raise RunError(
-            "nothing is left of the surface: no camera of the run sees it; keep it with --unseen keep"
-        )
     normals = mesh.normals
     positions = torch.from_numpy(mesh.vertices).float()
     seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
     looks = SurfaceAppearance(scene.materials, *seen)
-    world = _TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
+    world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
@@ -255,7 +278,7 @@ _WHAT = "surface of an unmix-nerf run"
 
 
 def _write_ply(
-    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     vertices = {
         **{name: mesh.vertices[:, axis] for axis, name in enumerate("xyz")},
@@ -266,7 +289,7 @@ def _write_ply(
 
 
 def _write_obj(
-    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     # The material that most corners of a face have, that of the first where all differ.
     corners = looks.material_ids.astype(np.int64)[mesh.faces]
@@ -285,7 +308,7 @@ def _write_obj(
 
 
 def _write_glb(
-    path: Path, mesh: _TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
 ) -> list[Path]:
     numbers = {"_MATERIAL": looks.material_ids.astype(np.float32)}
     for name, values in looks.properties().items():

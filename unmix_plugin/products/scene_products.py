@@ -117,6 +117,25 @@ class Metamerism(Product):
 
 
 @dataclass(frozen=True)
+class Page(Product):
+    """One HTML file to mail to others, page.html: the surface in 3-D in any band, light, abundance or index; a click
+    shows spectrum and mixture. It opens in a browser and needs no server, no network and no installation."""
+
+    name = "page"
+
+    title: str = ""
+    """Title of the page; the scene's name where none is given."""
+    resolution: int = 256
+    """Cells along the longest edge of the scene box; fewer where the page would exceed 20 MB."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Find the surface, look at every vertex, write the page."""
+        from unmix_plugin.products.page.page import export_page
+
+        return export_page(job, self.title, self.resolution)
+
+
+@dataclass(frozen=True)
 class Pca(Product):
     """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
     what red, green and blue stand for."""
@@ -256,6 +275,7 @@ PRODUCTS: tuple[Product, ...] = (
     Endmembers(),
     Mesh(),
     Metamerism(),
+    Page(),
     Pca(),
     PointCloud(),
     Poses(),

@@ -85,6 +85,19 @@ def resized_views(views: Sequence[RunView], size: tuple[int, int] | None = None)
     )
 
 
+def up_direction(cameras: Cameras) -> tuple[float, float, float]:
+    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is."""
+    mean = cameras.camera_to_world[:, :, 1].double().mean(dim=0)
+    length = float(mean.norm())
+    if length < 1e-3:
+        return (0.0, 0.0, 1.0)
+    up = (mean / length).cpu().numpy()
+    axis = int(np.abs(up).argmax())
+    if abs(up[axis]) > math.cos(math.radians(20)):
+        up = np.eye(3)[axis] * np.sign(up[axis])
+    return (float(up[0]), float(up[1]), float(up[2]))
+
+
 def _names(record: SceneRecord, split: str, count: int) -> list[str]:
     """Frame names, or `eval_000` where the data manager has noted none."""
     frames, indices = record.summary.get("frames"), record.summary.get(f"{split}_indices")

@@ -164,17 +164,23 @@ def _excess_px(
 
 
 @torch.no_grad()
+def look_at(
+    scene: TrainedScene, positions: Float[Tensor, "P 3"], directions: Float[Tensor, "P 3"]
+) -> Coefficients:
+    """What rays see that start a pixel's size before each point of a surface and go along these unit vectors."""
+    indices = torch.zeros(len(positions), dtype=torch.int64)
+    rays = RayBundle(positions - scene.pixel_size * directions, directions, indices).to(scene.device)
+    return scene.renderer.composite(scene.field, rays)
+
+
 def look_from_above(
     scene: TrainedScene, positions: Float[Tensor, "P 3"], normals: Float[Tensor, "P 3"]
 ) -> tuple[Float[Tensor, "P K"], Float[Tensor, "P B"]]:
     """Abundances, summing to 1, and diffuse spectra of points of a surface with these unit normals, seen from above."""
-    above = positions + scene.pixel_size * normals
-    indices = torch.zeros(len(above), dtype=torch.int64)
-    rays = RayBundle(above, -normals, indices).to(scene.device)
-    if len(rays) == 0:
+    if len(positions) == 0:
         return torch.zeros(0, len(scene.materials.names)), torch.zeros(0, len(scene.bands))
-    found = scene.renderer.composite(scene.field, rays)
-    abundances, scaled_abundances = _shares(found, torch.ones(len(above), dtype=torch.bool))
+    found = look_at(scene, positions, -normals)
+    abundances, scaled_abundances = _shares(found, torch.ones(len(positions), dtype=torch.bool))
     return abundances, scaled_abundances @ scene.materials.endmembers.detach().cpu()
 
 

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 import viser
 
 from unmix_plugin.editing import Recipe
+from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.access import ViewerOptions, free_port, start_notices
 from unmix_plugin.viewer.connections import LABEL, open_server, quiet, send_what_is_queued
 from unmix_plugin.viewer.gate import Gate
@@ -19,7 +20,7 @@ from unmix_plugin.viewer.page import failures_said, paragraph
 from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
-from unmix_plugin.viewer.view_cameras import point_ahead, pose_of, up_direction
+from unmix_plugin.viewer.view_cameras import point_ahead, pose_of
 
 _TICK_S = 0.5
 _UNWATCHED_S = 5

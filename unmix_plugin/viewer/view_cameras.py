@@ -112,19 +112,6 @@ def pose_of(camera: Cameras) -> ViewPose:
     )
 
 
-def up_direction(cameras: Cameras) -> tuple[float, float, float]:
-    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is."""
-    mean = cameras.camera_to_world[:, :, 1].double().mean(dim=0)
-    length = float(mean.norm())
-    if length < 1e-3:
-        return (0.0, 0.0, 1.0)
-    up = (mean / length).cpu().numpy()
-    axis = int(np.abs(up).argmax())
-    if abs(up[axis]) > math.cos(math.radians(20)):
-        up = np.eye(3)[axis] * np.sign(up[axis])
-    return (float(up[0]), float(up[1]), float(up[2]))
-
-
 def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
     """The point on the viewing axis that is nearest to the middle of the scene box, but in front of the camera."""
     place, forward = camera.camera_to_world[0, :, 3], -camera.camera_to_world[0, :, 2]

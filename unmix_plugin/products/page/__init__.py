@@ -1,0 +1,1 @@
+"""One HTML page that shows a run in 3-D, to mail to others."""

@@ -1,0 +1,332 @@
+"""One HTML page of a run, to mail to others: its surface in 3-D with spectra and mixtures, without a server.
+
+The page holds a mesh with the coefficients of every vertex, and the spectra that they are multiplied with; its script
+(page.js) makes every picture from both, as `trained/outputs.py` does from a rendered view. What depends on the
+direction of view, gloss, is a polynomial of second degree in that direction (nine spherical harmonics), fitted to what
+the training cameras see of each vertex.
+
+Notation: `V` vertices, `F` faces, `K` endmembers, `J` specular spectra, `B` bands.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, Int64, UInt8
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from unmix_plugin import __version__
+from unmix_plugin.editing.apply import relighting_factors
+from unmix_plugin.editing.recipe import Light
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.formats.files import write_file
+from unmix_plugin.products.mesh import TriangleMesh, find_surface
+from unmix_plugin.products.product import Job
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
+from unmix_plugin.spectral.library.material_library import measured_library
+from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
+from unmix_plugin.trained.run_views import RunView, cameras_of, directions_to_world, up_direction
+from unmix_plugin.trained.surface import look_at
+from unmix_plugin.trained.trained_scene import TrainedScene
+
+MOST_BYTES = 20_000_000
+"""Of a page: what mail takes, and a phone loads in seconds."""
+
+_COARSER = 0.75
+"""Part of the resolution that is tried next where a page would be too large."""
+
+_LIGHTS = ("D65", "D50", "A", "FL2", "FL11", "LED-B3")
+_MOST_CAMERAS = 200
+_CAMERAS = 16
+_LEAST_FACING = 0.15
+"""Cosine between normal and line of sight below which a camera tells little of a vertex."""
+_RIDGE = 0.05
+"""Weight of small harmonics beside the cameras' mean square error: few cameras don't make wild highlights."""
+_CHUNK = 1 << 17
+
+
+def export_page(job: Job, title: str, resolution: int) -> list[Path]:
+    """Find the surface, look at every vertex, and write `page.html`.
+
+    Args:
+        job: The run and where to write.
+        title: Of the page; empty: the scene's name.
+        resolution: Cells along the longest edge of the scene box; fewer where the page would exceed `MOST_BYTES`.
+    """
+    path = job.folder / "page.html"
+    job.claim([path])
+    while True:
+        mesh, _ = find_surface(job, resolution)
+        page = _page(job, mesh, title)
+        if len(page) <= MOST_BYTES:
+            break
+        coarser = int(resolution * _COARSER)
+        job.say(
+            f"a page of {len(mesh.faces)} triangles would have {len(page) / 1e6:.1f} MB, more than the "
+            f"{MOST_BYTES / 1e6:g} MB that a mail takes: made again with {coarser} cells along the longest edge"
+        )
+        resolution = coarser
+    job.say(f"{len(mesh.faces)} triangles, {len(page) / 1e6:.1f} MB")
+    return [write_file(path, page)]
+
+
+def _page(job: Job, mesh: TriangleMesh, title: str) -> bytes:
+    """The whole page."""
+    with job.working("looking at the surface's points"):
+        arrays, layout = _packed(_vertex_arrays(job.scene, mesh, job.frame))
+    root = job.loaded.record.summary.get("root")
+    name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
+    facts = {
+        "title": name,
+        "subtitle": f"{job.loaded.config.method_name}, run {job.loaded.folder.path.name}",
+        "made": f"unmix-nerf {__version__}, {datetime.now(timezone.utc):%Y-%m-%d}",
+        "arrays": layout,
+        **_spectral_facts(job.materials),
+        **_camera_facts(job.views("all"), cameras_of(job.scene.views, "train"), job.frame),
+    }
+    return _fill(facts, arrays, _pictures(job))
+
+
+def _spectral_facts(materials: Materials) -> dict[str, Any]:
+    """Spectra, lights and names."""
+    bands, power = materials.bands, None
+    endmembers = materials.endmembers.detach().cpu().double().numpy()
+    if materials.light is not None:
+        power = materials.light.cpu().double().numpy()
+    lights = [{"name": "as recorded", "factors": [1.0] * len(bands), "notes": []}]
+    for light in _LIGHTS:
+        try:
+            factors, notes = relighting_factors(bands, power, Light(light))
+        except SpectrumError:
+            continue  # it does not reach these bands: not offered
+        lights.append({"name": light, "factors": _rounded(factors), "notes": notes})
+    known = shown_matches(endmembers, bands, power, measured_library())
+    return {
+        "wavelengths_nm": _rounded(bands.centers_nm),
+        "edges_nm": _rounded(bands.edges_nm),
+        "names": list(materials.names),
+        "colours": _rounded(endmember_colours(materials)),
+        "endmembers": _rounded(endmembers),
+        "specular": _rounded(materials.specular_spectra.detach().cpu().double().numpy()),
+        "light": None if power is None else _rounded(power),
+        "rgb": _rounded(rgb_matrix(bands, torch.float64).numpy()),
+        "colour": describe_colour(bands),
+        "lights": lights,
+        "known": [
+            [f"{one.match.name} ({one.match.angle_rad:.3f} rad)" for one in matches] for matches in known
+        ],
+        "indices": [
+            {"name": name, "formula": NAMED_INDICES[name].formula, "title": NAMED_INDICES[name].title}
+            | {"range": NAMED_INDICES[name].usual_range}
+            for name in available_indices(bands)
+        ],
+        "colour_map": _viridis(),
+    }
+
+
+def _camera_facts(views: list[RunView], trained: Cameras, frame: Normalisation) -> dict[str, Any]:
+    """What is up, and where the cameras stand, in the world's axes."""
+    up = directions_to_world(frame, np.asarray(up_direction(trained)))
+    shown = views[:: -(-len(views) // _MOST_CAMERAS)]
+    cameras = []
+    for view in shown:
+        pose = view.camera.camera_to_world[0].double().cpu().numpy()
+        focal, centre = view.camera.focal_px[0].tolist(), view.camera.center_px[0].tolist()
+        cameras.append(
+            {
+                "name": view.name,
+                "position": frame.to_world(pose[None, :, 3])[0].tolist(),
+                "axes": directions_to_world(frame, pose[:, :3].T).tolist(),
+                "size": [view.camera.width, view.camera.height],
+                "focal_px": focal,
+                "centre_px": centre,
+            }
+        )
+    return {"up": _rounded(up), "cameras": cameras}
+
+
+def _vertex_arrays(
+    scene: TrainedScene, mesh: TriangleMesh, frame: Normalisation
+) -> dict[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]]:
+    """What the page knows of every vertex, and which three make a triangle.
+
+    The mixture is what is seen from straight above, as in other exports of surfaces; gloss is fitted to what the
+    training cameras in front of a vertex see.
+    """
+    positions = torch.from_numpy(mesh.vertices).float()
+    normals = torch.from_numpy(mesh.normals).float()
+    above = look_at(scene, positions, -normals).map(lambda packed: packed.cpu())
+    found = above.map(lambda packed: packed / packed[:, :1].clamp(min=1e-6))
+    tints = torch.zeros_like(above.specular)
+    fit = _GlossFit.empty(len(positions))
+    trained = [view.camera for view in scene.views if view.split == "train"]
+    for camera in trained[:: -(-len(trained) // _CAMERAS)]:
+        directions = normalize(camera.camera_to_world[0, :, 3].cpu() - positions, dim=1)
+        facing = ((directions * normals).sum(dim=1) > _LEAST_FACING).nonzero()[:, 0]
+        for part in facing.split(_CHUNK):
+            seen = look_at(scene, positions[part], -directions[part]).map(lambda packed: packed.cpu())
+            gloss = seen.specular / seen.accumulation.clamp(min=1e-6)[:, None]
+            tints[part] += gloss
+            along = torch.from_numpy(directions_to_world(frame, directions[part].numpy())).float()
+            fit.add(part, _harmonics(along), gloss.sum(dim=1))
+    arrays = {
+        "positions": frame.to_world(mesh.vertices),
+        "normals": directions_to_world(frame, mesh.normals),
+        "faces": mesh.faces,
+        "scaled": found.scaled_abundances.numpy(),
+        "abundances": found.abundances.numpy(),
+        "materials": scene.materials.to("cpu").ids(found),
+        "confidence": scene.materials.to("cpu").confidence(found).numpy(),
+    }
+    if len(scene.materials.specular_spectra):
+        arrays["gloss"] = fit.solve().numpy()
+        arrays["tints"] = (tints / tints.sum(dim=1, keepdim=True).clamp(min=1e-9)).numpy()
+    return arrays
+
+
+@dataclass(frozen=True)
+class _GlossFit:
+    """Least squares of each vertex: how much gloss is sent along a direction."""
+
+    squares: Float[Tensor, "V 9 9"]
+    products: Float[Tensor, "V 9"]
+
+    @staticmethod
+    def empty(count: int) -> _GlossFit:
+        """Nothing seen yet."""
+        return _GlossFit(_RIDGE * torch.eye(9).repeat(count, 1, 1), torch.zeros(count, 9))
+
+    def add(self, part: Int64[Tensor, " P"], basis: Float[Tensor, "P 9"], gloss: Float[Tensor, " P"]) -> None:
+        """What one camera sees of some of the vertices."""
+        self.squares[part] += basis[:, :, None] * basis[:, None, :]
+        self.products[part] += basis * gloss[:, None]
+
+    def solve(self) -> Float[Tensor, "V 9"]:
+        """The nine coefficients."""
+        return torch.linalg.solve(self.squares, self.products[..., None])[..., 0]
+
+
+def _harmonics(directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V 9"]:
+    """The polynomials of second degree on the sphere, as page.js has them; not normalised but for similar size."""
+    x, y, z = directions.unbind(-1)
+    one = torch.ones_like(x)
+    return torch.stack([one, x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], dim=-1)
+
+
+def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
+    """All arrays as one text (base64 of gzip), and for each where it lies and how its numbers are got back.
+
+    Positions have 16 bits over their box; shares and brightness 8 bits of their square root, as an eye sees them; each
+    corner of a triangle is stored as its difference from the one before.
+    """
+    positions, faces = arrays.pop("positions"), arrays.pop("faces")
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    extent = float((high - low).max())
+    parts: dict[str, tuple[np.ndarray, dict[str, Any]]] = {
+        "positions": (
+            np.round((positions - low) / extent * 65535).astype("<u2"),
+            {"scale": extent / 65535, "offset": low.tolist()},
+        ),
+        "faces": (np.diff(faces.reshape(-1), prepend=0).astype("<i4"), {}),
+        "normals": (np.round(arrays.pop("normals") * 127).astype("i1"), {"scale": 1 / 127}),
+        "materials": (np.asarray(arrays.pop("materials")).astype("u1"), {"scale": 1}),
+    }
+    if "gloss" in arrays:
+        gloss = arrays.pop("gloss")
+        largest = np.maximum(np.abs(gloss).max(axis=0), 1e-9)
+        # A few vertices have far more gloss than all others: 16 bits serve both.
+        parts["gloss"] = (
+            np.round(gloss / largest * 32767).astype("<i2"),
+            {"scales": (largest / 32767).tolist()},
+        )
+    for name, values in arrays.items():
+        largest = max(float(values.max()), 1e-9)
+        parts[name] = (_roots(values / largest), {"scale": largest / 255**2, "is_root": True})
+    layout, content = {}, io.BytesIO()
+    for name, (values, how) in parts.items():
+        width = values.shape[1] if values.ndim > 1 and name != "faces" else 1
+        content.write(b"\0" * (-content.tell() % 4))
+        layout[name] = {
+            "start": content.tell(),
+            "count": values.size,
+            "type": values.dtype.str[-2:],
+            "width": width,
+        } | how
+        content.write(np.ascontiguousarray(values).tobytes())
+    return base64.b64encode(gzip.compress(content.getvalue(), 6, mtime=0)).decode(), layout
+
+
+def _roots(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
+    return np.round(255 * np.sqrt(np.clip(values, 0, 1))).astype(np.uint8)
+
+
+def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
+    return json.loads(
+        json.dumps(np.asarray(values).tolist()), parse_float=lambda text: float(f"{float(text):.6g}")
+    )
+
+
+def _viridis() -> list[list[int]]:
+    from matplotlib import colormaps
+
+    return np.round(255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(int).tolist()
+
+
+def _pictures(job: Job) -> list[dict[str, str]]:
+    """Two pictures for browsers that can't draw in 3-D."""
+    from PIL import Image
+
+    from unmix_plugin.products.segmentation import paint_ids
+
+    view = job.views("eval")[0] if job.views("eval") else job.views("all")[0]
+    seen = job.scene.look(view.camera)
+    ids = seen["segmentation"].cpu().numpy()
+    shown = {
+        f"{view.name} in colour": np.round(255 * seen["rgb"].cpu().numpy()).astype(np.uint8),
+        f"{view.name}, materials": np.round(
+            255 * paint_ids(ids, dict(enumerate(endmember_colours(job.materials))))
+        ).astype(np.uint8),
+    }
+    pictures = []
+    for caption, pixels in shown.items():
+        content = io.BytesIO()
+        Image.fromarray(pixels).convert("RGB").save(content, format="JPEG", quality=85)
+        pictures.append({"caption": caption, "data": base64.b64encode(content.getvalue()).decode()})
+    return pictures
+
+
+def _fill(facts: dict[str, Any], arrays: str, pictures: list[dict[str, str]]) -> bytes:
+    """The template with scripts and data in it; nothing of the data can end its element."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    try:
+        loader = PackageLoader("unmix_plugin.products.page", ".")
+        environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+        script = (Path(__file__).parent / "page.js").read_text(encoding="utf-8")
+        library = (Path(__file__).parent / "three.js").read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"the installation lacks the page's scripts ({error}); install unmix-nerf again"
+        ) from error
+    text = json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    return (
+        environment.get_template("page.html")
+        .render(
+            facts=text, arrays=arrays, pictures=pictures, script=script, library=library, title=facts["title"]
+        )
+        .encode()
+    )
