@@ -16,18 +16,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
 from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import (
     GridPoints,
     SeenSurface,
     SurfaceAppearance,
     SurfacePoints,
+    look_at,
     look_from_above,
     may_be_solid,
     sample_densities,
@@ -37,6 +39,11 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _END_QUANTILE = 0.07
 """Rays end inside what they hit: this part of them where the density is still lower than at the surface."""
+
+_MOST_MOVED = 3.0
+"""Pixels that a vertex is moved at most: deeper, a ray from above went through a hole."""
+_RINGS = 3
+"""Neighbours over which the way that vertices are moved is smoothed."""
 
 _HEALED_RINGS = 3
 """Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
@@ -60,6 +67,15 @@ class TriangleMesh:
         faces = self.faces[chosen]
         used, renumbered = np.unique(faces, return_inverse=True)
         return TriangleMesh(self.vertices[used], renumbered.reshape(faces.shape))
+
+    def smoothed(self, values: Float[np.ndarray, " V"], rings: int) -> Float64[np.ndarray, " V"]:
+        """Numbers of vertices, each replaced as often as `rings` by the mean of itself and its neighbours."""
+        links = _links(self)
+        links.data[:] = 1.0  # an edge counts once, however many faces have it
+        counts = 1 + np.asarray(links.sum(axis=1)).ravel()
+        for _ in range(rings):
+            values = (values + links @ values) / counts
+        return values.astype(np.float64)
 
     @property
     def normals(self) -> Float[np.ndarray, "V 3"]:
@@ -168,6 +184,21 @@ def _links(mesh: TriangleMesh):  # noqa: ANN202 - a sparse matrix of scipy, whic
     return coo_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
 
 
+@torch.no_grad()
+def _where_rays_end(scene: TrainedScene, mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh with its vertices moved along their normals to where rays from above end on average.
+
+    A surface of equal density lies up to a pixel before that, and seen aslant what is on it would be beside its place.
+    """
+    normals = mesh.normals
+    positions, along = (torch.from_numpy(values).float() for values in (mesh.vertices, -normals))
+    found = look_at(scene, positions, along)
+    depths = (found.ray_distance - scene.pixel_size) * (found.accumulation > OCCUPIED_ACCUMULATION)
+    most = _MOST_MOVED * scene.pixel_size
+    moved = mesh.smoothed(depths.clamp(-most, most).double().cpu().numpy(), _RINGS)
+    return TriangleMesh(mesh.vertices - moved[:, None] * normals, mesh.faces)
+
+
 _MOST_SMOOTHING = 8.0
 _NUM_RAYS = 300_000
 """Rays that tell what of the surface is seen."""
@@ -225,6 +256,8 @@ def find_surface(
         threshold = _surface_density(scene, ends) if density is None else density / job.frame.scale
         solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
         mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
+        if density is None:
+            mesh = _where_rays_end(scene, mesh)
         mesh = _without_stray_pieces(mesh if keeps_unseen else _trim_unseen(mesh, surface))
     return _not_empty(mesh), threshold
 

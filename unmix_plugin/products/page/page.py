@@ -70,7 +70,7 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
     path = job.folder / "page.html"
     job.claim([path])
     while True:
-        mesh, _ = find_surface(job, resolution)
+        mesh = find_surface(job, resolution)[0]
         page = _page(job, mesh, title)
         if len(page) <= MOST_BYTES:
             break

@@ -1,0 +1,168 @@
+"""The exported page in a real browser: its layers against renders of the same cameras, its probe, its layout."""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import binary_erosion
+from skimage.color import deltaE_ciede2000, rgb2lab
+
+from tests.commands.browser import CHROMIUM, FLAGS
+from tests.commands.running import run
+from unmix_plugin.commands.export import export
+from unmix_plugin.commands.train import train
+from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.trained.open_run import open_run
+
+HAS_BROWSER = CHROMIUM is not None and importlib.util.find_spec("playwright") is not None
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not HAS_BROWSER, reason="needs the package playwright and the program chromium"),
+]
+
+SIDE = 256
+NAME = '<b>matt</b> & "bright"</script>'
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A trained run and its page, with markup in its title."""
+    folder = tmp_path_factory.mktemp("page")
+    make_demo_scene(folder / "scene", 96, 32, 8)
+    given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 400]
+    ended = run(train, "unmix-nerf", *given, "--pipeline.model.num-endmembers=5")
+    assert ended.status == 0, ended.err
+    path = ended.last_line.removeprefix("run: ")
+    ended = run(export, "page", "--run", path, "--output", folder, "--title", NAME, "--resolution=128")
+    assert ended.status == 0, ended.err
+    return open_run(path), folder / "page.html"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as session:
+        flags = [flag for flag in FLAGS if flag not in ("--headless", "--disable-gpu")]
+        software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        found = session.chromium.launch(executable_path=CHROMIUM, args=[*flags, *software])
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def opened(exported, browser, request):
+    """The page from its file, without a network, in a window of the size asked for."""
+    width, height = getattr(request, "param", (SIDE, SIDE))
+    context = browser.new_context(viewport={"width": width, "height": height}, offline=True)
+    page = context.new_page()
+    said = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on(
+        "request",
+        lambda asked: (
+            said.append(asked.url) if not asked.url.startswith(("file:", "blob:", "data:")) else None
+        ),
+    )
+    page.goto(exported[1].as_uri())
+    page.wait_for_function("window.unmixPage")
+    yield page
+    assert said == []
+    context.close()
+
+
+def picture(page, layer):
+    """What the canvas shows of a layer, sRGB in [0, 1]."""
+    page.evaluate(f"unmixPage.choose('{layer}')")
+    url = page.evaluate("(unmixPage.draw(), document.querySelector('canvas').toDataURL())")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")) / 255
+
+
+def test_layers_match_renders_of_the_same_camera(exported, opened):
+    scene, _ = exported
+    view = scene.views[-1]
+    opened.evaluate(
+        f"unmixPage.lookThrough(unmixPage.facts.cameras.findIndex((one) => one.name === '{view.name}'))"
+    )
+    rendered = scene.look(view.camera.resized(SIDE, SIDE))
+    inside = binary_erosion(rendered.opacity.numpy() > 0.97, iterations=4)
+    band = f"band:{scene.bands.centers_nm[len(scene.bands) // 2]}nm"
+    grey = np.repeat(rendered[band].numpy()[..., None], 3, axis=-1)
+    expected = {"colour": rendered["rgb"].numpy(), "band": srgb(grey)}
+    for layer, truth in expected.items():
+        off = deltaE_ciede2000(rgb2lab(truth), rgb2lab(picture(opened, layer)))[inside]
+        assert np.median(off) < 3, (layer, np.median(off))
+
+
+def srgb(linear):
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def test_all_layers_differ(opened):
+    layers = opened.evaluate("[...document.querySelectorAll('#layer option')].map((one) => one.value)")
+    opened.evaluate("unmixPage.state.formula = 'r650/r550'")
+    shown = [picture(opened, layer) for layer in layers]
+    assert len(layers) == 7
+    for index, one in enumerate(shown):
+        assert all(np.abs(one - other).mean() > 0.004 for other in shown[:index]), layers[index]
+
+
+def test_a_click_gives_the_spectrum_that_the_scene_has_there(exported, opened):
+    scene, _ = exported
+    view = scene.views[-1]
+    opened.evaluate(
+        f"unmixPage.lookThrough(unmixPage.facts.cameras.findIndex((one) => one.name === '{view.name}'))"
+    )
+    opened.evaluate("unmixPage.draw()")
+    camera, angles = view.camera.resized(SIDE, SIDE), []
+    for column in range(40, SIDE, 24):
+        for row in range(40, SIDE, 24):
+            probe, found = scene.probe(camera, column, row), None
+            if probe.opacity > 0.97:
+                found = opened.evaluate(f"unmixPage.pick({column + 0.5}, {row + 0.5})?.spectrum")
+            if found:
+                angles.append(angle(np.array(found), probe.values["predicted"]))
+    assert len(angles) > 10
+    assert np.median(angles) < 0.03
+
+
+def angle(a, b):
+    return np.arccos(np.clip(a @ b / np.linalg.norm(a) / np.linalg.norm(b), -1, 1))
+
+
+def test_names_are_text_and_points_are_saved(opened):
+    opened.set_viewport_size({"width": 1000, "height": 700})
+    opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+    opened.mouse.click(325, 350)
+    opened.wait_for_selector("#points svg")
+    assert opened.inner_text("#head h1") == NAME
+    assert opened.title() == NAME
+    lines = opened.evaluate("unmixPage.csvText()").splitlines()
+    assert lines[0] == "quantity,point 1"
+    assert len(lines) == 1 + 3 + 5 + 8
+    opened.evaluate("unmixPage.state.formula = 'r650 +'")
+    opened.evaluate("unmixPage.choose('index')")
+    assert "the formula ends too early" in opened.inner_text("#about")
+
+
+@pytest.mark.parametrize("opened", [(1440, 900), (390, 844)], indirect=True)
+def test_the_object_is_not_under_the_panel(opened):
+    opened.wait_for_timeout(300)
+    box = opened.locator("#panel").bounding_box()
+    size = opened.viewport_size
+    free = (0, box["x"]) if size["width"] > 700 else (0, size["width"])
+    url = opened.evaluate("(unmixPage.draw(), document.querySelector('canvas').toDataURL())")
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")).astype(
+        int
+    )
+    columns = np.abs(pixels - pixels[2, 2]).max(axis=(0, 2)) > 12
+    taken = np.flatnonzero(columns)
+    assert free[0] < taken[0] < taken[-1] < free[1]
+    assert opened.evaluate("document.documentElement.scrollWidth") <= size["width"]
