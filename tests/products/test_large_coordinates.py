@@ -56,7 +56,7 @@ def test_points_are_where_the_source_says(tmp_path):
 def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
     mesh = TriangleMesh(np.array(ball.vertices), np.array(ball.faces))
-    ply, obj, _, glb = _write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR)
+    ply, obj, _, glb = _write_mesh(tmp_path, ("ply", "obj", "glb"), mesh, SCENE, FAR, up="z")
     expected = source_of(FRAME.to_world(mesh.vertices))
     assert_close(columns(ply), expected)
     lines = [line.split()[1:4] for line in obj.read_text().splitlines() if line.startswith("v ")]

@@ -29,6 +29,7 @@ from unmix_plugin.products.mesh import (
     _without_stray_pieces,
     _write_mesh,
 )
+from unmix_plugin.trained.run_views import world_up
 from unmix_plugin.trained.surface import GridPoints, sample_slice
 
 SCENE = ball_scene()
@@ -164,7 +165,7 @@ def test_the_surface_lies_at_the_density_where_rays_end(seen_all_round):
 @pytest.fixture(scope="module")
 def files(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
-    written = _write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME)
+    written = _write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME, up="z")
     assert written == _mesh_paths(folder, ("ply", "obj", "glb"))
     return {path.suffix: path for path in written}
 
@@ -200,6 +201,16 @@ def test_vertices_have_the_material_of_their_half(files):
     height = FRAME.to_model(world)[:, 2]
     assert (vertices["material"][height > 0.05] == 0).all()
     assert (vertices["material"][height < -0.05] == 1).all()
+
+
+def test_up_is_y_in_glb_unless_asked_otherwise(files, outside, tmp_path):
+    up = world_up(SCENE.views, FRAME)
+    _write_mesh(tmp_path, ("glb",), outside, SCENE, FRAME)
+    turned, as_is = loaded_mesh(tmp_path / "mesh.glb"), loaded_mesh(files[".glb"])
+    np.testing.assert_allclose(turned.vertices[:, 1], as_is.vertices @ up, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(turned.vertices, axis=1), np.linalg.norm(as_is.vertices, axis=1), atol=1e-5
+    )
 
 
 def test_a_density_that_nothing_reaches_is_refused(densities):

@@ -33,6 +33,7 @@ _TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "i
 _FLOAT, _UNSIGNED_INT = 5126, 5125
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+_POINTS = 0
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 _READ_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 _READ_TYPES |= {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"}
@@ -190,6 +191,7 @@ def write_glb(
     faces: Int[np.ndarray, "F 3"],
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
+    up: Sequence[float] = (0.0, 1.0, 0.0),
 ) -> Path:
     """Write a mesh in colours of its vertices.
 
@@ -201,10 +203,86 @@ def write_glb(
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
+        up: The direction that is up; its node turns it to +y, as glTF prescribes.
     """
     material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
     attributes = {"POSITION": positions, "NORMAL": normals, "COLOR_0": linear_rgb, **numbers}
-    return _write_mesh(path, attributes, faces, material, {}, extras)
+    return _write_glb(path, attributes, faces, material, {}, extras, up)
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Gaussians: ellipsoids of matter that fades from their centres."""
+
+    positions: Float32[np.ndarray, "P 3"]
+    rotations: Float32[np.ndarray, "P 4"]
+    """Unit quaternions x, y, z, w from an ellipsoid's axes to those of the world."""
+    scales: Float32[np.ndarray, "P 3"]
+    """Standard deviation along each axis."""
+    srgb: Float32[np.ndarray, "P 3"]
+    """[0, 1]."""
+    opacity: float
+    """At every centre, (0, 1)."""
+
+    @property
+    def constant_harmonics(self) -> Float32[np.ndarray, "P 3"]:
+        """The colour as coefficients of the harmonic of degree 0."""
+        return ((self.srgb - 0.5) / _HARMONIC_0).astype(np.float32)
+
+
+_HARMONIC_0 = 0.28209479177387814
+"""sqrt(1 / (4 pi)): the spherical harmonic of degree 0."""
+
+
+def write_splats_glb(
+    path: Path,
+    splats: Splats,
+    numbers: Mapping[str, np.ndarray],
+    extras: Mapping[str, Any],
+    up: Sequence[float],
+) -> Path:
+    """Write Gaussians as points of a GLB, with their colours for programs that know points only.
+
+    Args:
+        path: File; its folder is made.
+        splats: What to write.
+        numbers: More of each Gaussian, (P,) float32, by a name that starts with `_`.
+        extras: What else the file says, as JSON has it.
+        up: The direction that is up; the node turns it to +y.
+    Source:
+        Khronos Group, KHR_gaussian_splatting.
+    """
+    own = "KHR_gaussian_splatting"
+    opacity = np.full(len(splats.positions), splats.opacity, dtype=np.float32)
+    linear = np.where(splats.srgb <= 0.04045, splats.srgb / 12.92, ((splats.srgb + 0.055) / 1.055) ** 2.4)
+    attributes = {
+        "POSITION": splats.positions,
+        "COLOR_0": np.concatenate([linear, opacity[:, None]], axis=1),
+        f"{own}:ROTATION": splats.rotations,
+        f"{own}:SCALE": splats.scales,
+        f"{own}:OPACITY": opacity,
+        f"{own}:SH_DEGREE_0_COEF_0": splats.constant_harmonics,
+        **numbers,
+    }
+    how = {own: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    return _write_glb(path, attributes, None, None, {}, extras, up, how)
+
+
+def write_splats_ply(
+    path: Path, splats: Splats, numbers: Mapping[str, np.ndarray], comments: Sequence[str]
+) -> Path:
+    """Write Gaussians with the property names of the authors' own program (Kerbl et al. 2023), which viewers read:
+    logarithms of scales, the logit of the opacity, quaternions w first; `numbers` (P,) come after them."""
+    logit = np.full(len(splats.positions), np.log(splats.opacity / (1 - splats.opacity)), dtype=np.float32)
+    vertices = {
+        **{name: splats.positions[:, axis] for axis, name in enumerate("xyz")},
+        **{f"f_dc_{axis}": splats.constant_harmonics[:, axis] for axis in range(3)},
+        "opacity": logit,
+        **{f"scale_{axis}": np.log(splats.scales[:, axis]) for axis in range(3)},
+        **{f"rot_{index}": splats.rotations[:, axis] for index, axis in enumerate((3, 0, 1, 2))},
+        **numbers,
+    }
+    return write_ply(path, vertices, comments=comments)
 
 
 def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]) -> Path:
@@ -229,18 +307,20 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
     }
     attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals, "TEXCOORD_0": mesh.uv}
     pictures = {"base_colour": mesh.base_colour_png, "metallic_roughness": mesh.metallic_roughness_png}
-    return _write_mesh(path, attributes, mesh.faces, material, pictures, extras)
+    return _write_glb(path, attributes, mesh.faces, material, pictures, extras)
 
 
-def _write_mesh(
+def _write_glb(
     path: Path,
     attributes: Mapping[str, np.ndarray],
-    faces: Int[np.ndarray, "F 3"],
-    material: Mapping[str, Any],
+    faces: Int[np.ndarray, "F 3"] | None,
+    material: Mapping[str, Any] | None,
     pictures: Mapping[str, bytes],
     extras: Mapping[str, Any],
+    up: Sequence[float] = (0.0, 1.0, 0.0),
+    extensions: Mapping[str, Any] | None = None,
 ) -> Path:
-    """A file of one mesh in one material: attributes of vertices, faces and pictures in one buffer."""
+    """A file of one mesh in one material, or of points: attributes, faces and pictures in one buffer."""
     data, views, accessors = bytearray(), [], []
 
     def add(content: bytes, **view: int) -> int:
@@ -259,10 +339,19 @@ def _write_mesh(
         if name == "POSITION" and len(values):
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         accessors.append(accessor)
-    view = add(faces.astype("<u4").tobytes(), target=_INDEX_BUFFER)
-    accessors.append(
-        {"bufferView": view, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"}
-    )
+    primitive: dict[str, Any] = {"attributes": {name: index for index, name in enumerate(attributes)}}
+    if faces is None:
+        primitive["mode"] = _POINTS
+    else:
+        primitive["indices"] = len(accessors)
+        view = add(faces.astype("<u4").tobytes(), target=_INDEX_BUFFER)
+        accessors.append(
+            {"bufferView": view, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"}
+        )
+    if material is not None:
+        primitive["material"] = 0
+    if extensions:
+        primitive["extensions"] = dict(extensions)
     images = [
         {"name": name, "mimeType": "image/png", "bufferView": add(content)}
         for name, content in pictures.items()
@@ -273,15 +362,14 @@ def _write_mesh(
         "samplers": [sampler],
         "images": images,
     }
-    indices = {name: index for index, name in enumerate(attributes)}
-    primitive = {"attributes": indices, "indices": len(accessors) - 1, "material": 0}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface"}],
+        "nodes": [{"mesh": 0, "name": "surface", "rotation": _turn_to_y(up)}],
         "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
-        "materials": [material],
+        **({} if material is None else {"materials": [material]}),
+        **({"extensionsUsed": list(extensions)} if extensions else {}),
         **(textures if images else {}),
         "accessors": accessors,
         "bufferViews": views,
@@ -292,3 +380,12 @@ def _write_mesh(
     chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
     chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data
     return write_file(path, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+
+
+def _turn_to_y(up: Sequence[float]) -> list[float]:
+    """Unit quaternion x, y, z, w of the least turn that takes a direction to +y."""
+    x, y, z = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    if y < -1 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]
+    quaternion = np.array([-z, 0.0, x, 1 + y])  # up cross y, and 1 + their cosine
+    return (quaternion / np.linalg.norm(quaternion)).tolist()

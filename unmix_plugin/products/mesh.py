@@ -12,7 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_p
 from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
-from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import (
     GridPoints,
     SeenSurface,
@@ -211,6 +213,7 @@ def export_mesh(
     density: float | None,
     smoothing: float,
     keeps_unseen: bool,
+    up: Literal["y", "z"] = "y",
 ) -> list[Path]:
     """Sample the density, march through it, trim and colour the surface.
 
@@ -221,12 +224,13 @@ def export_mesh(
         density: Per world unit at which the surface lies; None: that at which rays end.
         smoothing: Standard deviation of the blur, cells.
         keeps_unseen: Whether surfaces that no camera sees stay.
+        up: What is up in GLB; `z` turns nothing.
     """
     _require_sound(density, smoothing)
     job.claim(_mesh_paths(job.folder, formats))
     mesh, threshold = find_surface(job, resolution, density, smoothing, keeps_unseen)
     with job.working("making the mesh"):
-        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame)
+        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, up)
     job.say(
         f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
         f"at a density of {threshold * job.frame.scale:.4g} per world unit"
@@ -290,6 +294,7 @@ def _write_mesh(
     mesh: TriangleMesh,
     scene: TrainedScene,
     frame: Normalisation,
+    up: Literal["y", "z"] = "y",
 ) -> list[Path]:
     """Write a mesh with the colour, material and abundances of each vertex, seen from straight above it.
 
@@ -303,7 +308,8 @@ def _write_mesh(
     looks = SurfaceAppearance(scene.materials, *seen)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
-    writers = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}
+    glb = partial(_write_glb, up=world_up(scene.views, frame) if up == "y" else (0.0, 1.0, 0.0))
+    writers = {"ply": _write_ply, "obj": _write_obj, "glb": glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
 
 
@@ -341,19 +347,30 @@ def _write_obj(
 
 
 def _write_glb(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path,
+    mesh: TriangleMesh,
+    normals: Float32[np.ndarray, "V 3"],
+    looks: SurfaceAppearance,
+    up: Sequence[float],
 ) -> list[Path]:
+    positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
+    return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras, up)]
+
+
+def gltf_content(
+    mesh: TriangleMesh, looks: SurfaceAppearance, what: str
+) -> tuple[Float32[np.ndarray, "V 3"], dict[str, np.ndarray], dict[str, Any]]:
+    """Positions as float32, which glTF has alone; numbers of vertices under names that it allows; extras."""
     numbers = {"_MATERIAL": looks.material_ids.astype(np.float32)}
     for name, values in looks.properties().items():
         if name.startswith("abundance_"):
             numbers[f"_{name.upper()}"] = values
-    extras = {"materials": list(looks.materials.names), "about": looks.comments(_WHAT)[:2]}
+    extras: dict[str, Any] = {"materials": list(looks.materials.names), "about": looks.comments(what)[:2]}
     vertices = mesh.vertices
-    if vertices.dtype == np.float64:  # glTF has float32 only
+    if vertices.dtype == np.float64:
         extras["offset"] = np.round(vertices.mean(axis=0)).tolist()
         vertices = vertices - extras["offset"]
-    positions = vertices.astype(np.float32)
-    return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras)]
+    return vertices.astype(np.float32), numbers, extras
 
 
 def _paths(folder: Path, kind: str) -> list[Path]:

@@ -76,6 +76,8 @@ class Mesh(Product):
     """Blur before the surface is looked for: standard deviation in cells, 0 for none."""
     unseen: Literal["drop", "keep"] = "drop"
     """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
+    up: Literal["y", "z"] = "y"
+    """What is up in GLB: y, as glTF prescribes and its viewers expect, or z: turned by nothing."""
 
     def write(self, job: Job) -> list[Path]:
         """Sample the density, march through it, trim and colour the surface."""
@@ -88,6 +90,7 @@ class Mesh(Product):
             self.density,
             self.smoothing,
             self.unseen == "keep",
+            self.up,
         )
 
 
@@ -253,6 +256,27 @@ class Spectrum(Product):
 
 
 @dataclass(frozen=True)
+class Splats(Product):
+    """The surface as Gaussians for splat viewers: splats.glb (KHR_gaussian_splatting) and splats.ply, one flat Gaussian
+    for each piece of the surface, in the colour that cameras see, with its material and every abundance."""
+
+    name = "splats"
+
+    formats: tuple[Literal["glb", "ply"], ...] = ("glb", "ply")
+    """glb (up is +y), ply (up is -y, as viewers of splats expect)."""
+    resolution: int = 256
+    """Pieces along the longest edge of the scene box."""
+    up: Literal["y", "z"] = "y"
+    """z: coordinates stay those of the scene's world."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Find the surface and make a Gaussian of each of its vertices."""
+        from unmix_plugin.products.splats import export_splats
+
+        return export_splats(job, self.formats, self.resolution, self.up)
+
+
+@dataclass(frozen=True)
 class Volume(Product):
     """Density and abundances on a regular grid: volume.npz with `density` (X, Y, Z), per world unit, `abundances`
     (X, Y, Z, K), the matrix `index_to_world`, and names and spectra of the endmembers."""
@@ -282,6 +306,7 @@ PRODUCTS: tuple[Product, ...] = (
     Report(),
     Segmentation(),
     Spectrum(),
+    Splats(),
     Volume(),
 )
 """All that scenes of mixed materials have, with the defaults of its options."""

@@ -98,6 +98,12 @@ def up_direction(cameras: Cameras) -> tuple[float, float, float]:
     return (float(up[0]), float(up[1]), float(up[2]))
 
 
+def world_up(views: Sequence[RunView], frame: Normalisation) -> Float64[np.ndarray, "3"]:
+    """What is up in the world of the scene, a unit vector, from its training views."""
+    up = np.asarray(up_direction(cameras_of(views, "train")), dtype=np.float64)
+    return directions_to_world(frame, up)
+
+
 def _names(record: SceneRecord, split: str, count: int) -> list[str]:
     """Frame names, or `eval_000` where the data manager has noted none."""
     frames, indices = record.summary.get("frames"), record.summary.get(f"{split}_indices")

@@ -28,7 +28,6 @@ from torch.nn.functional import normalize
 from unmix_plugin import __version__
 from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.editing.recipe import Light
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.mesh import TriangleMesh, find_surface
@@ -39,7 +38,7 @@ from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
-from unmix_plugin.trained.run_views import RunView, cameras_of, directions_to_world, up_direction
+from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -96,7 +95,8 @@ def _page(job: Job, mesh: TriangleMesh, title: str) -> bytes:
         "made": f"unmix-nerf {__version__}, {datetime.now(timezone.utc):%Y-%m-%d}",
         "arrays": layout,
         **_spectral_facts(job.materials),
-        **_camera_facts(job.views("all"), cameras_of(job.scene.views, "train"), job.frame),
+        "up": _rounded(world_up(job.scene.views, job.frame)),
+        "cameras": _camera_facts(job.views("all"), job.frame),
     }
     return _fill(facts, arrays, _pictures(job))
 
@@ -138,9 +138,8 @@ def _spectral_facts(materials: Materials) -> dict[str, Any]:
     }
 
 
-def _camera_facts(views: list[RunView], trained: Cameras, frame: Normalisation) -> dict[str, Any]:
-    """What is up, and where the cameras stand, in the world's axes."""
-    up = directions_to_world(frame, np.asarray(up_direction(trained)))
+def _camera_facts(views: list[RunView], frame: Normalisation) -> list[dict[str, Any]]:
+    """Where the cameras stand, in the world's axes."""
     shown = views[:: -(-len(views) // _MOST_CAMERAS)]
     cameras = []
     for view in shown:
@@ -156,7 +155,7 @@ def _camera_facts(views: list[RunView], trained: Cameras, frame: Normalisation) 
                 "centre_px": centre,
             }
         )
-    return {"up": _rounded(up), "cameras": cameras}
+    return cameras
 
 
 def _vertex_arrays(

@@ -1,0 +1,112 @@
+"""The surface as Gaussians, for viewers of splats: nothing is fitted, each vertex of the exported surface becomes one.
+
+A Gaussian is flat along the surface, a tenth as thick as it is wide, and so wide that neighbours overlap without a gap:
+its standard deviation is the edge of the square that has the vertex's share of the area.
+
+Notation: `V` vertices, one Gaussian each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Float64
+
+from unmix_plugin.formats.meshes import Splats, write_splats_glb, write_splats_ply
+from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content
+from unmix_plugin.products.product import Job
+from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.trained.run_views import directions_to_world, world_up
+from unmix_plugin.trained.surface import SurfaceAppearance, look_at
+
+_WIDTH = 0.75
+"""Standard deviation along the surface, relative to the square root of the vertex's area."""
+_THICKNESS = 0.1
+_OPACITY = 0.98
+_WHAT = "surface of an unmix-nerf run as Gaussians"
+
+
+def export_splats(
+    job: Job, formats: Sequence[str], resolution: int, up: Literal["y", "z"] = "y"
+) -> list[Path]:
+    """Find the surface and make a Gaussian of each of its vertices.
+
+    Args:
+        job: The run and where to write.
+        formats: Of `glb`, `ply`.
+        resolution: Pieces along the longest edge of the scene box.
+        up: `y`: up is +y in GLB and -y in PLY, as their viewers expect; `z`: coordinates of the world.
+    """
+    paths = {kind: job.folder / f"splats.{kind}" for kind in formats}
+    job.claim(list(paths.values()))
+    mesh, _ = find_surface(job, resolution)
+    scene, frame = job.scene, job.frame
+    with job.working("looking at the surface's points"):
+        normals = mesh.normals
+        seen = look_at(
+            scene, torch.from_numpy(mesh.vertices).float(), torch.from_numpy(-normals).float()
+        ).map(lambda packed: packed.cpu() / packed[:, :1].clamp(min=1e-6).cpu())
+        looks = _as_seen(job, seen)
+    world = TriangleMesh(frame.to_world(mesh.vertices), mesh.faces)
+    positions, numbers, extras = gltf_content(world, looks, _WHAT)
+    widths = _WIDTH * np.sqrt(_vertex_areas(world))
+    splats = Splats(
+        positions,
+        _turns_to(directions_to_world(frame, normals)),
+        np.stack([widths, widths, _THICKNESS * widths], axis=1).astype(np.float32),
+        looks.srgb.astype(np.float32),
+        _OPACITY,
+    )
+    axis = world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0])
+    written = []
+    if "glb" in paths:
+        written.append(write_splats_glb(paths["glb"], splats, numbers, extras, axis))
+    if "ply" in paths:
+        own = {name.lower().lstrip("_"): values for name, values in numbers.items()}
+        comments = looks.comments(_WHAT)
+        if up == "y":
+            splats = _turned(splats, axis)
+            comments.append("turned so that -y is up; --up z keeps the axes of the world")
+        written.append(write_splats_ply(paths["ply"], splats, own, comments))
+    job.say(f"{len(positions)} Gaussians")
+    return written
+
+
+def _as_seen(job: Job, seen: Coefficients) -> SurfaceAppearance:
+    """The looks of the vertices, gloss from straight above included."""
+    materials = job.materials.to("cpu")
+    return SurfaceAppearance(materials, seen.abundances, materials.spectra(seen))
+
+
+def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
+    """Of each vertex a third of the area of its triangles, at least a hundredth of the mean."""
+    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
+    shares = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    areas = sum(np.bincount(corner, weights=shares, minlength=len(mesh.vertices)) for corner in mesh.faces.T)
+    return np.maximum(areas, 0.01 * np.mean(areas))
+
+
+def _turns_to(normals: Float[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 4"]:
+    """Unit quaternions x, y, z, w of the least turns that take +z to each of these unit vectors."""
+    x, y, z = normals.T
+    quaternions = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=1)
+    quaternions[1 + z < 1e-9] = [1.0, 0.0, 0.0, 0.0]
+    return (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _turned(splats: Splats, up: Float[np.ndarray, "3"]) -> Splats:
+    """The same with `up` turned to -y."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.align_vectors([[0.0, -1.0, 0.0]], [up])[0]
+    return Splats(
+        turn.apply(splats.positions).astype(np.float32),
+        (turn * Rotation.from_quat(splats.rotations)).as_quat().astype(np.float32),
+        splats.scales,
+        splats.srgb,
+        splats.opacity,
+    )
