@@ -1,6 +1,8 @@
 """`unmix-export`: what is written and refused, from a run alone, edited and relit; and products of methods."""
 
+import base64
 import csv
+import gzip
 import importlib.metadata
 import json
 import shutil
@@ -31,7 +33,9 @@ from unmix_plugin.trained.open_run import load_run, open_run
 SMALL = {
     "cubes": ["--formats", "envi", "exr", "npy"],
     "mesh": ["--formats", "ply", "obj", "glb", "--resolution", 24],
+    "page": ["--resolution", 24, "--title", "pots </script><b>"],
     "point-cloud": ["--num-points", 500],
+    "splats": ["--resolution", 24],
     "report": ["--max-views", 1],
     "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
     "volume": ["--resolution", 8],
@@ -289,6 +293,49 @@ def test_points_and_mesh_lie_where_the_scene_is(solid, exported):
     for kind in ("ply", "obj", "glb"):
         mesh = loaded_mesh(exported[0] / "mesh" / f"mesh.{kind}")
         assert ((mesh.vertices >= low - 0.2) & (mesh.vertices <= high + 0.2)).all()
+
+
+def test_splats_are_flat_upright_and_as_dense_as_the_surface(exported):
+    ply = PlyData.read(exported[0] / "splats" / "splats.ply")["vertex"]
+    content = json_of(exported[0] / "splats" / "splats.glb")
+    primitive = content["meshes"][0]["primitives"][0]
+    assert (primitive["mode"], content["extensionsUsed"]) == (0, ["KHR_gaussian_splatting"])
+    assert content["accessors"][primitive["attributes"]["POSITION"]]["count"] == len(ply["x"])
+    sizes = np.exp(np.stack([ply[f"scale_{axis}"] for axis in range(3)], axis=1))
+    np.testing.assert_allclose(sizes[:, 2] / sizes[:, 0], 0.1, rtol=1e-4)
+    # As many as cover the surface of the mesh of the same resolution, neighbours overlapping by half.
+    mesh = loaded_mesh(exported[0] / "mesh" / "mesh.ply")
+    assert (sizes[:, 0] ** 2).sum() == pytest.approx(0.75**2 * mesh.area, rel=0.02)
+    # The third axis is the normal, and the scene's up, +z, is -y.
+    w, x, y, z = (ply[f"rot_{index}"] for index in range(4))
+    normals = PlyData.read(exported[0] / "mesh" / "mesh.ply")["vertex"]["nz"]
+    np.testing.assert_allclose(2 * (y * z - x * w), -normals, atol=1e-4)
+
+
+def json_of(path):
+    """The JSON part of a GLB."""
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+
+
+def test_a_page_holds_the_surface_and_escapes_its_title(exported):
+    page = (exported[0] / "page" / "page.html").read_text()
+    assert page.count("<b>") == 0
+    facts = json.loads(page.split('id="data-facts">')[1].split("</script>")[0])
+    assert facts["title"] == "pots </script><b>"
+    arrays = gzip.decompress(base64.b64decode(page.split('id="data-arrays">')[1].split("<")[0]))
+    how = facts["arrays"]["positions"]
+    stored = np.frombuffer(arrays, "<u2", how["count"], how["start"]).reshape(-1, 3)
+    mesh = loaded_mesh(exported[0] / "mesh" / "mesh.ply")
+    found = stored * how["scale"] + how["offset"]
+    np.testing.assert_allclose(found, mesh.vertices, atol=0.6 * how["scale"])
+    how = facts["arrays"]["faces"]
+    corners = np.cumsum(np.frombuffer(arrays, "<i4", how["count"], how["start"]))
+    np.testing.assert_array_equal(corners.reshape(-1, 3), mesh.faces)
+    how = facts["arrays"]["abundances"]
+    roots = np.frombuffer(arrays, "u1", how["count"], how["start"]).reshape(-1, 6) / 1.0
+    np.testing.assert_allclose((how["scale"] * roots**2).sum(axis=1), 1, atol=0.03)
+    assert "https://" not in page.split("<body>")[0]
 
 
 def test_points_have_the_indices_asked_for_of_reflectance(solid, tmp_path):

@@ -107,7 +107,7 @@ def _spectral_facts(materials: Materials) -> dict[str, Any]:
     endmembers = materials.endmembers.detach().cpu().double().numpy()
     if materials.light is not None:
         power = materials.light.cpu().double().numpy()
-    lights = [{"name": "as recorded", "factors": [1.0] * len(bands), "notes": []}]
+    lights = [{"name": "the scene's own", "factors": [1.0] * len(bands), "notes": []}]
     for light in _LIGHTS:
         try:
             factors, notes = relighting_factors(bands, power, Light(light))
