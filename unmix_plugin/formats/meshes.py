@@ -191,7 +191,7 @@ def write_glb(
     faces: Int[np.ndarray, "F 3"],
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
-    up: Sequence[float] = (0.0, 1.0, 0.0),
+    up: Sequence[float] | Float64[np.ndarray, "3"] = (0.0, 1.0, 0.0),
 ) -> Path:
     """Write a mesh in colours of its vertices.
 
@@ -239,7 +239,7 @@ def write_splats_glb(
     splats: Splats,
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
-    up: Sequence[float],
+    up: Sequence[float] | Float64[np.ndarray, "3"],
 ) -> Path:
     """Write Gaussians as points of a GLB, with their colours for programs that know points only.
 
@@ -317,7 +317,7 @@ def _write_glb(
     material: Mapping[str, Any] | None,
     pictures: Mapping[str, bytes],
     extras: Mapping[str, Any],
-    up: Sequence[float] = (0.0, 1.0, 0.0),
+    up: Sequence[float] | Float64[np.ndarray, "3"] = (0.0, 1.0, 0.0),
     extensions: Mapping[str, Any] | None = None,
 ) -> Path:
     """A file of one mesh in one material, or of points: attributes, faces and pictures in one buffer."""
@@ -382,7 +382,7 @@ def _write_glb(
     return write_file(path, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
 
 
-def _turn_to_y(up: Sequence[float]) -> list[float]:
+def _turn_to_y(up: Sequence[float] | Float64[np.ndarray, "3"]) -> list[float]:
     """Unit quaternion x, y, z, w of the least turn that takes a direction to +y."""
     x, y, z = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     if y < -1 + 1e-9:

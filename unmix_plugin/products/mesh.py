@@ -351,7 +351,7 @@ def _write_glb(
     mesh: TriangleMesh,
     normals: Float32[np.ndarray, "V 3"],
     looks: SurfaceAppearance,
-    up: Sequence[float],
+    up: Sequence[float] | Float64[np.ndarray, "3"],
 ) -> list[Path]:
     positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
     return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras, up)]
