@@ -16,6 +16,7 @@ from unmix_plugin.captures.calibration.calibration import is_srgb
 from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
 from unmix_plugin.captures.masks import BackgroundRule, background_rule, choose_mask
 from unmix_plugin.captures.options import MaskKind, ProcessOptions
+from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe, stamps
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
@@ -40,6 +41,8 @@ class Plan:
     """With their evidence, as JSON-able values."""
     notes: tuple[str, ...]
     """What a user should know, one sentence each."""
+    warnings: tuple[str, ...] = ()
+    """What may make values, wavelengths or geometry wrong, one sentence each."""
     reference_files: tuple[Path, ...] = ()
     """Of dark frame and white reference."""
 
@@ -70,7 +73,10 @@ def make_plan(
         by_sensor[view.sensor].append(view)
     sensors: dict[str, Sensor] = {}
     for name, same in by_sensor.items():
-        all_of_it = tuple(view for view in capture.views if view.sensor == name)
+        # Views of several sizes are several sensors, and one may show the panel of all.
+        all_of_it = tuple(
+            view for view in capture.views if view.sensor == name or not (name and view.release)
+        )
         sensors[name] = prepare_sensor(name, same, options, replace(references, views=all_of_it))
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = choose_mask(views, options.mask)
@@ -110,6 +116,16 @@ def make_plan(
     said += _notes_on_pictures([view.cube for view in views])
     said += [note for view in views[:1] for note in view.cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
+    warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
+    warned += _warnings_of_files(
+        [
+            (view.name, file)
+            for view in views
+            for file in (view.cube, view.dark, view.white)
+            if file is not None
+        ]
+        + [(file.path.name, file) for file in opened]
+    )
     return Plan(
         capture,
         tuple(views),
@@ -119,6 +135,7 @@ def make_plan(
         mask,
         decisions,
         (*capture.notes, *said),
+        (*capture.warnings, *warned),
         tuple(path for file in opened for path in file.files),
     )
 
@@ -141,7 +158,17 @@ def _find_backdrop(
 def input_files(view: CaptureView) -> list[Path]:
     """Every file that a view is made of."""
     more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
-    return [*view.cube.files, *more]
+    references = [file for file in (view.dark, view.white) if file is not None]
+    return [*view.cube.files, *more, *(path for file in references for path in file.files)]
+
+
+def _warnings_of_files(files: Sequence[tuple[str, SpectralFile]]) -> list[str]:
+    """What files warn of; one sentence where several warn of the same."""
+    names: dict[str, list[str]] = defaultdict(list)
+    for name, file in files:
+        for warning in file.warnings:
+            names[warning].append(name)
+    return [f"{name_some(where)}: {warning}" for warning, where in names.items()]
 
 
 def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:

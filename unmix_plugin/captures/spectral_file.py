@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +17,7 @@ from types import ModuleType
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int, Shaped
+from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
@@ -31,6 +31,8 @@ _ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
 
 _WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
+MOST_WIDTH = 0.25
+"""Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
 _PARTLY_KNOWN = "only some of the files give wavelengths"
 _KEPT_BYTES = 2**28
 _kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
@@ -68,6 +70,63 @@ class BandTable:
     names: tuple[str, ...] | None = None
     """What the file calls its bands."""
 
+    @property
+    def is_broad(self) -> Bool[np.ndarray, " B"]:
+        """Which bands are too broad to have one wavelength; none where wavelengths or widths are unknown."""
+        if self.wavelengths_nm is None or self.fwhm_nm is None:
+            return np.zeros(0, bool)
+        return self.fwhm_nm > MOST_WIDTH * self.wavelengths_nm
+
+
+@dataclass(frozen=True)
+class Linear:
+    """What the stored numbers of a file stand for: value = gain * stored + offset, band by band."""
+
+    gains: Float64[np.ndarray, " B"]
+    """Above 0."""
+    offsets: Float64[np.ndarray, " B"]
+    evidence: str
+    """Where the file says so, for people: `header field 'data gain values'`."""
+
+    def apply(self, stored: np.ndarray, bands: BandIndex) -> Float32[np.ndarray, "h W b"]:
+        """Values of some bands."""
+        gains, offsets = (numbers[bands].astype(np.float32) for numbers in (self.gains, self.offsets))
+        return stored.astype(np.float32) * gains + offsets
+
+    @property
+    def scale(self) -> float | None:
+        """Stored number that stands for 1, where one number says all."""
+        is_one = not self.offsets.any() and np.ptp(self.gains) == 0
+        return float(f"{1.0 / self.gains[0]:.12g}") if is_one else None
+
+
+def linear_values(
+    path: Path, num_bands: int, gains: Sequence[float], offsets: Sequence[float], evidence: str
+) -> Linear | None:
+    """The calibration that a file states; None where it changes nothing.
+
+    Args:
+        gains, offsets: One a band, one for all, or none.
+    Raises:
+        CaptureError: another number of them, or gains that are not above 0: without them spectra would be false.
+    """
+    columns = []
+    for name, numbers, usual in (("gains", gains, 1.0), ("offsets", offsets, 0.0)):
+        values = np.array(numbers or [usual], dtype=np.float64)
+        if len(values) not in (1, num_bands):
+            raise CaptureError(
+                f"{path}: {evidence} gives {len(values)} {name} for {num_bands} bands; expected one a band, or one for "
+                "all: correct them or take them out"
+            )
+        if not np.isfinite(values).all() or (name == "gains" and values.min() <= 0):
+            raise CaptureError(
+                f"{path}: {evidence} gives {name} from {values.min():g} to {values.max():g}; expected finite numbers"
+                f"{' above 0' if name == 'gains' else ''}: correct them or take them out"
+            )
+        columns.append(np.broadcast_to(values, num_bands))
+    changes = (columns[0] != 1).any() or columns[1].any()
+    return Linear(columns[0], columns[1], evidence) if changes else None
+
 
 @dataclass(frozen=True)
 class SpectralFile:
@@ -86,12 +145,16 @@ class SpectralFile:
     bands: BandTable = BandTable()
     interleave: str | None = None
     """bsq, bil or bip where the format has a choice."""
-    scale: float | None = None
-    """Stored number that stands for 1, if the file says so."""
+    linear: Linear | None = None
+    """What stored numbers stand for, if the file says so."""
     no_data: float | None = None
     """Stored number that stands for no measurement."""
+    valid_range: tuple[float, float] | None = None
+    """Least and greatest stored number that was measured, if the file says so."""
     notes: tuple[str, ...] = ()
     """What is odd about the file, one sentence each."""
+    warnings: tuple[str, ...] = ()
+    """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Other facts by name, as JSON-able values: exposure_s, gain, black_level, xmp, ..."""
     sources: tuple[Path, ...] = ()
@@ -129,6 +192,11 @@ class SpectralFile:
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
     @property
+    def scale(self) -> float | None:
+        """Stored number that stands for 1, if the file says one for all bands."""
+        return None if self.linear is None else self.linear.scale
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """Every file that `read` depends on, `path` first."""
         return (self.path, *(source for source in self.sources if source != self.path))
@@ -149,7 +217,7 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     """Files of one view that hold some bands each, as one file with all of them, in the order given.
 
-    A scale, a no-data value and metadata are those that all parts share.
+    A no-data value and metadata are those that all parts share.
 
     Args:
         parts: At least one, all of one size.
@@ -171,9 +239,11 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         wanted = np.arange(len(owner))[bands]
         return np.concatenate([parts[owner[band]].read(rows, within[[band]]) for band in wanted], axis=-1)
 
-    def shared(values: list[float | None]) -> float | None:
-        return values[0] if len({repr(value) for value in values}) == 1 else None
-
+    no_data = {repr(part.no_data) for part in parts}
+    ranges = {part.valid_range for part in parts}
+    differing = [
+        what for what, found in (("no-data values", no_data), ("valid ranges", ranges)) if len(found) > 1
+    ]
     # Metadata that differ are listed by part.
     same = {
         key: value
@@ -181,6 +251,11 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         if all(repr(part.metadata.get(key)) == repr(value) for part in parts)
     }
     own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
+    exposed = [part.metadata.get("exposure_s") for part in parts]
+    if "exposure_s" not in same and all(isinstance(time, float) for time in exposed):
+        gains = [part.metadata.get("gain", 1.0) for part in parts]
+        same = {key: value for key, value in same.items() if key != "gain"}
+        same["exposure_s"] = [time * gain for time, gain in zip(exposed, gains, strict=True)]
     return replace(
         first,
         path=path,
@@ -188,11 +263,31 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         dtype=np.result_type(*(part.dtype for part in parts)),
         read_part=read_part,
         bands=_stack_tables(parts),
-        scale=shared([part.scale for part in parts]),
-        no_data=shared([part.no_data for part in parts]),
+        linear=_stack_linears(parts),
+        no_data=None if len(no_data) > 1 else first.no_data,
+        valid_range=None if len(ranges) > 1 else first.valid_range,
         metadata=same | ({"parts": own} if any(own) else {}),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        warnings=(
+            *dict.fromkeys(warning for part in parts for warning in part.warnings),
+            *(f"{what} differ between the files of one view and are not used" for what in differing),
+        ),
         sources=tuple(source for part in parts for source in part.files),
+    )
+
+
+def _stack_linears(parts: list[SpectralFile]) -> Linear | None:
+    """Gains and offsets of all parts, those of parts without any being 1 and 0."""
+    stated = [part.linear for part in parts]
+    evidence = next((linear.evidence for linear in stated if linear is not None), None)
+    if evidence is None:
+        return None
+    plain = [Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts]
+    each = [own or none for own, none in zip(stated, plain, strict=True)]
+    return Linear(
+        np.concatenate([linear.gains for linear in each]),
+        np.concatenate([linear.offsets for linear in each]),
+        evidence,
     )
 
 
@@ -220,7 +315,7 @@ def _stack_tables(parts: list[SpectralFile]) -> BandTable:
 def choose_axes(
     shape: tuple[int, ...], given: Axes | None, num_wavelengths: int | None, default: Axes = "yxb"
 ) -> tuple[Axes, tuple[str, ...]]:
-    """Axes of a 3-D array, and notes.
+    """Axes of a 3-D array, and warnings.
 
     Args:
         shape: Of the array.
@@ -314,6 +409,9 @@ class CaptureView:
     """Black where pixels are ignored."""
     labels: Path | None = None
     """True materials, if known."""
+    dark: SpectralFile | None = None
+    white: SpectralFile | None = None
+    """References that were taken for this view alone."""
     alpha: SpectralFile | None = None
     """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
     lens: Lens | None = None
@@ -336,3 +434,5 @@ class Capture:
     """Where the layout has poses of its own."""
     notes: tuple[str, ...] = ()
     """What is odd about the folder, one sentence each."""
+    warnings: tuple[str, ...] = ()
+    """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""

@@ -53,33 +53,47 @@ class StatedBands:
 def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[str, ...]]:
     """The table of an image's bands, with units brought to nm and nothing impossible accepted.
 
+    A wavelength of 0 marks a band that is not used, as PRISMA's files have it: the band counts as bad.
+
     Returns:
-        The table, and notes on what of it is left out.
+        The table, and warnings of what of it is left out.
     """
     notes: list[str] = []
     names = _fitting("names of bands", stated.names, num_bands, notes)
-    centres, evidence, factor = None, BandTable.evidence, None
+    centres, evidence, factor, unused = None, BandTable.evidence, None, np.zeros(num_bands, bool)
     if stated.centres is not None:
         evidence = _UNUSABLE
         values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, notes)
         if values is not None:
-            factor, found = _nm_per_stated(float(values.min()), float(values.max()), stated)
+            unused = values == 0 if (values > 0).any() else unused
+            used = values[~unused]
+            factor, found = _nm_per_stated(float(used.min()), float(used.max()), stated)
             if factor is None:
                 notes.append(found)
             else:
-                centres, evidence = values * factor, found
+                # An unused band gets the wavelength of the nearest band that is used.
+                nearest = np.abs(np.subtract.outer(np.arange(num_bands), np.flatnonzero(~unused))).argmin(
+                    axis=1
+                )
+                centres, evidence = used[nearest] * factor, found
+                evidence += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
     named = None if centres is not None or names is None else wavelengths_in_names(list(map(str, names)))
     if named is not None and names is not None:
         centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
-    if centres is not None and (np.diff(centres) == 0).any():
+    if centres is not None and (np.diff(centres[~unused]) == 0).any():
         notes.append("two bands beside each other have the same wavelength")
     fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes)
+    if fwhm is not None and factor is not None and (fwhm[~unused] > 0).all():
+        fwhm = np.where(unused, fwhm[~unused].mean(), fwhm) * factor
+    else:
+        fwhm = None
     good = _numbers("marks of bad bands", stated.good, num_bands, notes)
+    bad = unused if good is None else (good == 0) | unused
     table = BandTable(
         centres,
         evidence,
-        fwhm * factor if fwhm is not None and factor is not None and (fwhm > 0).all() else None,
-        None if good is None else good == 0,
+        fwhm,
+        None if good is None and not unused.any() else bad,
         None if names is None else tuple(map(str, names)),
     )
     return table, tuple(notes)

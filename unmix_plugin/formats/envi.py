@@ -9,6 +9,7 @@ Notation: `H` lines, `W` samples and `C` bands of an image; `K` spectra of `B` b
 
 from __future__ import annotations
 
+import glob
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -95,11 +96,7 @@ def read_header(path: Path) -> dict[str, str]:
     size = path.stat().st_size
     if size > MOST_TEXT_BYTES:
         raise ValueError(f"no ENVI header: {size} bytes; expected a text of a few kB")
-    data = read_bounded(path).removeprefix(b"\xef\xbb\xbf")
-    try:
-        text = data.decode()
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
+    text = _decoded(read_bounded(path))
     try:
         return _parse_header(text)
     except ValueError as error:
@@ -112,10 +109,27 @@ def read_header(path: Path) -> dict[str, str]:
         ) from error
 
 
+def _decoded(data: bytes) -> str:
+    """Text in UTF-8, in UTF-16 with its mark, or in Latin-1."""
+    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    try:
+        return data.decode(encoding)
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def header_begins(begin: bytes) -> bool:
+    """Whether the first bytes of a file are those of a header."""
+    return re.match(r"ENVI\s", _decoded(begin[: len(begin) // 2 * 2])) is not None
+
+
 def _parse_header(text: str) -> dict[str, str]:
     r"""
     >>> _parse_header("ENVI\n; by hand\nBands = 2\nwavelength = {\n450,\n; half\n550}")
     {'bands': '2', 'wavelength': '450,\n550'}
+    >>> _parse_header("ENVI\nwavelength_units = nm\nwavelength = [450\n550]")
+    {'wavelength units': 'nm', 'wavelength': '450\n550'}
     """
     lines = [line for line in text.splitlines() if not line.lstrip().startswith(";")]
     if not lines or lines[0].strip() != "ENVI":
@@ -128,10 +142,17 @@ def _parse_header(text: str) -> dict[str, str]:
         position = end + 1
         if not equals or _BRACE.search(name):
             continue
-        key = " ".join(name.lower().split())
+        key = " ".join(name.lower().replace("_", " ").split())
         opening = _NOT_SPACE.search(body, end - len(value))
+        close = -1
         if opening is not None and opening[0] == "{":
             close = _closing_brace(body, opening.start(), key, key in header)
+        elif (
+            opening is not None and opening[0] == "["
+        ):  # NumPy's way, which a value of one line may begin with too
+            close = body.find("]", opening.end())
+            close = -1 if "=" in body[opening.end() : close] else close
+        if opening is not None and close >= 0:
             value, position = body[opening.end() : close], body.index("\n", close) + 1
         header[key] = value.strip()
     return header
@@ -173,7 +194,7 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
             raise ValueError(
                 f"'{key}' is {header[key]}; expected 0: write the image without bytes between frames"
             )
-    height, width, num_bands = (_count(header, key, least=1) for key in ("lines", "samples", "bands"))
+    height, width, num_bands = image_size(header)
     code, notes = _count(header, "data type"), ()
     if code not in _TYPES:
         found = f"{code}, complex numbers" if code in _COMPLEX_TYPES else str(code)
@@ -193,6 +214,16 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
     offset = _count(header, "header offset", default="0")
     dtype = kind.newbyteorder(">" if order else "<")
     return EnviLayout((height, width, num_bands), dtype, interleave, offset, notes)
+
+
+def image_size(header: Mapping[str, str]) -> tuple[int, int, int]:
+    """Lines, samples and bands.
+
+    Raises:
+        ValueError: one is missing or no whole number above 0.
+    """
+    height, width, num_bands = (_count(header, key, least=1) for key in ("lines", "samples", "bands"))
+    return height, width, num_bands
 
 
 def _count(header: Mapping[str, str], key: str, default: str = "", least: int = 0) -> int:
@@ -223,6 +254,11 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     if first == "" and base.suffix:  # x.raw.hdr beside x.RAW
         candidates |= {base.with_suffix(base.suffix.upper()): None}
     found = [path for path in candidates if path.is_file() and path != header_path]
+    # Any other file of this name will do if it has just the size.
+    others = (
+        [] if found or needed_bytes == 0 else sorted(header_path.parent.glob(f"{glob.escape(base.name)}.*"))
+    )
+    found += [path for path in others if path.is_file() and path.stat().st_size == needed_bytes]
     if not found:
         usual = f"{base.name}{first}" if first else f"{base.name} or {base.name}.img"
         raise ValueError(

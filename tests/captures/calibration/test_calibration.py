@@ -17,7 +17,8 @@ from unmix_plugin.captures.calibration.calibration import (
     panel_reference,
 )
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.captures.spectral_file import Linear
+from unmix_plugin.errors import CaptureError, ConfigError
 
 LINES, SAMPLES, NUM = 40, 24, 3
 EMPTY = file_of(np.zeros((LINES, SAMPLES, NUM), np.uint16))
@@ -107,7 +108,9 @@ def test_exposures_are_brought_to_that_of_the_white():
     white = open_reference(
         file_of(np.full((1, WIDTH, BANDS), 3000, np.uint16)), "white reference", file_of(counts)
     )
-    calibration = Calibration(WHOLE, EVERY, white=WhiteReference(white, np.full(BANDS, 0.5)), exposure=20.0)
+    calibration = Calibration(
+        WHOLE, EVERY, white=WhiteReference(white, np.full(BANDS, 0.5)), exposure=np.full(1, 20.0)
+    )
     shorter = file_of(counts, metadata={"exposure_s": 5.0, "gain": 2.0})
     np.testing.assert_allclose(
         calibration.rows(shorter, 0, HEIGHT).values, counts / 3000 * 0.5 * 20.0 / 10.0, rtol=1e-6
@@ -134,12 +137,30 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
 def test_a_no_data_value_of_zero_has_to_stand_in_every_band(no_data: float, expected: list[bool]):
     value = 7 if no_data == 7.0 else 0
     stored = np.array([[[value, 5], [value, value]]], np.uint16)
-    np.testing.assert_array_equal(find_missing(stored, no_data)[0], expected)
+    np.testing.assert_array_equal(find_missing(stored, file_of(stored, no_data=no_data))[0], expected)
+
+
+def test_numbers_out_of_the_valid_range_are_missing():
+    stored = np.array([[[5, 6], [4, 6], [5, 9]]], np.uint16)
+    file = file_of(stored, valid_range=(5.0, 8.0))
+    np.testing.assert_array_equal(find_missing(stored, file)[0], [False, True, True])
+
+
+def test_a_reference_has_gains_where_the_cubes_have_them():
+    stored = np.full((4, 3, 2), 100, np.uint16)
+    gains, offsets = np.array([0.5, 2.0]), np.array([1.0, -1.0])
+    cube = file_of(stored, linear=Linear(gains, offsets, "its header"))
+    found = open_reference(cube, "white reference", cube)
+    np.testing.assert_allclose(found.mean[0, 0], stored[0, 0] * gains + offsets)
+    np.testing.assert_allclose(found.stored_mean[0, 0], stored[0, 0])
+    for pair in ((cube, file_of(stored)), (file_of(stored), cube)):
+        with pytest.raises(CaptureError, match=r"no gains or scale.*its header.*write the same"):
+            open_reference(pair[0], "white reference", pair[1])
 
 
 def test_a_pixel_without_a_number_in_some_band_is_missing():
     stored = np.array([[[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]]], np.float32)
-    np.testing.assert_array_equal(find_missing(stored, None)[0], [True, False, True])
+    np.testing.assert_array_equal(find_missing(stored, file_of(stored))[0], [True, False, True])
 
 
 @given(st.integers(0, 5), st.integers(0, 5), st.integers(1, 3), st.floats(5.0, 500.0), st.floats(-20.0, 40.0))

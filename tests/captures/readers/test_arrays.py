@@ -241,7 +241,7 @@ def test_npy_arrays_are_mapped(tmp_path, order, dtype):
 
 def test_the_order_of_axes_can_be_said(tmp_path):
     np.save(tmp_path / "a.npy", CUBE.transpose(2, 0, 1))
-    assert "axis 0 is the shortest" in open_spectral_file(tmp_path / "a.npy").notes[0]
+    assert "axis 0 is the shortest" in open_spectral_file(tmp_path / "a.npy").warnings[0]
     file = open_spectral_file(tmp_path / "a.npy", ReadOptions(axes="byx"))
     np.testing.assert_array_equal(file.read(), CUBE)
     file = open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM))
@@ -285,3 +285,79 @@ def test_members_that_promise_too_much_are_refused(tmp_path):
         archive.writestr("cube.npy", header.getvalue() + bytes(20))
     with pytest.raises(CaptureError, match=r"cube\.npy holds 148 bytes; its header promises 18000000000000$"):
         open_spectral_file(tmp_path / "a.npz")
+
+
+def prisma(path, zeros=(0, 1)):
+    """Two cubes of rows, bands and columns, with wavelengths as attributes of the file."""
+    nm = np.linspace(900, 500, 5).astype("f4")
+    nm[list(zeros)] = 0
+    with h5py.File(path, "w") as file:
+        group = file.create_group("HDFEOS/SWATHS/PRS_L2D_HCO/Data Fields")
+        group["VNIR_Cube"] = CUBE.transpose(0, 2, 1)
+        group["SWIR_Cube"] = CUBE[..., :4].transpose(0, 2, 1)
+        group["VNIR_PIXEL_L2_ERR"] = np.zeros((8, 5, 9), np.uint8)
+        file.attrs.update(
+            {
+                "List_Cw_Vnir": nm,
+                "List_Cw_Swir": np.array([2400, 1800, 1200, 1000], "f4"),
+                "List_Cw_Vnir_Flags": (nm > 0).astype("u1"),
+                "List_Fwhm_Vnir": np.where(nm > 0, 11, 0).astype("f4"),
+                "L2ScaleVnirMin": np.float32(-0.1),
+                "L2ScaleVnirMax": np.float32(0.9),
+                "ScaleFactor_Swir": np.float32(100),
+                "Offset_Swir": np.float32(2),
+            }
+        )
+    return path
+
+
+def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_bands(tmp_path):
+    path = prisma(tmp_path / "a.he5")
+    file = open_spectral_file(path, ReadOptions(dataset="VNIR_Cube"))
+    np.testing.assert_array_equal(file.read(), CUBE)
+    np.testing.assert_array_equal(centres_nm(file)[2:], [700, 600, 500])
+    np.testing.assert_array_equal(file.bands.bad, [True, True, False, False, False])
+    np.testing.assert_array_equal(widths_nm(file), 11)
+    assert file.linear is not None
+    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE / 65535 - 0.1, atol=1e-6)
+    other = open_spectral_file(path, ReadOptions(dataset="SWIR_Cube"))
+    np.testing.assert_array_equal(centres_nm(other), [2400, 1800, 1200, 1000])
+    assert other.linear is not None
+    np.testing.assert_allclose(
+        other.linear.apply(other.read(), slice(None)), CUBE[..., :4] / 100 - 2, atol=1e-5
+    )
+
+
+def test_of_cubes_and_their_errors_the_cubes_could_be_the_image(tmp_path):
+    with pytest.raises(CaptureError, match="2 data sets could be the image"):
+        open_spectral_file(prisma(tmp_path / "a.he5"))
+
+
+@pytest.mark.parametrize(("bands", "is_known"), [(NM, True), (np.arange(1.0, 6), False)])
+def test_a_list_called_bands_may_be_wavelengths(tmp_path, bands, is_known):
+    scipy.io.savemat(tmp_path / "a.mat", {"rad": CUBE, "rgb": CUBE[..., :3], "bands": bands})
+    options = ReadOptions() if is_known else ReadOptions(dataset="rad")
+    assert (open_spectral_file(tmp_path / "a.mat", options).bands.wavelengths_nm is not None) == is_known
+
+
+def test_facts_of_groups_hold_for_the_images_in_them(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/cube"] = CUBE
+        file["run"].attrs.update(
+            {"integration_time": 20.0, "integration_time_units": "us", "scale_factor": 0.5}
+        )
+        file["exposure"] = 3.0
+    found = open_spectral_file(tmp_path / "a.h5")
+    assert found.metadata["exposure_s"] == pytest.approx(2e-5)
+    assert found.scale == 2
+
+
+def test_a_valid_range_is_kept(tmp_path):
+    with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
+        for axis, length in zip("yxb", CUBE.shape, strict=True):
+            file.createDimension(axis, length)
+        variable = file.createVariable("cube", "h", tuple("yxb"))
+        variable[:] = CUBE.astype(np.int16)
+        variable.valid_min, variable.valid_max, variable._FillValue = 0, 5000, -1
+    found = open_spectral_file(tmp_path / "a.nc")
+    assert (found.valid_range, found.no_data) == ((0, 5000), -1)

@@ -14,7 +14,13 @@ import tifffile
 
 from tests.captures.file_factory import centres_nm, header_text, widths_nm, write_envi
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, stack_bands
+from unmix_plugin.captures.spectral_file import (
+    BandTable,
+    ReadOptions,
+    SpectralFile,
+    linear_values,
+    stack_bands,
+)
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
 from unmix_plugin.errors import CaptureError, ConfigError
@@ -49,7 +55,9 @@ def part(tmp_path, value, **metadata):
         lambda rows, bands: values[rows][..., bands],
         table,
         metadata=metadata,
-        scale=metadata.get("scale"),
+        linear=linear_values(tmp_path, 1, [1 / metadata["scale"]], [], "test")
+        if "scale" in metadata
+        else None,
     )
 
 
@@ -61,6 +69,7 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     stack = stack_bands(parts, tmp_path)
     assert stack.metadata == {
         "camera": "a",
+        "exposure_s": [0.1, 0.2],
         "parts": [{"exposure_s": 0.1, "scale": 2.0}, {"exposure_s": 0.2}],
     }
     assert stack.scale is None
@@ -91,7 +100,7 @@ BANDS = "wavelength units = nm\nwavelength = {450, 550, 650.5}\nfwhm = {5, 5, 6}
 
 FACTS = {
     *("file", "reader", "shape", "dtype", "interleave", "wavelengths_nm", "wavelength_evidence", "fwhm_nm"),
-    *("band_names", "bad_bands", "scale", "no_data", "poses", "notes", "metadata"),
+    *("band_names", "bad_bands", "scale", "gains", "offsets", "no_data", "poses", "notes", "metadata"),
 }
 
 
@@ -277,7 +286,7 @@ data ignore value = 65535
     np.testing.assert_array_equal(centres_nm(file), [400.5, 410, 420, 430])
     np.testing.assert_array_equal(file.bands.bad, [False, True, False, False])
     assert (file.scale, file.no_data) == (10000, 65535)
-    assert file.notes == ("the header has no byte order; taken as little-endian",)
+    assert file.warnings == ("the header has no byte order; taken as little-endian",)
     np.testing.assert_array_equal(file.read(), ENVI_CUBE)
 
 
@@ -325,7 +334,7 @@ def test_wavelengths_come_with_their_evidence(tmp_path, entries, nm, evidence):
 def test_wavelengths_that_cannot_be_used_are_left_out_with_a_note(tmp_path, entries, note):
     file = open_spectral_file(write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", entries))
     assert file.bands.wavelengths_nm is None
-    assert any(note in text for text in file.notes), file.notes
+    assert any(note in text for text in file.warnings), file.warnings
 
 
 @pytest.mark.parametrize(
@@ -444,3 +453,134 @@ def test_bands_that_are_not_there_are_an_index_error(tmp_path):
         file.read(bands=np.array([4]))
     assert file.read(slice(2, 2)).shape == (0, 7, 4)
     np.testing.assert_array_equal(file.read(slice(0, 5, 2), slice(None, None, -1)), ENVI_CUBE[::2, :, ::-1])
+
+
+GAINS, OFFSETS = np.array([0.5, 0.25, 2.0]), np.array([-1.0, 3.0, 0.25])
+
+
+def listed(numbers):
+    return "{" + ", ".join(f"{number:g}" for number in numbers) + "}"
+
+
+def gdal_items(**lists):
+    roles = {"scale": 'role="scale"', "offset": 'role="offset"'}
+    items = "".join(
+        f'<Item name="{name}" sample="{band}" {roles.get(name, "")}>{number}</Item>'
+        for name, numbers in lists.items()
+        for band, number in enumerate(numbers)
+    )
+    return [(42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>", True)]
+
+
+def calibrated_envi(folder, more):
+    return write_envi(folder / "a.hdr", CUBE, "bil", more)
+
+
+def calibrated_tiff(folder, tags, aux=""):
+    tifffile.imwrite(folder / "a.tif", CUBE, planarconfig="contig", photometric="minisblack", extratags=tags)
+    if aux:
+        (folder / "a.tif.aux.xml").write_text(aux)
+    return folder / "a.tif"
+
+
+def calibrated_tiff_with_header(folder):
+    path = calibrated_tiff(folder, [])
+    text = f"file type = TIFF\ndata gain values = {listed(GAINS)}\ndata offset values = {listed(OFFSETS)}\n"
+    (folder / "a.hdr").write_text(header_text(CUBE, "bip", {}) + text)
+    return path
+
+
+def calibrated_hdf5(folder, attributes):
+    with h5py.File(folder / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs.update(attributes)
+    return folder / "a.h5"
+
+
+AUX = "<PAMDataset>" + "".join(
+    f'<PAMRasterBand band="{band}"><Offset>{offset}</Offset><Scale>{gain}</Scale></PAMRasterBand>'
+    for band, (gain, offset) in enumerate(zip(GAINS, OFFSETS, strict=True), start=1)
+)
+CALIBRATED = {
+    "ENVI": lambda folder: calibrated_envi(
+        folder, f"data gain values = {listed(GAINS)}\ndata offset values = {listed(OFFSETS)}"
+    ),
+    "ENVI, reflectance": lambda folder: calibrated_envi(
+        folder,
+        f"data reflectance gain values = {listed(GAINS)}\ndata_reflectance_offset_values = {listed(OFFSETS)}\n"
+        "data gain values = {7, 7, 7}",
+    ),
+    "roles of GDAL": lambda folder: calibrated_tiff(folder, gdal_items(scale=GAINS, offset=OFFSETS)),
+    "names in GDAL's metadata": lambda folder: calibrated_tiff(
+        folder, gdal_items(scale_factor=GAINS, add_offset=OFFSETS)
+    ),
+    "GDAL's file beside it": lambda folder: calibrated_tiff(folder, [], AUX + "</PAMDataset>"),
+    "a header beside a TIFF": calibrated_tiff_with_header,
+    "HDF5, by band": lambda folder: calibrated_hdf5(folder, {"scale_factor": GAINS, "add_offset": OFFSETS}),
+}
+
+
+@pytest.mark.parametrize("kind", CALIBRATED)
+def test_a_linear_calibration_is_known_by_whatever_name_a_format_has_for_it(tmp_path, kind):
+    file = open_spectral_file(CALIBRATED[kind](tmp_path))
+    assert file.linear is not None
+    wanted = np.array([2, 0])
+    np.testing.assert_allclose(
+        file.linear.apply(file.read(bands=wanted), wanted),
+        CUBE[..., wanted] * GAINS[wanted] + OFFSETS[wanted],
+    )
+
+
+def test_a_linear_calibration_of_the_whole_file(tmp_path):
+    file = open_spectral_file(calibrated_envi(tmp_path, "data gain values = 0.25\ndata offset values = 2"))
+    assert file.linear is not None
+    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE * 0.25 + 2)
+    assert file.scale is None
+    assert open_spectral_file(calibrated_hdf5(tmp_path, {"Scale_Factor": 10000.0})).scale == 10000
+    assert (
+        open_spectral_file(calibrated_hdf5(tmp_path, {"scale_factor": 1.0, "add_offset": 0.0})).linear is None
+    )
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ("data gain values = {1, 2}", "'data gain values' gives 2 gains for 3 bands"),
+        ("data gain values = {1, 2, x}", "'data gain values' has 'x'"),
+        ("data gain values = {1, 0, 2}", "gains from 0 to 2; expected finite numbers above 0"),
+        ("data gain values = 2\nreflectance scale factor = 10000", "it is unclear which the numbers need"),
+    ],
+)
+def test_a_calibration_that_cannot_be_applied_is_refused(tmp_path, more, message):
+    with pytest.raises(CaptureError, match=message):
+        open_spectral_file(calibrated_envi(tmp_path, more))
+
+
+def test_the_header_beside_a_tiff_describes_it(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", CUBE, planarconfig="contig", photometric="minisblack")
+    more = (
+        "file type = TIFF\nbbl = {1, 0, 1}\nwavelength units = Micrometers\nwavelength = {0.45, 0.5, 0.6}\n"
+    )
+    more += "tint = 5\n"
+    (tmp_path / "a.hdr").write_text(header_text(CUBE, "bip", {}) + more)
+    for name in ("a.tif", "a.hdr"):
+        file = open_spectral_file(tmp_path / name)
+        np.testing.assert_allclose(centres_nm(file), [450, 500, 600])
+        np.testing.assert_array_equal(file.bands.bad, [False, True, False])
+        assert (file.reader, file.metadata["exposure_s"]) == ("tiff", 0.005)
+        np.testing.assert_array_equal(file.read(), CUBE)
+    (tmp_path / "a.hdr").write_text(header_text(CUBE[:2], "bip", {}) + more)
+    assert any("describes 2 x 6 x 3" in text for text in open_spectral_file(tmp_path / "a.tif").warnings)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding):
+    header = write_envi(tmp_path / "a.hdr", CUBE, "bil")
+    text = (
+        header.read_text()
+        + "sensor = Größe [m\nwavelength_units = nm\nwavelength = [ 450.0 550.0\n   650.0]\nbbl = [1 0 1]\n"
+    )
+    header.write_bytes(text.encode(encoding))
+    file = open_spectral_file(header)
+    np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
+    np.testing.assert_array_equal(file.bands.bad, [False, True, False])

@@ -91,7 +91,7 @@ def test_rows_as_pages_are_recognised_by_the_number_of_wavelengths_or_said(tmp_p
     np.testing.assert_array_equal(file.read(slice(10, 20), slice(2, 4)), CUBE[10:20, :, 2:4])
     np.testing.assert_array_equal(centres_nm(file), nm)
     tifffile.imwrite(tmp_path / "b.tif", CUBE, photometric="minisblack", compression="zlib")
-    assert "axis 2 is the shortest" in open_spectral_file(tmp_path / "b.tif").notes[0]
+    assert "axis 2 is the shortest" in open_spectral_file(tmp_path / "b.tif").warnings[0]
     file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="yxb"))
     np.testing.assert_array_equal(file.read(slice(1, 70, 3), np.array([5, 2])), CUBE[1::3][..., [5, 2]])
     file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="xyb"))
@@ -212,14 +212,25 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path):
         file.write(PLANES[1, :9], metadata=None)
     file = open_spectral_file(tmp_path / "a.tif")
     assert file.shape == (70, 50, 1)
-    assert "2 pages of other sizes" in file.notes[0]
+    assert "pages of other sizes or types are left out: 1 of 9 x 50" in file.warnings[0]
+
+
+@pytest.mark.parametrize("below", [False, True])
+def test_a_preview_that_is_not_marked_as_one_is_not_taken_for_the_image(tmp_path, below):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        preview = (255 * CUBE[::2, ::2, :3] / CUBE.max()).astype(np.uint8)
+        file.write(preview, photometric="rgb", subifds=1 if below else 0, metadata=None)
+        file.write(CUBE, photometric="minisblack", planarconfig="contig", metadata=None)
+    file = open_spectral_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(file.read(), CUBE)
+    assert "left out: 1 of 35 x 25 x 3" in file.warnings[0]
 
 
 def test_opacity_is_noted(tmp_path):
     image = CUBE[..., :4].copy()
     file = written(tmp_path, image, photometric="rgb", extrasamples=["unassalpha"])
     np.testing.assert_array_equal(file.read(), image)
-    assert "marked as opacity" in file.notes[0]
+    assert "marked as opacity" in file.warnings[0]
 
 
 def test_time_and_gain_of_exif(tmp_path):

@@ -10,16 +10,17 @@ bands of the result.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.exposure import exposure_of
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import SpectralFile
+from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
@@ -36,7 +37,9 @@ def is_srgb(file: SpectralFile) -> bool:
     return file.metadata.get("encoding") == "sRGB"
 
 
-def _linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
+def _linear(
+    file: SpectralFile, stored: np.ndarray, rows: slice, bands: BandIndex = slice(None)
+) -> Float32[np.ndarray, "h W b"]:
     """Numbers of some whole rows: pictures decoded, and the calibration applied that the file carries itself."""
     if is_srgb(file):  # IEC 61966-2-1:1999
         top = np.iinfo(stored.dtype).max
@@ -44,7 +47,9 @@ def _linear(file: SpectralFile, stored: np.ndarray, rows: slice) -> Float32[np.n
         light = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
         return light.astype(np.float32)[stored]
     model = radiometric_model(file)
-    return stored.astype(np.float32) if model is None else model.apply(stored.astype(np.float32), rows)
+    if model is not None:
+        return model.apply(stored.astype(np.float32), rows)
+    return stored.astype(np.float32) if file.linear is None else file.linear.apply(stored, bands)
 
 
 @dataclass(frozen=True)
@@ -61,10 +66,18 @@ class Reference:
     how: str
     """How it is used, for people."""
 
+    @property
+    def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
+        """The mean in numbers as the file stores them."""
+        linear = self.file.linear
+        if linear is None or is_srgb(self.file):
+            return self.mean.astype(np.float64)
+        return (self.mean - linear.offsets) / linear.gains
+
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
         if self.is_per_pixel:
-            return _linear(self.file, self.file.read(rows, bands), rows)[:, columns]
+            return _linear(self.file, self.file.read(rows, bands), rows, bands)[:, columns]
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
@@ -85,13 +98,20 @@ def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Referen
     camera that takes whole images), and by the mean of its lines otherwise (a line camera).
 
     Raises:
-        CaptureError: another number of bands than the cubes, or a value that is not finite.
+        CaptureError: another number of bands than the cubes, other units, or a value that is not finite.
     """
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(
             f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected one "
             "taken by the same camera with the same settings"
+        )
+    if (file.linear is None) != (cube.linear is None):
+        has, lacks = (file, cube) if cube.linear is None else (cube, file)
+        stated = "" if has.linear is None else has.linear.evidence
+        raise CaptureError(
+            f"{lacks.path} has no gains or scale, {has.path} has ({stated}); expected both or neither, as numbers of "
+            "one can't be compared with those of the other: write the same into both"
         )
     mean, pattern = _column_means(file)
     if not np.isfinite(mean).all():
@@ -145,7 +165,9 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
     whole = slice(0, height)
     patterns = [
-        _pattern(_linear(file, file.read(whole, judged[[index]]), whole)[..., 0] - mean[:, band])
+        _pattern(
+            _linear(file, file.read(whole, judged[[index]]), whole, judged[[index]])[..., 0] - mean[:, band]
+        )
         for index, band in enumerate(judged)
     ]
     return mean[None].astype(np.float32), float(np.median(patterns))
@@ -316,6 +338,14 @@ class CalibratedRows:
 
 
 @dataclass(frozen=True)
+class OwnReferences:
+    """What was taken for one view alone."""
+
+    dark: Reference | None
+    white: WhiteReference | None
+
+
+@dataclass(frozen=True)
 class Calibration:
     """How the files of one sensor are calibrated."""
 
@@ -328,11 +358,11 @@ class Calibration:
     white: WhiteReference | None = None
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
-    gain: float = 1.0
-    """Factor on all values, such as one over the scale factor of the files."""
-    exposure: float | None = None
-    """Exposure time times gain that values are brought to: that of the white reference, otherwise of the first view;
-    None where the files do not say."""
+    exposure: Float64[np.ndarray, " b"] | None = None
+    """Exposure time times gain that values are brought to, one number or one a band of the file: that of the white
+    reference, otherwise of the first view; None where exposures are not compared."""
+    own: Mapping[Path, OwnReferences] = field(default_factory=dict)
+    """References of single views, by the path of their cube; they go before the common ones."""
 
     @property
     def num_bands(self) -> int:
@@ -348,7 +378,7 @@ class Calibration:
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
-        missing = find_missing(stored, file.no_data)
+        missing = find_missing(stored, file)
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
         values = self._values(file, whole, rows)
         sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so
@@ -365,24 +395,32 @@ class Calibration:
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
-        values = _linear(file, whole, rows)[:, columns]  # a new array, free to be changed
-        exposure = exposure_of(file)
-        if exposure is None or self.exposure is None:
-            factor = np.float32(self.gain)
-        else:
-            factor = np.float32(self.gain * (self.exposure / exposure))
-        dark = None if self.dark is None else self.dark.rows(rows, columns, bands)
+        values = _linear(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
+        references = self.own.get(file.path, OwnReferences(self.dark, self.white))
+        white = references.white
+        dark = None if references.dark is None else references.dark.rows(rows, columns, bands)
+        factor = self._exposure_factor(file, white)
         if dark is not None:
             values -= dark
-        if self.white is not None:
-            light = self.white.reference.rows(rows, columns, bands)
+        if white is not None:
+            light = white.reference.rows(rows, columns, bands)
             if dark is not None:
                 light = light - dark
             # NaN where the white is not above the dark.
             light = np.where(light > 0, light, np.float32(np.nan))
-            factor = factor * (self.white.reflectance[bands].astype(np.float32) / light)
+            factor = factor * (white.reflectance[bands].astype(np.float32) / light)
         values *= factor
         return values
+
+    def _exposure_factor(self, file: SpectralFile, white: WhiteReference | None) -> Float32[np.ndarray, " b"]:
+        """What brings the kept bands of a view to the common exposure, or to that of its own white reference."""
+        wanted, found = self.exposure, exposure_of(file)
+        if file.path in self.own and white is not None and wanted is not None:
+            wanted = exposure_of(white.reference.file)
+        if wanted is None or found is None:
+            return np.ones(1, np.float32)
+        factor = wanted / found
+        return (factor if len(factor) == 1 else factor[self.bands]).astype(np.float32)
 
     def _in_bins(self, values: np.ndarray) -> np.ndarray:
         """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
@@ -390,25 +428,21 @@ class Calibration:
         return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
-def find_missing(stored: np.ndarray, no_data: float | None) -> Bool[np.ndarray, "h W"]:
-    """Pixels without a measurement: no number in some band, or the file's no-data value.
+def find_missing(stored: np.ndarray, file: SpectralFile) -> Bool[np.ndarray, "h W"]:
+    """Pixels without a measurement: no number in some band, the file's no-data value, or out of its valid range.
 
     A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
     """
     missing = np.zeros(stored.shape[:2], bool)
     if stored.dtype.kind == "f":
         missing |= ~np.isfinite(stored).all(axis=-1)
+    if file.valid_range is not None:
+        low, high = file.valid_range
+        missing |= ((stored < low) | (stored > high)).any(axis=-1)
+    no_data = file.no_data
     if no_data is not None and np.isfinite(no_data):
         limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
         if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
             same = stored == stored.dtype.type(no_data)
             missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
     return missing
-
-
-def exposure_of(file: SpectralFile) -> float | None:
-    """Exposure time times gain, where the file has the time."""
-    exposure, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
-    if not isinstance(exposure, int | float) or not isinstance(gain, int | float):
-        return None
-    return float(exposure * gain) if exposure > 0 and gain > 0 else None

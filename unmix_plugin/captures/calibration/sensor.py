@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,10 @@ from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
+    OwnReferences,
     Raster,
     Reference,
     WhiteReference,
-    exposure_of,
     is_srgb,
     open_reference,
     panel_reference,
@@ -27,10 +28,11 @@ from unmix_plugin.captures.calibration.calibration import (
     white_reference,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.exposure import Exposures, compare_exposures
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
+from unmix_plugin.captures.spectral_file import MOST_WIDTH, CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, ConfigError, counted
+from unmix_plugin.errors import CaptureError, ConfigError
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -84,9 +86,13 @@ class _BandChoice:
         return _BandChoice(self.wavelengths_nm, {**added, **self.dropped})
 
     def without_repeated(self) -> _BandChoice:
-        """The choice without bands whose wavelength an earlier band has."""
-        repeated = np.ones(len(self.wavelengths_nm), bool)
-        repeated[np.unique(self.wavelengths_nm, return_index=True)[1]] = False
+        """The choice without bands whose wavelength an earlier one that is kept has."""
+        left = np.array(
+            [index for index in range(len(self.wavelengths_nm)) if index not in self.dropped], int
+        )
+        repeated = np.zeros(len(self.wavelengths_nm), bool)
+        repeated[left] = True
+        repeated[left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]] = False
         return self.without(repeated, "an earlier band has the same wavelength")
 
     def require(self, binning: int, where: str) -> None:
@@ -125,6 +131,8 @@ class Sensor:
     lamp: Float64[np.ndarray, " c"] | None = None
     """Light on the white panel as the detector sees it, greatest value 1."""
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """What may make values wrong, one sentence each."""
 
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
@@ -161,6 +169,8 @@ def prepare_sensor(
     model = radiometric_model(first)
     choice, notes = _stated_bands(first, options), []
     dark, white = _references(views, choice, options, references)
+    own = _own_references(views, choice, options, dark, white)
+    whites = [one for one in (white, *(pair.white for pair in own.values())) if one is not None]
     if options.saturation is not None:
         saturation, how = options.saturation, "given with --saturation"
     elif model is not None:
@@ -169,26 +179,29 @@ def prepare_sensor(
         saturation, how = _find_saturation(files, choice.kept)
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
-    if white is not None:
-        share = 0.0 if saturation is None else float((white.reference.mean >= saturation).mean())
+    for used in whites:
+        share = 0.0 if saturation is None else float((used.reference.stored_mean >= saturation).mean())
         if share > _MOST_SATURATED_WHITE:
             raise CaptureError(
-                f"{white.reference.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and "
+                f"{used.reference.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and "
                 "above); take it again with a shorter exposure"
             )
-        signal = panel_signal(white.reference, dark)
-        lamp = signal / white.reflectance
+        its_dark = next((pair.dark for pair in own.values() if pair.white is used), dark)
+        signal = panel_signal(used.reference, its_dark)
+        lamp = signal / used.reflectance if lamp is None else lamp
         choice = choice.without(
             signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
         )
     choice.require(binning, str(first.path))
     # A maker's calibration accounts for exposures already.
-    exposure, said = _common_exposure(files, white) if model is None else (None, [])
-    gain = 1.0 if first.scale is None or is_srgb(first) else 1.0 / first.scale
-    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, gain, exposure)
+    exposures = Exposures()
+    if model is None:
+        darks = [one.file for one in (dark, *(pair.dark for pair in own.values())) if one is not None]
+        exposures = compare_exposures(files, [one.reference.file for one in whites], darks, is_srgb(first))
+    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
-    notes += [*said, *noted]
+    notes += [*exposures.notes, *noted]
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
     calibration = replace(calibration, bands=choice.kept, bin_bands=binning)
@@ -196,19 +209,28 @@ def prepare_sensor(
         lamp = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
         lamp = np.clip(lamp, 0.0, None) / lamp.max()
     # Floating-point numbers may have been brought to what stands for 1 already.
-    has_one = is_srgb(first) or first.scale is not None or (first.dtype.kind == "f" and model is None)
+    has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
     evidence |= _evidence(views, choice, dark, white)
+    if own:
+        used = next(iter(own.values()))
+        pairs = (("dark", used.dark), ("white", used.white and used.white.reference))
+        evidence |= {
+            what: {"file": "each view's own", "use": f"each view's own; {reference.how}"}
+            for what, reference in pairs
+            if reference is not None
+        }
     return Sensor(
         name,
         calibration,
         choice,
-        _unit(first, white),
-        white is not None or has_one,
+        "reflectance" if whites else _unit(first),
+        bool(whites) or has_one,
         _binned(sample.values[:, still_kept], binning),
         evidence,
         lamp,
         tuple(notes),
+        exposures.warnings,
     )
 
 
@@ -219,9 +241,13 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
             "with --wavelengths, as a list in nm or a CSV file"
         )
-    choice = _BandChoice(wavelengths, {}).without_repeated()
+    choice = _BandChoice(wavelengths, {})
     if file.bands.bad is not None:
         choice = choice.without(file.bands.bad, "marked as bad in the file")
+    if file.bands.fwhm_nm is not None:
+        broad = file.bands.is_broad
+        choice = choice.without(broad, f"wider than {MOST_WIDTH:.0%} of its wavelength: too broad for one")
+    choice = choice.without_repeated()
     if options.drop_bands is not None:
         choice = choice.without(in_ranges(options.drop_bands, wavelengths), "named in --drop-bands")
     return choice
@@ -247,37 +273,38 @@ def _references(
     return dark, white_reference(panel, dark, options.white_reflectance, choice.wavelengths_nm)
 
 
-def _common_exposure(
-    files: Sequence[SpectralFile], white: WhiteReference | None
-) -> tuple[float | None, list[str]]:
-    """The exposure that all values are brought to, and what to tell of it."""
-    found = [exposure_of(file) for file in files]
-    of_white = None if white is None else exposure_of(white.reference.file)
-    known = [exposure for exposure in found if exposure is not None]
-    if len(known) < len(found):
-        missing = len(found) - len(known)
-        said = (
-            [f"{counted(missing, 'view')} without exposure time: exposures are not compared"] if known else []
-        )
-        return None, said
-    common, source = (known[0], "the first view") if of_white is None else (of_white, "the white reference")
-    if all(exposure == common for exposure in known):
-        return common, []
-    low, high = min(known), max(known)
-    return common, [
-        f"views were exposed {low:g} to {high:g} s times gain: all are brought to {common:g}, as {source} has"
-    ]
+def _own_references(
+    views: Sequence[CaptureView],
+    choice: _BandChoice,
+    options: ProcessOptions,
+    dark: Reference | None,
+    white: WhiteReference | None,
+) -> dict[Path, OwnReferences]:
+    """References of views that were taken with their own, by cube; what the user names goes before them."""
+    own = {}
+    for view in views:
+        its_dark, its_white = dark, white
+        if dark is None and view.dark is not None:
+            its_dark = open_reference(view.dark, "dark frame", view.cube)
+        if white is None and view.white is not None:
+            panel = open_reference(view.white, "white reference", view.cube)
+            its_white = white_reference(panel, its_dark, options.white_reflectance, choice.wavelengths_nm)
+        if its_dark is not dark or its_white is not white:
+            own[view.cube.path] = OwnReferences(its_dark, its_white)
+    return own
 
 
-def _unit(file: SpectralFile, white: WhiteReference | None) -> str:
-    if white is not None:
-        return "reflectance"
+def _unit(file: SpectralFile) -> str:
     if is_srgb(file):
         return "linear light of pictures in sRGB"
     model = radiometric_model(file)
     if model is not None:
         return model.description
-    return "relative radiance" if file.scale is None else "values divided by the scale factor of the files"
+    if file.linear is None:
+        return "relative radiance"
+    if file.linear.scale is not None:
+        return "values divided by the scale factor of the files"
+    return f"stored numbers times a gain plus an offset ({file.linear.evidence})"
 
 
 def _evidence(

@@ -17,13 +17,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from unmix_plugin.captures.exposure import exposure_facts, is_exposure
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
+    Linear,
     ReadOptions,
     SpectralFile,
     choose_axes,
     image_shape,
+    linear_values,
     loaded,
     take_part,
 )
@@ -42,12 +45,18 @@ _TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
 """(h, W, b) numbers of a stored array whose axes are these."""
 
 _CENTRES = re.compile(
-    r"(list_cw_.*)|((band_?|cent(er|re|ral)_?|sensor_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?))(_?(nm|um))?"
+    r"(list_cw_[^_]*)|(bands)|((band_?|cent(er|re|ral)_?|sensor_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?))(_?(nm|um))?"
 )
-_WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_.*)(_?(nm|um))?")
-_GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)")
-_NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data")
-_SCALES = ("scale_factor", "reflectance_scale_factor")
+_WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
+_GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
+_NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data", "fill_value")
+_GAINS, _OFFSETS = ("scale_factor", "reflectance_scale_factor"), ("add_offset",)
+_OWN_GAINS = ("scalefactor", "scale", "gain", "gains", "slope")
+_OWN_OFFSETS = ("offset", "offsets", "bias", "intercept")
+"""Names that mean this only beside the numbers themselves; those above hold for all images of a file."""
+_DIVISORS = ("reflectance_scale_factor",)
+_QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertainty|std|stddev)(_|$)")
+"""What an array of three axes is called that measures nothing itself."""
 _AXIS_NAMES = {
     "b": "band bands wavelength wavelengths wl lambda channel spectral",
     "y": "y lat latitude row rows line lines downtrack northing height",
@@ -71,6 +80,8 @@ class FoundArray:
     take: _TakePart | None = None
     """A faster way to some rows and bands than through `whole`."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    inherited: Mapping[str, Any] = field(default_factory=dict)
+    """Attributes of the groups that it is in and of the file, the nearest first."""
     dimensions: tuple[str, ...] | None = None
     """Names of its axes."""
 
@@ -78,6 +89,11 @@ class FoundArray:
     def own_name(self) -> str:
         """Without groups, in lower case."""
         return self.name.rpartition("/")[2].lower()
+
+    @property
+    def all_attributes(self) -> dict[str, Any]:
+        """Its own attributes, and those inherited that it lacks."""
+        return {**self.inherited, **self.attributes}
 
     @property
     def is_vector(self) -> bool:
@@ -93,7 +109,7 @@ def image_of_arrays(
     image = _find_image(path, arrays, options)
     what = image.name or "the array"
     size = _pixel_list_size(image, arrays, options)
-    fixed, notes = options.axes, ()
+    fixed = options.axes
     shape, take = image.shape, image.take
     if len(image.shape) == 2:  # a list of pixels, column after column, or one band
         if size is None and options.size is not None:
@@ -113,10 +129,11 @@ def image_of_arrays(
         fixed = named if sorted(named) == ["b", "x", "y"] else None
     stated = _state_bands(arrays, image)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
-    axes, notes = choose_axes(shape, fixed, None if given is None else len(given))
+    axes, axis_warnings = choose_axes(shape, fixed, None if given is None else len(given))
     of_image = image_shape(shape, axes)
-    bands, band_notes = check_bands(stated, of_image[2])
-    scale, scale_notes = _scale(image.attributes)
+    bands, band_warnings = check_bands(stated, of_image[2])
+    linear = _linear(path, image, of_image[2])
+    exposure, exposure_warnings = _exposure(arrays, image)
 
     def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
         if take is not None:
@@ -130,10 +147,11 @@ def image_of_arrays(
         dtype=image.dtype,
         read_part=read_part,
         bands=bands,
-        scale=scale,
-        no_data=_first_number(image.attributes, _NO_DATA),
-        notes=notes + band_notes + scale_notes,
-        metadata={"dataset": image.name, "axes": axes} if len(arrays) > 1 else {"axes": axes},
+        linear=linear,
+        no_data=_first_number(image.all_attributes, _NO_DATA),
+        valid_range=_valid_range(image.all_attributes),
+        warnings=axis_warnings + band_warnings + exposure_warnings,
+        metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )
 
 
@@ -155,6 +173,8 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
     images = [array for array in numeric if len(array.shape) == 3]
     if not images:
         images = [array for array in numeric if _pixel_list_size(array, arrays, options) is not None]
+    if len(images) > 1:
+        images = [image for image in images if not _QUALITY.search(image.own_name)] or images
     if len(images) > 1:
         images = [image for image in images if _find_vector(arrays, image, _CENTRES) is not None] or images
     if not images:
@@ -199,9 +219,18 @@ def _find_vector(
     found = [
         array
         for array in arrays
-        if array.is_vector and prod(array.shape) in image.shape and names.fullmatch(array.own_name)
+        if array.is_vector
+        and prod(array.shape) in image.shape
+        and names.fullmatch(array.own_name)
+        and not (array.own_name == "bands" and _counts(array))
     ]
     return max(found, key=lambda array: common_groups(array.name), default=None)
+
+
+def _counts(array: FoundArray) -> bool:
+    """Whether a list counts instead of measuring: whole numbers one apart."""
+    numbers = array.whole().reshape(-1)
+    return bool((np.diff(numbers) == 1).all()) and numbers[0] < 100
 
 
 def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands:
@@ -211,32 +240,121 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
         return None if vector is None else vector.whole().reshape(-1).tolist()
 
     centres, widths, good = (_find_vector(arrays, image, names) for names in (_CENTRES, _WIDTHS, _GOOD))
+    of_image = [_find_attribute(image, names) for names in (_CENTRES, _WIDTHS, _GOOD)]
     if centres is not None:
         where, listed = f"data set '{centres.name}'", numbers(centres)
         name, attributes = centres.own_name, centres.attributes
     else:
-        attribute = next((key for key in image.attributes if _CENTRES.fullmatch(key.lower())), None)
-        values = np.atleast_1d(image.attributes[attribute]) if attribute is not None else np.zeros(0)
-        listed = values.tolist() if values.ndim == 1 and len(values) in image.shape else None
-        where, name, attributes = f"attribute '{attribute}'", attribute or "", {}
+        name, listed = of_image[0]
+        where, attributes = f"attribute '{name}'", {}
     unit = next((value for key, value in attributes.items() if key.lower() in ("unit", "units")), None)
     if unit is None:
         suffix = name.lower()[-2:]
         unit = suffix if suffix in ("nm", "um") else None
     else:
         unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
-    return StatedBands(where, listed, unit, numbers(widths), numbers(good))
+    return StatedBands(
+        where, listed, unit, numbers(widths) or of_image[1][1], numbers(good) or of_image[2][1]
+    )
 
 
-def _scale(attributes: Mapping[str, Any]) -> tuple[float | None, tuple[str, ...]]:
-    """Stored number that stands for 1: factors above 1 divide, those below multiply, as climate files have it."""
-    factor = _first_number(attributes, _SCALES)
-    offset = _first_number(attributes, ("add_offset",))
-    note = f"an offset of {offset:g} is to be added to scaled values, which is left to you" if offset else ""
-    notes = (note,) if note else ()
-    if factor is None or not np.isfinite(factor) or factor <= 0 or factor == 1:
-        return None, notes
-    return (factor if factor > 1 else 1 / factor), notes
+def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, list[object] | None]:
+    """The attribute with such a name that fits an axis; of several the one whose name has a word of the image's."""
+    words = set(re.split(r"[\W_]+", image.own_name))
+    found = {
+        key: values.tolist()
+        for key, value in image.all_attributes.items()
+        if names.fullmatch(key.lower())
+        and (values := np.atleast_1d(value)).ndim == 1
+        and values.dtype.kind in "iufb"
+        and len(values) in image.shape
+    }
+    best = max(found, key=lambda key: len(words & set(re.split(r"[\W_]+", key.lower()))), default="")
+    return best, found.get(best)
+
+
+def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
+    """Gains and offsets among the attributes: value = factor * stored + offset, as climate files have it.
+
+    A single factor above 1 without an offset divides, as NEON's 10000 does. PRISMA's are those of its level.
+    """
+    columns, evidence = [], []
+    for names, own_names in ((_GAINS, _OWN_GAINS), (_OFFSETS, _OWN_OFFSETS)):
+        key = _first_key(image.all_attributes, names) or _first_key(image.attributes, own_names)
+        numbers = [] if key is None else _numbers(image.all_attributes[key])
+        columns.append(numbers)
+        evidence += [f"'{key}'"] if numbers else []
+    gains, offsets = columns
+    if len(gains) == 1 and not offsets and evidence[0].lower() == "'gain'":  # that of a camera
+        gains, evidence = [], []
+    is_divisor = len(gains) == 1 and gains[0] > 1 and not offsets
+    if is_divisor or (gains and evidence[0].strip("'").lower() in _DIVISORS):
+        gains = [1.0 / gain if gain else np.nan for gain in gains]
+    if not evidence and (prisma := _prisma(image)) is not None:
+        gains, offsets, evidence = [prisma[0]], [prisma[1]], [prisma[2]]
+    return linear_values(path, num_bands, gains, offsets, f"attribute {' and '.join(evidence)}")
+
+
+def _prisma(image: FoundArray) -> tuple[float, float, str] | None:
+    """Gain, offset and where they stand in a PRISMA file: radiances of level 1, reflectances of level 2.
+
+    Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`).
+    """
+    for part in ("Vnir", "Swir"):
+        if part.lower() not in image.own_name:
+            continue
+        low, high = (
+            _first_number(image.all_attributes, (f"l2scale{part.lower()}{end}",)) for end in ("min", "max")
+        )
+        if low is not None and high is not None and high > low:
+            return (high - low) / 65535.0, low, f"'L2Scale{part}Min' and 'L2Scale{part}Max'"
+        factor, offset = (
+            _first_number(image.all_attributes, (f"{name}_{part.lower()}",))
+            for name in ("scalefactor", "offset")
+        )
+        if factor:
+            return 1.0 / factor, -(offset or 0.0), f"'ScaleFactor_{part}' and 'Offset_{part}'"
+    return None
+
+
+def _numbers(value: Any) -> list[float]:
+    """Numbers of an attribute; none where it is something else."""
+    try:
+        return np.asarray(value, dtype=np.float64).reshape(-1).tolist()
+    except (TypeError, ValueError):
+        return []
+
+
+def _valid_range(attributes: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Least and greatest stored number that was measured, by NetCDF's attributes."""
+    named = {key.lower(): _numbers(value) for key, value in attributes.items()}
+    both = named.get("valid_range", [])
+    if len(both) == 2:
+        return both[0], both[1]
+    low, high = named.get("valid_min", [-np.inf]), named.get("valid_max", [np.inf])
+    is_given = len(low) == len(high) == 1 and ("valid_min" in named or "valid_max" in named)
+    return (low[0], high[0]) if is_given else None
+
+
+def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Exposure among attributes, and single numbers or lists of one a band beside the image."""
+    entries: dict[str, Any] = dict(image.all_attributes)
+    for array in arrays:
+        if array.is_vector and prod(array.shape) in (1, *image.shape) and is_exposure(array.own_name):
+            unit = next(
+                (value for key, value in array.attributes.items() if key.lower() in ("unit", "units")), ""
+            )
+            text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
+            entries[array.own_name] = ",".join(
+                f"{number} {text}" for number in array.whole().reshape(-1).tolist()
+            )
+    return exposure_facts(entries, "data set or attribute")
+
+
+def _first_key(attributes: Mapping[str, Any], names: Sequence[str]) -> str | None:
+    """The attribute with the first of some names that is there, in any case."""
+    named = {key.lower(): key for key in attributes}
+    return next((named[name] for name in names if name in named), None)
 
 
 def _first_number(attributes: Mapping[str, Any], names: Sequence[str]) -> float | None:
@@ -371,9 +489,10 @@ def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
 
         attributes = dict(variable._attributes)
         kind = variable.data.dtype
-        return FoundArray(name, variable.shape, kind, whole, take, attributes, variable.dimensions)
+        return FoundArray(name, variable.shape, kind, whole, take, attributes, root, variable.dimensions)
 
     with netcdf_file(str(path), "r", mmap=True) as file:
         allow_parts(path, len(file.variables), "variables", CaptureError)
+        root = dict(file._attributes)
         arrays = [found(name, variable) for name, variable in file.variables.items()]
     return image_of_arrays(path, "netcdf", arrays, options)

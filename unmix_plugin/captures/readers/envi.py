@@ -3,31 +3,44 @@
 from __future__ import annotations
 
 import math
-import re
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from unmix_plugin.captures.exposure import exposure_facts
 from unmix_plugin.captures.spectral_file import (
     BandIndex,
+    Linear,
     ReadOptions,
     SpectralFile,
+    linear_values,
     take_part,
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.formats.envi import EnviLayout, data_beside, header_items, read_header, read_layout
+from unmix_plugin.formats.envi import (
+    EnviLayout,
+    data_beside,
+    header_begins,
+    header_items,
+    image_size,
+    read_header,
+    read_layout,
+)
 
 _SHOWN_LENGTH = 200
 """Longer entries of a header are lists, which are not kept as metadata."""
+_DESCRIBED = (".tif", ".tiff", ".exr", ".npy", ".h5", ".hdf5", ".he5", ".nc", ".mat")
+"""Images that a header may describe instead of plain numbers."""
 _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"PK\x03\x04": "zip", b"\xfd7zXZ": "xz"}
 
 
 def is_envi_header(path: Path) -> bool:
     """Whether a file of any name begins as a header does."""
     with path.open("rb") as file:
-        begin = file.read(16).removeprefix(b"\xef\xbb\xbf")
-    return re.match(rb"ENVI\s", begin) is not None
+        return header_begins(file.read(32))
 
 
 def header_beside(data_path: Path) -> Path | None:
@@ -51,6 +64,61 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
         data_path = path if path != header_path else data_beside(header_path, layout.num_bytes)
     except ValueError as error:
         raise CaptureError(f"{header_path}: {error}") from error
+    size_warnings = _check_size(header_path, data_path, layout)
+    plain = SpectralFile(
+        path=header_path,
+        reader="envi",
+        shape=layout.shape,
+        dtype=layout.dtype,
+        read_part=lambda rows, wanted: _read_part(data_path, layout, rows, wanted),
+        interleave=layout.interleave,
+        warnings=layout.notes + size_warnings,
+        sources=(data_path,),
+    )
+    return _described(plain, header_path, header)
+
+
+def described_by_header(file: SpectralFile) -> SpectralFile:
+    """An image of another format with what an ENVI header beside it says; unchanged where there is none.
+
+    Programs write such headers beside TIFF files to keep wavelengths and gains, often with `file type = TIFF`.
+
+    Raises:
+        CaptureError: it is a header of this image and is damaged.
+    """
+    header_path = header_beside(file.path)
+    if header_path is None or described_image(header_path) != file.path:
+        return file
+    try:
+        header = read_header(header_path)
+        shape = image_size(header)
+    except ValueError as error:
+        raise CaptureError(f"{header_path}: {error}") from error
+    if shape != file.shape:
+        expected, found = (" x ".join(map(str, size)) for size in (file.shape, shape))
+        warning = f"{header_path.name} describes {found} rows, columns and bands, the image has {expected}: not used"
+        return replace(file, warnings=(*file.warnings, warning))
+    described = _described(file, header_path, header)
+    return replace(described, sources=(*file.sources, header_path))
+
+
+def described_image(header_path: Path) -> Path | None:
+    """The image of another format that a header describes, x.tif for x.hdr or x.tif.hdr; None for plain numbers."""
+    named = [header_path.with_suffix(""), *(header_path.with_suffix(suffix) for suffix in _DESCRIBED)]
+    named += [path.with_suffix(path.suffix.upper()) for path in named[1:]]
+    others = [path for path in named if path.suffix.lower() in _DESCRIBED and path.is_file()]
+    if not others or not is_envi_header(header_path):
+        return None
+    with suppress(ValueError, OSError):
+        if "tif" not in read_header(header_path).get("file type", "").lower():
+            _ = data_beside(header_path, 0)
+            return None
+    return others[0]
+
+
+def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) -> SpectralFile:
+    """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
+    num_bands = file.shape[2]
     stated = StatedBands(
         "header field 'wavelength'",
         header_items(header, "wavelength") or None,
@@ -59,27 +127,63 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
         header_items(header, "bbl") or None,
         header_items(header, "band names", ",") or None,
     )
-    size_notes = _check_size(header_path, data_path, layout)
-    bands, band_notes = check_bands(stated, layout.shape[2])
-    key, scale_notes = "reflectance scale factor", ()
+    bands, band_warnings = check_bands(stated, num_bands)
+    linear, linear_warnings = _linear(header_path, header, num_bands)
+    exposure, exposure_warnings = exposure_facts(header, "header field")
+    own, no_data = file.bands, _number(header, "data ignore value")
+    if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
+        bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
+    shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
+    return replace(
+        file,
+        bands=bands if bands.names is not None else replace(bands, names=own.names),
+        linear=linear or file.linear,
+        no_data=file.no_data if no_data is None else no_data,
+        warnings=file.warnings + band_warnings + linear_warnings + exposure_warnings,
+        metadata=file.metadata | exposure | {"header": shown},
+    )
+
+
+def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear | None, tuple[str, ...]]:
+    """Gains and offsets of a header; reflectances go before radiances where it has both; and warnings.
+
+    Source: NV5, ENVI Header Files (`data gain values`, `data reflectance gain values`, `reflectance scale factor`).
+    """
+    found: list[Linear] = []
+    for kind in ("data reflectance", "data"):
+        keys = [f"{kind} gain values", f"{kind} offset values"]
+        gains, offsets = ([_float(path, key, item) for item in header_items(header, key)] for key in keys)
+        stated = " and ".join(
+            f"'{key}'" for key, column in zip(keys, (gains, offsets), strict=True) if column
+        )
+        found += [
+            one
+            for one in [linear_values(path, num_bands, gains, offsets, f"header field {stated}")]
+            if one is not None
+        ]
+    key, warnings = "reflectance scale factor", ()
     scale = _number(header, key)
     if key in header and (scale is None or not math.isfinite(scale) or scale <= 0):
-        scale_notes = (f"'{key}' is {header[key]} and is left out; expected a number above 0",)
-        scale = None
-    return SpectralFile(
-        path=header_path,
-        reader="envi",
-        shape=layout.shape,
-        dtype=layout.dtype,
-        read_part=lambda rows, wanted: _read_part(data_path, layout, rows, wanted),
-        bands=bands,
-        interleave=layout.interleave,
-        scale=scale,
-        no_data=_number(header, "data ignore value"),
-        notes=layout.notes + size_notes + band_notes + scale_notes,
-        metadata={"header": {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}},
-        sources=(data_path,),
-    )
+        warnings = (f"'{key}' is {header[key]} and is left out; expected a number above 0",)
+    elif scale is not None and scale != 1:
+        if found:
+            raise CaptureError(
+                f"{path}: has '{key}' {scale:g} and other gains ({found[0].evidence}); expected one of them, as it is "
+                "unclear which the numbers need: take the other out of the header"
+            )
+        found = [
+            one for one in [linear_values(path, num_bands, [1 / scale], [], f"header field '{key}'")] if one
+        ]
+    if len(found) > 1:
+        warnings = (f"{found[0].evidence} is applied, not {found[1].evidence}",)
+    return (found[0] if found else None), warnings
+
+
+def _float(path: Path, key: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise CaptureError(f"{path}: '{key}' has {text!r}; expected numbers, one a band") from None
 
 
 def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandIndex) -> np.ndarray:
@@ -94,7 +198,7 @@ def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandInde
 
 
 def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple[str, ...]:
-    """A note if there is more than the header describes; less, or compressed numbers, are refused."""
+    """A warning if there is more than the header describes; less, or compressed numbers, are refused."""
     found, needed = data_path.stat().st_size, layout.num_bytes
     if found >= needed:
         return (f"{found - needed} bytes more than the header describes",) if found > needed else ()

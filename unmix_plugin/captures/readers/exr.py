@@ -3,6 +3,10 @@
 Three ways of naming channels for wavelengths are known: `S0.450,000000nm` and `T.450,0nm` (Fichet et al. 2021, where a
 comma stands for the decimal point since a dot parts layers), `360.00-407.00nm` (Mitsuba, a range), and a plain number.
 
+A file may have several parts, each with channels of its own; bands are looked for in all of them. The picture is the
+display window: a data window that is smaller leaves pixels without a measurement, and what is outside is cut off.
+Source: OpenEXR, Technical Introduction.
+
 Notation: `H` rows, `W` columns, `B` bands.
 """
 
@@ -19,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.exposure import exposure_facts
 from unmix_plugin.captures.spectral_file import (
     BandTable,
     ReadOptions,
@@ -48,12 +53,13 @@ LAYERS = ("S0", "T", "")
 
 @dataclass(frozen=True)
 class _Channel:
-    """One channel as the header lists it."""
+    """One channel as the header of its part lists it."""
 
     name: str
+    part: int
     dtype: np.dtype
-    sampling: tuple[int, int]
-    """1, 1 but for channels that leave out pixels."""
+    is_whole: bool
+    """Whether there is a number for each pixel."""
 
 
 @dataclass(frozen=True)
@@ -71,85 +77,166 @@ class _SpectralChannel:
 def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     """Open an image by its header; the numbers are read as a whole, when the first of them is asked for.
 
-    `options.dataset` names a layer (`S0`, `T`), or one channel.
+    `options.dataset` names a layer (`S0`, `T`), a part, or one channel.
 
     Raises:
-        CaptureError: the file is damaged, or has no such layer or channel.
+        CaptureError: the file is damaged, or has no such layer, part or channel.
     """
     with path.open("rb") as file:
         begin = file.read(_HEADER_BYTES)
     try:
-        channels = _list_channels(begin)
+        _ = _list_channels(begin, [False])
+        parts = _opened(path, header_only=True).parts
+        channels = _list_channels(begin, ["deep" in str(part.type()).lower() for part in parts])
     except ValueError as error:
         raise CaptureError(f"{path}: no OpenEXR image: {error}; copy the file again") from error
     allow_parts(path, len(channels), "channels", CaptureError)
-    bands, notes = _choose(path, [channel.name for channel in channels], options.dataset)
-    names = bands.names or ()
-    chosen = [channel for channel in channels if channel.name in names]
-    if any(channel.sampling != (1, 1) for channel in chosen):
+    wanted, titles = options.dataset, [str(part.header.get("name", "")) for part in parts]
+    considered = [one for one in channels if wanted is None or titles[one.part] == wanted]
+    table, chosen, warnings = _choose(path, considered or channels, None if considered else wanted)
+    if not all(channel.is_whole for channel in chosen):
         raise CaptureError(
-            f"{path}: channels leave out pixels (sampling above 1); expected one number a pixel"
+            f"{path}: channels leave out pixels (sampling above 1, or a deep image); expected one number a pixel"
         )
-    header = _opened(path, header_only=True).header()
-    (left, top), (right, bottom) = header["dataWindow"]
-    a_pixel = sum(channel.dtype.itemsize for channel in channels)  # the library decodes all of them
-    size = (int(bottom) - int(top) + 1) * (int(right) - int(left) + 1) * a_pixel
-    allow_decoded(path, size, CaptureError)
-    if not np.array_equal(header["dataWindow"], header["displayWindow"]):
-        notes += ("the image is a part of a larger picture: its data window is not its display window",)
-    others = [channel.name for channel in channels if channel.name not in names]
+    header = parts[chosen[0].part].header
+    frame = _window(header, "displayWindow")
+    others = [channel.name for channel in channels if channel not in chosen]
+    unused = [
+        title or f"number {index}"
+        for index, title in enumerate(titles)
+        if not any(channel.part == index for channel in chosen)
+    ]
+    if unused and table.wavelengths_nm is None:
+        warnings += (f"only the first part is taken; the file also has the parts {', '.join(unused)}",)
+    windows = [_window(parts[index].header, "dataWindow") for index in sorted({one.part for one in chosen})]
+    if any(window.isdisjoint(frame) for window in windows):
+        raise CaptureError(
+            f"{path}: its data window {windows[0]} lies outside of the picture {frame} (left, top, right, bottom); "
+            "expected a part of it: render it again"
+        )
+    # The library decodes all channels of a part; what is taken is put on the picture.
+    for index in {channel.part for channel in chosen}:
+        own = _window(parts[index].header, "dataWindow")
+        a_pixel = sum(channel.dtype.itemsize for channel in channels if channel.part == index)
+        allow_decoded(path, max(own.size, frame.size) * a_pixel, CaptureError)
+    is_partial = any(not window.covers(frame) for window in windows)
+    dtype = np.result_type(*(channel.dtype for channel in chosen))
     attributes = {
         name: value
         for name, value in header.items()
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
+    exposure, exposure_warnings = exposure_facts(attributes, "attribute")
+    speed = header.get("isoSpeed")
+    if exposure and isinstance(speed, float) and speed > 0:
+        exposure["gain"] = speed / 100
+    listed = [
+        {
+            "name": title,
+            "type": str(part.type()),
+            "channels": len([one for one in channels if one.part == index]),
+        }
+        for index, (title, part) in enumerate(zip(titles, parts, strict=True))
+    ]
+    keys = tuple((channel.part, channel.name) for channel in chosen)
     return SpectralFile(
         path=path,
         reader="exr",
-        shape=(int(bottom) - int(top) + 1, int(right) - int(left) + 1, len(names)),
-        dtype=np.result_type(*(channel.dtype for channel in chosen)),
-        read_part=lambda rows, wanted: np.moveaxis(loaded(_load_exr, path, names)[wanted][:, rows], 0, -1),
-        bands=bands,
-        notes=notes,
-        metadata=attributes | ({"other_channels": others} if others else {}),
+        shape=(frame.bottom - frame.top + 1, frame.right - frame.left + 1, len(chosen)),
+        dtype=np.result_type(dtype, np.float16) if is_partial else dtype,
+        read_part=lambda rows, wanted: np.moveaxis(loaded(_load_exr, path, keys)[wanted][:, rows], 0, -1),
+        bands=table,
+        notes=("the data window is a part of the picture: pixels outside of it are missing",)
+        if is_partial
+        else (),
+        warnings=(*warnings, *exposure_warnings),
+        metadata=attributes
+        | exposure
+        | ({"other_channels": others} if others else {})
+        | ({"parts": listed} if len(parts) > 1 else {}),
     )
 
 
-def _list_channels(header: bytes) -> list[_Channel]:
-    """Channels of the first part, from the first bytes of a file; ValueError where they are damaged."""
-    position = header.find(_MARK) + len(_MARK)
-    if position < len(_MARK):
-        raise ValueError("no list of channels in the header")
-    position, channels = position + 4, []
-    while position < len(header) and header[position] != 0:
-        end = header.find(b"\0", position)
-        if end < 0 or end + 17 > len(header):
-            raise ValueError("the list of channels is cut short")
-        kind, across, down = struct.unpack_from("<i4xii", header, end + 1)
-        if not 0 <= kind < len(_TYPES):
-            raise ValueError(f"a channel has the unknown type {kind}")
-        name = header[position:end].decode("utf-8", "replace")
-        channels.append(_Channel(name, _TYPES[kind], (across, down)))
-        position = end + 17
+@dataclass(frozen=True)
+class _Window:
+    """A rectangle of pixels; its last column and row belong to it."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @property
+    def size(self) -> int:
+        """Number of pixels."""
+        return max(0, self.right - self.left + 1) * max(0, self.bottom - self.top + 1)
+
+    def covers(self, other: _Window) -> bool:
+        """Whether all of the other lies in it."""
+        is_wide = self.left <= other.left and other.right <= self.right
+        return is_wide and self.top <= other.top and other.bottom <= self.bottom
+
+    def isdisjoint(self, other: _Window) -> bool:
+        """Whether they share no pixel."""
+        is_beside = self.right < other.left or other.right < self.left
+        return is_beside or self.bottom < other.top or other.bottom < self.top
+
+    def __str__(self) -> str:
+        return f"({self.left}, {self.top}, {self.right}, {self.bottom})"
+
+
+def _window(header: dict[str, Any], key: str) -> _Window:
+    (left, top), (right, bottom) = header[key]
+    return _Window(int(left), int(top), int(right), int(bottom))
+
+
+def _list_channels(header: bytes, is_deep: Sequence[bool]) -> list[_Channel]:
+    """Channels of all parts, from the first bytes of a file; ValueError where they are damaged.
+
+    Args:
+        header: The first bytes.
+        is_deep: Of each part, whether its pixels hold any number of numbers.
+    """
+    channels, position = [], 0
+    for part, deep in enumerate(is_deep):
+        position = header.find(_MARK, position) + len(_MARK)
+        if position < len(_MARK):
+            raise ValueError("no list of channels in the header")
+        position += 4
+        while position < len(header) and header[position] != 0:
+            end = header.find(b"\0", position)
+            if end < 0 or end + 17 > len(header):
+                raise ValueError("the list of channels is cut short")
+            kind, across, down = struct.unpack_from("<i4xii", header, end + 1)
+            if not 0 <= kind < len(_TYPES):
+                raise ValueError(f"a channel has the unknown type {kind}")
+            name = header[position:end].decode("utf-8", "replace")
+            channels.append(_Channel(name, part, _TYPES[kind], (across, down) == (1, 1) and not deep))
+            position = end + 17
     return channels
 
 
-def _choose(path: Path, names: list[str], wanted: str | None) -> tuple[BandTable, tuple[str, ...]]:
-    """The channels of a layer that are wavelengths, or all channels if none is; and notes."""
+def _choose(
+    path: Path, channels: list[_Channel], wanted: str | None
+) -> tuple[BandTable, list[_Channel], tuple[str, ...]]:
+    """The channels of a layer that are wavelengths, or all of the first part if none is; and warnings."""
+    names = [channel.name for channel in channels]
     if not names:
         raise CaptureError(f"{path}: no channels in this OpenEXR image")
     if wanted is not None and wanted in names:
-        return BandTable(names=(wanted,)), ()
-    spectral = _spectral_channels(names)
+        return BandTable(names=(wanted,)), [channels[names.index(wanted)]], ()
+    by_name = {channel.name: channel for channel in reversed(channels)}
+    spectral = _spectral_channels(list(by_name))
     layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*LAYERS, layer).index(layer))
     if wanted is not None and wanted not in layers:
         raise CaptureError(
-            f"{path}: no layer or channel '{wanted}'; it has {', '.join(layers + names)[:300]}"
+            f"{path}: no layer, part or channel '{wanted}'; it has {', '.join(layers + names)[:300]}"
         )
     if not spectral:
-        bands = [name for name in names if name.rpartition(".")[2] not in _ALPHA] or names
+        own = [channel.name for channel in channels if channel.part == channels[0].part]
+        bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
         bands.sort(key=lambda name: _COLOURS.index(name) if name in _COLOURS else -1)
-        return BandTable(names=tuple(bands)), ()
+        return BandTable(names=tuple(bands)), [by_name[name] for name in bands], ()
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
     widths = [channel.width_nm for channel in taken if channel.width_nm is not None]
@@ -159,8 +246,15 @@ def _choose(path: Path, names: list[str], wanted: str | None) -> tuple[BandTable
         np.array(widths) if len(widths) == len(taken) else None,
         names=tuple(channel.name for channel in taken),
     )
-    others = ", ".join(repr(other) for other in layers if other != layer)
-    return table, (f"layer '{layer}' is taken; the file also has {others}",) if others else ()
+    chosen, warnings = [by_name[channel.name] for channel in taken], []
+    if others := [repr(other) for other in layers if other != layer and wanted is None]:
+        warnings.append(f"layer '{layer}' is taken; the file also has {', '.join(others)} (--dataset)")
+    alike = {channel.part for channel in channels if channel.name in (table.names or ())}
+    if repeated := alike - {channel.part for channel in chosen}:
+        warnings.append(
+            f"wavelengths of the first part are taken; {len(repeated)} other parts have the same ones (--dataset)"
+        )
+    return table, chosen, tuple(warnings)
 
 
 def _spectral_channels(names: Sequence[str]) -> list[_SpectralChannel]:
@@ -202,10 +296,34 @@ def _number(text: str) -> float:
     return float(text.replace(",", "."))
 
 
-def _load_exr(path: Path, names: tuple[str, ...]) -> np.ndarray:
-    """Channels (B, H, W), each in its own piece of memory."""
-    found = _opened(path).channels()
-    return np.stack([found[name].pixels for name in names])
+def _load_exr(path: Path, keys: tuple[tuple[int, str], ...]) -> np.ndarray:
+    """Channels (B, H, W) by part and name, on the display window; NaN where a part has no pixels."""
+    parts = _opened(path).parts
+    frame = _window(parts[keys[0][0]].header, "displayWindow")
+    channels = []
+    for index, name in keys:
+        pixels, window = parts[index].channels[name].pixels, _window(parts[index].header, "dataWindow")
+        if window != frame:
+            pixels = _on_frame(pixels, window, frame)
+        channels.append(pixels)
+    return np.stack(channels)
+
+
+def _on_frame(pixels: np.ndarray, window: _Window, frame: _Window) -> np.ndarray:
+    """Pixels of a window where they lie in the frame."""
+    shape = (frame.bottom - frame.top + 1, frame.right - frame.left + 1)
+    placed = np.full(shape, np.nan, np.result_type(pixels.dtype, np.float16))
+    spans = [
+        (max(low, start), min(high, end) + 1, start, low)
+        for low, high, start, end in (
+            (window.top, window.bottom, frame.top, frame.bottom),
+            (window.left, window.right, frame.left, frame.right),
+        )
+    ]
+    target = tuple(slice(first - start, last - start) for first, last, start, _ in spans)
+    source = tuple(slice(first - low, last - low) for first, last, _, low in spans)
+    placed[target] = pixels[source]
+    return placed
 
 
 def _opened(path: Path, **options: bool) -> Any:

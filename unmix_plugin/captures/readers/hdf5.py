@@ -35,6 +35,8 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     with path.open("rb") as begin:
         is_matlab = begin.read(10) == b"MATLAB 7.3"
     arrays: list[FoundArray] = []
+    groups: dict[str, dict[str, Any]] = {}
+
     with h5py.File(path, "r") as file:
         visited = 0
 
@@ -44,12 +46,14 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
             allow_parts(path, visited, "groups and data sets", CaptureError)
             allow_depth(path, name.count("/") + 1, CaptureError)
             arrays.extend(_found(path, name, item, is_matlab))
+            if not hasattr(item, "shape"):
+                groups[name] = _attributes(path, item)
 
         file.visititems(visit)
         root = _attributes(path, file)
-    # Attributes of the file hold for its images where these have none of that name.
+    # Attributes of the file and of groups hold for images in them.
     arrays = [
-        replace(array, attributes={**root, **array.attributes}) if len(array.shape) == 3 else array
+        replace(array, inherited=_inherited(array.name, root, groups)) if len(array.shape) == 3 else array
         for array in arrays
     ]
     opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
@@ -61,6 +65,15 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
         of_chunk = prod(image.chunks) if image.chunks else 0
         allow_decoded(path, max(image.size, of_chunk) * image.dtype.itemsize, CaptureError)
     return opened
+
+
+def _inherited(name: str, root: dict[str, Any], groups: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Attributes of the file and of the groups that an array is in; the nearest go before the others."""
+    parts = name.split("/")[:-1]
+    inherited = dict(root)
+    for depth in range(1, len(parts) + 1):
+        inherited |= groups.get("/".join(parts[:depth]), {})
+    return inherited
 
 
 def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray]:
@@ -94,7 +107,13 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
     dimensions = tuple(names) if any(names) else None
     return [
         FoundArray(
-            name, shape, item.dtype, whole, take if is_cube else None, _attributes(path, item), dimensions
+            name,
+            shape,
+            item.dtype,
+            whole,
+            take if is_cube else None,
+            _attributes(path, item),
+            dimensions=dimensions,
         )
     ]
 

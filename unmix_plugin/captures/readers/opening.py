@@ -10,11 +10,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from unmix_plugin.captures.readers.arrays import open_netcdf3, open_npy, open_npz, open_torch
-from unmix_plugin.captures.readers.envi import header_beside, is_envi_header, open_envi
+from unmix_plugin.captures.readers.envi import (
+    described_by_header,
+    described_image,
+    header_beside,
+    is_envi_header,
+    open_envi,
+)
 from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.hdf5 import open_hdf5
 from unmix_plugin.captures.readers.matlab import open_matlab
@@ -24,10 +31,11 @@ from unmix_plugin.captures.spectral_file import (
     BandTable,
     ReadOptions,
     SpectralFile,
+    linear_values,
     unreadable,
 )
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import open_regular, open_zip
+from unmix_plugin.limits import open_regular, open_zip, read_bounded
 
 _BEGINNINGS = {
     b"II*\0": "tiff",
@@ -77,7 +85,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
     """
     options = options or ReadOptions()
     try:
-        opened = _READERS[_file_kind(path)](path, options)
+        opened = _opened(path, options)
         height, width, num_bands = opened.shape
         size = f"{height} rows x {width} columns x {num_bands} bands"
         if 0 in opened.shape:
@@ -96,6 +104,54 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         raise
     except Exception as error:
         raise unreadable(path, error) from error
+
+
+def _opened(path: Path, options: ReadOptions) -> SpectralFile:
+    """The file by its reader, with what lies beside it: an ENVI header, or GDAL's .aux.xml."""
+    kind = _file_kind(path)
+    described = described_image(path) if kind == "envi" and path.suffix.lower() == ".hdr" else None
+    if described is not None:
+        path, kind = described, _file_kind(described)
+    opened = _READERS[kind](path, options)
+    if kind in ("envi", "folder"):
+        return opened if kind == "folder" else _with_aux_xml(opened)
+    return _with_aux_xml(described_by_header(opened))
+
+
+def _with_aux_xml(file: SpectralFile) -> SpectralFile:
+    """The file with gains, offsets and the no-data value that GDAL keeps in NAME.aux.xml, where it has none itself.
+
+    Raises:
+        CaptureError: gains are impossible.
+    """
+    beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
+    found = next((path for path in beside if path.is_file()), None)
+    if found is None:
+        return file
+    data = read_bounded(found)
+    try:
+        bands = [] if b"<!" in data else list(ElementTree.fromstring(data).iter("PAMRasterBand"))
+    except ElementTree.ParseError:
+        return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: gains in it are not used"))
+    columns = {"Scale": np.ones(file.shape[2]), "Offset": np.zeros(file.shape[2])}
+    no_data = None
+    for band in bands:
+        index = int(band.get("band", "0")) - 1
+        for name, column in columns.items():
+            text = band.findtext(name)
+            if text is not None and 0 <= index < len(column):
+                column[index] = float(text)
+        text = band.findtext("NoDataValue")
+        no_data = float(text) if text is not None else no_data
+    linear = linear_values(
+        file.path, file.shape[2], columns["Scale"].tolist(), columns["Offset"].tolist(), found.name
+    )
+    return replace(
+        file,
+        linear=file.linear or linear,
+        no_data=no_data if file.no_data is None else file.no_data,
+        sources=(*file.sources, found),
+    )
 
 
 def _file_kind(path: Path) -> str:
@@ -171,10 +227,12 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
         "fwhm_nm": _listed(bands.fwhm_nm),
         "band_names": None if bands.names is None else list(bands.names),
         "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),
-        "scale": opened and _plain(opened.scale),
+        "scale": opened and _plain(opened.linear and opened.linear.scale),
+        "gains": opened and opened.linear and _plain(opened.linear.gains),
+        "offsets": opened and opened.linear and _plain(opened.linear.offsets),
         "no_data": opened and _plain(opened.no_data),
         "poses": None,
-        "notes": opened and list(opened.notes),
+        "notes": opened and [*opened.warnings, *opened.notes],
         "metadata": opened and _plain(opened.metadata),
     }
     if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):

@@ -13,6 +13,7 @@ import logging
 import math
 import re
 import struct
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,15 +24,18 @@ from xml.etree import ElementTree
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
+from unmix_plugin.captures.exposure import exposure_facts
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
     BandTable,
+    Linear,
     ReadOptions,
     SpectralFile,
     choose_axes,
     image_shape,
     import_extra,
+    linear_values,
     take_part,
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
@@ -49,6 +53,11 @@ _CENTRES = ("wavelength", "wavelengths", "center_wavelength", "central_wavelengt
 _MOST_TAGS = 4096
 """What TIFF libraries take."""
 _UNITS = ("wavelength_units", "wavelength_unit")
+_GAIN_ITEMS = {
+    "scale": ("scale", "scale_factor", "gain", "data_gain_values"),
+    "offset": ("offset", "add_offset", "bias", "data_offset_values"),
+}
+"""Names of gains and offsets in GDAL's metadata, by the role that GDAL itself marks them with."""
 _LIST = re.compile(
     r"""["']?wavelengths?(?: ?\(?(?P<unit>[a-zµμ]{1,20})\)?)?["']?\s{0,9}[=:]\s*[\[{(]?(?P<list>[\d.,;\s]+)""",
     re.I,
@@ -66,7 +75,7 @@ class _Stack:
     """In the byte order of the file."""
     unlisted_from: int | None = None
     """Where the numbers of all pages lie, if only the first has an entry."""
-    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -96,11 +105,14 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
             )
         first = stack.pages[0]
         tags = camera_tags(first.tags)
-        items = _gdal_items(first)
-    stated = _from_gdal(items) or _from_description(first) or _from_pages(stack.pages)
+        # What holds for the whole file stands in its first page, which may be a preview.
+        top: Any = file.pages.first
+        items = _gdal_items(first) or _gdal_items(top)
+        stated = _from_gdal(items) or _from_description(first) or _from_description(top)
+    stated = stated or _from_pages(stack.pages)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
-    axes, axis_notes = (
+    axes, axis_warnings = (
         choose_axes(stack.shape, options.axes, None if given is None else len(given), "byx")
         if is_stack
         else ("yxb", ())
@@ -110,8 +122,8 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     else:
         interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     shape = image_shape(stack.shape, axes)
-    bands, band_notes = check_bands(stated, shape[2])
-    scale, scale_notes = _scale(items)
+    bands, band_warnings = check_bands(stated, shape[2])
+    exposure, exposure_warnings = _exposure(tags, items)
     return SpectralFile(
         path=path,
         reader="tiff",
@@ -120,10 +132,11 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         read_part=lambda rows, wanted: _read_part(path, stack, axes, rows, wanted),
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
-        scale=scale,
+        linear=_linear(path, items, shape[2]),
         no_data=_number(str(first.tags.valueof(_GDAL_NODATA) or "")),
-        notes=stack.notes + axis_notes + band_notes + scale_notes + tuple(messages[:3]),
-        metadata={name: value for name, value in tags.items() if value} | _exposure(tags),
+        notes=tuple(messages[:3]),
+        warnings=stack.warnings + axis_warnings + band_warnings + exposure_warnings,
+        metadata={name: value for name, value in tags.items() if value} | exposure,
     )
 
 
@@ -174,42 +187,62 @@ def _logged() -> Iterator[list[str]]:
 
 
 def _find_stack(path: Path, file: TiffFile) -> _Stack:
-    """The first page and all that are like it; previews and masks are passed over."""
-    in_file: Any = file.pages
-    pages = [page for page in in_file if not (page.is_reduced or page.is_mask)]
+    """The pages that hold the most bands, all alike; previews and masks are passed over."""
+    pages = _image_pages(file)
     if not pages:
         raise CaptureError(f"{path}: no image in this TIFF; expected at least one page")
-    first, size = pages[0], path.stat().st_size
-    like = [page for page in pages if (page.shape, page.dtype) == (first.shape, first.dtype)]
+    groups: dict[Any, list[TiffPage]] = defaultdict(list)
+    for page in pages:
+        groups[page.shape, page.dtype].append(page)
+    like = max(groups.values(), key=_size_of_group)
+    first, size = like[0], path.stat().st_size
     for page in like:
         _check_page(path, page, size)
         _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
     compressed = [page for page in like if not _is_mappable(page)]
     of_strip = max((math.prod(page.chunks) * page.dtype.itemsize for page in compressed), default=0)  # type: ignore[union-attr]
     allow_decoded(path, max(of_strip, sum(page.nbytes for page in compressed)), CaptureError)
-    left_out = len(file.pages) - len(like)
-    notes = (f"{left_out} pages of other sizes, previews or masks are left out",) if left_out else ()
+    others = [group for group in groups.values() if group is not like]
+    shown = ", ".join(f"{len(group)} of {' x '.join(map(str, group[0].shape))}" for group in others)
+    warnings = (f"pages of other sizes or types are left out: {shown}",) if others else ()
     planes, _, height, width, samples = first.shaped
     dtype = np.dtype(first.dtype).newbyteorder(file.byteorder)
     # ImageJ describes one page of one band, behind which the others lie.
     series = file.series[0]
-    has_unlisted = series.dataoffset is not None and series.size > first.size * len(in_file)
+    has_unlisted = series.dataoffset is not None and series.size > first.size * len(file.pages)
     if has_unlisted and first.samplesperpixel == 1:
         num_pages, start = series.size // (height * width), series.dataoffset
         end = start + series.size * dtype.itemsize
         if end > size:
             raise CaptureError(f"{path}: cut short: {num_pages} pages reach to byte {end} of {size}")
-        return _Stack(like[:1], (num_pages, height, width), dtype, start, notes)
+        return _Stack(like[:1], (num_pages, height, width), dtype, start, warnings)
     if any(extra in _OPACITY for extra in first.extrasamples):
-        notes = (*notes, "a number of each pixel is marked as opacity; it is kept as a band")
+        warnings = (*warnings, "a number of each pixel is marked as opacity; it is kept as a band")
     if len(like) == 1:
-        return _Stack(like, (height, width, planes * samples), dtype, None, notes)
+        return _Stack(like, (height, width, planes * samples), dtype, None, warnings)
     if planes * samples > 1:
         raise CaptureError(
             f"{path}: {len(like)} pages of {planes * samples} numbers a pixel; expected one page with all bands, or "
             "one band a page. Split the file into one image each"
         )
-    return _Stack(like, (len(like), height, width), dtype, None, notes)
+    return _Stack(like, (len(like), height, width), dtype, None, warnings)
+
+
+def _image_pages(file: TiffFile) -> list[TiffPage]:
+    """Pages that are no previews or masks, with those that lie below a page (SubIFDs); of several positions or times of
+    an OME-TIFF those of the first."""
+    in_file: Any = file.pages
+    listed: list[Any] = list(in_file)
+    if file.is_ome and len(file.series) > 1 and len({series.shape for series in file.series}) == 1:
+        listed = [page for page in file.series[0].pages if page is not None]
+    below = [sub for page in listed for sub in (page.pages or ())]
+    return [page for page in [*listed, *below] if not (page.is_reduced or page.is_mask)]
+
+
+def _size_of_group(pages: list[TiffPage]) -> tuple[int, int]:
+    """Bands that the pages hold together, and pixels of each."""
+    planes, _, height, width, samples = pages[0].shaped
+    return len(pages) * planes * samples, height * width
 
 
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
@@ -311,17 +344,36 @@ def _gdal_items(page: TiffPage) -> list[_GdalItem]:
     ]
 
 
-def _scale(items: list[_GdalItem]) -> tuple[float | None, tuple[str, ...]]:
-    """Stored number that stands for 1, and notes."""
+def _linear(path: Path, items: list[_GdalItem], num_bands: int) -> Linear | None:
+    """Gains and offsets in GDAL's metadata: by their role, by names that ENVI and NetCDF give them, or one factor."""
+    columns = []
+    for role, names in _GAIN_ITEMS.items():
+        by_role = [item for item in items if item.role == role]
+        chosen = by_role or [
+            item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names
+        ]
+        own = {item.sample: item.value for item in chosen if item.sample is not None}
+        whole = next((item.value for item in chosen if item.sample is None), None)
+        usual = "1" if role == "scale" else "0"
+        if own:
+            texts = [own.get(sample, whole or usual) for sample in range(num_bands)]
+        else:
+            texts = re.findall(r"[^\s,{}]+", whole or "")
+        numbers = [_number(text) for text in texts]
+        if None in numbers:
+            raise CaptureError(
+                f"{path}: GDAL's {role} is {texts[numbers.index(None)]!r}; expected a number a band: correct it"
+            )
+        columns.append([number for number in numbers if number is not None])
     named = [_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
-    if named and named[0]:
-        return named[0], ()
-    factors = {_number(item.value) for item in items if item.role == "scale"} - {None}
-    offsets = {_number(item.value) for item in items if item.role == "offset"} - {None, 0.0}
-    if len(factors) == 1 and not offsets and (factor := factors.pop()) and factor > 0:
-        return (1 / factor if factor != 1 else None), ()
-    note = "scales and offsets of GDAL differ between bands and are left out"
-    return None, (note,) if factors or offsets else ()
+    factor = named[0] if named and named[0] else 1.0
+    linear = linear_values(path, num_bands, columns[0], columns[1], "GDAL's scales and offsets")
+    if factor != 1 and linear is not None:
+        raise CaptureError(
+            f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; expected one of them, as "
+            "it is unclear which the numbers need: take the other out"
+        )
+    return linear or linear_values(path, num_bands, [1.0 / factor], [], "GDAL's reflectance_scale_factor")
 
 
 def _from_gdal(items: list[_GdalItem]) -> StatedBands | None:
@@ -389,7 +441,9 @@ def _from_description(page: TiffPage) -> StatedBands | None:
 
 
 def _from_pages(pages: list[TiffPage]) -> StatedBands:
-    """Names of pages, where each has its own."""
+    """Names of pages, where each is a band and has its own."""
+    if pages[0].shaped[0] * pages[0].shaped[-1] > 1:
+        return StatedBands("the file")
     for tag, what in ((_PAGE_NAME, "names of pages"), (_DESCRIPTION, "descriptions of pages")):
         names = [" ".join(str(page.tags.valueof(tag) or "").split()) for page in pages]
         if all(0 < len(name) < 200 for name in names) and len(set(names)) == len(names):
@@ -410,13 +464,17 @@ def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> 
     return replace(found, names=table.names, bad=table.bad) if is_fitting else table
 
 
-def _exposure(tags: dict[str, Any]) -> dict[str, float]:
-    """Time and gain out of EXIF, unless XMP may hold a calibration that has them in it already."""
+def _exposure(tags: dict[str, Any], items: list[_GdalItem]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Time and gain out of EXIF or GDAL's metadata, and warnings."""
     exif = tags["exif"]
     time_s, iso = exif.get("ExposureTime"), exif.get("ISOSpeedRatings", exif.get("ISOSpeed"))
-    if tags["xmp"] or not isinstance(time_s, int | float):
-        return {}
-    return {"exposure_s": float(time_s), **({"gain": iso / 100} if isinstance(iso, int | float) else {})}
+    if isinstance(time_s, int | float) and time_s > 0:
+        facts: dict[str, Any] = {"exposure_s": float(time_s), "exposure_evidence": "EXIF ExposureTime"}
+        return facts | ({"gain": iso / 100} if isinstance(iso, int | float) and iso > 0 else {}), ()
+    texts: dict[str, Any] = defaultdict(list)
+    for item in items:
+        texts[item.name.removeprefix("exif_")].append(item.value)
+    return exposure_facts({name: ",".join(values) for name, values in texts.items()}, "GDAL metadata")
 
 
 def _number(text: str) -> float | None:

@@ -59,9 +59,12 @@ def write_scene_files(
         assert camera.lens is not None
         lens = plan.sensors[view.sensor].calibration.raster.lens(camera.lens)
         seen.append(SeenView(record, replace(camera, lens=lens), folder / record.paths["file_path"]))
-    # Views of different sensors can't be compared: those of the one that took the most are checked.
+    # Views of sensors with other bands can't be compared with those of the one that took the most.
     ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
-    checked = check_views([view for view in seen if view.record.sensor == greatest], posed.poses.points)
+    alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
+    checked = check_views([view for view in seen if view.record.sensor in alike], posed.poses.points)
+    warned = dict.fromkeys((*plan.warnings, *posed.poses.warnings))
+    checked = replace(checked, findings=(*warned, *checked.findings))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
     write_file(folder / _REPORT_NAME, report_text(title, checked, done).encode())
@@ -113,12 +116,17 @@ def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
 def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
     """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene."""
     sensor = next(iter(plan.sensors.values()))
-    if sensor.lamp is None or len(plan.sensors) > 1:
+    if sensor.lamp is None or not all(_has_bands_of(sensor, other) for other in plan.sensors.values()):
         return {}
     bands = Bands(sensor.centers_nm)
     write_spectra_csv(folder / _ILLUMINANT_NAME, SpectraTable(bands, ("power",), sensor.lamp[None]))
     write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
     return {"illuminant_path": _FLAT_LIGHT_NAME}
+
+
+def _has_bands_of(sensor: Sensor, other: Sensor) -> bool:
+    """Whether views of two sensors can be compared."""
+    return np.array_equal(sensor.centers_nm, other.centers_nm)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

@@ -1,0 +1,100 @@
+"""Exposure under its many names, and what becomes of it."""
+
+import numpy as np
+import pytest
+
+from tests.captures.capture_factory import make_capture, process, write_cube
+from tests.captures.file_factory import file_of
+from unmix_plugin.captures.exposure import compare_exposures, exposure_facts, exposure_of
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "seconds"),
+    [
+        ("tint", "10.5", 0.0105),
+        ("integration time", "8000 us", 0.008),
+        ("Integration_Time (us)", "8000", 0.008),
+        ("camera exposure time [s]", "0.02", 0.02),
+        ("exposure_ms", 4, 0.004),
+        ("ExposureTime", "2.5 msec", 0.0025),
+        ("expTime", 0.5, 0.5),
+        ("shutter", "1/50 s", 0.02),
+        ("integration time", "{5, 5, 5}", 0.005),
+        ("exposure time", "500 \u00b5s", 0.0005),
+    ],
+)
+def test_times_by_any_name_in_any_unit(name, text, seconds):
+    facts, warnings = exposure_facts({name: text}, "header field")
+    assert facts["exposure_s"] == pytest.approx(seconds)
+    assert not warnings
+
+
+def test_a_unit_may_stand_in_an_entry_of_its_own():
+    facts, _ = exposure_facts({"integration time": "500", "integration time units": "us"}, "header field")
+    assert facts["exposure_s"] == pytest.approx(5e-4)
+    assert "no unit" not in facts["exposure_evidence"]
+
+
+def test_gains_are_factors_or_decibels_and_what_is_not_understood_is_said():
+    assert exposure_facts({"gain": "6.0206 dB"}, "")[0]["gain"] == pytest.approx(2.0, rel=1e-4)
+    assert exposure_facts({"camera gain": "4"}, "")[0]["gain"] == 4
+    facts, (warning,) = exposure_facts({"exposure": "-1.5 EV"}, "header field")
+    assert not facts
+    assert "'exposure' is '-1.5 EV', which is not understood" in warning
+
+
+def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as milliseconds"):
+    return file_of(
+        np.ones((2, 2, 3), np.uint16),
+        metadata={"exposure_s": time, "gain": gain, "exposure_evidence": evidence},
+    )
+
+
+def test_views_are_brought_to_the_white_and_that_is_said():
+    found = compare_exposures([exposed(0.01), exposed(0.02, 2.0)], [exposed(0.005)], [], False)
+    np.testing.assert_array_equal(found.common, [0.005])
+    assert found.notes == (
+        "views were exposed 0.01 to 0.04 s times gain: each is brought to that of the white reference, 0.005",
+    )
+    assert found.warnings == ()
+    same = compare_exposures([exposed(0.01)] * 2, [exposed(0.01)], [exposed(0.01)], False)
+    assert (same.notes, same.warnings) == ((), ())
+
+
+def test_what_may_be_wrong_with_exposures_is_said():
+    def warnings(given, whites=(), darks=(), is_bent=False):
+        return " ".join(compare_exposures(given, whites, darks, is_bent).warnings)
+
+    plain = file_of(np.ones((2, 2, 3), np.uint16))
+    views = [exposed(0.01), exposed(0.02)]
+    assert "dark frame was exposed 0.02" in warnings(views, [exposed(0.005)], [exposed(0.02)])
+    assert "1 view without exposure time" in warnings([*views, plain], [], [])
+    assert "does not say how long" in warnings(views, [plain], [])
+    assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
+    other = exposed(0.005, evidence="header field 'exposure time'")
+    assert "have no unit in some files" in warnings(views, [other], [])
+
+
+def test_bands_of_one_view_may_differ_in_exposure():
+    file = exposed([0.01, 0.02, 0.04])
+    np.testing.assert_array_equal(exposure_of(file), [0.01, 0.02, 0.04])
+    found = compare_exposures([file], [], [], False)
+    np.testing.assert_array_equal(found.common, [0.02])
+    assert found.notes
+
+
+def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
+    made = make_capture(tmp_path / "capture")
+    name = "view_01"
+    counts = made.reflectance[name] * made.white * 3 + made.dark
+    write_cube(tmp_path / "capture", name, np.rint(counts).astype(np.uint16), header={"tint": "30"})
+    for other in ("view_00", "view_02", "view_03", "white", "dark"):
+        with (tmp_path / "capture" / f"{other}.hdr").open("a") as header:
+            header.write("exposure time (us) = 10000\n")
+    references = {key: tmp_path / "capture" / f"{key}.hdr" for key in ("white", "dark")}
+    wrong = process(tmp_path / "capture", tmp_path / "scene", **references)
+    assert any("the dark frame was exposed 0.01" in text for text in wrong)
+    assert any("have no unit in some files" in text for text in wrong)
+    for view in made.reflectance:
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{view}.npy") / 65535
+        np.testing.assert_allclose(stored, made.reflectance[view], atol=1e-3)
