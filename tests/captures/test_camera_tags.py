@@ -97,6 +97,11 @@ MICASENSE = {
     "Camera:VignettingPolynomial": ["-3e-05", "1e-05", "-3e-07", "1e-09", "-1e-11", "7e-14"],
     "DLS:SpectralIrradiance": "1.085",
 }
+MICASENSE_2D = {
+    "MicaSense:RadiometricCalibration": ["0.00014", "1.2e-07", "1.4e-06"],
+    "Camera:VignettingPolynomial2DName": ["0", "0", "1", "0", "0", "1", "2", "1"],
+    "Camera:VignettingPolynomial2D": ["0.6", "0.7", "-0.2", "-0.4"],
+}
 SEQUOIA = {
     "Camera:SensorModel": "13220.63,2046.04,411.72",
     "Camera:VignettingPolynomial2DName": "0,0,1,0,2,0,0,1,0,2",
@@ -138,6 +143,13 @@ def micasense_by_hand(p: int, x: int, y: int) -> float:
     return 0.00014 / (4.0 * 0.0008) * (p - 4801.5) / 65536 / v / row
 
 
+def micasense_2d_by_hand(p: int, x: int, y: int) -> float:
+    u, w = x / 50, y / 30
+    v = 0.6 + 0.7 * u - 0.2 * w - 0.4 * u**2 * w
+    row = 1 + 1.2e-07 * y / 0.0008 - 1.4e-06 * y
+    return 0.00014 / (4.0 * 0.0008) * (p - 4801.5) / 65536 / v / row
+
+
 def sequoia_by_hand(p: int, x: int, y: int) -> float:
     u, w = x / 50, y / 30
     v = 0.4 + 1.2 * u - 1.1 * u**2 + 1.3 * w - 1.25 * w**2
@@ -154,6 +166,7 @@ def dji_by_hand(p: int, x: int, y: int) -> float:
     ("tags", "options", "by_hand", "unit"),
     [
         (MICASENSE, {"black_level": [4800, 4801, 4802, 4803]}, micasense_by_hand, "W/m2/sr/nm"),
+        (MICASENSE_2D, {"black_level": [4800, 4801, 4802, 4803]}, micasense_2d_by_hand, "W/m2/sr/nm"),
         (SEQUOIA, {}, sequoia_by_hand, "relative"),
         (DJI, {"as_attributes": True}, dji_by_hand, "relative"),
     ],

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
+from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Raster
-from unmix_plugin.captures.masks import _find_background, clean, read_labels
+from unmix_plugin.captures.masks import _find_background, clean, read_labels, read_view_masks
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
@@ -54,3 +56,26 @@ def test_pictures_that_hold_no_labels_are_refused(tmp_path, pixels):
     view = CaptureView("a", cube, labels=tmp_path / "labels.png")
     with pytest.raises(CaptureError, match="expected labels of 0 to 255 in one channel"):
         read_labels(view, Raster(0, 0, 4, 5, 1))
+
+
+CUBE = file_of(np.zeros((6, 8, 2), np.uint16))
+WHOLE = Raster(0, 0, 6, 8, 1)
+LEFT = np.arange(8)[None, :].repeat(6, axis=0) < 4
+
+
+@pytest.mark.parametrize("white", [1, 255])
+def test_masks_of_ones_are_those_of_255(tmp_path, white):
+    Image.fromarray(LEFT.astype(np.uint8) * np.uint8(white)).save(tmp_path / "mask.png")
+    view = CaptureView("a", CUBE, mask=tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_view_masks(view, WHOLE, use_opacity=True).opacity, LEFT * 255)
+    np.testing.assert_array_equal(read_view_masks(view, WHOLE, use_opacity=False).valid, LEFT)
+
+
+def test_a_scene_without_any_matter_is_refused(tmp_path):
+    made = make_capture(tmp_path / "capture")
+    for name in made.reflectance:
+        pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        Image.fromarray(pixels).save(made.root / f"{name}.png")
+    with pytest.raises(CaptureError, match=r"no view shows anything but background, by its mask \(files\)"):
+        process(made.root, tmp_path / "scene", mask="files")
+    assert not (tmp_path / "scene").exists()

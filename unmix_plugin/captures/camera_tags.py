@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, TypeAlias
 from xml.etree import ElementTree
 
@@ -245,10 +246,11 @@ def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
 def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
     """MicaSense RedEdge and Altum: radiance in W/m2/sr/nm.
 
-        L = 1 / V(r) * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
+        L = 1 / V * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
 
-    with V a polynomial of the distance to the vignetting centre, gain = ISO speed / 100, and pBL the mean black level.
-    Source: MicaSense, RedEdge camera radiometric calibration model.
+    with gain = ISO speed / 100, pBL the mean black level, and V a polynomial of the distance to the vignetting centre,
+    or, in a RedEdge-P or Altum-PT, a polynomial in x / W and y / H.
+    Source: MicaSense, RedEdge camera radiometric calibration model; imageprocessing, metadata and image classes.
     """
     a1, a2, a3 = _xmp(file, tags, 3, "RadiometricCalibration")
     exposure = _exif(file, exif, "ExposureTime")
@@ -256,13 +258,17 @@ def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Ra
         exposure = _TRUE_EXPOSURE_S
     iso = _exif(file, exif, "ISOSpeed", "ISOSpeedRatings", "PhotographicSensitivity")
     levels = exif.get("BlackLevel") or tag_numbers(tags, "DarkRowValue") or [0.0]
-    centre = _xmp(file, tags, 2, "VignettingCenter")
-    polynomial = _xmp(file, tags, 6, "VignettingPolynomial")
     gain = a1 / (0.01 * iso * exposure) / _stored_range(exif)
+    has_centre = tag_numbers(tags, "VignettingCenter") is not None
+    if not has_centre and tag_numbers(tags, "VignettingPolynomial2D") is not None:
+        vignetting = _vignetting_2d(file, tags)
+    else:
+        centre = _xmp(file, tags, 2, "VignettingCenter")
+        polynomial = _xmp(file, tags, 6, "VignettingPolynomial")
+        vignetting = partial(_radial_polynomial, polynomial, centre)
 
     def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        rows = 1.0 + a2 * y / exposure - a3 * y
-        return gain / (_radial_polynomial(polynomial, centre, y, x) * rows)
+        return gain / (vignetting(y, x) * (1.0 + a2 * y / exposure - a3 * y))
 
     irradiance = tag_numbers(tags, "HorizontalIrradiance", "SpectralIrradiance")
     to_si = tag_numbers(tags, "IrradianceScaleToSIUnits")
@@ -283,27 +289,37 @@ def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Radi
     a, b, c = _xmp(file, tags, 3, "SensorModel")
     exposure, f_number = _exif(file, exif, "ExposureTime"), _exif(file, exif, "FNumber")
     iso = _exif(file, exif, "ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed")
-    height, width = file.shape[:2]
     gain = f_number**2 / (a * exposure * iso + c)
+    vignetting = _vignetting_2d(file, tags)
+
+    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return gain / vignetting(y, x)
+
+    saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
+    return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
+
+
+def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
+    """A polynomial in x / W and y / H, whose powers the file lists; 1 where it lists none."""
+    height, width = file.shape[:2]
     powers = [int(power) for power in tag_numbers(tags, "VignettingPolynomial2DName") or ()]
     if len(powers) % 2 or not all(0 <= power <= _GREATEST_POWER for power in powers):
         raise CaptureError(
             f"{file.path}: the tag XMP VignettingPolynomial2DName holds {powers}; expected pairs of powers from 0 to "
             f"{_GREATEST_POWER}"
         )
-    vignetting = np.ones((1, 1))  # coefficients of x^n y^m
+    coefficients = np.ones((1, 1))  # of x^n y^m
     if powers:
-        vignetting = np.zeros((max(powers[::2]) + 1, max(powers[1::2]) + 1))
+        coefficients = np.zeros((max(powers[::2]) + 1, max(powers[1::2]) + 1))
         numbers = _xmp(file, tags, len(powers) // 2, "VignettingPolynomial2D")
-        np.add.at(vignetting, (powers[::2], powers[1::2]), numbers)
+        np.add.at(coefficients, (powers[::2], powers[1::2]), numbers)
 
-    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        across = np.vander(x[0] / width, vignetting.shape[0], increasing=True)
-        down = np.vander(y[:, 0] / height, vignetting.shape[1], increasing=True)
-        return gain / (down @ vignetting.T @ across.T)
+    def vignetting(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+        across = np.vander(x[0] / width, coefficients.shape[0], increasing=True)
+        down = np.vander(y[:, 0] / height, coefficients.shape[1], increasing=True)
+        return down @ coefficients.T @ across.T
 
-    saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
-    return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
+    return vignetting
 
 
 def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:

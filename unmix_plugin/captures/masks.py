@@ -9,10 +9,10 @@ Notation: `H x W` pixels, `B` bands; values in [0, 1] as they are written.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
@@ -23,13 +23,17 @@ from unmix_plugin.captures.options import MaskKind
 from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.scenes.reading.images import UnreadableImageError, white_of
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP")
 """Pillow reads more, some of them with other programs."""
 _Background = Literal["white", "black"]
 
 HALF, OPAQUE = 127, 255
-"""Grey above which a mask is white; opacity of matter that covers a pixel."""
+"""Opacity above which a pixel counts as matter; that of matter that covers a pixel."""
 _SMALL_SHARE = 5e-4
 """Specks and holes smaller than this share of the picture are removed."""
 _DEVIATIONS = 6.0
@@ -221,7 +225,7 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
 
     Args:
         view: It may have an alpha channel. Its mask is black where pixels are ignored, or, if opacity is looked for and
-            there is no alpha channel, where background is.
+            there is no alpha channel, where background is; see `white_of`.
         raster: Of the scene; a square of pixels is valid where all of it is, and as opaque as its mean.
         use_opacity: Whether to look for it.
     Raises:
@@ -232,11 +236,11 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
     if alpha is not None:
         opacity = np.rint(raster.averaged(_cut(alpha, raster).astype(np.float32))).astype(np.uint8)
     if view.mask is not None:
-        mask = _cut(_read(view.mask, "L", view), raster)
+        is_black = raster.any_in_square(~_cut(_read(view.mask, white_of, view), raster))
         if use_opacity and opacity is None:
-            opacity = np.where(raster.any_in_square(mask <= HALF), 0, OPAQUE).astype(np.uint8)
+            opacity = np.where(is_black, 0, OPAQUE).astype(np.uint8)
         else:
-            valid = ~raster.any_in_square(mask == 0)
+            valid = ~is_black
     return ViewMasks(valid, opacity)
 
 
@@ -244,11 +248,11 @@ def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] |
     """True materials of a view; None if it has none, or if pixels are averaged.
 
     Raises:
-        CaptureError: the file can't be read or has another size than the cube.
+        CaptureError: the file can't be read, has another size than the cube, or is a picture in colour.
     """
     if view.labels is None or raster.binning > 1:
         return None
-    labels = _read(view.labels, None, view)
+    labels = _read(view.labels, np.asarray, view)
     if (
         labels.ndim != 2
         or labels.dtype.kind not in "bui"
@@ -271,7 +275,11 @@ def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
             )
         return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
     picture = _alpha_picture(view)
-    return None if picture is None else _read(picture, "RGBA", view)[..., 3]
+    return (
+        None
+        if picture is None
+        else _read(picture, lambda image: np.asarray(image.convert("RGBA")), view)[..., 3]
+    )
 
 
 def _alpha_picture(view: CaptureView) -> Path | None:
@@ -293,8 +301,8 @@ def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
     return pixels[raster.file_rows(0, raster.height), raster.columns]
 
 
-def _read(path: Path, mode: str | None, view: CaptureView) -> np.ndarray:
-    """A picture with the pixels of the cube, converted to a mode of Pillow or as it is."""
+def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: CaptureView) -> np.ndarray:
+    """What `pixels_of` makes of a picture with the pixels of the cube."""
     from PIL import Image
 
     height, width, _ = view.cube.shape
@@ -305,6 +313,8 @@ def _read(path: Path, mode: str | None, view: CaptureView) -> np.ndarray:
                     f"{path} has {picture.size[0]} x {picture.size[1]} pixels (width x height); expected "
                     f"{width} x {height}, as the cube of view {view.name} has"
                 )
-            return np.asarray(picture if mode is None else picture.convert(mode))
+            return pixels_of(picture)
+    except UnreadableImageError as error:
+        raise CaptureError(f"{path} {error}") from error
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise CaptureError(f"{path} can't be read as a picture ({error}); mend or remove it") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.posing import ESTIMATE, PosedViews, estimated_poses, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
@@ -122,7 +124,7 @@ def _open_capture(options: ProcessOptions) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
     references = tuple(path for path in (options.dark, options.white) if path is not None)
     asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=references)
-    capture = find_views(options.layout, options.data, asked)
+    capture = _by_size(find_views(options.layout, options.data, asked))
     first: dict[str, SpectralFile] = {}
     for view in capture.views:
         _refuse_unlike(view.cube, first.setdefault(view.sensor, view.cube))
@@ -133,6 +135,26 @@ def _open_capture(options: ProcessOptions) -> Capture:
                 f"--output-dir {options.output_dir} holds files of the capture; give another folder"
             )
     return capture
+
+
+def _by_size(capture: Capture) -> Capture:
+    """Views of one camera in several sizes, upright and across, as views of several sensors."""
+    sizes: dict[tuple[str, int], set[tuple[int, int]]] = defaultdict(set)
+    for view in capture.views:
+        sizes[view.sensor, view.cube.shape[2]].add(view.cube.shape[:2])
+    if all(len(found) == 1 for found in sizes.values()):
+        return capture
+    views = [
+        replace(view, sensor=f"{view.sensor} {view.cube.shape[1]}x{view.cube.shape[0]}".strip())
+        if len(sizes[view.sensor, view.cube.shape[2]]) > 1
+        else view
+        for view in capture.views
+    ]
+    listed = sorted({f"{view.cube.shape[1]} x {view.cube.shape[0]}" for view in capture.views})
+    note = (
+        f"views have {len(listed)} sizes ({name_some(listed)}, width x height): each is a sensor of its own"
+    )
+    return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 
 def _open_references(options: ProcessOptions) -> References:

@@ -68,11 +68,15 @@ def image(argv: list[str]) -> None:
     opened = open_spectral_file(options.file, _reading(options))
     bands, wavelengths = _good_bands(opened)
     cube = opened.read(bands=bands)
-    mask = ~find_missing(cube, opened.no_data)
+    mask = ~find_missing(cube, opened)
+    if opened.linear is not None:
+        cube = opened.linear.apply(cube, bands)
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
     height, width, num_bands = cube.shape
     print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
+    for warning in opened.warnings:
+        print(f"looks wrong: {warning}")
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -418,3 +419,17 @@ def test_a_lens_that_folds_the_image_is_refused():
     tags = PERSPECTIVE | {"Camera:PerspectiveDistortion": ["-3", "0", "0.5", "0", "0"]}
     with pytest.raises(CaptureError, match=r"a.tif, lens in the XMP"):
         lens_of(file_with(tags))
+
+
+def test_a_panchromatic_band_is_left_out_with_a_note(flight, tmp_path):
+    shutil.copytree(flight, tmp_path / "flight")
+    for path in (tmp_path / "flight").glob("*_NIR.TIF"):
+        path.write_bytes(path.read_bytes().replace(b"WavelengthFWHM>40<", b"WavelengthFWHM>99<"))
+    assert len(find_rig(tmp_path / "flight", PLAIN).views) == 40
+    for path in (tmp_path / "flight").glob("*_NIR.TIF"):
+        path.write_bytes(path.read_bytes().replace(b"CentralWavelength>790<", b"CentralWavelength>390<"))
+    capture = find_rig(tmp_path / "flight", PLAIN)
+    assert {view.sensor for view in capture.views} == {"green", "red", "rededge"}
+    assert any(
+        "10 images of bands too broad for one wavelength left out: NIR" in note for note in capture.notes
+    )

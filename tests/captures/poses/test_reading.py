@@ -116,6 +116,76 @@ def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
     assert not found.offset.any()
 
 
+def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
+    terms = {"k1": 0.01, "k2": -0.02, "k3": 0.001, "k4": -0.002, "p1": 0.0, "p2": 0.0}
+    marked = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, is_fisheye=True))
+    named = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, camera_model="OPENCV_FISHEYE"))
+    plain = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, is_fisheye=False))
+    lenses = [next(iter(found.cameras.values())).lens for found in (marked, named, plain)]
+    assert lenses[0] == lenses[1] != lenses[2]
+    with pytest.raises(CaptureError, match="'is_fisheye' is true and camera_model \"PINHOLE\""):
+        read(tmp_path, transforms(ring(), **terms, is_fisheye=True, camera_model="PINHOLE"))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("latlong", True),
+        ("equirectangular", True),
+        ("orthographic", True),
+        ("from_mitsuba", True),
+        ("k6", 0.1),
+        ("skew", -0.5),
+        ("fisheye624_params", [0.0, 1.0]),
+    ],
+)
+@pytest.mark.parametrize("is_of_frame", [False, True])
+def test_keys_that_change_geometry_are_refused_by_name_where_they_are_set(tmp_path, key, value, is_of_frame):
+    content = transforms(ring())
+    (content["frames"][2] if is_of_frame else content)[key] = value
+    with pytest.raises(CaptureError, match=f"'{key}' is set, which stands for"):
+        read(tmp_path, content)
+    (content["frames"][2] if is_of_frame else content)[key] = [0, False, None]
+    assert_same_poses(read(tmp_path, content), ring())
+
+
+def test_keys_that_are_not_followed_are_said(tmp_path):
+    content = transforms(ring(), rolling_shutter=[0, 0, 0.5, 0], sparkle=3)
+    for number, frame in enumerate(content["frames"]):
+        frame["time"] = number
+    found = read(tmp_path, content)
+    assert len(found.warnings) == 2
+    assert "'rolling_shutter' is set and not followed" in found.warnings[0]
+    assert "'time'" in found.warnings[1]
+    assert any(note.endswith("not known and not used: sparkle") for note in found.notes)
+    assert read(tmp_path, transforms(ring(), aabb_scale=4, rolling_shutter=[0, 0, 0, 0])).warnings == ()
+
+
+def test_focal_lengths_in_degrees_and_as_a_matrix(tmp_path):
+    content = transforms(ring())
+    for key in ("fl_x", "fl_y", "cx", "cy"):
+        content.pop(key)
+    found = read(tmp_path, {**content, "x_fov": 60.0, "y_fov": 50.0})
+    lens = next(iter(found.cameras.values())).lens
+    assert lens is not None
+    np.testing.assert_allclose(lens.focal_px, [320 / math.tan(math.pi / 6), 240 / math.tan(math.radians(25))])
+    matrix = [[500, 0, 321, 0], [0, 510, 239, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    for frame in content["frames"]:
+        frame["intrinsic_matrix"] = matrix
+    lens = next(iter(read(tmp_path, content).cameras.values())).lens
+    assert lens is not None
+    assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
+    matrix[0][1] = 2
+    with pytest.raises(CaptureError, match="skew 2; expected focal lengths above 0 and no skew"):
+        read(tmp_path, content)
+
+
+def test_json_of_windows_editors_is_read(tmp_path):
+    for encoding in ("utf-8-sig", "utf-16"):
+        (tmp_path / "transforms.json").write_bytes(json.dumps(transforms(ring())).encode(encoding))
+        assert_same_poses(read_poses(tmp_path / "transforms.json"), ring())
+
+
 def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
     far = np.array([500_123.4, 5_400_321.6, 300.0])
     moved = {name: pose + np.column_stack([np.zeros((3, 3)), far]) for name, pose in ring().items()}

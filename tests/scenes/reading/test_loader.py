@@ -11,6 +11,8 @@ from PIL import Image
 from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene
 from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading import loader
+from unmix_plugin.scenes.reading.faults import find_named
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 
@@ -122,6 +124,75 @@ def test_invalid_pixels_are_masked_out_and_zero_when_asked_to(tmp_path):
     assert np.isfinite(scene.cube(2)).all()
     assert not scene.cube(2)[2, 3].any()
     assert scene.valid_mask(1).all()
+
+
+MASKS = {
+    "255": lambda white: Image.fromarray(white * np.uint8(255)),
+    "1": lambda white: Image.fromarray(white.astype(np.uint8)),
+    "bits": Image.fromarray,
+    "16 bits": lambda white: Image.fromarray(white * np.uint16(65535)),
+    "1 in 16 bits": lambda white: Image.fromarray(white.astype(np.uint16)),
+    "38": lambda white: Image.fromarray(white * np.uint8(38)),
+    "colour": lambda white: Image.fromarray(np.dstack([white * np.uint8(255)] * 3)),
+    "opacity": lambda white: Image.fromarray(
+        np.dstack([np.full((*white.shape, 3), 255, np.uint8), white * np.uint8(255)])
+    ),
+    "opacity of black": lambda white: Image.fromarray(
+        np.dstack([np.zeros((*white.shape, 3), np.uint8), white * np.uint8(255)])
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", MASKS)
+def test_a_mask_is_white_where_pixels_count_whatever_its_numbers(tmp_path, kind):
+    white = np.arange(12).reshape(3, 4) % 3 > 0
+    MASKS[kind](white).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", (3, 4)), white)
+
+
+def test_masks_of_one_tone_and_soft_masks(tmp_path):
+    for number, is_white in ((0, False), (1, True), (255, True)):
+        Image.new("L", (4, 3), number).save(tmp_path / "mask.png")
+        assert (read_mask(tmp_path / "mask.png", (3, 4)) == is_white).all()
+    Image.fromarray(np.array([[0, 100, 200, 255]], np.uint8)).save(tmp_path / "mask.png")
+    assert read_mask(tmp_path / "mask.png", (1, 4)).tolist() == [[False, False, True, True]]
+    Image.fromarray(np.array([[0, 1, 2, 3]], np.uint8)).save(tmp_path / "mask.png")
+    with pytest.raises(UnreadableImageError, match="4 dark greys up to 3; expected 0 and 255"):
+        read_mask(tmp_path / "mask.png", (1, 4))
+
+
+@pytest.mark.parametrize(
+    "renamed",
+    [
+        lambda path: path.replace("/", "\\"),
+        lambda path: ".\\" + path.replace("/", "\\"),
+        lambda path: "C:\\Users\\me\\pot\\" + path.replace("/", "\\"),
+        lambda path: "/home/someone/pot/" + path,
+        str.upper,
+        lambda path: path.replace("view", "%76iew"),
+    ],
+)
+def test_paths_of_other_systems_are_followed(tmp_path, renamed):
+    folder = make_scene(tmp_path / "scene")
+    plain = load_scene(folder.root)
+
+    def rename(content):
+        for frame in content["frames"]:
+            frame.update({key: renamed(value) for key, value in frame.items() if key.endswith("_path")})
+        for key in ("train_filenames", "test_filenames"):
+            content[key] = [renamed(path) for path in content[key]]
+
+    scene = load_scene(folder.edit(rename).root)
+    assert [frame.cube_path for frame in scene.frames] == [frame.cube_path for frame in plain.frames]
+    assert [frame.label_path for frame in scene.frames] == [frame.label_path for frame in plain.frames]
+
+
+def test_a_mask_of_another_machine_is_not_looked_for_by_its_bare_name(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"a picture")
+    assert find_named(tmp_path, "/home/someone/masks/a.png") == tmp_path / "a.png"
+    assert find_named(tmp_path, "/home/someone/masks/a.png", least_parts=2) is None
+    (tmp_path / "inside").mkdir()
+    assert find_named(tmp_path / "inside", "../a.png") is None
 
 
 def test_black_pixels_of_a_mask_do_not_count(tmp_path):

@@ -1,27 +1,51 @@
-"""Layout `cubes`: a folder with one spectral file a view, or one folder of band files a view.
+"""Layout `cubes`: a folder with one spectral file a view, one folder of band files a view, or a tree of such folders as
+instruments write them.
 
 Files with the name of a cube and a suffix of a picture are its RGB picture. Where there are pictures alone, they are
 the views: three bands, gamma-encoded.
+
+Cameras of Specim write each view with its own references, and what they make of it themselves:
+
+    NAME/capture/{NAME, DARKREF_NAME, WHITEREF_NAME}.{hdr,raw}     stored numbers
+    NAME/results/REFLECTANCE_NAME.{hdr,dat}                        taken where a view has no white reference
+
+The same names count in any folder and in any case; files such as darkReference are references of the views beside them.
 """
 
 from __future__ import annotations
 
+import os
 import re
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+from unmix_plugin.captures.layouts.registry import view_names
+from unmix_plugin.captures.poses.pose_set import name_some
+from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
 _CUBE_SUFFIXES = frozenset(
-    {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".nc", ".pt"}
+    {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4", ".pt"}
 )
 _PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
-_REFERENCE_NAME = re.compile(
-    r"(white|dark|flat)[ _-]*(ref(erence)?|frame|field|current)?[ _-]*\d*", re.IGNORECASE
+_BAND_SUFFIXES = _PICTURE_SUFFIXES | {".tif", ".tiff", ".exr"}
+_WORD = r"(?:ref(?:erence)?|frame|field|current|calibration)"
+_REFERENCE = re.compile(
+    rf"(?P<kind>white|dark|flat)[ _-]*(?P<word>{_WORD})?(?:[ _-]+(?P<of>.+))?"
+    rf"|(?P<of2>.+?)[ _-]+(?P<kind2>white|dark|flat)[ _-]*(?P<word2>{_WORD})?",
+    re.IGNORECASE,
 )
-"""Names of files that hold no view."""
+"""Names of files that hold no view: WHITEREF_212, dark frame 3, 212_darkReference, white."""
+_RESULT = re.compile(r"reflectance[ _-]+(?P<of>.+)", re.IGNORECASE)
+_RESULTS = "results"
+"""Folder of what a camera makes of its numbers."""
+_STEPS = ("capture", "captures", "results", "raw")
+"""Folders below that of a view, which don't name it."""
+_DEEPEST = 5
 
 
 def find_cubes(root: Path, options: ReadOptions) -> Capture:
@@ -33,35 +57,189 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     """
     excluded = {path.resolve() for path in options.exclude}
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
-    references = [path for path in files if _REFERENCE_NAME.fullmatch(path.stem)]
-    files = [path for path in files if path not in references]
-    cubes = [path for path in files if path.suffix.lower() in _CUBE_SUFFIXES]
     pictures = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
-    folders = [] if cubes else _band_folders(root, excluded)
-    found = cubes or folders or list(pictures.values())
-    if not found:
+    cubes = _cubes_among(files)
+    if cubes:
+        return _capture_of_groups(root, {root: cubes}, pictures, options)
+    if folders := _band_folders(root, excluded):
+        return _capture_of_plain(root, folders, pictures, options)
+    if deeper := _cubes_below(root, excluded):
+        return _capture_of_groups(root, deeper, {}, options)
+    if not pictures:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
+    return _capture_of_plain(
+        root, [path for path in pictures.values() if not _is_reference(path, ())], {}, options
+    )
+
+
+def _capture_of_plain(
+    root: Path, found: Sequence[Path], pictures: dict[str, Path], options: ReadOptions
+) -> Capture:
+    """Views that are pictures, or folders of bands."""
+    _refuse_same_names(found)
+    views = [
+        CaptureView(_name(path), _open(path, options), picture=pictures.get(_name(path)))
+        for path in sorted(found, key=_name)
+    ]
+    return Capture("cubes", root, tuple(views))
+
+
+@dataclass
+class _Group:
+    """What belongs to one view."""
+
+    cube: Path | None = None
+    result: Path | None = None
+    """Reflectance that the camera wrote."""
+    dark: Path | None = None
+    white: Path | None = None
+
+
+def _capture_of_groups(
+    root: Path, folders: dict[Path, list[Path]], pictures: dict[str, Path], options: ReadOptions
+) -> Capture:
+    """Views of one folder or of a tree, with the references that were taken for each."""
+    groups: dict[tuple[Path, str], _Group] = defaultdict(_Group)
+    left_out: list[Path] = []
+    for folder, cubes in folders.items():
+        left_out += _sort_into(groups, _place(folder, root), cubes, is_tree=folder != root)
+    complete = {key: group for key, group in groups.items() if group.cube or group.result}
+    take_results = all(group.result for group in complete.values()) and not all(
+        group.cube and group.white for group in complete.values()
+    )
+    paths = {
+        key: group.result if take_results or group.cube is None else group.cube
+        for key, group in complete.items()
+    }
+    if not any(paths.values()):
+        raise CaptureError(
+            f"{root} holds references only ({name_some([path.name for path in left_out])}); expected one file a view"
+        )
+    if len(folders) == 1 and root in folders:
+        _refuse_same_names([path for path in paths.values() if path is not None])
+        names = [_name(path) for path in paths.values() if path is not None]
+    else:
+        names = view_names([str(place.relative_to(root) / f"{name}.x") for place, name in paths], str(root))
+    views: list[CaptureView] = []
+    references: dict[str, int] = {"dark": 0, "white": 0}
+    for name, (key, path) in sorted(zip(names, paths.items(), strict=True), key=lambda pair: pair[0]):
+        assert path is not None
+        view = CaptureView(name, _open(path, options), picture=pictures.get(name))
+        for kind in references:
+            own = getattr(complete[key], kind)
+            if own is not None and path == complete[key].cube:
+                view = replace(view, **{kind: open_spectral_file(own, replace(options, wavelengths_nm=None))})
+                references[kind] += 1
+        views.append(view)
+    return Capture("cubes", root, tuple(views), notes=_notes(references, len(views), left_out, take_results))
+
+
+def _notes(
+    references: dict[str, int], num_views: int, left_out: list[Path], take_results: bool
+) -> tuple[str, ...]:
+    notes = [
+        f"{count} of {num_views} views have a {what} of their own, which is used unless --{kind} names another"
+        for (kind, count), what in zip(references.items(), ("dark frame", "white reference"), strict=True)
+        if count
+    ]
+    if take_results:
+        notes.append("views are the reflectances that the camera wrote, as not all have a white reference")
+    if left_out:
+        several = len(left_out) > 1
+        notes.append(
+            f"{name_some([path.name for path in left_out])} {'were' if several else 'was'} left out, as "
+            f"{'their names are those of references' if several else 'its name is that of a reference'}; use "
+            f"{'one' if several else 'it'} with --white or --dark"
+        )
+    return tuple(notes)
+
+
+def _sort_into(
+    groups: dict[tuple[Path, str], _Group], place: Path, cubes: list[Path], is_tree: bool
+) -> list[Path]:
+    """Cubes of one folder as views and their references; returns references of no view."""
+    stems = [path.stem for path in cubes]
+    references = [path for path in cubes if _is_reference(path, stems)]
+    others = [path for path in cubes if path not in references]
+    own = []
+    for path in others:
+        match = _RESULT.fullmatch(path.stem)
+        is_result = match is not None and (path.parent.name.lower() == _RESULTS or match["of"] in stems)
+        group = groups[place, match["of"] if is_result and match is not None else path.stem]
+        if is_result:
+            group.result = path
+            continue
+        if group.cube is not None and path.parent == group.cube.parent:
+            raise CaptureError(_same_name(group.cube, path))
+        group.cube = path
+        own.append(path.stem)
+    left_out = []
+    for path in references:
+        match = _REFERENCE.fullmatch(path.stem)
+        assert match is not None
+        kind = "dark" if (match["kind"] or match["kind2"]).lower() == "dark" else "white"
+        of = match["of"] or match["of2"]
+        owners = [stem for stem in own if of is not None and stem.casefold() == of.casefold()]
+        if not owners and is_tree and (len(own) == 1 or of is None):
+            owners = own
+        for stem in owners:
+            setattr(groups[place, stem], kind, path)
+        left_out += [] if owners else [path]
+    return left_out
+
+
+def _is_reference(path: Path, stems: Sequence[str]) -> bool:
+    """Whether a name is that of a reference: with such a word, of a view that is there, or with a number or nothing."""
+    match = _REFERENCE.fullmatch(path.stem)
+    if match is None:
+        return False
+    of = match["of"] or match["of2"]
+    if match["word"] or match["word2"] or of is None or (match["of"] or "").isdecimal():
+        return True
+    return of.casefold() in (stem.casefold() for stem in stems)
+
+
+def _place(folder: Path, root: Path) -> Path:
+    """The folder that stands for a view: NAME of NAME/capture."""
+    return folder.parent if folder != root and folder.name.lower() in _STEPS else folder
+
+
+def _cubes_among(files: Sequence[Path]) -> list[Path]:
+    """Files that may be cubes; a header that describes one of them is none."""
+    cubes = [path for path in files if path.suffix.lower() in _CUBE_SUFFIXES]
+    return [path for path in cubes if path.suffix.lower() != ".hdr" or described_image(path) is None]
+
+
+def _cubes_below(root: Path, excluded: set[Path]) -> dict[Path, list[Path]]:
+    """Cubes in folders below, by folder."""
+    found: dict[Path, list[Path]] = {}
+    for parent, folders, _ in os.walk(root):
+        folder = Path(parent)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if len(folder.relative_to(root).parts) == _DEEPEST:
+            folders.clear()
+        cubes = _cubes_among([path for path in _visible_files(folder) if path.resolve() not in excluded])
+        if cubes:
+            found[folder] = cubes
+    return found
+
+
+def _refuse_same_names(found: Sequence[Path]) -> None:
     owners: dict[str, Path] = {}
     for path in found:
         other = owners.setdefault(_name(path).casefold(), path)
         if other is not path:
-            raise CaptureError(
-                f"{other} and {path} would both be the view '{_name(other)}'; expected one file a view: rename or move "
-                "one of them"
-            )
-    views = []
-    for path in sorted(found, key=_name):
-        picture = pictures.get(_name(path)) if cubes or folders else None
-        views.append(CaptureView(_name(path), _open(path, options), picture=picture))
-    notes = (
-        f"{path.name} was left out, as its name is that of a reference; use it with --white or --dark"
-        for path in references
-        if path.suffix.lower() in _CUBE_SUFFIXES
+            raise CaptureError(_same_name(other, path))
+
+
+def _same_name(first: Path, second: Path) -> str:
+    return (
+        f"{first} and {second} would both be the view '{_name(first)}'; expected one file a view: rename or move one "
+        "of them"
     )
-    return Capture("cubes", root, tuple(views), notes=tuple(notes))
 
 
 def _open(path: Path, options: ReadOptions) -> SpectralFile:
@@ -77,13 +255,16 @@ def _visible_files(folder: Path) -> list[Path]:
 
 
 def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
-    """Folders that hold more than one file, each a view of band files."""
+    """Folders that hold more than one file of a band, and no cube, each a view."""
     folders = [path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    folders = [path for path in folders if path.resolve() not in excluded]
-    folders = [path for path in folders if not _REFERENCE_NAME.fullmatch(path.name)]
-    kinds = _CUBE_SUFFIXES | _PICTURE_SUFFIXES
-    counts = [sum(file.suffix.lower() in kinds for file in _visible_files(path)) for path in folders]
-    return sorted(path for path, count in zip(folders, counts, strict=True) if count > 1)
+    folders = [path for path in folders if path.resolve() not in excluded and not _is_reference(path, ())]
+    suffixes = [[file.suffix.lower() for file in _visible_files(path)] for path in folders]
+    return sorted(
+        path
+        for path, own in zip(folders, suffixes, strict=True)
+        if sum(suffix in _BAND_SUFFIXES for suffix in own) > 1
+        and not _CUBE_SUFFIXES - _BAND_SUFFIXES & set(own)
+    )
 
 
 def _name(path: Path) -> str:

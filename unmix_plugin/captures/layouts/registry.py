@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from unmix_plugin.captures.spectral_file import Capture, ReadOptions
 from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.scenes.reading.faults import find_named
 
 _FindViews: TypeAlias = Callable[[Path, ReadOptions], Capture]
 """Finds the views below a folder; raises CaptureError where there are none or they can't be opened."""
@@ -55,8 +56,9 @@ class FoundFiles:
         self._root = root.resolve()
         self._missing: list[str] = []
 
-    def look(self, where: str, *texts: str) -> Path | None:
-        """The first of some paths in the folder that is a file; None if none is.
+    def look(self, where: str, *texts: str, least_parts: int = 1) -> Path | None:
+        """The first of some paths in the folder that is a file; None if none is. Paths of other systems are followed
+        as `find_named` does.
 
         Raises:
             CaptureError: the path leaves the folder.
@@ -70,21 +72,23 @@ class FoundFiles:
                 raise CaptureError(
                     f"{where}: {text!r} can't be followed ({error}); expected a path in the folder"
                 ) from error
+            if is_inside and is_file:
+                return path
+            if found := find_named(self._root, text, least_parts):
+                return found
             if not is_inside:
                 raise CaptureError(
                     f"{where}: {text!r} leaves the folder {self._root}; copy the file into it and name it from there"
                 )
-            if is_file:
-                return path
         return None
 
-    def find(self, where: str, text: str, *others: str) -> Path | None:
+    def find(self, where: str, text: str, *others: str, least_parts: int = 1) -> Path | None:
         """The same; noted as missing if none is.
 
         Raises:
             CaptureError: the path leaves the folder.
         """
-        path = self.look(where, text, *others)
+        path = self.look(where, text, *others, least_parts=least_parts)
         self._missing += [] if path else [text]
         return path
 

@@ -66,6 +66,9 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
     opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in _TIFF_SUFFIXES]
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
+    bands = [
+        item for item in bands if options.wavelengths_nm is not None or not item.file.bands.is_broad.any()
+    ]
     if not bands:
         raise CaptureError(
             f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or "
@@ -150,6 +153,12 @@ def _notes(
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
     if thermal:
         notes.append(f"{counted(thermal, 'thermal image')} left out")
+    broad = [item for item in opened if item.file.shape[2] == 1 and item.file.bands.is_broad.any()]
+    if broad and len(bands) < len(opened) - thermal - colour:
+        names = sorted({tag_text(item.tags, "BandName") or item.ending for item in broad})
+        notes.append(
+            f"{counted(len(broad), 'image')} of bands too broad for one wavelength left out: {', '.join(names)}"
+        )
     if colour:
         notes.append(
             f"{counted(colour, 'colour picture')} left out: nothing says what their channels measure"

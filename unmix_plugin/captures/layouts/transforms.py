@@ -24,10 +24,17 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
-from unmix_plugin.captures.poses.pose_set import load_json
+from unmix_plugin.captures.poses.pose_set import load_json, path_text
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
+from unmix_plugin.captures.spectral_file import (
+    BandTable,
+    Capture,
+    CaptureView,
+    ReadOptions,
+    SpectralFile,
+    linear_values,
+)
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
@@ -59,9 +66,9 @@ class _Frame:
         return next((self.text(key) for key in _NAME_KEYS if self.text(key)), "")
 
     def text(self, key: str) -> str:
-        """A path in it, without a leading `./`; empty where it is absent or no text."""
+        """A path in it, see `path_text`; empty where it is absent or no text."""
         value = self.values.get(key)
-        return value.strip().removeprefix("./") if isinstance(value, str) else ""
+        return path_text(value) if isinstance(value, str) else ""
 
 
 @dataclass(frozen=True)
@@ -122,7 +129,7 @@ def read_frames(root: Path, key: str) -> _FrameList:
 def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_Frame, ...]:
     """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation."""
     train, val, test = (
-        {text.removeprefix("./") for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
+        {path_text(text) for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
         for name in ("train", "val", "test")
     )
     evaluation = test or val
@@ -194,7 +201,7 @@ def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
         path = found.find(frame.where, frame.name, *others)
         pictures += [] if path is None else [path]
         text = frame.text("mask_path")
-        masks.append(found.find(frame.where, text) if text else None)
+        masks.append(found.find(frame.where, text, least_parts=2) if text else None)
     found.refuse_missing("copy them into the folder, or drop the frames")
     views = []
     for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True):
@@ -216,7 +223,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         text = frame.text(_CUBE_KEY)
         path = found.find(frame.where, text, _in_eval(text))
         cubes += [] if path is None else [path]
-        moved += path is not None and not (root / text).is_file()
+        moved += path is not None and "val" in PurePosixPath(text).parts and not (root / text).is_file()
     found.refuse_missing(
         "copy them into the folder; if there are RGB pictures alone, the layout 'nerfstudio' takes those"
     )
@@ -231,8 +238,10 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     views = []
     for frame, name, cube, split in zip(listed.frames, names, cubes, by_folder, strict=True):
         picture, mask, labels = (
-            found.look(frame.where, frame.text(key), _in_eval(frame.text(key))) if frame.text(key) else None
-            for key in ("file_path", "mask_path", "seg_file_path")
+            found.look(frame.where, frame.text(key), _in_eval(frame.text(key)), least_parts=least_parts)
+            if frame.text(key)
+            else None
+            for key, least_parts in (("file_path", 1), ("mask_path", 2), ("seg_file_path", 2))
         )
         file = _open_cube(cube, wavelengths, options)
         views.append(
@@ -260,8 +269,9 @@ def _in_eval(text: str) -> str:
 def _open_cube(path: Path, wavelengths: np.ndarray | None, options: ReadOptions) -> SpectralFile:
     """A cube; numbers of 8 bits stand for fractions of 255."""
     file = open_spectral_file(path, options)
-    if file.dtype == np.uint8 and file.scale is None:
-        file = replace(file, scale=255.0)
+    if file.dtype == np.uint8 and file.linear is None:
+        linear = linear_values(path, file.shape[2], [1 / 255], [], "numbers of 8 bits")
+        file = replace(file, linear=linear)
     if wavelengths is not None and len(wavelengths) == file.shape[2] and file.bands.wavelengths_nm is None:
         file = replace(file, bands=BandTable(wavelengths, "'wavelengths' of transforms.json, nm"))
     return file

@@ -7,6 +7,7 @@ over what is written; `make_pose_set` refuses what is no pose and makes the othe
 
 from __future__ import annotations
 
+import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -79,6 +80,17 @@ class PoseSet:
     """Whether the coordinates mean something to the user. Those of estimated poses don't."""
     notes: tuple[str, ...] = ()
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
+    warnings: tuple[str, ...] = ()
+    """What may make the geometry wrong, one sentence each: reports begin with it."""
+
+
+def path_text(text: str) -> str:
+    """A path of a JSON file with slashes between folders and without a leading `./`.
+
+    >>> path_text(".\\\\images\\\\0001.png")
+    'images/0001.png'
+    """
+    return text.strip().replace("\\", "/").removeprefix("./")
 
 
 def make_pose_set(
@@ -88,6 +100,7 @@ def make_pose_set(
     points: SparsePoints | None = None,
     up: Float64[np.ndarray, "3"] | None = None,
     notes: Iterable[str] = (),
+    warnings: Iterable[str] = (),
 ) -> PoseSet:
     """Check and tidy what a reader found: rigid rotations, one camera a name, coordinates near 0.
 
@@ -123,6 +136,7 @@ def make_pose_set(
         offset,
         None if up is None else up / np.linalg.norm(up),
         notes=tuple(said),
+        warnings=tuple(warnings),
     )
 
 
@@ -400,7 +414,7 @@ def _stem(name: str) -> str:
 
 
 def _path(name: str) -> PurePosixPath:
-    return PurePosixPath(name.replace("\\", "/"))
+    return PurePosixPath(unicodedata.normalize("NFC", name.replace("\\", "/")))
 
 
 _KEYS: tuple[Callable[[str], str], ...] = (

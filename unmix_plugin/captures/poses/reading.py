@@ -34,13 +34,15 @@ from unmix_plugin.captures.poses.pose_set import (
     load_xml,
     make_pose_set,
     name_some,
+    path_text,
 )
 from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
-from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number
+from unmix_plugin.scenes.reading.foreign_keys import keys_to_say
 from unmix_plugin.scenes.reading.images import FORMATS
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, read_lens
 
@@ -75,7 +77,7 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
 
 
 def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
-    start = _first_bytes(path).lstrip(b"\xef\xbb\xbf\t\r\n ")
+    start = _first_bytes(path).lstrip(b"\xef\xbb\xbf\xff\xfe\0\t\r\n ")
     if path.suffix in (".bin", ".txt") and find_models(path.parent)[:1] == [path.parent]:
         return read_colmap(path.parent)
     if start[:1] in (b"{", b"["):
@@ -223,9 +225,15 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
     cameras: list[tuple[str, PosedCamera]] = []
     notes: list[str] = []
     points: SparsePoints | None = None
+    warnings: list[str] = []
     up = np.array([0.0, 0.0, 1.0])
     for path, content in contents.items():
         top = content if isinstance(content, dict) else {}
+        listed = top.get("frames") if top else content
+        frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
+        warned, said = keys_to_say(top, frames)
+        warnings += [f"{path.name}: {text}" for text in warned]
+        notes += [f"{path.name}: {text}" for text in said]
         faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
         found = _read_frames(path, content, sizes, faults, notes)
@@ -243,7 +251,7 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
         up = placement.rotation.T @ np.array([0.0, 0.0, 1.0])
     where = ", ".join(str(path) for path in contents)
     source = " and ".join(path.name for path in contents)
-    return make_pose_set(cameras, source, where, points, up, dict.fromkeys(notes))
+    return make_pose_set(cameras, source, where, points, up, dict.fromkeys(notes), dict.fromkeys(warnings))
 
 
 def _read_frames(
@@ -262,7 +270,7 @@ def _read_frames(
         if not isinstance(frame, dict):
             raise CaptureError(f"{where} is {describe(frame)}; expected an object with 'transform_matrix'")
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
-        names = [text.removeprefix("./") for text in texts] or [f"#{index:04d}"]
+        names = [path_text(text) for text in texts] or [f"#{index:04d}"]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
         model, terms, read_from = _other_model(top, frame, where)
         given = read_lens(*read_from, f"frames[{index}]", faults)
@@ -279,7 +287,7 @@ def _read_frames(
                 notes += [note for note in lenses[key][1:] if note is not None]
             lens = lenses[key][0]
         read.append((names, matrix, lens))
-        missing += [] if _is_there(path.parent / names[0]) else [names[0]]
+        missing += [] if _is_there(path.parent, names[0]) else [names[0]]
     if missing:
         notes.append(
             f"{path.name}: {len(missing)} of {len(read)} frames name files that are not there ({name_some(missing)}); "
@@ -290,12 +298,9 @@ def _read_frames(
     return read
 
 
-def _is_there(path: Path) -> bool:
+def _is_there(folder: Path, name: str) -> bool:
     """Whether a file exists, also where Blender's files leave out the suffix."""
-    try:
-        return path.is_file() or path.with_name(f"{path.name}.png").is_file()
-    except (OSError, ValueError):
-        return False
+    return find_named(folder, name) is not None or find_named(folder, f"{name}.png") is not None
 
 
 def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | None:
@@ -406,7 +411,7 @@ def _read_points(
     if not isinstance(name, str):
         return None
     try:
-        positions, colours = read_ply_points(path.parent / name)
+        positions, colours = read_ply_points(find_named(path.parent, name) or path.parent / name)
     except (OSError, ValueError) as error:
         notes.append(f"{path.name}: the sparse points of {name} can't be read ({error}); left out")
         return None

@@ -8,8 +8,12 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
+import unicodedata
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
@@ -80,14 +84,15 @@ def read_json_file(path: Path) -> Any:
     """The value in a JSON file.
 
     Raises:
-        UnreadableJsonError: it is not UTF-8, not JSON, nested too deeply, or has text that is not Unicode.
+        UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply, or has text that is not Unicode.
         OSError: it cannot be opened.
     """
     data = read_bounded(path, MOST_TABLE_BYTES)
     if not data.strip(b"\xef\xbb\xbf\t\r\n "):
         raise UnreadableJsonError("is empty; expected JSON")
     try:
-        content = json.loads(data.decode("utf-8-sig"))
+        is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        content = json.loads(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
         json.dumps(
             content, ensure_ascii=False
         ).encode()  # fails on lone surrogates, which no file name can hold
@@ -121,10 +126,64 @@ def read_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
+_DRIVE = re.compile(r"[A-Za-z]:/")
+
+
+def find_named(root: Path, text: str, least_parts: int = 1) -> Path | None:
+    """The file in a folder that a text of another system names; None if there is none.
+
+    Backslashes part folders; of an absolute path of another machine its tail is tried, the longest first; `%20` is a
+    space; upper and lower case, and how umlauts are composed, need not be the same.
+
+    Args:
+        least_parts: Of a tail. With 2 a mask is never looked for by its bare name, which a picture may have too.
+    """
+    path = text.replace("\\", "/").removeprefix("file://")
+    parts = [part for part in path.split("/") if part not in ("", ".")]
+    is_absolute = path.startswith("/") or _DRIVE.match(path) is not None
+    tails = [parts[start:] for start in range(1, len(parts) - least_parts + 1)] if is_absolute else []
+    candidates = [parts, *tails]
+    candidates += [[unquote(part) for part in tail] for tail in candidates if "%" in text]
+    followed = (_follow(root, tail) for tail in candidates)
+    return next((path for path in followed if path is not None), None)
+
+
+def _follow(root: Path, parts: list[str]) -> Path | None:
+    """The file in a folder, its names in any case; None where a name is missing, fits several or leads out of it."""
+    with suppress(OSError, RuntimeError, ValueError):
+        path = _in_any_case(root, parts)
+        if path is not None and path.is_file() and path.resolve().is_relative_to(root.resolve()):
+            return path
+    return None
+
+
+def _in_any_case(root: Path, parts: list[str]) -> Path | None:
+    path = root
+    for part in parts:
+        if not (path / part).exists() and part != "..":
+            wanted = _plain(part)
+            alike = (
+                [entry.name for entry in path.iterdir() if _plain(entry.name) == wanted]
+                if path.is_dir()
+                else []
+            )
+            if len(alike) != 1:
+                return None
+            part = alike[0]
+        path = path / part
+    return path
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
 def resolve_path(
-    root: Path, text: str, allow_outside: bool | None, where: str, faults: Faults
+    root: Path, text: str, allow_outside: bool | None, where: str, faults: Faults, least_parts: int = 1
 ) -> Path | None:
     """Find the file a scene names; None and a noted fault if it is missing, no plain file, or out of bounds.
+
+    Paths of other systems are followed as `find_named` does.
 
     A path is out of bounds if it is absolute or if it leads out of the scene folder, be it by `..` or through a
     symbolic link. Such a path is followed with `allow_outside`; None is for those who can't be asked to, to whom the
@@ -140,6 +199,8 @@ def resolve_path(
             f"{text!r} cannot be followed ({type(error).__name__}); expected a file in the scene folder",
         )
         return None
+    if not (is_file and (inside or allow_outside)) and (found := find_named(root, text, least_parts)):
+        return found
     if not inside and not allow_outside:
         or_allow = (
             ""
@@ -149,8 +210,8 @@ def resolve_path(
         faults.add(where, f"{text!r} leaves the scene folder; copy the file into it{or_allow}")
         return None
     if not is_file:
-        found = "is not a plain file" if path.exists() else "is missing"
-        faults.add(where, f"{text!r} {found}; add the file or drop the entry")
+        state = "is not a plain file" if path.exists() else "is missing"
+        faults.add(where, f"{text!r} {state}; add the file or drop the entry")
         return None
     return path
 

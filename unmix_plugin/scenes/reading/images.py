@@ -70,9 +70,43 @@ def read_mask(path: Path, size: Size) -> Bool[np.ndarray, "H W"]:
     """Read a mask: True where a pixel counts, False where it is black (nerfstudio's convention).
 
     Raises:
-        UnreadableImageError: not a readable picture of this size.
+        UnreadableImageError: not a readable picture of this size, or neither black and white nor two numbers.
     """
-    return _read(path, size, lambda image: np.asarray(image.convert("L")) > 0)
+    return _read(path, size, white_of)
+
+
+def white_of(image: Image.Image) -> Bool[np.ndarray, "H W"]:
+    """Where a mask is white. The one rule for masks: white is what is brighter than half of the range.
+
+    A mask whose numbers are all dark holds 0 and one other number, such as 1, which is its white. Opacity counts as
+    brightness over black.
+
+    Raises:
+        UnreadableImageError: all is dark and there are several greys, so that white can't be told.
+    """
+    grey, top = _grey_of(image)
+    brightest = grey.max(initial=0)
+    if brightest > top // 2 or image.format == "JPEG":  # which has noise where all is black
+        return grey > top // 2
+    levels = np.unique(grey)
+    if len(levels[levels > 0]) > 1:
+        raise UnreadableImageError(
+            f"is a mask with {len(levels)} dark greys up to {brightest}; expected 0 and {top} (black and white), or 0 "
+            "and 1"
+        )
+    return grey > 0
+
+
+def _grey_of(image: Image.Image) -> tuple[np.ndarray, int]:
+    """Brightness of a mask's pixels, and that of white."""
+    if image.mode.startswith("I"):
+        grey = np.asarray(image).astype(np.int64)
+        return grey, 65535 if grey.max(initial=0) > 255 else 255
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        pixels = np.asarray(image.convert("LA")).astype(np.int64)
+        over_black = pixels[..., 0] * pixels[..., 1] // 255
+        return (over_black if over_black.any() else pixels[..., 1] * (np.ptp(pixels[..., 1]) > 0)), 255
+    return np.asarray(image.convert("L")).astype(np.int64), 255
 
 
 def _read(path: Path, size: Size, convert: Callable[[Image.Image], np.ndarray]) -> np.ndarray:

@@ -223,7 +223,8 @@ def _locate_files(
     for frame in entry.frames:
         paths: dict[str, Path] = {}
         for key, text in frame.paths.items():
-            path = resolve_path(root, text, options.allow_outside_paths, frame.where, faults)
+            least_parts = 1 if key in ("file_path", "hyperspectral_file_path") else 2
+            path = resolve_path(root, text, options.allow_outside_paths, frame.where, faults, least_parts)
             if path is not None:
                 paths[key] = path
         cube = paths.get("hyperspectral_file_path")

@@ -25,6 +25,7 @@ from unmix_plugin.scenes.reading.faults import (
     read_json_file,
     read_number,
 )
+from unmix_plugin.scenes.reading.foreign_keys import refused_keys
 from unmix_plugin.spectral.bands import require_nanometres
 
 FILE_NAME = "transforms.json"
@@ -63,7 +64,7 @@ class Intrinsics:
     """Lens of one frame. Sizes in pixels; None where the file says nothing."""
 
     model: Any
-    """What `camera_model` says; OPENCV where it is absent. Only `read_intrinsics` refuses models."""
+    """What `camera_model` or `is_fisheye` says; OPENCV where they are absent. Only `read_intrinsics` refuses models."""
     width: int | None
     height: int | None
     focal_px: tuple[float | None, float | None]
@@ -96,7 +97,7 @@ class Intrinsics:
 
 
 def read_lens(
-    content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults
+    content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults, is_scene: bool = False
 ) -> Intrinsics | None:
     """The lens keys of a frame of any transforms.json, whatever its model and whether or not it has a focal length.
 
@@ -107,14 +108,22 @@ def read_lens(
         frame: Keys of the frame.
         where: How messages call the frame.
         faults: Where faults are noted.
+        is_scene: Whether rays are cast through the lens as it is.
     Returns:
         None, with noted faults, if a number is impossible.
     """
     noted_before = faults.noted
+    for message in refused_keys(content, frame, is_scene):
+        faults.add(where, message)
+    matrix = _read_intrinsic_matrix(
+        frame.get("intrinsic_matrix", content.get("intrinsic_matrix")), where, faults
+    )
 
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
         source = frame if frame.get(key) is not None else content
         value = source.get(key)
+        if value is None and key in matrix:
+            return matrix[key]
         number, owner = read_number(value), FILE_NAME if source is content else where
         if value is not None and (number is None or abs(number) > _GREATEST_PX):
             faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
@@ -131,6 +140,11 @@ def read_lens(
             ("c", -_GREATEST_PX, _GREATEST_PX, _A_NUMBER),
         )
     )
+    fields = [read(key, 1e-4, 180 - 1e-4, "degrees between 0 and 180") for key in ("x_fov", "y_fov")]
+    angles = tuple(
+        angle if angle is not None or field is None else math.radians(field)
+        for angle, field in zip(angles, fields, strict=True)
+    )
     bending = [read(key, -_GREATEST_PX, _GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
     listed = frame.get("distortion_params", content.get("distortion_params"))
     if listed is not None:
@@ -144,8 +158,42 @@ def read_lens(
         return None
     width, height = (None if side is None else int(side) for side in sides)
     k1, k2, k3, k4, p1, p2 = (number or 0.0 for number in bending)
-    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
-    return Intrinsics(model, width, height, focal_px, angles, center_px, (k1, k2, p1, p2), (k3, k4))
+    model = _read_model(content, frame, where, faults)
+    if faults.noted > noted_before:
+        return None
+    return Intrinsics(
+        model, width, height, focal_px, (angles[0], angles[1]), center_px, (k1, k2, p1, p2), (k3, k4)
+    )
+
+
+def _read_model(content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults) -> Any:
+    """The lens model: `camera_model`, or instant-ngp's `is_fisheye`; a fault where they contradict each other."""
+    model = frame.get("camera_model", content.get("camera_model"))
+    model = model.upper() if isinstance(model, str) else model
+    if frame.get("is_fisheye", content.get("is_fisheye")):
+        if model not in (None, "OPENCV_FISHEYE"):
+            faults.add(
+                where, f"'is_fisheye' is true and camera_model {describe(model)}; expected one of them"
+            )
+        return "OPENCV_FISHEYE"
+    return "OPENCV" if model is None else model
+
+
+def _read_intrinsic_matrix(matrix: Any, where: str, faults: Faults) -> dict[str, float]:
+    """Focal lengths and principal point of NeuS2's `intrinsic_matrix`, by our keys; none where there is no matrix."""
+    if matrix is None:
+        return {}
+    rows = [row[:3] for row in matrix[:3] if isinstance(row, list)] if isinstance(matrix, list) else []
+    numbers = [[read_number(value) for value in row] for row in rows]
+    if [len(row) for row in numbers] != [3, 3, 3] or any(None in row for row in numbers):
+        faults.add(where, f"'intrinsic_matrix' is {describe(matrix)}; expected 3 rows of 3 numbers in pixels")
+        return {}
+    ((fx, skew, cx), (_, fy, cy), _) = np.array(numbers, dtype=np.float64).tolist()
+    if min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
+        found = f"focal lengths {fx:g}, {fy:g} and skew {skew:g}"
+        faults.add(where, f"'intrinsic_matrix' has {found}; expected focal lengths above 0 and no skew")
+        return {}
+    return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
 
 
 def read_intrinsics(
@@ -153,15 +201,16 @@ def read_intrinsics(
 ) -> Intrinsics | None:
     """As `read_lens`, for lenses that rays are cast through; None and noted faults if it is not to be used."""
     noted_before = faults.noted
-    lens = read_lens(content, frame, where, faults)
-    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
+    lens = read_lens(content, frame, where, faults, is_scene=True)
+    model = "OPENCV" if lens is None else lens.model
     if model not in _SUPPORTED_MODELS:
         faults.add(
             where if "camera_model" in frame else FILE_NAME,
             f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
             "unmix-process brings such pictures into an OPENCV lens",
         )
-    if all(source.get(key) is None for source in (frame, content) for key in ("fl_x", "camera_angle_x")):
+    focal_keys = ("fl_x", "camera_angle_x", "x_fov", "intrinsic_matrix")
+    if all(source.get(key) is None for source in (frame, content) for key in focal_keys):
         faults.add(
             where, "'fl_x' is absent; expected the focal length in pixels, for a frame or the whole scene"
         )
@@ -469,7 +518,7 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
     if not isinstance(value, str) or not value or any(character < " " for character in value):
         faults.add(where, f"'{key}' is {describe(value)}; expected a path")
         return None
-    return value
+    return value.replace("\\", "/")
 
 
 def _read_wavelengths(
@@ -538,5 +587,5 @@ def _read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tupl
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
             faults.add(FILE_NAME, f"'{key}' is {describe(values)}; expected a list of file paths")
             continue
-        lists[key.removesuffix("_filenames")] = tuple(values)
+        lists[key.removesuffix("_filenames")] = tuple(value.replace("\\", "/") for value in values)
     return lists

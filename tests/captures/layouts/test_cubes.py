@@ -1,0 +1,121 @@
+"""Folders with one file a view, and trees as instruments write them."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process, write_cube, write_poses
+from tests.captures.layouts.data_sets import PLAIN
+from unmix_plugin.captures.layouts.cubes import find_cubes
+from unmix_plugin.errors import CaptureError
+
+NAMES = [f"{number}" for number in range(212, 216)]
+
+
+def counts(level, rows=HEIGHT):
+    return np.full((rows, WIDTH, 9), level, np.uint16)
+
+
+def write_tree(root: Path, white="WHITEREF_{}", dark="DARKREF_{}", capture="capture") -> None:
+    """Four captures of a Specim IQ; the white of each has another brightness."""
+    for index, name in enumerate(NAMES):
+        folder = root / name / capture
+        folder.mkdir(parents=True)
+        (root / name / "results").mkdir()
+        write_cube(folder, name, counts(1100 + 100 * index))
+        write_cube(folder, white.format(name), counts(2100 + 400 * index, 3))
+        write_cube(folder, dark.format(name), counts(100, 3))
+        write_cube(root / name / "results", f"REFLECTANCE_{name}", counts(7))
+
+
+def stems(root):
+    return {
+        view.name: tuple(file and file.path.stem for file in (view.cube, view.white, view.dark))
+        for view in find_cubes(root, PLAIN).views
+    }
+
+
+@pytest.mark.parametrize(
+    ("white", "dark", "folder"),
+    [
+        ("WHITEREF_{}", "DARKREF_{}", "capture"),
+        ("whiteref_{}", "DarkRef_{}", "Capture"),
+        ("{}_WhiteReference", "{}-dark", "raw"),
+        ("white", "darkReference", "capture"),
+    ],
+)
+def test_each_view_of_a_tree_has_its_own_references(tmp_path, white, dark, folder):
+    write_tree(tmp_path / "tree", white, dark, folder)
+    assert stems(tmp_path / "tree") == {name: (name, white.format(name), dark.format(name)) for name in NAMES}
+    capture = find_cubes(tmp_path / "tree", PLAIN)
+    assert len(capture.notes) == 2
+
+
+def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
+    write_tree(tmp_path / "tree")
+    write_poses(tmp_path / "poses.json", NAMES)
+    process(
+        tmp_path / "tree",
+        tmp_path / "scene",
+        poses=str(tmp_path / "poses.json"),
+        saturation=60000.0,
+        max_noise=9.0,
+    )
+    for index, name in enumerate(NAMES):
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
+        np.testing.assert_allclose(stored, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
+
+
+def test_files_of_a_tree_that_were_copied_together_keep_their_references(tmp_path):
+    write_tree(tmp_path / "tree")
+    (tmp_path / "flat").mkdir()
+    for path in tmp_path.glob("tree/*/capture/*"):
+        shutil.copy(path, tmp_path / "flat")
+    assert stems(tmp_path / "flat") == {name: (name, f"WHITEREF_{name}", f"DARKREF_{name}") for name in NAMES}
+
+
+def test_reflectances_of_the_camera_are_taken_where_a_white_is_missing(tmp_path):
+    write_tree(tmp_path)
+    for path in tmp_path.glob("213/capture/WHITEREF*"):
+        path.unlink()
+    assert stems(tmp_path) == {name: (f"REFLECTANCE_{name}", None, None) for name in NAMES}
+    assert any("the reflectances that the camera wrote" in note for note in find_cubes(tmp_path, PLAIN).notes)
+
+
+def test_captures_of_several_days_may_have_the_same_names(tmp_path):
+    for day in ("monday", "tuesday"):
+        write_tree(tmp_path / day)
+    assert sorted(stems(tmp_path)) == sorted(
+        f"{day}_{name}_{name}" for day in ("monday", "tuesday") for name in NAMES
+    )
+
+
+def test_a_name_with_white_in_it_may_be_a_view_and_references_are_one_note(tmp_path):
+    made = make_capture(tmp_path / "capture")
+    for name in ("white_pot", "dark_frame_2019-06-09_010", "WHITEREF_9-a"):
+        write_cube(made.root, name, counts(7))
+    capture = find_cubes(made.root, PLAIN)
+    assert [view.name for view in capture.views] == [*made.reflectance, "white_pot"]
+    (note,) = capture.notes
+    assert "and 1 more were left out" in note
+
+
+def test_a_folder_of_references_alone_is_refused(tmp_path):
+    write_cube(tmp_path, "white", counts(7))
+    with pytest.raises(CaptureError, match="holds references only"):
+        find_cubes(tmp_path, PLAIN)
+
+
+def test_views_of_several_sizes_become_sensors(tmp_path):
+    made = make_capture(tmp_path / "capture")
+    upright = made.reflectance["view_01"][:, : HEIGHT - 4]
+    raw = upright * made.white[: HEIGHT - 4] + made.dark[: HEIGHT - 4]
+    write_cube(made.root, "view_01", np.rint(raw).astype(np.uint16))
+    content = (made.root / "transforms.json").read_text()
+    own = f'"file_path": "images/view_01.png", "w": {HEIGHT - 4}, "h": {HEIGHT},'
+    (made.root / "transforms.json").write_text(content.replace('"file_path": "images/view_01.png",', own))
+    process(made.root, tmp_path / "scene")
+    sizes = {path.stem: np.load(path).shape[:2] for path in (tmp_path / "scene/cubes").glob("*.npy")}
+    assert sizes == {name: (HEIGHT, HEIGHT - 4 if name == "view_01" else WIDTH) for name in made.reflectance}
