@@ -78,7 +78,7 @@ CASES: dict[str, tuple[Spoil, dict[str, Any], str]] = {
     "another size": (
         lambda root: write_cube(root, "view_02", COUNTS[:10]),
         {},
-        r"view_02\.hdr has 10 x 32 x 9 rows, columns and bands; expected 24 x 32 x 9",
+        r"view_02 has 32 x 10 pixels \(width x height\), its lens is given for 32 x 24; expected the same shape",
     ),
     "other wavelengths": (_other_wavelengths, {}, r"view_01\.hdr has 453 nm at band 0; expected 450 nm"),
     "another type": (

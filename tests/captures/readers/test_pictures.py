@@ -185,10 +185,10 @@ def test_one_of_several_layers_is_taken_or_named(tmp_path):
     channels = write(tmp_path / "a.exr", ["S1.450,0nm", "S0.450,0nm", "T.450,0nm"])
     file = open_spectral_file(tmp_path / "a.exr")
     np.testing.assert_array_equal(file.read()[..., 0], channels["S0.450,0nm"])
-    assert "layer 'S0' is taken; the file also has" in file.notes[0]
+    assert "layer 'S0' is taken; the file also has" in file.warnings[0]
     file = open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="T"))
     np.testing.assert_array_equal(file.read()[..., 0], channels["T.450,0nm"])
-    with pytest.raises(CaptureError, match="no layer or channel 'S3'"):
+    with pytest.raises(CaptureError, match="no layer, part or channel 'S3'"):
         open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="S3"))
 
 

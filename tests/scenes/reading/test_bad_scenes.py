@@ -210,8 +210,9 @@ def test_a_path_out_of_the_scene_folder_is_refused(folder, tmp_path, outside):
     assert f"frames[2]: {text!r} leaves the scene folder" in fault
 
 
-def test_an_absolute_path_into_the_scene_folder_is_refused_too(folder):
-    text = str(folder.root / "cubes/view_2.npy")
+def test_an_absolute_path_out_of_the_scene_folder_is_refused_too(folder, tmp_path):
+    np.save(tmp_path / "view_9.npy", np.zeros((HEIGHT, WIDTH, 4)))
+    text = str(tmp_path / "view_9.npy")
     assert "leaves the scene folder" in fault_of(folder.edit(set_frame(2, hyperspectral_file_path=text)))
 
 
