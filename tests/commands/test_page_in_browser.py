@@ -141,7 +141,7 @@ def test_names_are_text_and_points_are_saved(opened):
     opened.set_viewport_size({"width": 1000, "height": 700})
     opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
     opened.mouse.click(325, 350)
-    opened.wait_for_selector("#points svg")
+    opened.wait_for_selector("#points svg", state="attached")
     assert opened.inner_text("#head h1") == NAME
     assert opened.title() == NAME
     lines = opened.evaluate("unmixPage.csvText()").splitlines()
