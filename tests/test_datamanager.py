@@ -289,3 +289,45 @@ def test_camera_to_world_does_not_name_the_option_world(scene_folder, tmp_path):
     with pytest.raises(SceneError, match="camera to world") as refused:
         make(folder)
     assert "--pipeline" not in str(refused.value)
+
+
+def before_grey_paper(folder: Path) -> Path:
+    """The demo scene without alpha, before a grey backdrop that is brighter to the right."""
+    make_demo_scene(folder, size=48, bands=6, views=12)
+    for picture in sorted((folder / "images").iterdir()):
+        path = folder / "cubes" / f"{picture.stem}.npy"
+        alpha = np.asarray(Image.open(picture))[..., 3:] / 255.0
+        paper = np.linspace(0.3, 0.4, 48)[None, :, None]
+        cube = np.load(path)
+        np.save(path, (cube + (1 - alpha) * paper).astype(cube.dtype))
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["file_path"] = None
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        del content[key]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_what_stands_before_a_plain_backdrop_is_carved_without_alpha(tmp_path):
+    make_demo_scene(tmp_path / "alpha", size=48, bands=6, views=12)
+    with_alpha, manager = make(tmp_path / "alpha"), make(before_grey_paper(tmp_path / "paper"))
+    assert manager.metadata()["has_backdrop"]
+    assert not with_alpha.metadata()["has_backdrop"]
+    np.testing.assert_allclose(manager.scene_box.size, with_alpha.scene_box.size, rtol=0.15)
+    own, expected = (x.initial_data()["reachable"].mean() for x in (manager, with_alpha))
+    assert own < 1.3 * expected
+    (warning,) = manager.warnings()
+    assert "share a plain backdrop: it is learnt as what lies behind the scene" in warning
+    foreground = manager.scene.before_backdrop
+    assert foreground is not None
+    for view, before in zip(manager.scene.train_indices, foreground, strict=True):
+        name = manager.scene.frames[view].name
+        opaque = np.asarray(Image.open(tmp_path / "alpha" / "images" / f"{name}.png"))[..., 3] > 128
+        assert before[opaque].mean() > 0.99
+
+
+def test_a_world_that_is_asked_for_has_no_backdrop(tmp_path):
+    folder = before_grey_paper(tmp_path / "paper")
+    manager = make(folder, scene=SceneOptions(world="unbounded"))
+    assert not manager.metadata()["has_backdrop"]

@@ -81,7 +81,7 @@ class HyperspectralDataManager(DataManager):
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
         self._rays = PixelRays(self.scene, device)
-        self._preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded)
+        self._preset = preset_for(self.scene.has_alpha, self.scene.is_unbounded, self.scene.has_backdrop)
         self._num_rays = config.train_num_rays_per_batch
         self._choose_subpixels(step=0, progress=0.0)
 
@@ -150,6 +150,7 @@ class HyperspectralDataManager(DataManager):
             "illuminant": None if illuminant is None else illuminant.tolist(),
             "has_alpha": self.scene.has_alpha,
             "is_unbounded": self.scene.is_unbounded,
+            "has_backdrop": self.scene.has_backdrop,
             "grid_resolution": self._grid_resolution,
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
@@ -195,9 +196,9 @@ class HyperspectralDataManager(DataManager):
     def carved_by(self, cameras: Cameras) -> Bool[Tensor, "X Y Z"] | None:
         """`reachable` by other cameras of the training views; None where alpha doesn't tell of it, or they are too far
         off to carve by."""
-        if not self.scene.has_alpha or self.scene.is_unbounded:
+        foreground = self._foreground
+        if foreground is None or self.scene.is_unbounded:
             return None
-        foreground = self._evidence.foreground()
         hull = carve(self.scene, self._grid_resolution, foreground, cameras)
         is_right = share_explained(self.scene, hull, foreground, cameras) >= _FAIRLY_EXPLAINED
         return torch.from_numpy(hull) if is_right else None
@@ -213,12 +214,17 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(summary)
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention, cameras at one place, masks that contradict each other, sensors
-        that share no band or no place with another, and bad bands and values."""
+        """Poses that seem to follow another convention, cameras at one place, masks that contradict each other, a
+        backdrop, sensors that share no band or no place with another, and bad bands and values."""
         wrong_poses = check_scene_poses(self.scene)
         found = [self._carved[1] if wrong_poses is None else wrong_poses, *self._pixels.notes]
         found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
+        if self.scene.has_backdrop:
+            found.append(
+                "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and "
+                "no matter is sought where they show it (--world unbounded does without)"
+            )
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
 
@@ -256,11 +262,16 @@ class HyperspectralDataManager(DataManager):
     @cached_property
     def _carved(self) -> tuple[Bool[np.ndarray, "R R R"], str | None]:
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
-        foreground = self._evidence.foreground() if self.scene.has_alpha else None
+        foreground = self._foreground
         hull = self._surfaces.carved(carve(self.scene, self._grid_resolution, foreground))
         if foreground is None or self.scene.is_unbounded:
             return hull, None
         return hull, mask_warning(self.scene, foreground)
+
+    @property
+    def _foreground(self) -> list[Bool[np.ndarray, "_ _"]] | None:
+        """For each training view True where something may be, by alpha or by a backdrop; None where neither tells."""
+        return self._evidence.foreground() if self.scene.has_alpha else self.scene.before_backdrop
 
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:

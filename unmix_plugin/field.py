@@ -53,6 +53,11 @@ class CoefficientField(Field):
         """The lamp that moves with the camera; None where light is fixed or its place is not known."""
         return None
 
+    @property
+    def has_sky(self) -> bool:
+        """Whether something is behind all that is rendered."""
+        return False
+
     @abstractmethod
     def get_outputs(
         self,
@@ -111,6 +116,7 @@ class UnmixField(CoefficientField):
         lamp: Lamp | None = None,
         is_unbounded: bool = False,
         coarse_to_fine: bool = False,
+        has_sky: bool = False,
     ) -> None:
         """
         Args:
@@ -125,6 +131,7 @@ class UnmixField(CoefficientField):
             lamp: Where its lamp is at the start of training; None if that is not known.
             is_unbounded: Whether the field is defined in all of space, contracted around the box, with a sky behind.
             coarse_to_fine: Whether the grid's levels have weights, as refining poses needs them.
+            has_sky: Whether a bounded scene has something behind it too, such as a backdrop.
         """
         super().__init__()
         self.config, self.lit_by_camera = config, lit_by_camera
@@ -147,7 +154,7 @@ class UnmixField(CoefficientField):
         table = torch.empty(self.layout.num_rows, config.features_per_level)
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         self._make_networks()
-        if is_unbounded:
+        if is_unbounded or has_sky:
             self.sky_network = bias_free_network(NUM_SKY_FEATURES, config.hidden_width, num_endmembers + 1)
         weights = torch.ones(config.num_levels) if coarse_to_fine else None
         self.register_buffer("level_weights", weights)
@@ -170,6 +177,11 @@ class UnmixField(CoefficientField):
         """The lamp that moves with the camera; None where light is fixed or its place is not known."""
         return self.lamp
 
+    @property
+    def has_sky(self) -> bool:
+        """Whether something is behind all that is rendered: the sky of an unbounded world, or a backdrop."""
+        return hasattr(self, "sky_network")
+
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
     ) -> Float[Tensor, "S LF"]:
@@ -183,8 +195,8 @@ class UnmixField(CoefficientField):
         return contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
 
     def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
-        """Abundances and brightness of what is infinitely far away; None in a bounded scene."""
-        if not self.is_unbounded:
+        """Abundances and brightness of what is infinitely far away; None if nothing."""
+        if not self.has_sky:
             return None
         found = self.sky_network(sky_features(directions))
         shares = torch.softmax(found[:, :-1] / self.config.temperature, dim=-1)

@@ -87,7 +87,8 @@ class UnmixModel(Model):
         config, metadata = self.config, self.metadata
         self.bands = Bands.of(metadata["wavelengths_nm"])
         self.is_unbounded = bool(metadata.get("is_unbounded", False))
-        self.preset = preset_for(metadata["has_alpha"], self.is_unbounded)
+        self.has_backdrop = bool(metadata.get("has_backdrop", False))
+        self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, self.has_backdrop)
         self.num_endmembers = config.checked_num_endmembers(len(self.bands))
         shape = (self.num_endmembers, len(self.bands))
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
@@ -360,6 +361,7 @@ class UnmixModel(Model):
             self._lamp,
             self.is_unbounded,
             refines,
+            self.has_backdrop,
         )
 
     def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:

@@ -2,7 +2,8 @@
 
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
-only cleared by training. In an unbounded world every ray ends on something, if only the sky.
+only cleared by training. In an unbounded world every ray ends on something, if only the sky; where pictures without
+alpha share a plain backdrop, the hull of what is before it is carved as with alpha, and the backdrop is learnt.
 """
 
 from __future__ import annotations
@@ -75,8 +76,13 @@ UNBOUNDED = replace(
 )
 
 
-def preset_for(has_alpha: bool, is_unbounded: bool = False) -> AlphaPreset:
-    """The preset of a scene with or without alpha, in a box or in an unbounded world."""
+BEFORE_BACKDROP = replace(WITH_ALPHA, background="black")
+
+
+def preset_for(has_alpha: bool, is_unbounded: bool = False, has_backdrop: bool = False) -> AlphaPreset:
+    """The preset of a scene with or without alpha, in a box, before a backdrop or in an unbounded world."""
+    if has_backdrop:
+        return BEFORE_BACKDROP
     return UNBOUNDED if is_unbounded else WITH_ALPHA if has_alpha else WITHOUT_ALPHA
 
 

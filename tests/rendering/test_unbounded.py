@@ -153,3 +153,21 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
         for progress in (0.0, 0.4, 0.6):
             update_grid(grid, make()[1], renderer, Processes(), None, progress)
     assert blocks == [2, 2, 1, 1, 1, 1]
+
+
+def test_a_bounded_field_with_a_backdrop_has_it_behind_all_matter():
+    config = UnmixFieldConfig(log2_rows_per_level=8)
+    field = UnmixField(config, BOX, 3, 1, 1e-9, 0.1, has_sky=True)
+    reachable = torch.ones((8, 8, 8), dtype=torch.bool)
+    renderer = VolumeRenderer(BOX, torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3)
+    bundle = rays(20)
+    with torch.no_grad():
+        found = renderer.render(field, bundle)
+        quick = renderer.composite(field, bundle)
+        sky = field.sky(bundle.directions)
+    assert field.has_sky
+    assert sky is not None
+    assert_close(found.mixtures, sky[:, :-1], atol=1e-4, rtol=1e-3)
+    assert_close(found.coefficients.scaled_abundances, sky[:, -1:] * sky[:, :-1], atol=1e-4, rtol=1e-3)
+    assert_close(quick.scaled_abundances, found.coefficients.scaled_abundances, atol=1e-4, rtol=1e-3)
+    assert found.coefficients.accumulation.max() < 1e-4

@@ -249,6 +249,11 @@ class EditedField(CoefficientField):
         """As the edited field does."""
         return self.field.encode(positions, known)
 
+    @property
+    def has_sky(self) -> bool:
+        """Whether something is behind all that is rendered."""
+        return self.field.has_sky
+
     def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
         """The sky, without the light that removed materials stand for."""
         found = self.field.sky(directions)

@@ -22,9 +22,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
+from unmix_plugin.scenes.geometry.view_agreement import ReadView
+
 _NUM_FEATURES = 4
 """Coordinates of spectra along which those of the capture differ most."""
 _BRIGHT_PERCENTILE = 99.0
+LOOKED_AT = 12
+"""Views that a backdrop is looked for in."""
+_LONGEST_SIDE_PX, _MOST_BANDS = 200, 12
+"""Of views of a scene, in which it is looked for: larger ones are thinned out."""
 _BORDER_SHARE = 0.02
 """Width of the border, as a share of the view's."""
 _STRIPE_WINDOW = 25
@@ -245,6 +251,45 @@ class LookedAt:
         opacity = matter.astype(np.float32)
         opacity[rim] = np.where(weight > 1e-3, np.clip(share, 0.0, 1.0), 1.0)
         return opacity
+
+
+def find_before_backdrop(
+    sizes: Sequence[tuple[int, int]], read_view: ReadView
+) -> list[Bool[np.ndarray, "_ _"]] | None:
+    """Of each view, pixels where something may stand before a backdrop that all views share; None if there is none.
+
+    Args:
+        sizes: Width and height of each view.
+        read_view: Reads a part of a view.
+    """
+    stride = -(-max(max(size) for size in sizes) // _LONGEST_SIDE_PX)
+    bands = read_view(0, (slice(1), slice(1))).shape[2]
+    part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // _MOST_BANDS)))
+    chosen = np.unique(
+        np.linspace(0, len(sizes) - 1, min(len(sizes), LOOKED_AT)).round().astype(int)
+    ).tolist()
+    images = [read_view(view, part) for view in chosen]
+    sample = np.concatenate([image[::4, ::4].reshape(-1, image.shape[-1]) for image in images])
+    backdrop = judge_backdrop(images, [np.ones(image.shape[:2], bool) for image in images], sample)
+    if backdrop is None:
+        return None
+    masks = []
+    for view, (width, height) in enumerate(sizes):
+        image = read_view(view, part)
+        seen = backdrop.find(backdrop.features(image), np.ones(image.shape[:2], bool))
+        matter = np.ones(image.shape[:2], bool) if seen is None else _without_specks(~seen.shown)
+        masks.append(matter.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
+    return masks if any(mask.any() for mask in masks) else None
+
+
+def _without_specks(matter: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Matter without parts that are smaller than a hole may be, wider by a pixel."""
+    from scipy import ndimage
+
+    parts = _parts(matter)
+    kept = np.bincount(parts.ravel()) >= max(4.0, _HOLE_SHARE * matter.size)
+    kept[0] = False
+    return np.array(ndimage.binary_dilation(kept[parts]), bool)
 
 
 def judge_backdrop(

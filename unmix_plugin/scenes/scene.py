@@ -83,6 +83,9 @@ class Scene:
     """Every picture has an alpha channel and at least one pixel of one is not opaque."""
     is_unbounded: bool
     """Pictures show a world behind the scene box, up to the sky."""
+    before_backdrop: list[Bool[np.ndarray, "_ _"]] | None
+    """For each training view without alpha, True where something may stand before a plain backdrop that the views
+    share; None without one."""
     has_labels: bool
     """Every evaluation frame has labels."""
     has_abundances: bool
@@ -93,6 +96,11 @@ class Scene:
     """The same of files that only an evaluation reads: labels, abundances, endmembers."""
     options: SceneOptions
     """How the scene was read."""
+
+    @property
+    def has_backdrop(self) -> bool:
+        """Whether the training views have no alpha and share a plain backdrop."""
+        return self.before_backdrop is not None
 
     @property
     def is_rig(self) -> bool:
@@ -182,6 +190,7 @@ class Scene:
             **rig,  # nothing for the scenes of one ordinary camera, so that their records stay as they are
             "has_alpha": self.has_alpha,
             "is_unbounded": self.is_unbounded,
+            "has_backdrop": self.has_backdrop,
             "has_labels": self.has_labels,
             "has_abundances": self.has_abundances,
             "input_hashes": dict(self.input_hashes),
@@ -227,6 +236,7 @@ class _RecordedScene:
     illuminant: _Numbers | None = None
     has_alpha: bool = False
     is_unbounded: bool = False
+    has_backdrop: bool = False
     grid_resolution: int = 64
     pixel_size: float = 1.0
     subpixels: int = 1

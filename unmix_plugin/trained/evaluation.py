@@ -79,7 +79,7 @@ def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = No
     """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
     view = scene.look(camera, subpixels)
-    has_sky = scene.renderer.is_unbounded
+    has_sky = scene.field.has_sky
     return PredictedView(*(view[name].detach().cpu() for name in names), has_sky=has_sky)
 
 

@@ -48,8 +48,8 @@ class MaterialView:
 
     @property
     def coverage(self) -> Float[Tensor, "H W"]:
-        """How much of a pixel shows something, [0, 1]: where the world has no end, the sky is behind all."""
-        return torch.ones_like(self.opacity) if self.scene.renderer.is_unbounded else self.opacity
+        """How much of a pixel shows something, [0, 1]: a sky or a backdrop is behind all."""
+        return torch.ones_like(self.opacity) if self.scene.field.has_sky else self.opacity
 
     @property
     def spectra(self) -> Float[Tensor, "H W B"]:

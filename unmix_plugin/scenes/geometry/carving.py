@@ -88,7 +88,7 @@ def carve(
     cameras, box = scene.cameras[indices] if cameras is None else cameras, scene.scene_box
     if scene.is_unbounded:
         return _carve_world(cameras, box, resolution)
-    if not scene.has_alpha:
+    if not scene.has_alpha and foreground is None:
         fewest_views = max(1, math.ceil(_FAIR_SHARE_OPEN * len(indices)))
         return carve_box(cameras, None, box, resolution, fewest_views)
     if foreground is None:

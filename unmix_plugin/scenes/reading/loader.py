@@ -18,9 +18,11 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError, SpectrumError
+from unmix_plugin.scenes.backdrops import find_before_backdrop
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.view_agreement import (
+    ReadView,
     commonest,
     compare_conventions,
     describe,
@@ -137,7 +139,9 @@ def _assemble(
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    normalisation, scene_box, is_unbounded = _find_model_space(root, entry, checked, split.train, options)
+    normalisation, scene_box, is_unbounded, before = _find_model_space(
+        root, entry, checked, split.train, options
+    )
     inputs = [path for paths in located for key, path in paths.items() if key in _MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
     truths = [path for paths in located for key, path in paths.items() if key not in _MEASURED_KEYS]
@@ -160,6 +164,7 @@ def _assemble(
         endmembers=truth.endmembers,
         has_alpha=checked.foreground is not None,
         is_unbounded=is_unbounded,
+        before_backdrop=before,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
         input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
@@ -373,8 +378,9 @@ def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | No
 
 def _find_model_space(
     root: Path, entry: SceneEntry, checked: _CheckedFiles, train: tuple[int, ...], options: SceneOptions
-) -> tuple[Normalisation, SceneBox, bool]:
-    """The box that the training views show, how its longest edge becomes [-1, 1], and whether the world goes on.
+) -> tuple[Normalisation, SceneBox, bool, list[Bool[np.ndarray, "_ _"]] | None]:
+    """The box that the training views show, how its longest edge becomes [-1, 1], whether the world goes on, and what
+    may stand before a backdrop, if views without alpha share one.
 
     The similarity starts from the space of transforms.json. The box is found in a space centred on the training
     cameras, where coordinates are of order 1.
@@ -394,6 +400,10 @@ def _find_model_space(
     def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
         return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
 
+    before = None
+    if foreground is None and options.world != "unbounded" and len(alike) == len(train):
+        before = _before_backdrop(root, cameras, read_view)
+    foreground = foreground or before
     points = None
     if foreground is None and meeting_point(cameras.camera_to_world.double().numpy()) is None:
         points = find_matched_points(cameras[alike], read_view)
@@ -412,4 +422,17 @@ def _find_model_space(
     half = 0.5 * scale * (high - low)
     translation = first.translation - 0.5 * (low + high) / first.scale
     box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded
+    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded, before
+
+
+def _before_backdrop(
+    root: Path, cameras: Cameras, read_view: ReadView
+) -> list[Bool[np.ndarray, "_ _"]] | None:
+    """What may stand before a backdrop in each view; None if there is none, or poses contradict it."""
+    before = find_before_backdrop([cameras.size(view) for view in range(len(cameras))], read_view)
+    if before is not None:
+        try:
+            find_bounds(root, cameras, before)
+        except SceneError:
+            return None
+    return before
