@@ -129,6 +129,10 @@ class _Checked:
     measured: tuple[str, ...]
     """What was looked at, with its numbers."""
 
+    def with_more(self, findings: Sequence[str], measured: Sequence[str]) -> _Checked:
+        """These and others, found elsewhere."""
+        return _Checked((*self.findings, *findings), (*self.measured, *measured))
+
 
 def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
     """All checks.
@@ -179,7 +183,7 @@ def report_text(title: str, checked: _Checked, done: Sequence[str]) -> str:
     return "\n".join(parts)
 
 
-def _angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
+def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     """Angles between optical axes, degrees."""
     axes = np.stack([view.axis for view in views])
     return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
@@ -247,7 +251,7 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
         focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
         return [], "overlap is not judged: the cameras look at no one place, and there are no sparse points"
-    between = _angles_between(views)
+    between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
     for index, view in enumerate(views):
@@ -311,7 +315,7 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[s
             "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP"
         )
         return [], missing
-    angles = _angles_between(views) + 360.0 * np.eye(len(views))
+    angles = angles_between(views) + 360.0 * np.eye(len(views))
     before = [view._has_before_it(points) for view in views]
     gains = np.full(len(views), np.nan)  # logarithms, against the views around
     for index, view in enumerate(views):
@@ -364,7 +368,7 @@ def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[
     """The slope over all pairs of near views, its standard error, the number of pairs; None with too few of them."""
     if points is None or len(points) < _LEAST_PAIR_POINTS:
         return None
-    angles, (low, high) = _angles_between(views), _PAIR_ANGLES_DEG
+    angles, (low, high) = angles_between(views), _PAIR_ANGLES_DEG
     pairs = np.argwhere((angles >= low) & (angles <= high))
     pairs = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
     slopes = [_slope(views[first], views[second], points) for first, second in pairs.tolist()]

@@ -23,7 +23,7 @@ from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses, name_some
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
@@ -35,6 +35,8 @@ from unmix_plugin.scenes.reading.cubes import map_array
 ESTIMATE = "estimate"
 _LEAST_VIEWS = 2
 """One to train on and one for evaluation."""
+_MOST_UNPOSED = 0.25
+"""Share of views without a pose from which the source is probably not read as it was meant."""
 _MOST_STRETCH = 0.01
 """By which the shapes of a lens's image and of a cube may differ, as a share."""
 _LEAST_TURN_DEG = 10.0
@@ -54,6 +56,8 @@ class PosedViews:
     views: tuple[CaptureView, ...]
     poses: PoseSet
     """In the scene's world: cameras by view, each with the lens of the whole image in its file; the sparse points."""
+    findings: tuple[str, ...]
+    """What looks wrong, one sentence each."""
     keys: dict[str, Any]
     """What transforms.json records of the way from the source's world to the scene's; nothing where the poses were
     estimated: the scene's world, which stands upright, is then the one that exports return to."""
@@ -171,7 +175,36 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     placed = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     keys = placed.placement.to_json() if poses.has_world else {}
     notes = (*poses.notes, *matched, *completed, *resampled, *placed.notes)
-    return PosedViews(posed, placed.poses, keys, notes)
+    findings = [*_unposed(views, posed, poses.source), *_other_sizes(posed, cameras)]
+    return PosedViews(posed, placed.poses, tuple(findings), keys, notes)
+
+
+def _unposed(views: Sequence[CaptureView], posed: Sequence[CaptureView], source: str) -> list[str]:
+    """Whether so many views lack a pose that the source itself is suspect."""
+    missing = [view.name for view in views if view not in posed]
+    if len(missing) <= _MOST_UNPOSED * len(views):
+        return []
+    finding = (
+        f"{len(missing)} of {len(views)} views have no pose and are left out ({name_some(missing)}): is {source} the "
+        "whole model, and are the names in it those of the files?"
+    )
+    return [finding]
+
+
+def _other_sizes(posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]) -> list[str]:
+    """Lenses given for pictures of another size, which is no whole multiple: cut, perhaps, and not scaled."""
+    for view in posed:
+        lens, (height, width, _) = cameras[view.name].lens or view.lens, view.cube.shape
+        if lens is None or (lens.width, lens.height) == (width, height):
+            continue
+        ratio = max(width / lens.width, lens.width / width)
+        if abs(ratio - round(ratio)) > _MOST_STRETCH * ratio:
+            finding = (
+                f"the lens of view {view.name} is given for {lens.width} x {lens.height} pixels, its file has {width} "
+                f"x {height}: taken as scaled. If it was cut instead, give the lens of the cut picture"
+            )
+            return [finding]
+    return []
 
 
 def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:

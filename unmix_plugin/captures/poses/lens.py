@@ -59,12 +59,16 @@ class Lens:
         """Where ideal points are seen."""
         return project_opencv(ideal, self.focal_px, self.center_px, self.radial, self.tangential)
 
+    def ideal_of(self, pixels: Points) -> Points | None:
+        """The inverse of `pixels_of`; None where the distortion folds."""
+        return _invert(self.pixels_of, pixels, self)
+
     def file_pixels(self) -> Float64[np.ndarray, "H W 2"]:
         """Where the middle of each pixel lies in the file; NaN where the file's lens does not see it."""
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
         pixels = np.column_stack([columns.ravel(), rows.ravel()])
         if self.resampled_from is not None:
-            ideal = _invert(self.pixels_of, pixels, self)
+            ideal = self.ideal_of(pixels)
             assert ideal is not None  # it was chosen so
             pixels = self.resampled_from.project(ideal)
         return pixels.reshape(self.height, self.width, 2)

@@ -19,13 +19,15 @@ from jaxtyping import Float64, UInt8
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
-from unmix_plugin.captures.checks import SeenView, check_views, report_text
+from unmix_plugin.captures.checks import SeenView, angles_between, check_views, report_text
 from unmix_plugin.captures.masks import BackgroundRule
+from unmix_plugin.captures.match_checks import MatchedView, check_matches
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, RECORD_NAME, ViewRecord, hashes
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import counted
@@ -65,6 +67,7 @@ def write_scene_files(
     checked = check_views([view for view in seen if view.record.sensor in alike], posed.poses.points)
     warned = dict.fromkeys((*plan.warnings, *posed.poses.warnings))
     checked = replace(checked, findings=(*warned, *checked.findings))
+    checked = checked.with_more(*_contradictions(folder, plan, posed, seen, greatest, options))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
     write_file(folder / _REPORT_NAME, report_text(title, checked, done).encode())
@@ -99,6 +102,26 @@ def write_scene_files(
     _write_json(folder / RECORD_NAME, record)
     _write_json(folder / _SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
     return list(checked.findings)
+
+
+def _contradictions(
+    folder: Path,
+    plan: Plan,
+    posed: PosedViews,
+    seen: Sequence[SeenView],
+    greatest: str,
+    options: ProcessOptions,
+) -> tuple[list[str], list[str]]:
+    """What contradicts itself in files, poses, values and pictures; and what was measured."""
+    findings = [*posed.findings, *check_files(posed.views, options)]
+    for name, sensor in plan.sensors.items():
+        same = [view for view in seen if view.record.sensor == name]
+        samples = [ViewSample.of(view.record, folder) for view in same]
+        findings += check_values(samples, angles_between(same), sensor.centers_nm)
+    same = [view for view in seen if view.record.sensor == greatest]
+    matched = [MatchedView(view.name, view.camera, view.picture) for view in same]
+    found, said = check_matches(matched, angles_between(same))
+    return [*findings, *found], [said]
 
 
 def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:

@@ -112,6 +112,10 @@ class ViewRecord:
     """Contrast of the finest structures against those twice as large."""
     mean_spectrum: list[float]
     """Over pixels of matter."""
+    background_brightness: float = 0.0
+    """Median of the same over background, before it is set to black; 0 without any."""
+    background_spread: float = 0.0
+    """Range from dark to bright background (10th and 90th percentile) over its median."""
     sources: list[dict[str, Any]] = field(default_factory=list)
     """Files it was made of: path, bytes, SHA-256."""
 
@@ -246,6 +250,8 @@ class _Tally:
 
     def record(self, view: CaptureView, paths: dict[str, str]) -> ViewRecord:
         seen = (self.opacity > HALF) & ~self.missing
+        behind = self.brightness[(self.opacity <= HALF) & ~self.missing]
+        dark, usual, bright = np.percentile(behind, (10, 50, 90)).tolist() if len(behind) else (0.0, 0.0, 0.0)
         return ViewRecord(
             name=view.name,
             sensor=view.sensor,
@@ -261,6 +267,8 @@ class _Tally:
             brightness=float(np.median(self.brightness[seen])) if seen.any() else 0.0,
             detail=_detail(self.brightness, seen),
             mean_spectrum=(self.sum / max(1, self.num_summed)).tolist(),
+            background_brightness=usual,
+            background_spread=(bright - dark) / usual if usual > 0 else 0.0,
         )
 
 

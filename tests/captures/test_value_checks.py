@@ -1,0 +1,111 @@
+"""What contradicts itself in values, masks and files."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.captures.file_factory import file_of
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.spectral_file import BandTable, CaptureView
+from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
+from unmix_plugin.captures.writing.view_files import ViewRecord
+
+WAVELENGTHS_NM = np.linspace(450.0, 850.0, 12)
+RECORD = ViewRecord("view", "", {}, 1000, 0, 0, 0, 0, 0.5, 0, 0, 0.3, 1.0, [])
+OPTIONS = ProcessOptions("cubes", Path("capture"), Path("scene"))
+
+
+def scene(views: int = 10, pixels: int = 400) -> list[ViewSample]:
+    """Shaded mixtures of three materials; views from around see other parts of it."""
+    materials = np.stack(
+        [
+            0.1 + 0.6 / (1 + np.exp(-(WAVELENGTHS_NM - 700) / 15)),
+            0.5 - 0.3 * np.linspace(0, 1, 12) ** 2,
+            0.3 + 0.2 * np.exp(-(((WAVELENGTHS_NM - 550) / 60) ** 2)),
+        ]
+    )
+    samples = []
+    for index in range(views):
+        generator = np.random.default_rng(index)
+        shares = generator.dirichlet(1 + np.abs(np.sin(index + np.arange(3))), pixels)
+        shading = generator.uniform(0.2, 0.9, (pixels, 1))
+        spectra = shading * (shares @ materials) + generator.normal(0, 0.002, (pixels, 12))
+        samples.append(ViewSample(replace(RECORD, name=f"view_{index}"), spectra.astype(np.float32)))
+    return samples
+
+
+def angles(count: int) -> np.ndarray:
+    """Of views on a ring."""
+    steps = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    return 12.0 * np.minimum(steps, count - steps)
+
+
+def findings(samples: list[ViewSample]) -> list[str]:
+    return check_values(samples, angles(len(samples)), WAVELENGTHS_NM)
+
+
+def changed(change) -> list[ViewSample]:
+    return [replace(sample, spectra=change(sample.spectra, index)) for index, sample in enumerate(scene())]
+
+
+def test_a_scene_that_is_right_gives_no_finding():
+    assert findings(scene()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda spectra, index: spectra * (1.0, 0.5)[index % 2], "10 views brighter or darker .* 2.0"),
+        (lambda spectra, index: spectra * (1.0 if index != 4 else 0.7), "as bright as view_4"),
+        (
+            lambda spectra, _: spectra + 0.04 * (1 + np.sin(np.arange(12))),
+            "a level seems to be added to all values",
+        ),
+        (
+            lambda spectra, _: spectra * np.where(np.arange(12) == 5, 1.3, 1.0),
+            r"1 band off .*: 631.818 nm \(1\.[23]\d times\)",
+        ),
+    ],
+    ids=["two exposures", "one exposure", "a level", "a band's gain"],
+)
+def test_what_light_does_not_do_is_found_and_named(change, words):
+    (finding,) = findings(changed(lambda spectra, index: change(spectra, index).astype(np.float32)))
+    assert re.search(words, finding), finding
+
+
+def test_masks_the_wrong_way_round_are_named():
+    inverted = {"brightness": 0.001, "background_brightness": 0.4, "background_spread": 0.9}
+    samples = [replace(sample, record=replace(sample.record, **inverted)) for sample in scene()]
+    (finding,) = findings(samples)
+    assert "the wrong way round" in finding
+    white = [replace(sample, record=replace(sample.record, background_spread=0.05)) for sample in samples]
+    assert findings(white) == []  # dark matter before a white backdrop
+
+
+def test_a_mask_unlike_those_of_near_views_is_named():
+    samples = scene()
+    samples[3] = replace(samples[3], record=replace(samples[3].record, matter_share=0.95))
+    (finding,) = findings(samples)
+    assert "view_3 (95%, near ones 50%)" in finding
+
+
+def test_a_file_of_which_most_was_not_read_is_named(tmp_path: Path):
+    path = tmp_path / "view.exr"
+    path.write_bytes(bytes(200_000))
+    cube = replace(file_of(np.zeros((40, 50, 3), np.float32)), path=path)
+    views = [CaptureView("view", cube)]
+    (finding,) = check_files(views, OPTIONS)
+    assert "view.exr (3 bands of 0.2 MB)" in finding
+    assert check_files(views, replace(OPTIONS, dataset="spectral")) == []  # chosen on purpose
+    path.write_bytes(bytes(30_000))
+    assert check_files(views, OPTIONS) == []
+
+
+def test_a_band_too_wide_for_one_wavelength_is_named(tmp_path: Path):
+    table = BandTable(np.array([560.0, 634.5]), "tags", fwhm_nm=np.array([27.0, 463.0]))
+    cube = replace(file_of(np.zeros((4, 5, 2), np.float32)), path=tmp_path / "none", bands=table)
+    (finding,) = check_files([CaptureView("view", cube)], OPTIONS)
+    assert "634.5 nm (463 nm wide)" in finding

@@ -1,0 +1,259 @@
+"""Whether pictures fit their poses and lens, by features matched between near views.
+
+A view is compared with several around it. Matches are accepted by what two views alone tell: a fundamental matrix
+explains them. A feature found in three views or more is a point of space, whose place follows from poses and lens; how
+far from its pixels this place is seen is hardly more than the accuracy of features if all is right. A lens that is off,
+as one of another model read as ours, leaves more, and another lens explains the matches better: one with a focal length
+and two radial terms of its own is sought. Where none does, poses are off.
+
+Notation: `T` points of one star, which is a view and those around it; `V` its views; ideal coordinates as in the
+lens's module. Points that a view does not show are NaN there.
+
+Source: features as in Lowe 2004, Distinctive image features from scale-invariant keypoints.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, Int
+
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.lens_models import Points
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
+
+_LONGEST_SIDE_PX = 480
+"""Of pictures in which features are found."""
+_MOST_FEATURES = 500
+_STARS, _AROUND = 4, 5
+"""Views that are compared with others, and how many around each."""
+_ANGLES_DEG = (3.0, 30.0)
+"""Between the axes of a view and those around it."""
+_MOST_AMBIGUOUS = 0.8
+"""Of a match, its difference over that of the second best."""
+_LEAST_MATCHES, _LEAST_SHARE = 12, 0.4
+"""That a fundamental matrix explains, and their share of all, with which two views count."""
+_RANSAC_PX, _RANSAC_TRIALS = 1.5, 300
+"""In pixels of the picture in which features are found."""
+_LEAST_VIEWS, _LEAST_POINTS, _LEAST_FOR_LENS = 3, 30, 100
+"""That show a point; points of all stars that poses are judged by, and lenses."""
+_PERCENTILE = 85
+"""Of distances that are compared: a lens is off towards the corners most."""
+_BOUNDS = np.array([0.7, 1.0, 1.0])
+"""Of another lens: logarithm of the focal length, radial terms. One that is found there means nothing."""
+_BETTER = 0.75
+"""Distance left with another lens over that with the given one, from which the lens is said to be wrong."""
+_LEAST_OFF_PX = 0.7
+"""More than the accuracy of features, in pixels of the picture in which they are found."""
+_LEAST_MOVED_PX = 2.0
+"""What another lens must move the corners of the picture by, the same pixels."""
+_POSES_OFF_PX = 4.0
+"""Distance left with any lens, from which poses are said to be wrong."""
+
+
+@dataclass(frozen=True)
+class MatchedView:
+    """A view and where its picture lies."""
+
+    name: str
+    camera: PosedCamera
+    picture: Path
+
+
+@dataclass(frozen=True)
+class _Star:
+    """Points that a view and some around it show."""
+
+    ideal: Float64[np.ndarray, "T V 2"]
+    rotations: Float64[np.ndarray, "V 3 3"]
+    """Camera to world, OpenCV axes."""
+    positions: Float64[np.ndarray, "V 3"]
+    focal_px: float
+    """Pixels of the picture in which features are found."""
+
+    def misses_px(self, lens: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "T V 2"]:
+        """From where each point is seen to where its place in space would be, with a lens that has been changed."""
+        ideal = _changed(self.ideal.reshape(-1, 2), lens).reshape(self.ideal.shape)
+        rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1)
+        rays = np.einsum("vij,tvj->tvi", self.rotations, rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        seen = np.isfinite(rays[..., :1, None])
+        across = np.where(seen, np.eye(3) - rays[..., :, None] * rays[..., None, :], 0.0)  # off each ray
+        total = across.sum(axis=1) + 1e-9 * np.eye(3)
+        places = np.linalg.solve(total, np.einsum("tvij,vj->ti", across, self.positions)[..., None])[..., 0]
+        before = np.einsum("vji,tvj->tvi", self.rotations, places[:, None] - self.positions)
+        found = before[..., :2] / np.maximum(before[..., 2:], 1e-6)
+        return self.focal_px * np.exp(lens[0]) * np.clip(found - ideal, -1.0, 1.0)
+
+
+def check_matches(
+    views: Sequence[MatchedView], angles_deg: Float64[np.ndarray, "N N"]
+) -> tuple[list[str], str]:
+    """What does not fit, one sentence each, and what was measured.
+
+    Args:
+        views: Of one sensor, their cameras with lenses of the pictures.
+        angles_deg: Between their optical axes.
+    """
+    chosen = _choose_stars(angles_deg)
+    used = sorted({index for star in chosen for index in star})
+    features = {index: _features_of(views[index]) for index in used}
+    found = [
+        _find_star([views[index] for index in star], [features[index] for index in star]) for star in chosen
+    ]
+    stars = [star for star in found if star is not None]
+    lens = views[0].camera.lens
+    if lens is None or sum(len(star.ideal) for star in stars) < _LEAST_POINTS:
+        return [], "poses and lens are not compared with matched points: too few views share features"
+    return _judge(stars, lens)
+
+
+def _judge(stars: Sequence[_Star], lens: Lens) -> tuple[list[str], str]:
+    from scipy.optimize import least_squares
+
+    def misses(values: np.ndarray) -> np.ndarray:
+        found = np.concatenate([star.misses_px(values).reshape(-1, 2) for star in stars])
+        return found[np.isfinite(found).all(axis=1)]
+
+    def most(values: np.ndarray) -> float:
+        return float(np.percentile(np.linalg.norm(misses(values), axis=1), _PERCENTILE))
+
+    shrunk = min(1.0, _LONGEST_SIDE_PX / max(lens.width, lens.height))
+    given = np.zeros(3)
+    start = most(given)
+    best = least_squares(
+        lambda values: misses(values).ravel(),
+        given,
+        loss="soft_l1",
+        x_scale=(0.1, 0.05, 0.05),
+        bounds=(-_BOUNDS, _BOUNDS),
+    ).x
+    left, corner = most(best), lens.ideal_of(np.array([[0.5, 0.5]]))
+    moved = 0.0
+    if corner is not None:
+        moved = float(np.linalg.norm(lens.pixels_of(_changed(corner, best)) - lens.pixels_of(corner)))
+    count = sum(len(star.ideal) for star in stars)
+    said = (
+        f"{count} points matched in three views or more are seen {start / shrunk:.2f} px from where poses and lens put "
+        f"them ({_PERCENTILE} % of them less)"
+    )
+    is_better = left < min(_BETTER * start, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
+    if start > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
+        finding = (
+            f"the pictures do not fit their lens: {said}, but {left / shrunk:.2f} px with a focal length "
+            f"of {np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens "
+            "of another model (a fisheye), or given for pictures of another size or crop?"
+        )
+        return [finding], said
+    if left > _POSES_OFF_PX:
+        finding = (
+            f"the pictures do not fit their poses: {said}, and no lens brings them below {left / shrunk:.2f} px: are "
+            "the poses those of these pictures, and in the convention that their file is read with?"
+        )
+        return [finding], said
+    return [], said
+
+
+def _changed(ideal: Points, lens: Float64[np.ndarray, "3"]) -> Points:
+    """Ideal coordinates that another lens gives to the same pixels: logarithm of a focal length, two radial terms."""
+    squared = (ideal**2).sum(axis=1, keepdims=True)
+    return ideal * (np.exp(-lens[0]) * (1.0 + lens[1] * squared + lens[2] * squared**2))
+
+
+def _choose_stars(angles_deg: Float64[np.ndarray, "N N"]) -> list[list[int]]:
+    """Views spread over all, each with those that are turned least against it, but enough."""
+    low, high = _ANGLES_DEG
+    stars = []
+    count = len(angles_deg)
+    for view in np.unique(np.linspace(0, count - 1, min(count, _STARS)).round().astype(int)).tolist():
+        order = np.argsort(angles_deg[view]).tolist()
+        near = [other for other in order if other != view and low <= angles_deg[view, other] <= high]
+        if len(near) >= _LEAST_VIEWS - 1:
+            stars.append([view, *near[:_AROUND]])
+    return stars
+
+
+def _features_of(view: MatchedView) -> tuple[Points, np.ndarray] | None:
+    """Places in pixels of the picture, and descriptors; None where nothing stands out."""
+    from PIL import Image
+    from skimage.feature import SIFT
+
+    with Image.open(view.picture) as opened:
+        shrunk = min(1.0, _LONGEST_SIDE_PX / max(opened.size))
+        size = (max(1, round(opened.width * shrunk)), max(1, round(opened.height * shrunk)))
+        whole, opacity = opened.convert("L"), opened.convert("RGBA").getchannel("A")
+        grey = np.asarray(whole.resize(size, Image.Resampling.BOX), np.float64) / 255
+        matter = np.asarray(opacity.resize(size, Image.Resampling.BOX)) > 127
+    sift = SIFT(upsampling=2 if max(size) < _LONGEST_SIDE_PX else 1)
+    try:
+        sift.detect_and_extract(np.where(matter, grey, 0.0))
+    except (RuntimeError, ValueError):  # nothing stands out, or the view is too small
+        return None
+    places = np.asarray(sift.keypoints, np.float64)[:, ::-1]
+    some = np.unique(np.linspace(0, len(places) - 1, _MOST_FEATURES).round().astype(int))
+    scale = np.array(opened.size) / size
+    return (places[some] + 0.5) * scale, np.asarray(sift.descriptors)[some]
+
+
+def _find_star(
+    views: Sequence[MatchedView], features: Sequence[tuple[Points, np.ndarray] | None]
+) -> _Star | None:
+    """Points of the first view that enough of the others show; None without any."""
+    first, lenses = features[0], [view.camera.lens for view in views]
+    if first is None or lenses[0] is None:
+        return None
+    pixels = np.full((len(first[0]), len(views), 2), np.nan)
+    pixels[:, 0] = first[0]
+    shrunk = min(1.0, _LONGEST_SIDE_PX / max(lenses[0].width, lenses[0].height))
+    for index, other in enumerate(features[1:], start=1):
+        if other is not None:
+            mine, theirs = _matches(first, other, shrunk)
+            pixels[mine, index] = other[0][theirs]
+    pixels = pixels[np.isfinite(pixels[..., 0]).sum(axis=1) >= _LEAST_VIEWS]
+    ideal = np.full_like(pixels, np.nan)
+    for index, lens in enumerate(lenses):
+        seen = np.isfinite(pixels[:, index, 0])
+        if lens is not None and seen.any():
+            undone = lens.ideal_of(pixels[seen, index])
+            if undone is None:
+                return None
+            ideal[seen, index] = undone
+    if not len(ideal):
+        return None
+    poses = np.stack([view.camera.camera_to_world for view in views])
+    return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], shrunk * float(np.mean(lenses[0].focal_px)))
+
+
+def _matches(
+    one: tuple[Points, np.ndarray], other: tuple[Points, np.ndarray], shrunk: float
+) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
+    """Indices of features of two views that match and that a fundamental matrix explains; none if those are few."""
+    from skimage.feature import match_descriptors
+    from skimage.measure import ransac
+    from skimage.transform import FundamentalMatrixTransform
+
+    none = np.zeros(0, int)
+    if min(len(one[0]), len(other[0])) < _LEAST_MATCHES:
+        return none, none
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore"
+        )  # of descriptors that differ by nothing, and samples that tell nothing
+        found = match_descriptors(one[1], other[1], max_ratio=_MOST_AMBIGUOUS, cross_check=True)
+        if len(found) < _LEAST_MATCHES:
+            return none, none
+        _, inliers = ransac(
+            (one[0][found[:, 0]] * shrunk, other[0][found[:, 1]] * shrunk),
+            FundamentalMatrixTransform,
+            min_samples=8,
+            residual_threshold=_RANSAC_PX,
+            max_trials=_RANSAC_TRIALS,
+            stop_probability=0.999,
+            rng=0,
+        )
+    if inliers is None or inliers.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(found)):
+        return none, none
+    return found[inliers, 0], found[inliers, 1]
