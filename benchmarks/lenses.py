@@ -216,18 +216,17 @@ def _points_off_px(folder: Path, name: str, lens: Lens) -> float:
     if name not in _KEYS:
         _write_micmac(capture, frames)
     _process(capture, scene, None if name in _KEYS else str(capture / "Ori-All"))
-    shown = 100 * np.load(scene / "cubes" / "v0.npy")[..., :2] / 65535.0
+    shown = np.load(scene / "cubes" / "v0.npy")[..., :2] / 655.35
     missing = np.zeros(shown.shape[:2], bool)
     if (scene / "masks" / "v0.png").is_file():
         with Image.open(scene / "masks" / "v0.png") as mask:
             missing = np.asarray(mask.convert("L")) == 0
-    ideal = np.random.default_rng(0).uniform(-1.2, 1.2, (20000, 2))
-    wanted = LENSES[name](ideal)
-    pixels = lens.pixels_of(ideal) - 0.5
-    is_near = np.linalg.norm(wanted - pixels - 0.5, axis=1) < 12.0  # beyond the picture both may fold
+    pixels = np.random.default_rng(0).uniform((0.5, 0.5), (WIDTH - 0.51, HEIGHT - 0.51), (20000, 2))
+    ideal = lens.ideal_of(pixels)
+    assert ideal is not None
+    assert np.abs(lens.pixels_of(ideal) - pixels).max() < 1e-6
+    wanted, pixels = LENSES[name](ideal), pixels - 0.5
     column, row = np.floor(pixels).astype(int).T
-    inside = is_near & (column >= 0) & (row >= 0) & (column < WIDTH - 1) & (row < HEIGHT - 1)
-    pixels, wanted, column, row = pixels[inside], wanted[inside], column[inside], row[inside]
     found, seen = np.zeros((len(row), 2)), np.ones(len(row), bool)
     for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):
         weight = np.abs(1 - across - (pixels[:, 0] - column)) * np.abs(1 - down - (pixels[:, 1] - row))

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from tests.captures.poses.alignment import align_poses
@@ -68,6 +69,23 @@ def test_pictures_without_texture_are_refused_with_what_to_do(room, tmp_path):
     blank = {name: np.full_like(picture, 128) for name, picture in room[0].items()}
     with pytest.raises(CaptureError, match=r"only 0 of 8 views could be estimated.*more views"):
         estimate_poses(blank, tmp_path, threads=1)
+
+
+def test_views_that_match_little_are_shown_and_the_next_try_takes_what_was_found(room, tmp_path, monkeypatch):
+    generator = np.random.default_rng(0)
+    noise = {name: generator.integers(0, 255, (90, 120), np.uint8) for name in list(room[0])[:4]}
+    with pytest.raises(
+        CaptureError, match=r"share \d+ with the view nearest.* the fewest: view .*is kept for the next"
+    ):
+        estimate_poses(noise, tmp_path, threads=1)
+    report = (tmp_path / "report.txt").read_text()
+    assert report.count("\n- ") == 4
+    assert all(f"{name}: " in report for name in noise)
+    with Image.open(tmp_path / "worst-matches.png") as drawn:
+        assert drawn.width == 2 * next(iter(noise.values())).shape[1]
+    monkeypatch.setattr(estimation.subprocess, "run", pytest.fail)
+    with pytest.raises(CaptureError, match="is kept for the next try"):
+        estimate_poses(noise, tmp_path, threads=1)
 
 
 def test_two_views_are_too_few(room, tmp_path):

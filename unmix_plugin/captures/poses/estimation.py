@@ -8,12 +8,13 @@ Notation: `H x W` pixels, `B` bands.
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,11 +51,20 @@ _GAIN = 0.02
 """Part of the reprojection error that distortion has to remove to be kept."""
 _GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
-_LOG = "colmap.log"
-_WHAT_TO_DO = (
-    "take more views with smaller steps (10 degrees) and much overlap, mask a background that stands still while the "
-    "object turns, put printed texture beside the object, or give poses with --poses FILE"
+_LOG, _RESULT, _REPORT, _DRAWN = "colmap.log", "result.json", "report.txt", "worst-matches.png"
+_FEW_FEATURES, _FEW_MATCHES = 400, 60
+"""Of a view, and with the view that shares most with it, below which these are what is missing."""
+_STILL_PX, _MOSTLY_STILL = 1.5, 0.5
+"""Distance by which matched points hardly move, and the share of such points that tells of a still background."""
+_MOST_WORST = 3
+"""Views whose matches are drawn."""
+_SMALLER_STEPS = "take more views in smaller steps (10 degrees) with much overlap"
+_TEXTURE = (
+    "put printed markers or texture beside the object (for markers: --poses markers --marker-size METRES)"
 )
+_STILL = "mask a background that stands still while the object turns (--mask black, white or files)"
+_OTHER_POSES = "give poses of another program with --poses FILE"
+_WHAT_TO_DO = f"{_SMALLER_STEPS}; {_TEXTURE}; {_STILL}; {_OTHER_POSES}"
 
 
 def estimate_poses(
@@ -106,8 +116,10 @@ def estimate_poses(
         has_masks=masks is not None,
         sequential=len(pictures) > _MOST_EXHAUSTIVE,
         threads=threads or min(os.cpu_count() or 1, 8),
+        pictures=_digest(folder),
     )
-    return _best(_run(settings, folder), files, folder)
+    found = _run(settings, folder)
+    return _best(found["models"], found["views"], files, folder)
 
 
 def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."]], kind: str) -> None:
@@ -119,9 +131,20 @@ def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."
         Image.fromarray(pixels).save(place / name)
 
 
-def _run(settings: _Settings, folder: Path) -> list[dict]:
-    """Start the process that reconstructs, with its output in the log file."""
-    result, asked = folder / "result.json", folder.resolve() / "settings.json"
+def _digest(folder: Path) -> str:
+    """Of all pictures and masks: what tells whether an earlier try looked at the same."""
+    found = hashlib.sha256()
+    for path in sorted([*(folder / "images").glob("*.png"), *(folder / "masks").glob("*.png")]):
+        found.update(f"{path.parent.name}/{path.name}".encode() + path.read_bytes())
+    return found.hexdigest()
+
+
+def _run(settings: _Settings, folder: Path) -> dict[str, Any]:
+    """Start the process that reconstructs, with its output in the log file; or take what an earlier try found."""
+    result, asked = folder / _RESULT, folder.resolve() / "settings.json"
+    told = json.dumps(asdict(settings))
+    if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == told:
+        return json.loads(result.read_text(encoding="utf-8"))
     result.unlink(missing_ok=True)
     asked.write_text(json.dumps(asdict(settings)), encoding="utf-8")
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
@@ -138,14 +161,18 @@ def _run(settings: _Settings, folder: Path) -> list[dict]:
     return json.loads(result.read_text(encoding="utf-8"))
 
 
-def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet:
+def _best(
+    models: list[dict[str, Any]], views: dict[str, Any], files: Mapping[str, str], folder: Path
+) -> PoseSet:
     """The model with the most views, that with the smaller error where two have as many."""
     best = max(models, key=lambda model: (model["registered"], -model["error_px"]), default=None)
     registered = 0 if best is None else best["registered"]
     if best is None or registered < max(_LEAST_VIEWS, _LEAST_SHARE * len(files)):
+        evidence, advice = _explain(views, files, folder)
         raise CaptureError(
-            f"poses of only {registered} of {len(files)} views could be estimated; expected at least half: "
-            f"{_WHAT_TO_DO} (see {folder / _LOG})"
+            f"poses of only {registered} of {len(files)} views could be estimated; expected at least half. {evidence}. "
+            f"Try: {advice}. {folder / _REPORT} and {folder / _DRAWN} show the matches of the worst views; what was "
+            "found is kept for the next try"
         )
     poses = read_colmap(Path(best["folder"]))
     cameras = {name: poses.cameras[file] for name, file in files.items() if file in poses.cameras}
@@ -153,9 +180,74 @@ def _best(models: list[dict], files: Mapping[str, str], folder: Path) -> PoseSet
     error = f"a mean reprojection error of {best['error_px']:.2f} px"
     notes = [f"COLMAP registered {registered} of {len(files)} views with {error}"]
     if missing:
-        notes.append(f"views without pose: {name_some(missing)}")
+        matches = ", ".join(f"{name} ({_most_matches(views[files[name]])})" for name in missing[:_MOST_WORST])
+        notes.append(
+            f"views without pose: {name_some(missing)}; matches with the view nearest to each: {matches}"
+        )
     notes += poses.notes
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
+
+
+def _most_matches(view: dict[str, Any]) -> int:
+    """With the view that shares most with this one."""
+    return max((matches for matches, _ in view["matches"].values()), default=0)
+
+
+def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> tuple[str, str]:
+    """What was found of features and matches, and what to try, most likely first; writes report and picture."""
+    names = {file: name for name, file in files.items()}
+    order = sorted(views, key=lambda file: _most_matches(views[file]))
+    features = float(np.median([view["features"] for view in views.values()]))
+    usual = float(np.median([_most_matches(view) for view in views.values()]))
+    pairs = [pair for view in views.values() for pair in view["matches"].values()]
+    still = sum(count for _, count in pairs) / max(1, sum(matches for matches, _ in pairs))
+    tries = [_SMALLER_STEPS, _TEXTURE, _STILL]
+    if features < _FEW_FEATURES:
+        tries.sort(key=lambda what: what != _TEXTURE)
+    if still > _MOSTLY_STILL:
+        tries.sort(key=lambda what: what != _STILL)
+    worst = ", ".join(f"{names[file]} ({_most_matches(views[file])})" for file in order[:_MOST_WORST])
+    evidence = (
+        f"In the mean of all bands, views have {features:.0f} features and share {usual:.0f} with the view nearest to "
+        f"them (medians; {_FEW_FEATURES} and {_FEW_MATCHES} or more serve); the fewest: {worst}"
+    )
+    if still > _MOSTLY_STILL:
+        evidence += f"; {still:.0%} of the matches stand still in the picture, as a background does"
+    lines = ["Poses could not be estimated.", "", evidence + ".", "", "Try, the most likely first:"]
+    lines += [f"- {what}" for what in (*tries, _OTHER_POSES)]
+    lines += ["", "view: features, matches with the view that shares most, its name"]
+    for file in order:
+        others = views[file]["matches"]
+        best = max(others, key=lambda other: others[other][0], default=None)
+        partner = "no other view" if best is None else names[best]
+        lines.append(f"{names[file]}: {views[file]['features']}, {_most_matches(views[file])}, {partner}")
+    (folder / _REPORT).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _draw_worst(folder, views, order[:_MOST_WORST])
+    return evidence, "; ".join(tries)
+
+
+def _draw_worst(folder: Path, views: dict[str, Any], worst: Sequence[str]) -> None:
+    """Each of some views beside the one that shares most with it, and lines between matched points."""
+    from PIL import Image, ImageDraw
+
+    rows = []
+    for file in worst:
+        others = views[file]["matches"]
+        best = max(others, key=lambda other: others[other][0], default=file)
+        with Image.open(folder / "images" / file) as first, Image.open(folder / "images" / best) as second:
+            row = Image.new("RGB", (first.width + second.width, max(first.height, second.height)))
+            row.paste(first.convert("RGB"), (0, 0))
+            row.paste(second.convert("RGB"), (first.width, 0))
+            draw = ImageDraw.Draw(row)
+            for x, y, other_x, other_y in views[file].get("lines", []):
+                draw.line((x, y, other_x + first.width, other_y), fill=(255, 0, 200))
+        rows.append(row)
+    sheet = Image.new("RGB", (max(row.width for row in rows), sum(row.height for row in rows)))
+    top = 0
+    for row in rows:
+        sheet.paste(row, (0, top))
+        top += row.height
+    sheet.save(folder / _DRAWN)
 
 
 def contrast_picture(
@@ -200,20 +292,25 @@ class _Settings:
     sequential: bool
     """Match neighbours in the order of names instead of all pairs."""
     threads: int
+    pictures: str
+    """Digest of all of them."""
 
 
 def _reconstruct(path: Path) -> None:
-    """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model."""
+    """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model; and
+    features and matches of each image. Those of an earlier try of the same pictures are gone on with."""
     import pycolmap
 
     values = json.loads(path.read_text(encoding="utf-8"))
     settings = _Settings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
     pycolmap.set_random_seed(_SEED)
     folder = Path(settings.folder)
-    database = folder / "database.db"
-    database.unlink(missing_ok=True)
-    _extract(pycolmap, settings, database)
-    _match(pycolmap, settings, database)
+    database, matched = folder / "database.db", folder / "matched.txt"
+    if not (database.is_file() and matched.is_file() and matched.read_text() == settings.pictures):
+        database.unlink(missing_ok=True)
+        _extract(pycolmap, settings, database)
+        _match(pycolmap, settings, database)
+        matched.write_text(settings.pictures)
     count = sum(map(len, settings.sensors))
     found: list[dict[str, Any]] = []
     for factor in _FOCAL_FACTORS:
@@ -221,7 +318,30 @@ def _reconstruct(path: Path) -> None:
         found += _map(pycolmap, settings, database, folder / "models" / f"{factor:g}")
         if max((model["registered"] for model in found), default=0) >= _ENOUGH * count:
             break
-    (folder / "result.json").write_text(json.dumps(found), encoding="utf-8")
+    told = {"models": found, "views": _matches_of_views(pycolmap, database)}
+    (folder / _RESULT).write_text(json.dumps(told), encoding="utf-8")
+
+
+def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
+    """By image: its features; by other image, verified matches and how many of them stand still; and, as `lines`, the
+    matched points x, y, x, y of the pair with the most."""
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        points = {number: opened.read_keypoints(number)[:, :2] for number in names}
+        views = {name: {"features": len(points[number]), "matches": {}} for number, name in names.items()}
+        most = dict.fromkeys(names.values(), 0)
+        pairs, geometries = opened.read_two_view_geometries()
+        for pair, geometry in zip(pairs, geometries, strict=True):
+            first, second = pycolmap.pair_id_to_image_pair(pair)
+            inliers = np.asarray(geometry.inlier_matches, int).reshape(-1, 2)
+            ends = points[first][inliers[:, 0]], points[second][inliers[:, 1]]
+            still = int((np.linalg.norm(ends[0] - ends[1], axis=1) < _STILL_PX).sum())
+            for here, there, own, other in ((first, second, *ends), (second, first, *ends[::-1])):
+                views[names[here]]["matches"][names[there]] = (len(inliers), still)
+                if len(inliers) > most[names[here]]:
+                    most[names[here]] = len(inliers)
+                    views[names[here]]["lines"] = np.hstack([own, other]).round(1).tolist()[:200]
+    return views
 
 
 def _extract(pycolmap: Any, settings: _Settings, database: Path) -> None:

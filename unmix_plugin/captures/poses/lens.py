@@ -100,9 +100,8 @@ class Lens:
         )
 
 
-_LARGEST_ERROR_PX = 0.3
-"""Of a lens anywhere in the image that stands for another one as it is: about what poses are off. Beyond, pixels are
-moved, which costs sharpness."""
+_LARGEST_ERROR_PX = 0.1
+"""Of a lens anywhere in the image that stands for another one as it is. Beyond, pixels are moved."""
 _WIDEST_DEG = 75.0
 """From the axis: where the nearest OPENCV lens is looked for. Beyond, pixels grow without end."""
 _WIDEST_PINHOLE_DEG = 60.0
