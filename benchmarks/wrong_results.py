@@ -87,7 +87,7 @@ def _write_floor(folder: Path, is_fisheye: bool) -> None:
     frames = []
     for index in range(_FLOOR_VIEWS):
         azimuth = 2 * np.pi * index / _FLOOR_VIEWS
-        position = np.array([2.2 * np.cos(azimuth), 2.2 * np.sin(azimuth), 2.0 + 0.8 * (index % 2)])
+        position = np.array([2.2 * np.cos(azimuth), 2.2 * np.sin(azimuth), 1.6 + 1.2 * (index % 2)])
         back = position / np.linalg.norm(position)
         right = np.cross([0.0, 0.0, 1.0], back)
         right /= np.linalg.norm(right)

@@ -25,7 +25,8 @@ def pinhole_views(tmp_path_factory) -> list[MatchedView]:
 def make_views(folder: Path, straighten) -> list[MatchedView]:
     """Views of a floor with bumps of colour, through a lens that is told how to undo its bending."""
     generator = np.random.default_rng(0)
-    texture = sum(ndimage.gaussian_filter(generator.random((600, 600)), width) * width for width in (2, 4, 9))
+    waves = [ndimage.gaussian_filter(generator.random((600, 600)), width) * width for width in (2, 4, 9)]
+    texture = np.sum(waves, axis=0)
     texture = (texture - texture.min()) / np.ptp(texture)
     views = []
     for index in range(VIEWS):

@@ -37,7 +37,7 @@ _MOST_AMBIGUOUS = 0.8
 """Of a match, its difference over that of the second best."""
 _LEAST_MATCHES, _LEAST_SHARE = 12, 0.4
 """That a fundamental matrix explains, and their share of all, with which two views count."""
-_RANSAC_PX, _RANSAC_TRIALS = 1.5, 300
+_RANSAC_PX, _RANSAC_TRIALS = 1.5, 150
 """In pixels of the picture in which features are found."""
 _LEAST_VIEWS, _LEAST_POINTS, _LEAST_FOR_LENS = 3, 30, 100
 """That show a point; points of all stars that poses are judged by, and lenses."""
@@ -245,15 +245,15 @@ def _matches(
         found = match_descriptors(one[1], other[1], max_ratio=_MOST_AMBIGUOUS, cross_check=True)
         if len(found) < _LEAST_MATCHES:
             return none, none
-        _, inliers = ransac(
+        _, explained = ransac(
             (one[0][found[:, 0]] * shrunk, other[0][found[:, 1]] * shrunk),
             FundamentalMatrixTransform,
             min_samples=8,
             residual_threshold=_RANSAC_PX,
             max_trials=_RANSAC_TRIALS,
-            stop_probability=0.999,
             rng=0,
         )
-    if inliers is None or inliers.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(found)):
+    inliers = np.zeros(len(found), bool) if explained is None else np.asarray(explained, bool)
+    if inliers.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(found)):
         return none, none
     return found[inliers, 0], found[inliers, 1]

@@ -233,16 +233,17 @@ def _odd_bands(samples: Sequence[ViewSample], wavelengths_nm: Float64[np.ndarray
 def _excess(
     logs: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Float64[np.ndarray, "P B"]:
-    """Logarithm of the gain by which each band stands out from a smooth course through those around it; 0 at the ends.
+    """Logarithm of the gain by which each band stands out from a smooth course through those around it.
 
-    A gain of one band shows as +1 there and as -1/2 at both neighbours.
+    A gain of one band shows as +1 there and as -1/2 at both neighbours. 0 at the two bands of either end, of which not
+    all neighbours are known.
     """
     low, middle, high = wavelengths_nm[:-2], wavelengths_nm[1:-1], wavelengths_nm[2:]
     part = (middle - low) / (high - low)
     bends = np.zeros_like(logs)
     bends[:, 1:-1] = logs[:, 1:-1] - logs[:, :-2] * (1 - part) - logs[:, 2:] * part
     excess = np.zeros_like(logs)
-    excess[:, 1:-1] = (bends[:, 1:-1] - 0.5 * (bends[:, :-2] + bends[:, 2:])) / 1.5
+    excess[:, 2:-2] = (bends[:, 2:-2] - 0.5 * (bends[:, 1:-3] + bends[:, 3:-1])) / 1.5
     return excess
 
 
