@@ -127,7 +127,7 @@ def _is_plain_name(name: Any) -> bool:
     """Whether `name` is text that names a file in a folder, and never one elsewhere."""
     if not isinstance(name, str) or name in ("", ".", ".."):
         return False
-    return PurePath(name).name == name and all(character >= " " for character in name)
+    return PurePath(name).name == name and name.isprintable()
 
 
 _RELATIVE_TOLERANCE = 1e-4

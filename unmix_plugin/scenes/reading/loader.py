@@ -173,6 +173,16 @@ def _assemble(
     )
 
 
+def _readable(name: str) -> str:
+    """A name that shows what it is: no character that a terminal obeys, none that a table takes for a formula's.
+
+    >>> _readable("@SUM(A1)"), _readable("leaf\\u202e_1")
+    ('_SUM(A1)', 'leaf__1')
+    """
+    shown = "".join(character if character.isprintable() else "_" for character in name)
+    return f"_{shown[1:]}" if shown[:1] in ("=", "+", "-", "@") else shown
+
+
 def _name_frames(
     entry: SceneEntry, located: tuple[dict[str, Path], ...], sensors: tuple[int, ...]
 ) -> tuple[Frame, ...]:
@@ -184,6 +194,7 @@ def _name_frames(
         ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths],
         [f"{path.name}_{index}" for index, path in enumerate(paths)],
     )
+    candidates = [[_readable(name) for name in names] for names in candidates]
     names = next((names for names in candidates if len(set(names)) == len(names)), candidates[-1])
     return tuple(
         Frame(

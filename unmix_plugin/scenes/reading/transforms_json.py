@@ -571,7 +571,11 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
     values = content.get("materials")
     if values is None:
         return None
-    is_list = isinstance(values, list) and values and all(isinstance(v, str) and v.strip() for v in values)
+    is_list = (
+        isinstance(values, list)
+        and values
+        and all(isinstance(v, str) and v.strip() and v.isprintable() for v in values)
+    )
     if not is_list or len(set(values)) != len(values):
         faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
         return None
