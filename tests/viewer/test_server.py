@@ -6,7 +6,6 @@ import contextlib
 import math
 import socket
 import threading
-import time
 import urllib.error
 import urllib.request
 from types import SimpleNamespace
@@ -261,20 +260,29 @@ def test_a_message_larger_than_any_that_a_page_sends_ends_its_connection(viewer,
     assert capfd.readouterr().err == ""
 
 
-def test_a_page_that_sends_faster_than_any_is_slowed_down():
+def test_a_page_that_sends_faster_than_any_is_slowed_down(monkeypatch):
+    clock = SimpleNamespace(now=100.0)
+
+    async def sleep(seconds):
+        clock.now += seconds
+
+    monkeypatch.setattr(connections, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(connections, "asyncio", SimpleNamespace(sleep=sleep))
     connection = object.__new__(_Connection)
     connection._paid_until = 0.0
 
-    async def send(number, size):
-        begun = time.monotonic()
+    def send(number, size):
+        begun = clock.now
         for _ in range(number):
-            await connection._keep_pace(size)
-        return time.monotonic() - begun
+            asyncio.run(connection._keep_pace(size))
+        return clock.now - begun
 
     burst = int(connections._MESSAGES_PER_S * connections._BURST_S)
-    assert asyncio.run(send(burst, 100)) < 0.5
-    assert 0.2 < asyncio.run(send(connections._MESSAGES_PER_S // 4, 100)) < 2.0
-    assert asyncio.run(send(1, connections._BYTES_PER_S // 4)) > 0.2
+    assert send(burst, 100) == pytest.approx(0.0)
+    assert send(connections._MESSAGES_PER_S, 100) == pytest.approx(1.0)
+    assert send(1, connections._BYTES_PER_S) == pytest.approx(1.0)
+    clock.now += 60.0
+    assert send(burst, 100) == pytest.approx(0.0)
 
 
 def test_a_page_that_never_says_anything_loses_its_place(viewer, monkeypatch):

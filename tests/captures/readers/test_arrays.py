@@ -135,7 +135,7 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
         "a_structure": {"cube": CUBE, "name": "x"},
         "b_cells": np.array([CUBE, "x"], dtype=object),
         "c_complex": CUBE * 1j,
-        "d_sparse": scipy.sparse.eye_array(4).tocsc(),
+        "d_sparse": scipy.sparse.csc_matrix(np.eye(4)),
         "e_logical": CUBE > 9,
         "wl": NM[:, None],
     }
