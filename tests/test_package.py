@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = (
     *("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard"),
-    *("h5py", "tifffile", "PIL", "pycolmap"),
+    *("h5py", "tifffile", "PIL", "pycolmap", "cv2"),
 )
 COMMANDS = ("train", "eval", "render", "demo_scene", "process", "view", "export")
 

@@ -75,7 +75,7 @@ def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, 
     tilted = elsewhere(read_poses(capture.root / "transforms.json"))
     cameras = {Path(name).stem: camera for name, camera in tilted.cameras.items()}
     estimated = replace(tilted, cameras=cameras, up=None, has_world=False)
-    monkeypatch.setattr(process_module, "estimated_poses", lambda *_: estimated)
+    monkeypatch.setattr(process_module, "poses_of_written_views", lambda *_: estimated)
 
     process(capture.root, tmp_path / "scene", poses="estimate")
 

@@ -2,7 +2,7 @@
 
 A folder with one ENVI cube a view (`view_000.hdr` and `.raw`), `white` and `dark` the same, `poses-true.json` in the
 form of transforms.json, and `truth/` with labels and reflectances, for whoever compares. Writing it twice gives the
-same bytes.
+same bytes. On request a board of printed markers lies around the plate, and the camera sees more of the table.
 
 The instrument is a line camera. One row of an image is exposed at a time, so that every column and band of the detector
 has a sensitivity and a dark current of its own, and what a column gets wrong it gets wrong in every row.
@@ -14,17 +14,21 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.envi import HeaderValue, beside, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
     SIZE_BOUNDS,
     VIEWS_BOUNDS,
+    Place,
     check_bounds,
     demo_cameras,
     label_image,
@@ -35,12 +39,16 @@ from unmix_plugin.scenes.demo.scene import (
 )
 from unmix_plugin.scenes.demo.shading import (
     MATERIALS,
+    Blend,
+    Surface,
+    Thing,
     band_centers_nm,
     lamp_power,
     reflectances,
     render_view,
     speckled_things,
 )
+from unmix_plugin.scenes.demo.shapes import Placement
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
@@ -68,6 +76,12 @@ _VIGNETTING = 0.3
 """Light that the lens loses at the ends of the line, as a share."""
 _BAD_NOISE = 0.5
 """Noise of a noisy band as a share of the full well."""
+MARKER_FAMILY, MARKER_SIZE = "DICT_4X4_50", 0.42
+"""Of the printed board: OpenCV's name, and the side of a marker in scene units, which pass for metres."""
+_BOARD_REACH, _BOARD_STEP, _BOARD_TOP = 1.96, 0.553, -0.12
+"""Half the side of the board, the distance between its markers, and the height of the plate's underside."""
+_BOARD_ANGLE_DEG = 52.0
+"""Between the edges of a picture that shows most of the board."""
 POSES = "poses-true.json"
 _OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
 
@@ -79,6 +93,7 @@ def make_demo_capture(
     views: int = RAW_VIEWS,
     overwrite: bool = False,
     illuminant: str | Path = RAW_LAMP,
+    place: Place | None = None,
 ) -> None:
     """Write the demo capture. It is built beside the folder and moved in when complete.
 
@@ -87,11 +102,13 @@ def make_demo_capture(
         overwrite: Whether a folder with something in it is accepted: an older capture there is replaced, other files
             stay.
         illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
+        place: What there is to see, and from where; None is the table with speckles on every surface.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
         SceneError: the folder can't be written, or the disk is full.
     """
+    place = place or Place(speckled_things(), demo_cameras)
     numbers = {
         "size": (size, SIZE_BOUNDS),
         "bands": (bands, _RAW_BANDS_BOUNDS),
@@ -100,7 +117,7 @@ def make_demo_capture(
     check_bounds("a demo capture", numbers)
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
-    cameras, spectra = demo_cameras(size, views), reflectances(sampling.centers_nm)
+    cameras, spectra = place.cameras(size, views), reflectances(sampling.centers_nm)
     frames = [
         {"file_path": f"view_{index:03d}.hdr", "transform_matrix": transform_matrix(cameras, index)}
         for index in range(views)
@@ -110,14 +127,62 @@ def make_demo_capture(
         truth.mkdir()
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
         write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
-        _write_images(staging, cameras, spectra, _demo_line_camera(size, sampling.centers_nm, lamp), sampling)
+        instrument = _demo_line_camera(size, sampling.centers_nm, lamp)
+        _write_images(staging, cameras, place.things, spectra, instrument, sampling)
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
 
 
+def marked_place(things: Sequence[Thing] | None = None) -> Place:
+    """The table with a board of markers around the plate, as seen by a lens that is wide enough for it.
+
+    Args:
+        things: What there is besides; None is the speckled things of the demo.
+    Raises:
+        ConfigError: OpenCV, which knows the markers, is not installed.
+    """
+    placement = Placement("box", (0.0, 0.0, _BOARD_TOP - 0.02), (_BOARD_REACH, _BOARD_REACH, 0.02))
+    board = Thing(placement, Surface("white", "purple", _print_of_markers()))
+    cameras = partial(demo_cameras, angle_deg=_BOARD_ANGLE_DEG)
+    return Place((*(things or speckled_things()), board), cameras)
+
+
+def _print_of_markers() -> Blend:
+    """Where the board is printed: 24 markers on a square of 7 a side, upright towards +y."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise ConfigError(
+            "the board of markers can't be printed: OpenCV is not installed; pip install 'unmix-nerf[sfm]'"
+        ) from error
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, MARKER_FAMILY))
+    cells = dictionary.markerSize + 2  # with the black border
+    steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) == 3]
+    middles = _BOARD_STEP * np.array(steps)
+    black = np.stack(
+        [cv2.aruco.generateImageMarker(dictionary, index, cells) < 128 for index in range(len(steps))]
+    )
+
+    def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+        points = local_points[:, :2] * _BOARD_REACH
+        nearest = np.abs(points[:, None] - middles).max(axis=2).argmin(axis=1)
+        across, up = ((points - middles[nearest]) / MARKER_SIZE + 0.5).T
+        column, row = np.floor(across * cells).astype(int), np.floor((1.0 - up) * cells).astype(int)
+        inside = (np.minimum(column, row) >= 0) & (np.maximum(column, row) < cells)
+        printed = black[nearest, row.clip(0, cells - 1), column.clip(0, cells - 1)]
+        return (printed & inside & (local_points[:, 2] > 0.999)).astype(local_points.dtype)
+
+    return blend
+
+
 def _write_images(
-    folder: Path, cameras: Cameras, spectra: Float[np.ndarray, "K B"], camera: _LineCamera, bands: Bands
+    folder: Path,
+    cameras: Cameras,
+    things: Sequence[Thing],
+    spectra: Float[np.ndarray, "K B"],
+    camera: _LineCamera,
+    bands: Bands,
 ) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
@@ -126,7 +191,6 @@ def _write_images(
     shape = (_REFERENCE_LINES, len(camera.dark_counts), len(bands))
     for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
         _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
-    things = speckled_things()
     for index in range(len(cameras)):
         view, name = render_view(cameras, index, things=things), f"view_{index:03d}"
         counts = camera.expose(reflected(view, spectra), generator)

@@ -25,8 +25,17 @@ class ProcessOptions:
     output_dir: Path
     """Folder to write the scene to; it appears when the scene is complete."""
     poses: str | None = None
-    """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...), or
-    `estimate` to find them from the images; without it, the poses of the layout."""
+    """Where the cameras were: a file or folder of another program (transforms.json, COLMAP, Metashape, ...); or found
+    in the images, by structure from motion (`estimate`), printed markers (`markers`) or the angles of a turned object
+    (`turntable`); without it, the poses of the layout."""
+    marker_size: float | None = None
+    """Side of a printed marker, metres: gives scale and upright to poses that are found in the images."""
+    marker_family: str | None = None
+    """OpenCV's name of the markers, such as DICT_4X4_50 or DICT_APRILTAG_36H11; without it, the one that is found."""
+    angles: Annotated[str | None, tyro.conf.arg(metavar="SPEC")] = None
+    """By which the object was turned in each view, for `--poses turntable`: START:STOP:STEP in degrees (0:360:10), one
+    for each place of the camera, with commas between; or a CSV file with the columns view, angle and, if there were
+    several places, camera."""
     wavelengths: str | None = None
     """Band centres in nm for files that don't name them: a CSV file with a column `wavelength`, or a list such as
     620,555,503."""

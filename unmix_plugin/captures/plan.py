@@ -51,7 +51,7 @@ class Plan:
         asked = {
             key: str(value) if isinstance(value, Path) else value
             for key, value in asdict(options).items()
-            if key not in ("output_dir", "overwrite", "poses")
+            if key not in ("output_dir", "overwrite", "poses", "marker_size", "marker_family", "angles")
         }
         files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
         return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps(files)}

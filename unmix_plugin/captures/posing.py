@@ -17,22 +17,19 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
-from unmix_plugin.captures.plan import Plan
-from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses, name_some
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
-from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.placement import Placement
-from unmix_plugin.scenes.reading.cubes import map_array
 
-ESTIMATE = "estimate"
+FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
+"""Words that ask to find poses instead of reading them."""
 _LEAST_VIEWS = 2
 """One to train on and one for evaluation."""
 _MOST_UNPOSED = 0.25
@@ -90,57 +87,14 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
             why = "".join(f" ({note})" for note in capture.notes if "poses" in note)
             raise CaptureError(
                 f"{capture.root}: the layout '{capture.layout}' has no poses{why}; give --poses with transforms.json, "
-                f"a COLMAP model or another file, or '--poses {ESTIMATE}' to find them from the images"
+                f"a COLMAP model or another file, or find them from the images: '--poses {ESTIMATE}', '{MARKERS}' or "
+                f"'{TURNTABLE}'"
             )
         return capture.poses
     path = Path(where)
     if not path.exists() and (capture.root / where).exists():
         path = capture.root / where
     return read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in capture.views})
-
-
-def estimated_poses(plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path) -> PoseSet:
-    """Structure from motion on all views.
-
-    Args:
-        plan: Of the scene.
-        records: Of its views, which are all written.
-        scene: Folder that they are in.
-        work: Folder for files of the estimation.
-    Returns:
-        Poses by view, with lenses of the whole images as the capture has them.
-    Raises:
-        CaptureError: pycolmap is not installed, or too few views could be registered.
-    """
-    shown = {name: _shown(scene, record) for name, record in records.items()}
-    pictures = {
-        name: contrast_picture(
-            map_array(scene / record.paths["hyperspectral_file_path"]), float(FULL_SCALE), shown[name]
-        )
-        for name, record in records.items()
-    }
-    sensors = {view.name: view.sensor for view in plan.views}
-    poses = estimate_poses(pictures, work, sensors, shown if plan.mask != "none" else None)
-    cameras = {}
-    for view in plan.views:
-        camera = poses.cameras.get(view.name)
-        if camera is not None and camera.lens is not None:
-            raster = plan.recipes[view.sensor].calibration.raster
-            whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
-            cameras[view.name] = replace(camera, lens=whole)
-    return replace(poses, cameras=cameras)
-
-
-def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
-    """Pixels of matter that were measured."""
-    from PIL import Image
-
-    with Image.open(scene / record.paths["file_path"]) as picture:
-        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
-    if "mask_path" in record.paths:
-        with Image.open(scene / record.paths["mask_path"]) as mask:
-            shown = shown & (np.asarray(mask.convert("L")) > 0)
-    return shown
 
 
 def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
@@ -162,7 +116,7 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
             + "; ".join(said)
         )
     fitted = {
-        view.name: replace(cameras[view.name], lens=_lens_of(cameras[view.name].lens or view.lens, view))
+        view.name: replace(cameras[view.name], lens=lens_of_view(cameras[view.name].lens or view.lens, view))
         for view in posed
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
@@ -207,8 +161,12 @@ def _other_sizes(posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera
     return []
 
 
-def _lens_of(lens: Lens | None, view: CaptureView) -> Lens:
-    """The lens in pixels of the view's file, of which it may be given at another resolution."""
+def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
+    """The lens in pixels of the view's file, of which it may be given at another resolution.
+
+    Raises:
+        CaptureError: there is none, or it is that of pictures of another shape.
+    """
     height, width, _ = view.cube.shape
     if lens is None:
         raise CaptureError(

@@ -9,12 +9,13 @@ from dataclasses import replace
 import numpy as np
 
 from unmix_plugin.captures.calibration.sensor import References
+from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import name_some
-from unmix_plugin.captures.posing import ESTIMATE, PosedViews, estimated_poses, given_poses, pose_views
+from unmix_plugin.captures.posing import FROM_PICTURES, MARKERS, PosedViews, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.captures.wavelengths import parse_wavelengths
@@ -47,19 +48,23 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     refuse_output(options.output_dir, options.overwrite)
     capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
+    check_pose_options(options, capture)
     posed = None
-    if options.poses != ESTIMATE:
+    if options.poses not in FROM_PICTURES:
         posed = pose_views(capture.views, given_poses(capture, options.poses))
     views = capture.views if posed is None else posed.views
     plan = make_plan(capture, views, options, _open_references(options))
     for note in plan.notes:
         say(f"note: {note}")
+    if options.poses == MARKERS:
+        say("looking for markers ...")
+        posed = pose_views(plan.views, marked_poses(plan, options))
     folder = WorkFolder(options.output_dir)
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
     if folder.begin({**plan.fingerprint(options), "lenses": sorted(map(_numbers_of, resampled.values()))}):
         say(f"going on with {folder.path}")
     records: dict[str, ViewRecord] = {}
-    for view in follow("writing views", plan.views):
+    for view in follow("writing views", plan.views if posed is None else posed.views):
         record = folder.done(view.name)
         if record is None:
             lens = resampled.get(view.name)
@@ -75,7 +80,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         )
     if posed is None:
         say("estimating poses ...")
-        posed = pose_views(plan.views, estimated_poses(plan, records, folder.path, folder.poses))
+        found = poses_of_written_views(plan, records, folder.path, folder.poses, options)
+        posed = pose_views(plan.views, found)
     for note in posed.notes:
         say(f"poses: {note}")
     findings = write_scene_files(folder.path, plan, posed, records, options)

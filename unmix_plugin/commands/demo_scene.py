@@ -23,6 +23,8 @@ class DemoSceneOptions:
     raw: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write what an instrument would have written instead: raw counts as ENVI cubes, a white reference, a dark frame,
     and no poses; for unmix-process."""
+    markers: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """With --raw: lay a board of printed markers around the plate, for --poses markers of unmix-process."""
     size: int | None = None
     """Width and height of every image, pixels; 96, or 400 with --raw."""
     bands: int | None = None
@@ -44,6 +46,8 @@ def write_demo_scene(arguments: list[str]) -> None:
     options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
     if options.raw and options.place != "table":
         raise ConfigError(f"--raw writes the table alone, not --place {options.place}; leave one of them out")
+    if options.markers and not options.raw:
+        raise ConfigError("--markers is for what an instrument would have written; give --raw too")
     if options.raw:
         _write_capture(options)
     else:
@@ -90,12 +94,15 @@ def _write_scene(options: DemoSceneOptions) -> None:
 
 def _write_capture(options: DemoSceneOptions) -> None:
     from unmix_plugin.captures.demo import (
+        MARKER_FAMILY,
+        MARKER_SIZE,
         POSES,
         RAW_BANDS,
         RAW_LAMP,
         RAW_SIZE,
         RAW_VIEWS,
         make_demo_capture,
+        marked_place,
     )
     from unmix_plugin.spectral.colour.conversion import parse_light
 
@@ -103,7 +110,8 @@ def _write_capture(options: DemoSceneOptions) -> None:
     size, bands, views = _numbers(options, (RAW_SIZE, RAW_BANDS, RAW_VIEWS))
     light = parse_light(options.illuminant or RAW_LAMP)
     started = time.perf_counter()
-    make_demo_capture(folder, size, bands, views, options.overwrite, light)
+    place = marked_place() if options.markers else None
+    make_demo_capture(folder, size, bands, views, options.overwrite, light, place)
     seconds = time.perf_counter() - started
     print(
         f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in {seconds:.1f} s"
@@ -118,9 +126,12 @@ def _write_capture(options: DemoSceneOptions) -> None:
             ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
         ),
     )
+    poses = "estimate"
+    if options.markers:
+        poses = f"markers --marker-size {MARKER_SIZE} --marker-family {MARKER_FAMILY}"
     print(
         f"make a scene of it: unmix-process cubes --data {folder} --output-dir SCENE --white {folder / 'white.hdr'} "
-        f"--dark {folder / 'dark.hdr'} --poses estimate"
+        f"--dark {folder / 'dark.hdr'} --poses {poses}"
     )
 
 

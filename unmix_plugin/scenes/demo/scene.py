@@ -147,8 +147,12 @@ def written_once(
     return target
 
 
-def demo_cameras(size: int, views: int) -> Cameras:
-    """Cameras on a dome around the table, azimuths spread by the golden angle."""
+def demo_cameras(size: int, views: int, angle_deg: float = _VIEW_ANGLE_DEG) -> Cameras:
+    """Cameras on a dome around the table, azimuths spread by the golden angle.
+
+    Args:
+        angle_deg: Between the left and right edge of a picture.
+    """
     i = np.arange(views)
     azimuths = i * np.pi * (3 - np.sqrt(5))
     # A second irrational stride decouples elevation from order, so that every 4th view samples the whole dome.
@@ -158,7 +162,7 @@ def demo_cameras(size: int, views: int) -> Cameras:
     flat = np.sqrt(1 - heights**2)
     backward = np.stack([flat * np.cos(azimuths), flat * np.sin(azimuths), heights], axis=1)
     positions = np.asarray(_LOOK_AT) + _CAMERA_DISTANCE * backward
-    return upright_cameras(positions, backward, size, np.deg2rad(_VIEW_ANGLE_DEG))
+    return upright_cameras(positions, backward, size, np.deg2rad(angle_deg))
 
 
 def lens_entries(cameras: Cameras) -> dict[str, Any]:
@@ -204,7 +208,7 @@ def label_image(view: ViewCoefficients) -> UInt8[np.ndarray, "H W"]:
 
 
 @dataclass(frozen=True)
-class _Place:
+class Place:
     """What there is to see, and from where."""
 
     things: Sequence[Thing]
@@ -306,13 +310,13 @@ def _room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
 
 
-_TABLE = _Place(THINGS, demo_cameras)
+_TABLE = Place(THINGS, demo_cameras)
 """The table before nothing."""
-_WORLD = _Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
+_WORLD = Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
 """The table on a ground that runs to the horizon, with huts and trees, under a sky."""
-_ROOM = _Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
+_ROOM = Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
 """The table in a room with windows onto the same world."""
-PLACES: Mapping[str, _Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
+PLACES: Mapping[str, Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
 
 
 def demo_scene_path(cache_dir: Path | None = None) -> Path:
@@ -342,7 +346,7 @@ def make_demo_scene(
     views: int = DEFAULT_VIEWS,
     overwrite: bool = False,
     illuminant: str | Path = LAMP,
-    place: _Place = _TABLE,
+    place: Place = _TABLE,
 ) -> None:
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
@@ -380,7 +384,7 @@ def is_complete(directory: Path) -> bool:
 
 
 def _write_scene(
-    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: _Place = _TABLE
+    folder: Path, size: int, bands: int, views: int, illuminant: str | Path = LAMP, place: Place = _TABLE
 ) -> None:
     sampling = Bands.of(band_centers_nm(bands))
     spectra, lamp = reflectances(sampling.centers_nm), lamp_power(sampling.centers_nm, illuminant)

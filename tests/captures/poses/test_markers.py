@@ -1,0 +1,297 @@
+"""Printed markers: how exactly corners are found, what poses follow from them, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from tests.captures.poses.alignment import align_poses, elsewhere
+from tests.commands.running import run
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.captures.poses import markers as markers_module
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.marker_detection import FAMILIES, count_markers, find_markers, parse_family
+from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.commands.process import process
+from unmix_plugin.errors import CaptureError, ConfigError
+
+cv2 = pytest.importorskip("cv2")
+SIDE = 0.05
+LENS = Lens(320, 240, (350.0, 350.0), (160.0, 120.0), (-0.12, 0.03, 0.0, 0.0))
+PINHOLE = replace(LENS, distortion=(0.0, 0.0, 0.0, 0.0))
+SQUARE = SIDE * np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+FAMILY = "DICT_4X4_50"
+
+
+def board(columns: int = 4, rows: int = 3) -> dict[int, np.ndarray]:
+    """Corners of markers on a table, at height 0.3."""
+    step = 1.4 * SIDE
+    places = [(step * (i - 1.5), step * (j - 1.0), 0.3) for j in range(rows) for i in range(columns)]
+    return {number: SQUARE + np.array(place) for number, place in enumerate(places)}
+
+
+def cameras(count: int = 8, lens: Lens = LENS) -> PoseSet:
+    """Around the board, at several heights."""
+    found = {}
+    for index in range(count):
+        angle, height = 2.1 * index, 0.25 + 0.06 * (index % 4)
+        place = np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.3 + height])
+        found[f"view_{index}"] = PosedCamera(look_at(place, np.array([0.0, 0.0, 0.3]))[:3], lens)
+    return PoseSet(found, "the truth")
+
+
+def seen(truth: PoseSet, corners: dict[int, np.ndarray], noise_px: float = 0.1) -> dict[str, dict]:
+    """What every camera sees of the markers, each with an error."""
+    generator = np.random.default_rng(0)
+    return {
+        name: {
+            number: camera.pixels_of(points) + noise_px * generator.normal(size=(4, 2))
+            for number, points in corners.items()
+        }
+        for name, camera in truth.cameras.items()
+    }
+
+
+def solved(sightings: dict[str, dict], **changes):
+    sizes = dict.fromkeys(sightings, (LENS.width, LENS.height))
+    return poses_from_markers(sightings, sizes, **{"marker_size": SIDE, **changes})
+
+
+def picture(camera: PosedCamera, corners: dict[int, np.ndarray], family: str = FAMILY) -> np.ndarray:
+    """Light of printed markers on white paper, with shades of grey where a pixel is partly black."""
+    assert camera.lens is not None
+    fine, (width, height) = 6, (camera.lens.width, camera.lens.height)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
+    light = np.ones((fine * height, fine * width), np.float32)
+    for number, points in corners.items():
+        marker = cv2.aruco.generateImageMarker(dictionary, number, 240).astype(np.float32) / 255
+        target = (camera.pixels_of(points) * fine - 0.5).astype(np.float32)
+        source = np.array([[0, 0], [240, 0], [240, 240], [0, 240]], np.float32) - 0.5
+        warp = cv2.getPerspectiveTransform(source, target)
+        light = np.minimum(light, cv2.warpPerspective(marker, warp, light.shape[::-1], borderValue=1.0))
+    return 0.05 + 0.8 * light.reshape(height, fine, width, fine).mean(axis=(1, 3))
+
+
+def test_corners_are_found_to_a_few_hundredths_of_a_pixel():
+    truth, corners = cameras(4, PINHOLE), board()
+    pictures = {name: picture(camera, corners) for name, camera in truth.cameras.items()}
+    found, notes = find_markers(pictures, FAMILY)
+    assert notes == []
+    errors = [
+        pixels - truth.cameras[name].pixels_of(corners[number])
+        for name, those in found.items()
+        for number, pixels in those.items()
+    ]
+    assert len(errors) >= 0.95 * 4 * len(corners)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.06
+    assert np.abs(np.mean(errors)) < 0.02, "black and white have no influence on where an edge is"
+
+
+@pytest.mark.slow
+def test_the_family_is_that_of_the_markers():
+    shown = [
+        picture(camera, board(), "DICT_APRILTAG_36H11") for camera in cameras(2, PINHOLE).cameras.values()
+    ]
+    counts = count_markers(shown)
+    assert max(counts, key=lambda name: counts[name]) == "DICT_APRILTAG_36H11"
+    assert counts["DICT_APRILTAG_36H11"] >= 20
+    assert count_markers(shown, FAMILY) == {FAMILY: 0}
+
+
+def test_a_number_twice_in_a_picture_is_left_out_and_said():
+    corners = board(2, 2)
+    camera = cameras(1, PINHOLE).cameras["view_0"]
+    shown = np.minimum(
+        picture(camera, corners), picture(camera, {0: corners[3] + np.array([0.08, 0.0, 0.0])})
+    )
+    found, notes = find_markers({"one": shown}, FAMILY)
+    assert 0 not in found["one"]
+    assert set(found["one"]) >= {1, 2}
+    assert "twice in a picture, left out there: 0" in notes[0]
+
+
+def test_every_family_is_one_of_opencv():
+    assert all(hasattr(cv2.aruco, name) for name in FAMILIES)
+    assert parse_family("4x4_50") == FAMILY
+    with pytest.raises(ConfigError, match="did you mean DICT_APRILTAG_36H11"):
+        parse_family("april_36h11")
+
+
+def test_poses_lens_scale_and_up_follow_from_markers():
+    truth, corners = cameras(), board()
+    found = solved(seen(truth, corners))
+    aligned = align_poses(found, truth, points=np.concatenate(list(corners.values())))
+    assert aligned.names == tuple(truth.cameras)
+    assert aligned.rms_px < 0.15
+    assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
+    lens = found.cameras["view_0"].lens
+    assert lens is not None
+    assert lens.focal_px[0] == pytest.approx(350.0, rel=0.01)
+    assert lens.distortion[0] == pytest.approx(-0.12, abs=0.05)
+    assert found.has_world
+    np.testing.assert_allclose(aligned.similarity.rotation[2], [0, 0, 1], atol=2e-3)  # the table is level
+    heights = [camera.camera_to_world[2, 3] for camera in found.cameras.values()]
+    expected = [camera.camera_to_world[2, 3] - 0.3 for camera in truth.cameras.values()]
+    np.testing.assert_allclose(heights, expected, atol=2e-3)
+
+
+def test_a_lens_that_is_given_stays_and_markers_may_lie_anywhere():
+    truth = cameras()
+    turns = Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.5, 0.5, (12, 3))).as_matrix()
+    corners = {
+        number: points.mean(axis=0) + np.array([0, 0, 0.02 * (number % 3)]) + SQUARE @ turns[number].T
+        for number, points in board().items()
+    }
+    found = solved(seen(truth, corners), lenses={"": LENS}, marker_size=None)
+    assert {camera.lens for camera in found.cameras.values()} == {LENS}
+    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+    assert not found.has_world
+    assert any("no scale: give --marker-size" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_wrong_sightings_are_left_out_and_views_without_markers_named():
+    truth, corners = cameras(), board()
+    sightings = seen(truth, corners)
+    sightings["view_1"][3] = sightings["view_1"][3] + 9.0
+    sightings["view_5"] = {}
+    found = solved(sightings)
+    assert "view_5" not in found.cameras
+    assert "views without enough markers: view_5" in found.notes
+    assert any("1 sighting of markers left out" in note for note in found.notes)
+    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+
+
+def test_slopes_are_those_of_the_errors():
+    truth, corners = cameras(3), board(2, 1)
+    gathered = markers_module._gather(seen(truth, corners), dict.fromkeys(truth.cameras, 0))
+    start = markers_module._Chain(gathered, (LENS,)).grow()
+    columns = [np.arange(18).reshape(3, 6), 18 + np.arange(14).reshape(2, 7), 32 + np.arange(3).reshape(1, 3)]
+    exact = markers_module._slopes(start, gathered, np.zeros(35), columns)
+    step, sighting = 1e-6, 0
+    view, marker = gathered.view[sighting], gathered.marker[sighting]
+    for column in range(16):
+        turned = []
+        for sign in (step, -step):
+            cameras_now, placed = start.camera_from_world.copy(), start.world_from_marker.copy()
+            sizes, lens = start.sizes.copy(), LENS
+            if column < 12:
+                transforms, index = (cameras_now, view) if column < 6 else (placed, marker)
+                by = np.zeros(6)
+                by[column % 6] = sign
+                turn = Rotation.from_rotvec(by[:3]).as_matrix()
+                transforms[index, :3, :3] = turn @ transforms[index, :3, :3]
+                transforms[index, :3, 3] += by[3:]
+            elif column == 12:
+                sizes[marker] *= np.exp(sign)
+            elif column == 13:
+                lens = replace(LENS, focal_px=(350 * np.exp(sign), 350 * np.exp(sign)))
+            else:
+                bent = list(LENS.distortion)
+                bent[column - 14] += sign
+                lens = replace(LENS, distortion=tuple(bent))
+            changed = markers_module._Map(cameras_now, placed, sizes, (lens,))
+            turned.append(changed.errors(gathered)[sighting].ravel())
+        expected = (turned[0] - turned[1]) / (2 * step)
+        np.testing.assert_allclose(exact[sighting, :, column], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_board_in_one_view_only_is_refused():
+    truth = cameras()
+    sightings: dict[str, dict] = {name: {} for name in truth.cameras}
+    sightings["view_2"] = seen(truth, board())["view_2"]
+    with pytest.raises(CaptureError, match="seen in 1 of 8 views, the same ones in 0; expected at least 3"):
+        solved(sightings)
+
+
+@pytest.mark.slow
+def test_markers_of_two_sizes_are_refused_by_number():
+    truth, corners = cameras(), board()
+    corners[7] = corners[7].mean(axis=0) + 1.5 * SQUARE
+    with pytest.raises(CaptureError, match=r"several sizes: over the usual one, 7 \(1\.[45]"):
+        solved(seen(truth, corners))
+
+
+@pytest.mark.slow
+def test_boards_that_moved_against_each_other_are_refused():
+    truth, corners = cameras(), board()
+    moved = {
+        number: points + np.array([0.02, 0.01, 0.0]) * (number > 5) for number, points in corners.items()
+    }
+    before, after = seen(truth, corners), seen(truth, moved)
+    sightings = {name: (before if index < 4 else after)[name] for index, name in enumerate(truth.cameras)}
+    with pytest.raises(CaptureError, match="markers did not keep their places"):
+        solved(sightings)
+
+
+def test_markers_give_scale_and_up_to_poses_that_have_none():
+    truth, corners = cameras(), board()
+    tilted = replace(elsewhere(truth), has_world=False)
+    found = metric_poses(tilted, seen(truth, corners), SIDE)
+    aligned = align_poses(found, truth, points=np.concatenate(list(corners.values())))
+    assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
+    np.testing.assert_allclose(aligned.similarity.rotation[2], [0, 0, 1], atol=5e-3)
+    assert found.has_world
+    with pytest.raises(CaptureError, match="none of them seen by two cameras that agree"):
+        metric_poses(tilted, {"view_0": seen(truth, corners)["view_0"]}, SIDE)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Pictures of the board, and where they were taken from."""
+    path = tmp_path_factory.mktemp("capture")
+    truth = cameras(6, PINHOLE)
+    for name, camera in truth.cameras.items():
+        light = picture(camera, board())
+        grey = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+        Image.fromarray(np.dstack([np.round(255 * grey).astype(np.uint8)] * 3)).save(path / f"{name}.png")
+    return path, truth
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_wait_for_the_disk")
+def test_a_scene_of_marked_pictures_has_their_poses_in_metres(folder, tmp_path):
+    data, truth = folder
+    words = ["cubes", "--data", data, "--wavelengths", "610,550,465", "--mask", "white"]
+    ended = run(
+        process, *words, "--output-dir", tmp_path / "scene", "--poses", "markers", "--marker-size", SIDE
+    )
+    assert ended.status == 0, ended.err
+    found = read_poses(tmp_path / "scene" / "transforms.json")
+    names = {name: name.split("/")[-1].removesuffix(".png") for name in found.cameras}
+    aligned = align_poses(found, truth, names)
+    assert len(names) == 6
+    assert aligned.rms_px < 0.3
+    assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["--poses", "markers", "--marker-family", "5x5_50"],
+            "no markers of DICT_5X5_50 are in the pictures, but some",
+        ),
+        (
+            ["--poses", "markers", "--marker-size", "50"],
+            "--marker-size 50: expected the side of a marker in metres",
+        ),
+        (["--poses", "markers", "--angles", "0:360:60"], "--poses turntable and --angles go together"),
+        (["--poses", "turntable"], "--poses turntable and --angles go together"),
+        (
+            ["--poses", "turntable", "--angles", "0:360:10"],
+            "gives 36 angles (the end of a range is none of them) for 6",
+        ),
+        (["--marker-size", "0.05"], "--marker-size goes with --poses estimate, markers, turntable"),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_written(folder, tmp_path, words, said):
+    asked = ["cubes", "--data", folder[0], "--wavelengths", "610,550,465", "--output-dir", tmp_path / "scene"]
+    ended = run(process, *asked, *words)
+    assert ended.status == 2
+    assert said in ended.err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,193 @@
+"""Objects that were turned by known angles: what poses follow from outlines, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.captures.poses.alignment import align_poses
+from tests.scenes.scene_factory import look_at
+from unmix_plugin.captures.poses import turntable as turntable_module
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.captures.poses.turntable import Turn, parse_angles, poses_from_turntable
+from unmix_plugin.errors import CaptureError, ConfigError
+
+cv2 = pytest.importorskip("cv2")
+LENS = Lens(240, 200, (420.0, 420.0), (120.0, 100.0))
+COUNT = 18
+
+
+def knobs() -> np.ndarray:
+    """Points of a lump that looks different from all sides."""
+    generator = np.random.default_rng(4)
+    points = [np.array([0.5, 0.35, 0.0])]
+    points += [np.array([x, y, z]) for x, y, z in generator.uniform(-0.6, 0.6, (12, 3))]
+    ball = generator.normal(size=(400, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    return np.concatenate([point + 0.12 * ball for point in points])
+
+
+def vase() -> np.ndarray:
+    """Points of a round thing."""
+    turn, height = np.meshgrid(np.linspace(0, 2 * np.pi, 181), np.linspace(-0.5, 0.5, 40))
+    radius = 0.3 + 0.1 * np.sin(5 * height)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=-1).reshape(-1, 3)
+
+
+def camera_at(angle: float, height: float) -> PosedCamera:
+    """As seen from the object, which is not quite in the middle of the picture."""
+    place = np.array([3.0 * np.cos(angle), 3.0 * np.sin(angle), height])
+    return PosedCamera(look_at(place, np.array([0.0, 0.0, 0.05]))[:3], LENS)
+
+
+def silhouette(camera: PosedCamera, points: np.ndarray) -> np.ndarray:
+    """Pixels whose middles the outline encloses."""
+    hull = cv2.convexHull(camera.pixels_of(points).astype(np.float32))
+    mask = np.zeros((LENS.height, LENS.width), np.uint8)
+    cv2.fillConvexPoly(mask, np.round((hull - 0.5) * 256).astype(np.int32), 1, shift=8)
+    return mask > 0
+
+
+def turned(points: np.ndarray, heights=(1.2,), sense: float = 1.0, off_deg: float = 0.0):
+    """Pictures without any texture, the angles, masks, and where the camera was."""
+    generator = np.random.default_rng(0)
+    truth, masks, turns = {}, {}, {}
+    for place, height in enumerate(heights):
+        for index in range(COUNT):
+            name, angle = f"view_{place}_{index:02d}", 360.0 * index / COUNT
+            wrong = off_deg * generator.normal()
+            truth[name] = camera_at(-sense * np.radians(angle + wrong) + 0.3 * place, height)
+            masks[name], turns[name] = silhouette(truth[name], points), Turn(angle, place)
+    pictures = {name: np.where(mask, np.uint8(128), np.uint8(0)) for name, mask in masks.items()}
+    return pictures, turns, masks, PoseSet(truth, "the truth")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_outlines_alone_tell_the_axis_the_lens_and_the_sense(sense):
+    pictures, turns, masks, truth = turned(knobs(), sense=sense)
+    found = poses_from_turntable(pictures, turns, masks)
+    aligned = align_poses(found, truth)
+    assert len(aligned.names) == COUNT
+    assert aligned.rms_px < 0.5
+    assert any(f"turned {'against' if sense > 0 else 'with'} the clock" in note for note in found.notes)
+
+
+@pytest.mark.slow
+def test_two_heights_of_the_camera_share_one_world():
+    pictures, turns, masks, truth = turned(knobs(), heights=(0.5, 2.0))
+    found = poses_from_turntable(pictures, turns, masks)
+    assert align_poses(found, truth).rms_px < 0.5
+
+
+@pytest.mark.slow
+def test_masks_that_are_too_wide_do_not_move_the_cameras():
+    from scipy.ndimage import binary_dilation
+
+    pictures, turns, masks, truth = turned(knobs())
+    wide = {
+        name: binary_dilation(mask) if index % 3 else mask for index, (name, mask) in enumerate(masks.items())
+    }
+    assert align_poses(poses_from_turntable(pictures, turns, wide), truth).rms_px < 0.6
+
+
+def evidence_of(pictures, turns, masks):
+    names = sorted(pictures)
+    columns = ([values[name] for name in names] for values in (pictures, turns, masks))
+    return turntable_module._gather(cv2, *columns)
+
+
+def true_numbers(sense: float = 1.0):
+    pitch = np.arctan2(1.2 - 0.05, 3.0)
+    cameras = np.array([[0.0, pitch, 0.0, 0.0, 0.0, 0.0]])
+    return turntable_module._Numbers(420.0, sense, cameras, np.zeros(COUNT))
+
+
+def test_true_cameras_leave_nothing_of_the_outlines_unexplained():
+    evidence = evidence_of(*turned(knobs())[:3])
+    _, outlines = true_numbers().errors(evidence)
+    assert np.median(np.abs(outlines)) < 0.3
+    _, mirrored = true_numbers(-1.0).errors(evidence)
+    assert np.median(np.abs(mirrored)) > 1.0
+
+
+def test_slack_moves_pairs_by_the_difference_of_their_angles():
+    evidence = evidence_of(*turned(knobs())[:3])
+    numbers, step = true_numbers(), 1e-5
+    _, now = numbers.errors(evidence, rims=False)
+    _, ahead = numbers.errors(evidence, ahead=step, rims=False)
+    assert np.abs(ahead - now).max() > 1e-6
+    for view in (0, 7):
+        slack = np.zeros(COUNT)
+        slack[view] = step
+        _, alone = replace(numbers, slack=slack).errors(evidence, rims=False)
+        first, second = (evidence.touched == view).T
+        np.testing.assert_allclose(alone[first], ahead[first], atol=1e-9)
+        np.testing.assert_allclose((alone - now)[second], -(ahead - now)[second], atol=1e-7)
+
+
+def test_views_that_are_all_alike_are_refused():
+    with pytest.raises(
+        CaptureError, match=r"the axis can't be told, as all views are alike: silhouettes overlap by 100"
+    ):
+        poses_from_turntable(*turned(vase())[:3])
+    blank = {name: np.full((LENS.height, LENS.width), 128, np.uint8) for name in turned(vase())[0]}
+    with pytest.raises(CaptureError, match="all views are alike: there are no masks, and 0 of 0 points"):
+        poses_from_turntable(blank, turned(vase())[1])
+
+
+@pytest.mark.slow
+def test_wrong_angles_are_refused():
+    pictures, turns, masks, _ = turned(knobs())
+    halved = {name: Turn(0.5 * turn.angle_deg) for name, turn in turns.items()}
+    with pytest.raises(CaptureError, match="the angles do not explain the pictures"):
+        poses_from_turntable(pictures, halved, masks)
+
+
+def test_a_place_of_the_camera_needs_three_views():
+    pictures, turns, masks, _ = turned(knobs())
+    turns["view_0_00"] = Turn(0.0, 1)
+    with pytest.raises(
+        CaptureError, match="1 views were taken from place 2 of the camera; expected at least 3"
+    ):
+        poses_from_turntable(pictures, turns, masks)
+
+
+def test_angles_are_ranges_one_for_each_place_or_a_table(tmp_path):
+    names = ["a", "b", "c", "d"]
+    assert [turn.angle_deg for turn in parse_angles("0:40:10", names).values()] == [0, 10, 20, 30]
+    assert parse_angles("0:-20:-10,5:25:10", names)["d"] == Turn(15.0, 1)
+    table = tmp_path / "angles.csv"
+    table.write_text("view,angle,camera\nb.hdr,10,low\na,0,low\nc,0,high\nd,10,high\n")
+    assert parse_angles(str(table), names)["b"] == Turn(10.0, 0)
+    assert parse_angles(str(table), names)["d"] == Turn(10.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("0:360:10", "gives 36 angles .* for 4 views"),
+        ("0:360:0", "expected START:STOP:STEP"),
+        ("ten", "expected START:STOP:STEP"),
+        ("0:360:-90", "gives 0 angles"),
+    ],
+)
+def test_angles_that_do_not_fit_the_views_are_refused(text, said):
+    with pytest.raises(ConfigError, match=said):
+        parse_angles(text, ["a", "b", "c", "d"])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("view,angle\na,0\nb,10\n", "no angle for c"),
+        ("view,angle\na,0\nb,10\nc,20\nd,30\n", "no view is called d"),
+        ("view,angle\na,zero\n", "line 2: expected the columns view and angle"),
+        ("name,turn\na,0\n", "line 2: expected the columns view and angle"),
+    ],
+)
+def test_a_table_that_does_not_fit_the_views_is_refused(tmp_path, content, said):
+    (tmp_path / "angles.csv").write_text(content)
+    with pytest.raises(ConfigError, match=said):
+        parse_angles(str(tmp_path / "angles.csv"), ["a", "b", "c"])

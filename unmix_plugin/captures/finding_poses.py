@@ -1,0 +1,262 @@
+"""Poses that no file gives, found in the views of a capture: by structure from motion, by printed markers, or because
+the object was turned by known angles.
+
+Markers are sought in the light that was measured, before anything is cut out, since the paper that they are printed on
+may be taken for background.
+
+Notation: `H x W` pixels of the scene, `C` pictures of a view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from unmix_plugin.captures.calibration.calibration import Calibration
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.marker_detection import (
+    Sightings,
+    count_markers,
+    find_markers,
+    parse_family,
+    require_opencv,
+)
+from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
+from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.poses.turntable import Turn, parse_angles, poses_from_turntable
+from unmix_plugin.captures.posing import ESTIMATE, FROM_PICTURES, MARKERS, TURNTABLE, lens_of_view
+from unmix_plugin.captures.spectral_file import Capture, CaptureView
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
+from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.scenes.reading.cubes import map_array
+
+_MARKER_SIZES_M = (0.0005, 20.0)
+_SAMPLE_VIEWS, _SAMPLE_BANDS = 6, 8
+"""In which it is tried what shows the most markers."""
+_BLOCK_VALUES = 1 << 22
+
+
+def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
+    """Refuse what does not fit together, before anything is read.
+
+    Raises:
+        ConfigError: a flag is wrong, or asks for what this way of finding poses does not use.
+        CaptureError: OpenCV is not installed.
+    """
+    found = options.poses in FROM_PICTURES
+    for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
+        if value is not None and not found:
+            raise ConfigError(
+                f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; leave it out, or give one of them"
+            )
+    if options.marker_family is not None and options.marker_size is None and options.poses != MARKERS:
+        raise ConfigError("--marker-family needs --marker-size, the side of a marker in metres")
+    low, high = _MARKER_SIZES_M
+    if options.marker_size is not None and not low <= options.marker_size <= high:
+        raise ConfigError(
+            f"--marker-size {options.marker_size:g}: expected the side of a marker in metres, {low} to {high:g}"
+        )
+    parse_family(options.marker_family)
+    if (options.angles is None) == (options.poses == TURNTABLE):
+        raise ConfigError(
+            f"--poses {TURNTABLE} and --angles go together; give the angles of the views, such as --angles 0:360:10"
+        )
+    if options.angles is not None:
+        parse_angles(options.angles, [view.name for view in capture.views])
+    if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:
+        require_opencv()
+
+
+def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
+    """Poses by printed markers.
+
+    Returns:
+        Poses by view, with lenses of the whole images as the capture has them.
+    Raises:
+        CaptureError: there are too few markers, or they contradict each other.
+    """
+    sightings, notes = _sightings(plan, options)
+    rasters = {view.name: plan.recipes[view.sensor].calibration.raster for view in plan.views}
+    lenses: dict[str, Lens] = {
+        view.sensor: rasters[view.name].lens(lens_of_view(view.lens, view))
+        for view in plan.views
+        if view.lens is not None
+    }
+    for sensor, lens in lenses.items():
+        if lens.resampled_from is not None:
+            raise CaptureError(
+                f"lens {sensor} is of the model {lens.resampled_from.model}, through which markers are not followed; "
+                "expected a lens of k1, k2, p1, p2: undistort the images first, or give poses with --poses FILE"
+            )
+    found = poses_from_markers(
+        sightings,
+        {name: (raster.width, raster.height) for name, raster in rasters.items()},
+        options.marker_size,
+        {view.name: view.sensor for view in plan.views},
+        lenses,
+    )
+    return _in_files(plan, replace(found, notes=(*notes, *found.notes)))
+
+
+def poses_of_written_views(
+    plan: Plan, records: Mapping[str, ViewRecord], scene: Path, work: Path, options: ProcessOptions
+) -> PoseSet:
+    """Poses by structure from motion, or of a turntable, on all views.
+
+    Args:
+        plan: Of the scene.
+        records: Of its views, which are all written.
+        scene: Folder that they are in.
+        work: Folder for files of the estimation.
+    Returns:
+        Poses by view, with lenses of the whole images as the capture has them; metric and upright where markers of a
+        known size are in view.
+    Raises:
+        CaptureError: a library is not installed, or the pictures do not tell.
+    """
+    shown = {name: _shown(scene, record) for name, record in records.items()}
+    pictures = {
+        name: contrast_picture(
+            map_array(scene / record.paths["hyperspectral_file_path"]), float(FULL_SCALE), shown[name]
+        )
+        for name, record in records.items()
+    }
+    masks = shown if plan.mask != "none" or any(view.alpha is not None for view in plan.views) else None
+    if options.poses == ESTIMATE:
+        poses = estimate_poses(pictures, work, {view.name: view.sensor for view in plan.views}, masks)
+    else:
+        assert options.angles is not None
+        poses = _turned_poses(
+            plan, pictures, masks, parse_angles(options.angles, [view.name for view in plan.capture.views])
+        )
+    if options.marker_size is not None:
+        sightings, notes = _sightings(plan, options)
+        poses = metric_poses(poses, sightings, options.marker_size)
+        poses = replace(poses, notes=(*poses.notes, *notes))
+    return _in_files(plan, poses)
+
+
+def _turned_poses(
+    plan: Plan,
+    pictures: Mapping[str, UInt8[np.ndarray, "H W"]],
+    masks: Mapping[str, Bool[np.ndarray, "H W"]] | None,
+    turns: Mapping[str, Turn],
+) -> PoseSet:
+    if len({view.sensor for view in plan.views}) > 1:
+        raise CaptureError(
+            f"--poses {TURNTABLE} knows one camera; expected views of one sensor: process the views of one lens alone"
+        )
+    return poses_from_turntable(pictures, turns, masks)
+
+
+def _in_files(plan: Plan, poses: PoseSet) -> PoseSet:
+    """Poses with the lenses of whole files, from those of the scene's pictures."""
+    cameras = {}
+    for view in plan.views:
+        camera = poses.cameras.get(view.name)
+        if camera is not None and camera.lens is not None:
+            raster = plan.recipes[view.sensor].calibration.raster
+            whole = raster.lens_of_file(camera.lens, view.cube.shape[0], view.cube.shape[1])
+            cameras[view.name] = replace(camera, lens=whole)
+    return replace(poses, cameras=cameras)
+
+
+def _shown(scene: Path, record: ViewRecord) -> Bool[np.ndarray, "H W"]:
+    """Pixels of matter that were measured."""
+    from PIL import Image
+
+    with Image.open(scene / record.paths["file_path"]) as picture:
+        shown = np.asarray(picture.convert("RGBA"))[..., 3] > 127
+    if "mask_path" in record.paths:
+        with Image.open(scene / record.paths["mask_path"]) as mask:
+            shown = shown & (np.asarray(mask.convert("L")) > 0)
+    return shown
+
+
+def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str]]:
+    """Markers of all views, in the pictures of each sensor that show the most, and how they were found."""
+    family = parse_family(options.marker_family)
+    sightings: Sightings = {}
+    notes: list[str] = []
+    for sensor in plan.sensors:
+        views = [view for view in plan.views if view.sensor == sensor]
+        calibration = plan.recipes[sensor].calibration
+        chosen, band = _choose(views, calibration, family)
+        if chosen is None:
+            continue
+        pictures = {view.name: _light(view, calibration, [band])[0] for view in views}
+        found, said = find_markers(pictures, chosen)
+        sightings |= found
+        where = (
+            "the mean of all bands"
+            if band is None
+            else f"the band at {plan.sensors[sensor].centers_nm[band]:g} nm"
+        )
+        notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *said]
+    if not sightings:
+        others = _other_families(plan) if family is not None else ""
+        asked = "no markers are" if family is None else f"no markers of {family} are"
+        raise CaptureError(
+            f"{asked} in the pictures{others}; expected printed markers of OpenCV, sharp, with a white rim, at least "
+            "20 pixels wide"
+        )
+    return {view.name: sightings.get(view.name, {}) for view in plan.views}, notes
+
+
+def _choose(
+    views: Sequence[CaptureView], calibration: Calibration, family: str | None
+) -> tuple[str | None, int | None]:
+    """The family, and the band (None is the mean of all) in which some views show the most markers."""
+    count = calibration.num_bands
+    bands: list[int | None] = [None]
+    bands += dict.fromkeys(np.linspace(0, count - 1, min(_SAMPLE_BANDS, count)).astype(int).tolist())
+    places = np.linspace(0, len(views) - 1, min(_SAMPLE_VIEWS, len(views))).astype(int).tolist()
+    sample = [_light(views[place], calibration, bands) for place in dict.fromkeys(places)]
+    family = family or _family_of(sample)
+    if family is None:
+        return None, None
+    counts = [
+        count_markers([pictures[index] for pictures in sample], family)[family] for index in range(len(bands))
+    ]
+    best = int(np.argmax(counts))
+    return (family, bands[best]) if counts[best] else (None, None)
+
+
+def _family_of(sample: Sequence[Float32[np.ndarray, "C H W"]]) -> str | None:
+    """The family of most markers in the means of all bands, or, if there is none, in the middle one of the bands."""
+    for index in (0, sample[0].shape[0] // 2):
+        counts = count_markers([pictures[index] for pictures in sample[::2]])
+        name = max(counts, key=lambda kind: counts[kind])
+        if counts[name]:
+            return name
+    return None
+
+
+def _other_families(plan: Plan) -> str:
+    """Which families are there instead, for a message."""
+    for sensor in plan.sensors:
+        views = [view for view in plan.views if view.sensor == sensor]
+        chosen, _ = _choose(views, plan.recipes[sensor].calibration, None)
+        if chosen is not None:
+            return f", but some of {chosen} are: give --marker-family {chosen}"
+    return ""
+
+
+def _light(
+    view: CaptureView, calibration: Calibration, bands: Sequence[int | None]
+) -> Float32[np.ndarray, "C H W"]:
+    """Bands of a view as measured; None stands for the mean of all. Pixels without a measurement are 0."""
+    raster = calibration.raster
+    pictures = np.empty((len(bands), raster.height, raster.width), np.float32)
+    for first, last in raster.blocks(len(calibration.bands), _BLOCK_VALUES):
+        values = calibration.rows(view.cube, first, last).values
+        for picture, band in zip(pictures, bands, strict=True):
+            picture[first:last] = values.mean(axis=-1) if band is None else values[..., band]
+    return pictures

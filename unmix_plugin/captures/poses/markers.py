@@ -1,0 +1,686 @@
+"""Poses from printed markers: a map of the markers and all cameras, by bundle adjustment of the markers' corners.
+
+Every marker is a square of one size that lies anywhere; boards need no description. The map begins with the marker
+that most views show. One square alone has two poses that look nearly alike (Collins and Bartoli 2014), so each further
+marker is put where the views that see it beside known ones agree. Focal lengths that are not given are first tried in
+steps.
+
+The world of the result stands on the plane that most markers lie in: +z is up, away from the printed side.
+
+Notation: `S` sightings of a marker in a view, `N` views, `M` markers. Transforms are 4 x 4, `a_from_b` takes
+coordinates of b to those of a; camera axes are OpenCV's here, +x right, +y down, +z forward.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int
+
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.marker_detection import Sightings, require_opencv
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, name_some
+from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.scenes.placement import Placement
+
+LEAST_VIEWS = 3
+_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
+"""Corners of a marker in its own coordinates, over its side; +z points away from the printed side."""
+_FOCAL_FACTORS = (0.7, 1.0, 1.5, 2.3, 3.5, 6.0, 11.0)
+"""First focal lengths to try, over the longer side."""
+_WORST_PX = 20.0
+"""Misses count no more than this while the map is begun."""
+_OUTLIER_PX, _OUTLIER_FACTOR = 1.5, 5.0
+"""Root mean square over a sighting's corners from which it is left out, and at least so many times the median."""
+_MOST_LEFT_OUT = 0.25
+"""Share of the sightings that may be left out; beyond, the markers are no rigid thing."""
+_MOST_OFF_PX, _MOST_OFF = 1.5, 5e-4
+"""Median error of sightings, or over the diagonal, from which the markers are no rigid thing either."""
+_SIZE_TOLERANCE = 0.1
+"""By which markers may seem larger or smaller than the others, as a share."""
+_GAIN = 0.02
+"""Part of the reprojection error that distortion has to remove to be kept."""
+_CLEAR = 3.0
+"""How many times better one of a single marker's two poses has to fit to be taken."""
+_ONE_PLANE = np.cos(np.radians(10.0))
+"""Between normals of markers that lie in one plane."""
+
+_Transforms: TypeAlias = Float64[np.ndarray, "*n 4 4"]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """All sightings, in the order of their views."""
+
+    views: tuple[str, ...]
+    numbers: tuple[int, ...]
+    """Of the markers."""
+    view: Int[np.ndarray, " S"]
+    marker: Int[np.ndarray, " S"]
+    corners: Float64[np.ndarray, "S 4 2"]
+    """Pixels."""
+    sensor: Int[np.ndarray, " N"]
+    """Index of the lens of each view."""
+
+    def part(self, keep: Bool[np.ndarray, " S"]) -> _Seen:
+        return replace(self, view=self.view[keep], marker=self.marker[keep], corners=self.corners[keep])
+
+
+@dataclass(frozen=True)
+class _Map:
+    """Where everything is; NaN where it is not known."""
+
+    camera_from_world: Float64[np.ndarray, "N 4 4"]
+    world_from_marker: Float64[np.ndarray, "M 4 4"]
+    sizes: Float64[np.ndarray, " M"]
+    """Sides of the markers, the first one's is 1."""
+    lenses: tuple[Lens, ...]
+
+    def errors(self, seen: _Seen) -> Float64[np.ndarray, "S 4 2"]:
+        """Pixels by which corners are missed."""
+        corners = _transformed(self.world_from_marker, self.sizes[:, None, None] * _SQUARE)
+        local = _transformed(self.camera_from_world[seen.view], corners[seen.marker])
+        return _pixels(local, seen, self.lenses) - seen.corners
+
+
+def poses_from_markers(
+    sightings: Sightings,
+    sizes_px: Mapping[str, tuple[int, int]],
+    marker_size: float | None = None,
+    sensor_of: Mapping[str, str] | None = None,
+    lenses: Mapping[str, Lens] | None = None,
+) -> PoseSet:
+    """Where pictures were taken from, by the markers in them.
+
+    Args:
+        sightings: Markers of every view; views without any count as not posed.
+        sizes_px: Width and height of each view.
+        marker_size: Side of a marker, metres; without it 1 is the side of a marker.
+        sensor_of: Sensor of each view; views of one have one lens. None is one for all.
+        lenses: By sensor, where they are known; others are estimated.
+    Raises:
+        CaptureError: OpenCV is not installed, fewer than three views see markers that belong together, the markers
+            have several sizes, or they moved against each other.
+    """
+    require_opencv()
+    sensors = sorted({(sensor_of or {}).get(name, "") for name in sightings})
+    seen = _gather(sightings, {name: sensors.index((sensor_of or {}).get(name, "")) for name in sightings})
+    first = []
+    for sensor in sensors:
+        width, height = next(
+            size for name, size in sizes_px.items() if (sensor_of or {}).get(name, "") == sensor
+        )
+        known = (lenses or {}).get(sensor)
+        first.append(known or Lens(width, height, (0.0, 0.0), (width / 2, height / 2)))
+    free = np.array([sensor not in (lenses or {}) for sensor in sensors])
+    begun = _begin(seen, first, free)
+    found, kept = _adjust(begun, seen, free)
+    _refuse_several_sizes(found, seen, kept)
+    found = replace(found, sizes=np.ones(len(found.sizes)))
+    found, kept = _adjust(found, seen, free, same_size=True)
+    _refuse_moved(found, seen, kept)
+    found = _with_distortion(found, seen.part(kept), free)
+    return _pose_set(found, seen, kept, sightings, marker_size, free)
+
+
+def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> _Seen:
+    """Sightings of markers that at least two views have.
+
+    Raises:
+        CaptureError: there are none in at least three views.
+    """
+    views_of = Counter(number for markers in sightings.values() for number in markers)
+    shared = {number for number, count in views_of.items() if count > 1}
+    views = [name for name, markers in sightings.items() if shared & set(markers)]
+    if len(views) < LEAST_VIEWS:
+        alone = sum(bool(markers) for markers in sightings.values())
+        raise CaptureError(
+            f"markers are seen in {alone} of {len(sightings)} views, the same ones in {len(views)}; expected at least "
+            f"{LEAST_VIEWS} views of the same markers: take the board into every picture, larger or sharper, or let "
+            "another way find the poses (--poses estimate)"
+        )
+    numbers = sorted(shared)
+    rows = [
+        (index, numbers.index(number), corners)
+        for index, name in enumerate(views)
+        for number, corners in sightings[name].items()
+        if number in shared
+    ]
+    view, marker, corners = zip(*rows, strict=True)
+    sensors = np.array([sensor_of[name] for name in views])
+    return _Seen(tuple(views), tuple(numbers), np.array(view), np.array(marker), np.array(corners), sensors)
+
+
+# The map's beginning: poses of single squares, and what they agree on.
+
+
+def _begin(seen: _Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> _Map:
+    """A map with the focal length that explains the corners best."""
+    factors = _FOCAL_FACTORS if free.any() else (1.0,)
+    begun: list[tuple[float, float, _Map]] = []
+    for factor in factors:
+        tried = tuple(
+            replace(lens, focal_px=(factor * max(lens.width, lens.height),) * 2) if is_free else lens
+            for lens, is_free in zip(lenses, free, strict=True)
+        )
+        start = _Chain(seen, tried).grow()
+        usable = _usable(start, seen)
+        if usable.sum() >= LEAST_VIEWS:
+            misses = np.minimum(_rms(start.errors(seen.part(usable))), _WORST_PX)
+            begun.append((float(usable.mean()), float(misses.mean()), start))
+    if not begun:
+        raise CaptureError(
+            "the markers of the views do not belong together; expected pictures that show several markers at once, or "
+            "always the same: take the whole board into every picture"
+        )
+    most = max(share for share, _, _ in begun)
+    ranked = sorted((miss, index) for index, (share, miss, _) in enumerate(begun) if share > 0.95 * most)
+    tried_out = [_adjust(begun[index][2], seen, free, steps=15)[0] for _, index in ranked[:3]]
+    return min(tried_out, key=lambda found: _robust_cost(found, seen))
+
+
+def _usable(found: _Map, seen: _Seen) -> Bool[np.ndarray, " S"]:
+    """Sightings whose view and marker are in the map."""
+    return np.isfinite(found.camera_from_world[seen.view, 0, 0]) & np.isfinite(
+        found.world_from_marker[seen.marker, 0, 0]
+    )
+
+
+def _robust_cost(found: _Map, seen: _Seen) -> float:
+    usable = _usable(found, seen)
+    return float(np.minimum(_rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
+
+
+class _Chain:
+    """A map that grows marker by marker, each put where the views that see it beside known ones agree."""
+
+    def __init__(self, seen: _Seen, lenses: tuple[Lens, ...]) -> None:
+        self._seen, self._lenses = seen, lenses
+        self._focal = np.array([lens.focal_px[0] for lens in lenses])[seen.sensor][seen.view]
+        self._ideal = np.stack(
+            [_ideal(lenses[seen.sensor[v]], c) for v, c in zip(seen.view, seen.corners, strict=True)]
+        )
+        self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
+        """Both poses of each sighting, camera from marker."""
+        self._placed = np.full((len(seen.numbers), 4, 4), np.nan)
+        self._options: list[_Transforms] = [np.zeros((0, 4, 4))] * len(seen.views)
+        """Poses that each view may have, camera from world: two where it shows one known marker."""
+
+    def grow(self) -> _Map:
+        marker: int | None = int(np.bincount(self._seen.marker).argmax())
+        self._placed[marker] = np.eye(4)
+        while marker is not None:
+            for view in np.unique(self._seen.view[self._seen.marker == marker]).tolist():
+                self._look_again(view)
+            marker = self._place_next()
+        poses = np.full((len(self._options), 4, 4), np.nan)
+        for view, options in enumerate(self._options):
+            if len(options) == 1 or (len(options) > 1 and self._is_clear(view)):
+                poses[view] = options[0]
+        return _Map(poses, self._placed, np.ones(len(self._placed)), self._lenses)
+
+    def _known(self, view: int) -> list[int]:
+        """Sightings of the view of markers that are placed."""
+        those = np.flatnonzero(self._seen.view == view).tolist()
+        return [s for s in those if np.isfinite(self._placed[self._seen.marker[s], 0, 0])]
+
+    def _misses(self, camera_from_marker: _Transforms, sighting: int) -> Float64[np.ndarray, "*n"]:
+        """Mean pixels by which the corners of a sighting are missed."""
+        local = _transformed(camera_from_marker, _SQUARE)
+        depth = np.where(local[..., 2:] > 1e-6, local[..., 2:], np.nan)
+        away = np.linalg.norm(local[..., :2] / depth - self._ideal[sighting], axis=-1).mean(axis=-1)
+        return np.minimum(np.nan_to_num(away * self._focal[sighting], nan=_WORST_PX), _WORST_PX)
+
+    def _look_again(self, view: int) -> None:
+        """The pose of a view that is best for all markers that are placed, or both of a single one."""
+        known = self._known(view)
+        placed = [self._placed[self._seen.marker[s]] for s in known]
+        options = np.concatenate(
+            [self._squares[s] @ np.linalg.inv(pose) for s, pose in zip(known, placed, strict=True)]
+        )
+        if len(known) > 1:
+            misses = np.sum(
+                [self._misses(options @ pose, s) for s, pose in zip(known, placed, strict=True)], axis=0
+            )
+            corners = np.concatenate([_transformed(pose, _SQUARE) for pose in placed])
+            ideal = np.concatenate([self._ideal[s] for s in known])
+            options = _resected(options[int(np.argmin(misses))], corners, ideal)[None]
+        self._options[view] = options
+
+    def _place_next(self) -> int | None:
+        """Place the marker that most views with a pose see; None where there is none."""
+        support: dict[int, list[int]] = {}
+        for sighting, (view, marker) in enumerate(zip(self._seen.view, self._seen.marker, strict=True)):
+            if len(self._options[view]) and np.isnan(self._placed[marker, 0, 0]):
+                support.setdefault(int(marker), []).append(sighting)
+        if not support:
+            return None
+        marker = max(support, key=lambda one: len(support[one]))
+        options = {s: self._options[self._seen.view[s]] for s in support[marker]}
+        candidates = np.concatenate(
+            [
+                (np.linalg.inv(poses)[:, None] @ self._squares[s]).reshape(-1, 4, 4)
+                for s, poses in options.items()
+            ]
+        )
+        misses = [self._misses(poses[:, None] @ candidates, s).min(axis=0) for s, poses in options.items()]
+        self._placed[marker] = candidates[int(np.sum(misses, axis=0).argmin())]
+        return marker
+
+    def _is_clear(self, view: int) -> bool:
+        """Whether the first pose of a view with one marker fits much better than the second."""
+        (sighting,) = self._known(view)
+        first, second = self._misses(self._squares[sighting], sighting)
+        return bool(second > _CLEAR * first)
+
+
+def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4 4"]:
+    """Both poses of a square of side 1, the better first."""
+    cv2 = require_opencv()
+    _, turns, shifts, _ = cv2.solvePnPGeneric(
+        _SQUARE, ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    for pose, turn, shift in zip(poses, turns, shifts, strict=False):
+        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    return poses
+
+
+def _resected(
+    first: Float64[np.ndarray, "4 4"], points: Float64[np.ndarray, "P 3"], ideal: Float64[np.ndarray, "P 2"]
+) -> Float64[np.ndarray, "4 4"]:
+    """The camera with the least squares for points, from a first one."""
+    cv2 = require_opencv()
+    turn, shift = cv2.solvePnPRefineLM(
+        points, ideal[:, None].copy(), np.eye(3), None, cv2.Rodrigues(first[:3, :3])[0], first[:3, 3:].copy()
+    )
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    return pose
+
+
+def _ideal(lens: Lens, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, "P 2"]:
+    """Ideal points that a lens sees at pixels, by fixed-point iteration."""
+    ideal = (pixels - np.array(lens.center_px)) / np.array(lens.focal_px)
+    for _ in range(20 if any(lens.radial) or any(lens.tangential) else 0):
+        ideal = ideal + (pixels - lens.pixels_of(ideal)) / np.array(lens.focal_px)
+    return ideal
+
+
+# Bundle adjustment.
+
+
+def _adjust(
+    found: _Map,
+    seen: _Seen,
+    free: Bool[np.ndarray, " L"],
+    same_size: bool = False,
+    steps: int = 60,
+) -> tuple[_Map, Bool[np.ndarray, " S"]]:
+    """The map that explains most sightings, and which these are."""
+    usable = _usable(found, seen)
+    found = _solve(found, seen.part(usable), free, same_size, loss="soft_l1", steps=steps)
+    misses = np.full(len(usable), np.inf)
+    misses[usable] = _rms(found.errors(seen.part(usable)))
+    kept = misses < max(_OUTLIER_PX, _OUTLIER_FACTOR * float(np.median(misses[usable])))
+    return _solve(found, seen.part(kept), free, same_size, steps=steps), kept
+
+
+def _solve(
+    found: _Map,
+    seen: _Seen,
+    free: Bool[np.ndarray, " L"],
+    same_size: bool,
+    loss: str = "linear",
+    steps: int = 60,
+    bent: bool = False,
+) -> _Map:
+    """Least squares over the views and markers of the sightings, and over lenses that are free.
+
+    Columns are 6 for each view and 7 for each marker (a rotation vector, a shift, the logarithm of the size) and 3 for
+    each lens (the logarithm of the focal length, k1, k2); what is fixed has no column.
+    """
+    from scipy.optimize import least_squares
+    from scipy.sparse import csr_matrix
+    from scipy.spatial.transform import Rotation
+
+    views, markers = np.unique(seen.view), np.unique(seen.marker)
+    reference = markers[np.bincount(seen.marker)[markers].argmax()]  # holds the world in place
+    count = (len(found.camera_from_world), len(found.world_from_marker), len(found.lenses))
+    columns = [np.full((count[0], 6), -1), np.full((count[1], 7), -1), np.full((count[2], 3), -1)]
+    columns[0][views] = 0
+    columns[1][np.setdiff1d(markers, [reference]), : 6 if same_size else 7] = 0
+    columns[2][free, : 3 if bent else 1] = 0
+    total = 0
+    for block in columns:
+        block[block == 0] = np.arange(total, total + (block == 0).sum())
+        total += int((block >= 0).sum())
+
+    def state(values: np.ndarray) -> _Map:
+        """The map after steps from where it was."""
+        step = [np.where(block < 0, 0.0, np.append(values, 0.0)[block]) for block in columns]
+        cameras, placed = found.camera_from_world.copy(), found.world_from_marker.copy()
+        for transforms, by in ((cameras, step[0]), (placed, step[1])):
+            transforms[:, :3, :3] = Rotation.from_rotvec(by[:, :3]).as_matrix() @ transforms[:, :3, :3]
+            transforms[:, :3, 3] += by[:, 3:6]
+        lenses = tuple(
+            replace(
+                lens,
+                focal_px=(lens.focal_px[0] * float(np.exp(by[0])), lens.focal_px[1] * float(np.exp(by[0]))),
+                distortion=(
+                    lens.distortion[0] + float(by[1]),
+                    lens.distortion[1] + float(by[2]),
+                    *lens.distortion[2:],
+                ),
+            )
+            if is_free
+            else lens
+            for lens, by, is_free in zip(found.lenses, step[2], free, strict=True)
+        )
+        return _Map(cameras, placed, found.sizes * np.exp(step[1][:, 6]), lenses)
+
+    where = [columns[0][seen.view], columns[1][seen.marker], columns[2][seen.sensor[seen.view]]]
+    column = np.concatenate(where, axis=1)[:, None].repeat(8, axis=1)
+    row = np.arange(8 * len(seen.view)).reshape(-1, 8, 1).repeat(16, axis=2)
+    is_free = column >= 0
+
+    def slopes(values: np.ndarray) -> Any:
+        parts = _slopes(state(values), seen, values, columns)
+        return csr_matrix(
+            (parts[is_free], (row[is_free], column[is_free])), shape=(8 * len(seen.view), total)
+        )
+
+    result = least_squares(
+        lambda values: state(values).errors(seen).ravel(),
+        np.zeros(total),
+        jac=slopes,  # type: ignore[arg-type]
+        loss=loss,
+        x_scale="jac",
+        tr_solver="lsmr",
+        max_nfev=steps,
+    )
+    return state(result.x)
+
+
+def _slopes(
+    found: _Map, seen: _Seen, values: np.ndarray, columns: Sequence[np.ndarray]
+) -> Float64[np.ndarray, "S 8 16"]:
+    """Derivatives of the pixels of each sighting's corners by the columns of its view, marker and lens."""
+    padded = np.append(values, 0.0)
+    square = found.sizes[seen.marker, None, None] * _SQUARE
+    placed, camera = found.world_from_marker[seen.marker], found.camera_from_world[seen.view]
+    turned = _transformed(placed, square) - placed[:, None, :3, 3]
+    world = turned + placed[:, None, :3, 3]
+    swung = world @ camera[:, :3, :3].transpose(0, 2, 1)
+    local = swung + camera[:, None, :3, 3]
+    view_turn = np.where(columns[0] < 0, 0.0, padded[columns[0]])[seen.view, :3]
+    marker_turn = np.where(columns[1] < 0, 0.0, padded[columns[1]])[seen.marker, :3]
+    by_local, by_lens = _lens_slopes(local, seen, found.lenses)
+    into_camera = camera[:, None, :3, :3]
+    by_view = np.concatenate(
+        [-_cross(swung) @ _left(view_turn)[:, None], np.eye(3) + 0 * _cross(swung)], axis=-1
+    )
+    by_marker = np.concatenate(
+        [-_cross(turned) @ _left(marker_turn)[:, None], np.eye(3) + 0 * _cross(turned), turned[..., None]],
+        axis=-1,
+    )
+    parts = [by_local @ by_view, by_local @ (into_camera @ by_marker), by_lens]
+    return np.concatenate(parts, axis=-1).reshape(len(seen.view), 8, 16)
+
+
+def _cross(vectors: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """Matrices that take the cross product with vectors from the left."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _left(turns: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
+    """How rotation vectors turn further with a small step of theirs (the left Jacobian of SO(3))."""
+    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
+    cross = _cross(turns)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + first * cross + second * cross @ cross
+
+
+def _lens_slopes(
+    local: Float64[np.ndarray, "S 4 3"], seen: _Seen, lenses: Sequence[Lens]
+) -> tuple[Float64[np.ndarray, "S 4 2 3"], Float64[np.ndarray, "S 4 2 3"]]:
+    """Derivatives of pixels by the point before the camera, and by log f, k1, k2; tangential terms left out."""
+    sensor = seen.sensor[seen.view]
+    focal = np.array([lens.focal_px for lens in lenses])[sensor][:, None]
+    radial = np.array([lens.radial for lens in lenses])[sensor]
+    depth = local[..., 2:]
+    ideal = local[..., :2] / depth
+    squared = (ideal**2).sum(axis=-1)
+    powers = squared[..., None] ** np.arange(1, 5)
+    grown = 1.0 + (powers * radial[:, None]).sum(axis=-1)
+    growth = (np.arange(1, 5) * squared[..., None] ** np.arange(4) * radial[:, None]).sum(axis=-1)
+    by_ideal = grown[..., None, None] * np.eye(2) + 2 * growth[..., None, None] * (
+        ideal[..., :, None] * ideal[..., None, :]
+    )
+    by_point = np.concatenate([np.eye(2) + 0 * by_ideal, -ideal[..., None]], axis=-1) / depth[..., None]
+    by_lens = np.stack([ideal * grown[..., None], ideal * powers[..., :1], ideal * powers[..., 1:2]], axis=-1)
+    return focal[..., None] * (by_ideal @ by_point), focal[..., None] * by_lens
+
+
+def _with_distortion(found: _Map, seen: _Seen, free: Bool[np.ndarray, " L"]) -> _Map:
+    """The map with k1 and k2 estimated too, where that is better."""
+    if not free.any():
+        return found
+    bent = _solve(found, seen, free, same_size=True, bent=True)
+    before, after = (float(np.sqrt(np.mean(one.errors(seen) ** 2))) for one in (found, bent))
+    return bent if after < (1.0 - _GAIN) * before else found
+
+
+def _pixels(
+    local: Float64[np.ndarray, "S 4 3"], seen: _Seen, lenses: Sequence[Lens]
+) -> Float64[np.ndarray, "S 4 2"]:
+    """Where lenses see points; points behind the camera are taken far off the picture."""
+    ideal = local[..., :2] / np.maximum(local[..., 2:], 1e-3)
+    pixels = np.empty_like(ideal)
+    sensor = seen.sensor[seen.view]
+    for index, lens in enumerate(lenses):
+        pixels[sensor == index] = lens.pixels_of(ideal[sensor == index].reshape(-1, 2)).reshape(-1, 4, 2)
+    return pixels
+
+
+def _transformed(
+    transforms: _Transforms, points: Float64[np.ndarray, "*n P 3"]
+) -> Float64[np.ndarray, "*n P 3"]:
+    return points @ np.swapaxes(transforms[..., :3, :3], -1, -2) + transforms[..., None, :3, 3]
+
+
+def _rms(errors: Float64[np.ndarray, "S 4 2"]) -> Float64[np.ndarray, " S"]:
+    """Root mean square distance of each sighting's corners."""
+    return np.sqrt((errors**2).sum(axis=-1).mean(axis=-1))
+
+
+# What is refused, and the result.
+
+
+def _refuse_several_sizes(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]) -> None:
+    markers = np.flatnonzero(np.bincount(seen.marker[kept], minlength=len(seen.numbers)) > 1)
+    relative = found.sizes[markers] / np.median(found.sizes[markers])
+    odd = np.abs(relative - 1.0) > _SIZE_TOLERANCE
+    if odd.any():
+        each = [f"{seen.numbers[markers[i]]} ({relative[i]:.2f})" for i in np.flatnonzero(odd)]
+        raise CaptureError(
+            f"markers have several sizes: over the usual one, {name_some(each)}; expected all to have the side that "
+            "--marker-size gives: cover the others, or print them in another --marker-family"
+        )
+
+
+def _refuse_moved(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]) -> None:
+    usable = _usable(found, seen)
+    misses, lost = _rms(found.errors(seen.part(usable))), ~kept[usable]
+    diagonal = max(float(np.hypot(lens.width, lens.height)) for lens in found.lenses)
+    typical, limit = float(np.median(misses)), max(_MOST_OFF_PX, _MOST_OFF * diagonal)
+    if typical <= limit and lost.mean() <= _MOST_LEFT_OUT:
+        return
+    found_is = f"corners are off by {typical:.2g} px in the median (at most {limit:.2g} is expected)"
+    if typical <= limit:
+        count = len(seen.numbers)
+        share = np.bincount(seen.marker[usable & ~kept], minlength=count)
+        share = share / np.maximum(np.bincount(seen.marker[usable], minlength=count), 1)
+        numbers = [str(seen.numbers[index]) for index in np.argsort(-share) if share[index] > _MOST_LEFT_OUT]
+        found_is = (
+            f"{lost.mean():.0%} of the sightings are off, by {np.median(misses[lost]):.3g} px in the median, most of "
+            f"them of the markers {name_some(numbers)}"
+        )
+    raise CaptureError(
+        f"markers did not keep their places: {found_is}; expected boards that are fixed to each other and to the "
+        "object: cover those of one board, or print them in another --marker-family; if none moved, the lens bends "
+        "more than k1 and k2 can say"
+    )
+
+
+def _pose_set(
+    found: _Map,
+    seen: _Seen,
+    kept: Bool[np.ndarray, " S"],
+    sightings: Sightings,
+    marker_size: float | None,
+    free: Bool[np.ndarray, " L"],
+) -> PoseSet:
+    """Cameras in the world that stands on the markers, those without enough markers named."""
+    views = np.unique(seen.view[kept])
+    markers = np.unique(seen.marker[kept])
+    corners = _transformed(found.world_from_marker[markers], np.broadcast_to(_SQUARE, (len(markers), 4, 3)))
+    to_board, up, how_up = stand_on_markers(corners, marker_size or 1.0)
+    cameras = {}
+    for view in views:
+        pose = np.linalg.inv(found.camera_from_world[view])
+        position = to_board.to_scene(pose[:3, 3])
+        matrix = np.column_stack([to_board.rotation @ pose[:3, :3] @ FLIP, position])
+        cameras[seen.views[view]] = PosedCamera(matrix, found.lenses[seen.sensor[view]])
+    error = float(np.sqrt(np.mean(_rms(found.errors(seen.part(kept))) ** 2)))
+    notes = []
+    notes.append(
+        f"markers gave poses of {len(cameras)} of {len(sightings)} views: {counted(len(markers), 'marker')} in "
+        f"{len(seen.view[kept])} sightings, corners off by {error:.2f} px (root mean square)"
+    )
+    if missing := [name for name in sightings if name not in cameras]:
+        notes.append(f"views without enough markers: {name_some(missing)}")
+    if left := int((~kept).sum()):
+        notes.append(f"{counted(left, 'sighting')} of markers left out as not fitting the others")
+    focal = ", ".join(
+        f"{lens.focal_px[0]:.1f}" for lens, is_free in zip(found.lenses, free, strict=True) if is_free
+    )
+    notes += [f"focal length estimated from the markers: {focal} px"] if focal else []
+    notes.append(how_up)
+    notes.append(_how_large(marker_size))
+    return PoseSet(
+        dict(sorted(cameras.items())),
+        "markers in the pictures",
+        to_board.to_scene(corners.reshape(-1, 3)),
+        up=up,
+        has_world=marker_size is not None,
+        notes=tuple(notes),
+    )
+
+
+def _how_large(marker_size: float | None) -> str:
+    if marker_size is None:
+        return "there is no scale: give --marker-size for exports in metres"
+    return f"the scale is that of markers with sides of {marker_size:g} m"
+
+
+def stand_on_markers(
+    corners: Float64[np.ndarray, "M 4 3"], marker_size: float
+) -> tuple[Placement, Float64[np.ndarray, "3"] | None, str]:
+    """The way to the world that stands on the markers, in which their sides have a length.
+
+    Returns:
+        The way; up in that world, None where no two markers lie in a plane; and how up was found.
+    """
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    normals = np.cross(corners[:, 1] - corners[:, 2], corners[:, 0] - corners[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    alike = normals @ normals.T > _ONE_PLANE
+    group = alike[int(alike.sum(axis=1).argmax())]
+    points = corners[group].reshape(-1, 3)
+    up = normals[group].mean(axis=0)
+    flat = np.linalg.svd(points - points.mean(axis=0))[2][2]
+    flat *= np.sign(flat @ up)
+    up = flat if flat @ up > _ONE_PLANE * np.linalg.norm(up) else up / np.linalg.norm(up)
+    across = corners[group][0, 1] - corners[group][0, 0]
+    x = across - (across @ up) * up
+    x /= np.linalg.norm(x)
+    rotation = np.stack([x, np.cross(up, x), up])
+    way = Placement(rotation, -rotation @ points.mean(axis=0), marker_size / float(np.median(sides)))
+    if group.sum() < 2 <= len(corners):
+        return way, None, "no two markers lie in one plane, so they do not tell up"
+    return (
+        way,
+        np.array([0.0, 0.0, 1.0]),
+        f"up is square to the plane of {counted(int(group.sum()), 'marker')}",
+    )
+
+
+def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> PoseSet:
+    """Poses that were found without markers, in the world that stands on the markers in view.
+
+    Raises:
+        CaptureError: no marker is seen by two cameras that agree on where it is.
+    """
+    views_of: dict[int, list[tuple[PosedCamera, np.ndarray]]] = {}
+    for name, markers in sightings.items():
+        camera = poses.cameras.get(name)
+        if camera is not None and camera.lens is not None:
+            for number, pixels in markers.items():
+                views_of.setdefault(number, []).append((camera, pixels))
+    located = [_located(those) for those in views_of.values() if len(those) > 1]
+    corners = [found for found in located if found is not None]
+    if not corners:
+        raise CaptureError(
+            f"--marker-size: {counted(len(views_of), 'marker')} in the views, none of them seen by two cameras that "
+            "agree; expected the same marker, sharp, in two views or more: leave --marker-size out, or take it into "
+            "more pictures"
+        )
+    way, up, how_up = stand_on_markers(np.stack(corners), marker_size)
+    cameras = {}
+    for name, camera in poses.cameras.items():
+        pose = camera.camera_to_world
+        moved = np.column_stack([way.rotation @ pose[:, :3], way.to_scene(pose[:, 3])])
+        cameras[name] = replace(camera, camera_to_world=moved)
+    return replace(
+        poses,
+        cameras=cameras,
+        points=None if poses.points is None else way.to_scene(poses.points),
+        up=up,
+        has_world=True,
+        notes=(*poses.notes, how_up, _how_large(marker_size)),
+    )
+
+
+def _located(
+    seen: Sequence[tuple[PosedCamera, Float64[np.ndarray, "4 2"]]],
+) -> Float64[np.ndarray, "4 3"] | None:
+    """Corners where rays of cameras meet, None where they don't; cameras that disagree are left out."""
+    left = list(seen)
+    while len(left) > 1:
+        table, wanted = np.zeros((4, 3, 3)), np.zeros((4, 3))
+        for camera, pixels in left:
+            assert camera.lens is not None
+            pose = camera.camera_to_world
+            ideal = _ideal(camera.lens, pixels)
+            rays = np.column_stack([ideal, np.ones(4)]) @ FLIP @ pose[:, :3].T
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            across = np.eye(3) - rays[:, :, None] * rays[:, None]
+            table = table + across
+            wanted = wanted + across @ pose[:, 3]
+        points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
+        misses = [_rms((camera.pixels_of(points) - pixels)[None])[0] for camera, pixels in left]
+        if max(misses) < 2.0 * _OUTLIER_PX:
+            return points
+        left.pop(int(np.argmax(np.nan_to_num(misses, nan=np.inf))))
+    return None

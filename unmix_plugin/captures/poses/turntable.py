@@ -1,0 +1,713 @@
+"""Poses of an object that was turned in known steps before a camera that stood still.
+
+One axis explains all views, so few numbers are unknown: how the camera is turned against the axis, its focal length,
+and for each further place of the camera where it stood. They follow from two kinds of evidence. Matched points of two
+views lie on each other's epipolar lines. And where an epipolar plane touches the object, both outlines touch it: the
+tangents from the epipoles to the convex hulls of two silhouettes correspond (Wong and Cipolla 2001), whether the object
+has texture or not.
+
+The world has the axis as +z; the first camera is 1 away from the axis, at height 0.
+
+Notation: `N` views, `V` corners of a hull, `Q` pairs of views, `F` matches. Camera axes are OpenCV's here, +x right,
++y down, +z forward.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int, UInt8
+
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.marker_detection import require_opencv
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, name_some
+from unmix_plugin.errors import CaptureError, ConfigError
+
+_LEAST_VIEWS = 3
+"""Of each place of the camera."""
+_MOST_MATCHED_DEG, _MOST_TOUCHED_DEG = 30.0, 130.0
+"""Between views whose points, and whose outlines, are compared."""
+_RIM_PX = 4
+"""Beside the edge of a mask, where features are those of the silhouette and not of the surface."""
+_RATIO = 0.8
+"""Of the nearest to the second nearest descriptor (Lowe 2004)."""
+_MOST_FEATURES, _ENLARGED_PX = 2000, 600
+"""Of a picture; ones with a shorter longer side are doubled first."""
+_STILL_PX = 2.0
+"""Matches of views that moved less stand still as the object turns: stains, noise, the background."""
+_LEAST_PART = 0.02
+"""Of the matter of a view: smaller parts of its mask are specks."""
+_SCALE_PX = 1.0
+"""Errors beyond count less and less."""
+_RIM_PRIOR = 1.0
+"""Comparisons of outlines that say that a mask is neither too wide nor too narrow."""
+_MOST_ROUGH = (800, 300)
+_MOST_FINE = (4000, 2000)
+"""Matches and pairs of outlines that are used to begin with, and in the end."""
+_SLACK_DEG = 0.5
+"""By which angles may be wrong, about, where pictures say so."""
+_GAIN, _SLACK_GAIN = 0.02, 0.05
+"""Part of the error that distortion, and other angles, have to remove to be kept."""
+_LEAST_MATCHES, _LEAST_FIT, _MOST_ALIKE = 30, 0.3, 0.98
+"""With fewer matches that fit, or a smaller share, silhouettes have to tell; they can't if they overlap by so much."""
+_FITS_PX, _MOST_OFF = 2.0, 0.005
+"""Errors of matches that fit; upper quartile of those of outlines, over the diagonal, from which angles are refused."""
+_ENOUGH_MATCHES, _ENOUGH_FIT = 300, 0.5
+"""So many matches that fit, and such a share, are right whatever the outlines say."""
+_NOT_COMPARED_PX = 2.0
+"""What outlines count that can't be compared in the pose that is tried."""
+_LEAST_APART_DEG = 1.0
+"""Views of one place that differ by less tell nothing."""
+_GREATEST_BEND = 0.1
+"""Of half the diagonal: what distortion may move the corner of a picture by."""
+_PITCH, _AZIMUTH = 1, 4
+"""Columns of a place of the camera."""
+_FOCAL_FACTORS = (1.2, 2.0, 3.5, 7.0)
+_PITCHES_DEG = (0.0, 8.0, 16.0, 24.0, 32.0, 40.0, 48.0, 56.0, 64.0, 72.0)
+"""How far the camera may look down, to begin with."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """How a view was taken."""
+
+    angle_deg: float
+    """By which the object was turned."""
+    camera: int = 0
+    """Which of the places of the camera it was taken from."""
+
+
+def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
+    """Angles of views as a user gives them.
+
+    Args:
+        text: START:STOP:STEP in degrees without the end, one for each place of the camera, with commas between; or a
+            CSV file with columns view, angle and, if there are several places, camera.
+        names: Of the views, in their order.
+    Raises:
+        ConfigError: it is neither, or there are not as many angles as views.
+
+    >>> parse_angles("0:360:120", ["a", "b", "c"])["b"]
+    Turn(angle_deg=120.0, camera=0)
+    """
+    if Path(text).suffix.lower() == ".csv" or Path(text).is_file():
+        return _read_angles(Path(text), names)
+    turns: list[Turn] = []
+    for camera, part in enumerate(text.split(",")):
+        try:
+            start, stop, step = (float(number) for number in part.split(":"))
+            count = int(np.ceil((stop - start) / step - 1e-9))
+        except (ValueError, ZeroDivisionError, OverflowError) as error:
+            raise ConfigError(
+                f"--angles {text}: expected START:STOP:STEP in degrees, such as 0:360:10, or a CSV file with the "
+                "columns view and angle"
+            ) from error
+        turns += [Turn(start + index * step, camera) for index in range(max(count, 0))]
+    if len(turns) != len(names):
+        raise ConfigError(
+            f"--angles {text} gives {len(turns)} angles (the end of a range is none of them) for {len(names)} views; "
+            "expected one a view: give other steps, or a CSV file with the columns view and angle"
+        )
+    return dict(zip(names, turns, strict=True))
+
+
+def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"--angles {path}: it can't be read ({error}); give a CSV file") from error
+    found: dict[str, Turn] = {}
+    places: dict[str, int] = {}
+    for line, row in enumerate(rows, start=2):
+        try:
+            name, angle = (row["view"] or "").strip(), float(row["angle"])
+            if not np.isfinite(angle):
+                raise ValueError
+        except (KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"--angles {path}, line {line}: expected the columns view and angle (degrees), and camera if it stood "
+                "in several places"
+            ) from error
+        key = name if name in names else Path(name).stem
+        found[key] = Turn(angle, places.setdefault((row.get("camera") or "").strip(), len(places)))
+    missing, unknown = [n for n in names if n not in found], [n for n in found if n not in names]
+    if missing or unknown:
+        lacking = f"no angle for {name_some(missing)}; " if missing else ""
+        other = f"no view is called {name_some(unknown)}; " if unknown else ""
+        raise ConfigError(
+            f"--angles {path} has {len(found)} angles for {len(names)} views: {lacking}{other}expected one a view"
+        )
+    return found
+
+
+def poses_from_turntable(
+    pictures: Mapping[str, UInt8[np.ndarray, "H W"]],
+    turns: Mapping[str, Turn],
+    masks: Mapping[str, Bool[np.ndarray, "H W"]] | None = None,
+) -> PoseSet:
+    """Where the camera was, as seen from the object.
+
+    Args:
+        pictures: By the name of the view, all of one size; with high contrast.
+        turns: Of each view. The sense is found, by which cameras look down and not up.
+        masks: True on the object; None where it is not known.
+    Raises:
+        CaptureError: OpenCV is not installed, the views are alike or too few, or the angles do not explain them.
+    """
+    cv2 = require_opencv()
+    names = sorted(pictures, key=lambda name: (turns[name].camera, name))
+    _refuse_few(turns)
+    evidence = _gather(
+        cv2,
+        [pictures[name] for name in names],
+        [turns[name] for name in names],
+        None if masks is None else [masks[name] for name in names],
+    )
+    _refuse_alike(evidence, len(evidence.first))
+    fitted = _fit(evidence)
+    _refuse_unexplained(fitted, evidence)
+    return _pose_set(fitted, evidence, names)
+
+
+def _refuse_few(turns: Mapping[str, Turn]) -> None:
+    counts = np.bincount([turn.camera for turn in turns.values()])
+    if counts.min() < _LEAST_VIEWS:
+        raise CaptureError(
+            f"{counts.min()} views were taken from place {int(counts.argmin()) + 1} of the camera; expected at least "
+            f"{_LEAST_VIEWS} of each: leave it out, or give its views the place that they were taken from"
+        )
+
+
+# Evidence.
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What pictures tell of the cameras."""
+
+    angle: Float64[np.ndarray, " N"]
+    """Radians."""
+    camera: Int[np.ndarray, " N"]
+    """Which place it stood in."""
+    size: tuple[int, int]
+    """Width, height."""
+    first: Int[np.ndarray, " F"]
+    second: Int[np.ndarray, " F"]
+    """Views of each match."""
+    points: Float64[np.ndarray, "F 2 2"]
+    """In both, pixels."""
+    hulls: Float64[np.ndarray, "N V 2"]
+    """Corners, the last one repeated; no corners where masks are not known."""
+    touched: Int[np.ndarray, "Q 2"]
+    """Pairs of views whose outlines are compared."""
+    likeness: float
+    """Mean overlap of silhouettes with what most views of their place show, intersection over union."""
+
+    def part(self, views: Bool[np.ndarray, " N"]) -> _Evidence:
+        """That between some views alone; the numbers of views stay."""
+        keep = views[self.first] & views[self.second]
+        touched = self.touched[views[self.touched].all(axis=1)]
+        return replace(
+            self, first=self.first[keep], second=self.second[keep], points=self.points[keep], touched=touched
+        )
+
+    def thinned(self, most: tuple[int, int]) -> _Evidence:
+        """At most so many matches and pairs of outlines, drawn at random."""
+        generator = np.random.default_rng(0)
+        keep, pairs = (
+            np.sort(generator.permutation(count)[:limit])
+            for count, limit in zip((len(self.first), len(self.touched)), most, strict=True)
+        )
+        return replace(
+            self,
+            first=self.first[keep],
+            second=self.second[keep],
+            points=self.points[keep],
+            touched=self.touched[pairs],
+        )
+
+
+def _gather(
+    cv2: Any,
+    pictures: Sequence[UInt8[np.ndarray, "H W"]],
+    turns: Sequence[Turn],
+    masks: Sequence[Bool[np.ndarray, "H W"]] | None,
+) -> _Evidence:
+    height, width = pictures[0].shape
+    angle = np.radians([turn.angle_deg for turn in turns])
+    camera = np.array([turn.camera for turn in turns])
+    features = [
+        _features(cv2, picture, None if masks is None else masks[index])
+        for index, picture in enumerate(pictures)
+    ]
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    first, second, touched = [], [], []
+    points = [np.zeros((0, 2, 2))]
+    for i, j in combinations(range(len(pictures)), 2):
+        apart = np.degrees(abs(np.angle(np.exp(1j * (angle[i] - angle[j])))))
+        if camera[i] == camera[j] and apart < _LEAST_APART_DEG:
+            continue
+        if masks is not None and apart <= _MOST_TOUCHED_DEG:
+            touched.append((i, j))
+        if apart <= _MOST_MATCHED_DEG:
+            points.append(_matches(matcher, features[i], features[j]))
+            first += [i] * len(points[-1])
+            second += [j] * len(points[-1])
+    return _Evidence(
+        angle,
+        camera,
+        (width, height),
+        np.array(first, np.int64),
+        np.array(second, np.int64),
+        np.concatenate(points),
+        np.zeros((len(pictures), 0, 2)) if masks is None else _hulls(cv2, masks),
+        np.array(touched, np.int64).reshape(-1, 2),
+        1.0 if masks is None else _likeness(np.stack(masks), camera),
+    )
+
+
+def _features(
+    cv2: Any, picture: UInt8[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"] | None
+) -> tuple[Float64[np.ndarray, "K 2"], Any]:
+    """Where a picture has features, and their descriptors."""
+    from scipy.ndimage import binary_erosion
+
+    factor = 2 if max(picture.shape) < _ENLARGED_PX else 1
+    enlarged = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+    shown = None
+    if mask is not None:
+        inner = 255 * binary_erosion(mask, iterations=_RIM_PX).astype(np.uint8)
+        shown = inner.repeat(factor, axis=0).repeat(factor, axis=1)
+    found, descriptors = cv2.SIFT_create(nfeatures=_MOST_FEATURES).detectAndCompute(enlarged, shown)
+    return (np.array([key.pt for key in found]).reshape(-1, 2) + 0.5) / factor, descriptors
+
+
+def _matches(
+    matcher: Any, one: tuple[np.ndarray, Any], other: tuple[np.ndarray, Any]
+) -> Float64[np.ndarray, "F 2 2"]:
+    """Points that are each other's nearest, by far, and that moved."""
+    if one[1] is None or other[1] is None or min(len(one[0]), len(other[0])) < 2:
+        return np.zeros((0, 2, 2))
+    near = [a for a, b in matcher.knnMatch(one[1], other[1], k=2) if a.distance < _RATIO * b.distance]
+    back = {found.queryIdx: found.trainIdx for found in matcher.match(other[1], one[1])}
+    mutual = [(a.queryIdx, a.trainIdx) for a in near if back.get(a.trainIdx) == a.queryIdx]
+    pairs = np.array([(one[0][i], other[0][j]) for i, j in mutual]).reshape(-1, 2, 2)
+    return pairs[np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) > _STILL_PX]
+
+
+def _hulls(cv2: Any, masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float64[np.ndarray, "N V 2"]:
+    """Convex hulls of silhouettes without specks."""
+    from scipy.ndimage import label
+
+    found = []
+    around = np.array([[np.cos(turn), np.sin(turn)] for turn in np.arange(8) * np.pi / 4], np.float32)
+    for mask in masks:
+        parts, count = label(mask)  # type: ignore[misc]
+        sizes = np.bincount(parts.ravel(), minlength=count + 1)
+        sizes[0] = 0
+        rows, columns = np.nonzero((sizes > _LEAST_PART * sizes.sum())[parts])
+        middles = np.column_stack([columns, rows]).astype(np.float32) + 0.5
+        if not len(middles):
+            middles = np.array([mask.shape[::-1]], np.float32) / 2
+        # Outlines run half a pixel outside the middles of the outermost pixels.
+        hull = (cv2.convexHull(middles)[:, 0][:, None] + 0.5 * around).reshape(-1, 2)
+        found.append(cv2.convexHull(hull)[:, 0].astype(np.float64))
+    longest = max(map(len, found))
+    return np.stack(
+        [np.concatenate([hull, np.repeat(hull[-1:], longest - len(hull), axis=0)]) for hull in found]
+    )
+
+
+def _likeness(masks: Bool[np.ndarray, "N H W"], camera: Int[np.ndarray, " N"]) -> float:
+    overlaps = []
+    for place in np.unique(camera):
+        own = masks[camera == place]
+        usual = own.mean(axis=0) >= 0.5
+        both, either = (own & usual).sum(axis=(1, 2)), (own | usual).sum(axis=(1, 2))
+        overlaps.append(both / np.maximum(either, 1))
+    return float(np.concatenate(overlaps).mean())
+
+
+# Cameras from few numbers, and what of the evidence they leave unexplained.
+
+
+_Poses: TypeAlias = tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]
+"""Axes of cameras in the world, as columns, and where they stand."""
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """What is unknown. Angles in radians."""
+
+    focal_px: float
+    sense: float
+    """1 where the object turns against the clock as seen from above, -1 with it."""
+    cameras: Float64[np.ndarray, "C 6"]
+    """Of each place: yaw, pitch and roll, logarithm of the distance from the axis, azimuth, height."""
+    slack: Float64[np.ndarray, " N"]
+    """To add to the angles."""
+    k1: float = 0.0
+
+    def poses(self, evidence: _Evidence) -> _Poses:
+        """Axes of all cameras in the world, as columns, and where they stand."""
+        from scipy.spatial.transform import Rotation
+
+        yaw, pitch, roll, distance, azimuth, height = self.cameras[evidence.camera].T
+        inward = np.array(
+            [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
+        )  # at azimuth 0, towards the axis
+        turned = Rotation.from_euler("yxz", np.column_stack([yaw, -pitch, roll])).as_matrix()
+        about = azimuth - self.sense * (evidence.angle + self.slack)
+        swing = Rotation.from_euler("z", about[:, None]).as_matrix()
+        reach = np.exp(distance)
+        places = np.column_stack([reach * np.cos(about), reach * np.sin(about), height])
+        return swing @ inward @ turned, places
+
+    def ideal(
+        self, pixels: Float64[np.ndarray, "*n 2"], size: tuple[int, int]
+    ) -> Float64[np.ndarray, "*n 3"]:
+        """Directions of pixels before the camera, 1 forward."""
+        bent = (pixels - np.array(size) / 2) / self.focal_px
+        ideal = bent
+        for _ in range(4 if self.k1 else 0):
+            ideal = bent / (1.0 + self.k1 * (ideal**2).sum(axis=-1, keepdims=True))
+        return np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
+
+    def errors(
+        self, evidence: _Evidence, ahead: float = 0.0, rims: bool = True
+    ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, "Q 4"]]:
+        """Distances of matched points from epipolar lines, and of outlines from tangents, pixels.
+
+        Args:
+            ahead: By how much further the first view of each pair was turned.
+            rims: Whether what comes of masks that are too wide or too narrow is taken off.
+        """
+        second = self.poses(evidence)
+        first = replace(self, slack=self.slack + ahead).poses(evidence) if ahead else second
+        return (
+            self.focal_px * _epipolar(self.ideal(evidence.points, evidence.size), evidence, first, second),
+            _tangential(self, evidence, first, second, rims),
+        )
+
+    def cost(self, evidence: _Evidence) -> float:
+        """Mean of the robust errors."""
+        errors = np.concatenate([part.ravel() for part in self.errors(evidence)])
+        return float(np.mean(np.log1p((errors / _SCALE_PX) ** 2)))
+
+
+def _essential(first: _Poses, second: _Poses) -> Float64[np.ndarray, "P 3 3"]:
+    """Matrices that take directions in the first views to their epipolar lines in the second."""
+    into = second[0].transpose(0, 2, 1)
+    x, y, z = (into @ (first[1] - second[1])[..., None])[..., 0].T
+    cross = np.zeros((len(x), 3, 3))
+    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
+    return (cross - cross.transpose(0, 2, 1)) @ into @ first[0]
+
+
+def _epipolar(
+    ideal: Float64[np.ndarray, "F 2 3"], evidence: _Evidence, first: _Poses, second: _Poses
+) -> Float64[np.ndarray, " F"]:
+    """Distances of matched points from each other's epipolar lines, over the focal length (Sampson 1982)."""
+    i, j = evidence.first, evidence.second
+    essential = _essential((first[0][i], first[1][i]), (second[0][j], second[1][j]))
+    there = (essential @ ideal[:, 0, :, None])[..., 0]
+    back = (essential.transpose(0, 2, 1) @ ideal[:, 1, :, None])[..., 0]
+    slope = np.sqrt((there[:, :2] ** 2).sum(axis=-1) + (back[:, :2] ** 2).sum(axis=-1))
+    return (there * ideal[:, 1]).sum(axis=-1) / np.maximum(slope, 1e-12)
+
+
+def _tangential(
+    numbers: _Numbers, evidence: _Evidence, first: _Poses, second: _Poses, rims: bool
+) -> Float64[np.ndarray, "Q 4"]:
+    """How far outlines reach beyond the tangents of the others, pixels; what can't be compared counts as off."""
+    if not len(evidence.touched):
+        return np.zeros((0, 4))
+    i, j = evidence.touched.T
+    essential = _essential((first[0][i], first[1][i]), (second[0][j], second[1][j]))
+    ideal = numbers.ideal(evidence.hulls, evidence.size)
+    middles = ((ideal.min(axis=1) + ideal.max(axis=1)) / 2)[:, None]
+    inside = np.asarray(
+        ((evidence.hulls > 1.0) & (evidence.hulls < np.array(evidence.size) - 1.0)).all(axis=-1)
+    )
+    ends_i, good_i = _touching(ideal, middles, i, first[0][i], second[1][j] - first[1][i])
+    ends_j, good_j = _touching(ideal, middles, j, second[0][j], first[1][i] - second[1][j])
+    touch_i, touch_j = ideal[i[:, None], ends_i], ideal[j[:, None], ends_j]
+    good_i, good_j = (
+        good_i[:, None] & inside[i[:, None], ends_i],
+        good_j[:, None] & inside[j[:, None], ends_j],
+    )
+    lines_j, lines_i = touch_i @ essential.transpose(0, 2, 1), touch_j @ essential
+
+    def beyond(lines: np.ndarray, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
+        """How far points lie outside of lines, as seen from the middle of a hull."""
+        length = np.maximum(np.hypot(lines[..., 0], lines[..., 1]), 1e-12)
+        return -np.sign((lines * middle).sum(axis=-1)) * (lines * points).sum(axis=-1) / length
+
+    # Which tangent belongs to which depends on the sides that the epipoles lie on.
+    either = [
+        (
+            beyond(lines_i[:, ::order], touch_i, middles[i]),
+            beyond(lines_j, touch_j[:, ::order], middles[j]),
+            order,
+        )
+        for order in (1, -1)
+    ]
+    size = [(np.abs(of_i) + np.abs(of_j)).sum(axis=1) for of_i, of_j, _ in either]
+    straight = (size[0] <= size[1])[:, None]
+    of_i, of_j = (np.where(straight, either[0][part], either[1][part]) for part in (0, 1))
+    good = good_i & np.where(straight, good_j, good_j[:, ::-1])
+    of_i, of_j = numbers.focal_px * of_i, numbers.focal_px * of_j
+    if rims:
+        of_i, of_j = _without_rims(of_i, of_j, good, evidence)
+    found = np.where(np.tile(good, 2), np.concatenate([of_i, of_j], axis=1), _NOT_COMPARED_PX)
+    return np.asarray(found)
+
+
+def _touching(
+    ideal: Float64[np.ndarray, "N V 3"],
+    middles: Float64[np.ndarray, "N 1 3"],
+    views: Int[np.ndarray, " Q"],
+    axes: Float64[np.ndarray, "Q 3 3"],
+    towards: Float64[np.ndarray, "Q 3"],
+) -> tuple[Int[np.ndarray, "Q 2"], Bool[np.ndarray, " Q"]]:
+    """Which corners of the views' hulls tangents from the epipoles touch, and whether these lie outside the hulls.
+
+    Args:
+        axes: Of the views.
+        towards: From them to the others.
+    """
+    epipole = (towards[:, None] @ axes)[:, 0]
+    depth = np.where(np.abs(epipole[:, 2]) < 1e-6, 1e-6, epipole[:, 2])
+    place = epipole[:, None, :2] / depth[:, None, None]
+    ahead, rays = middles[views, :, :2] - place, ideal[views, :, :2] - place
+    along = ahead[..., 0] * rays[..., 0] + ahead[..., 1] * rays[..., 1]
+    across = ahead[..., 0] * rays[..., 1] - ahead[..., 1] * rays[..., 0]
+    slope = across / np.where(along > 0, along, np.inf)
+    is_outside = np.asarray((along > 0).all(axis=1))
+    return np.stack([slope.argmin(axis=1), slope.argmax(axis=1)], axis=1), is_outside
+
+
+def _without_rims(
+    of_i: Float64[np.ndarray, "Q 2"],
+    of_j: Float64[np.ndarray, "Q 2"],
+    good: Bool[np.ndarray, "Q 2"],
+    evidence: _Evidence,
+) -> tuple[Float64[np.ndarray, "Q 2"], Float64[np.ndarray, "Q 2"]]:
+    """Distances less what comes of masks that are too wide or too narrow, each by a length of its own."""
+    i, j = evidence.touched.T
+    beyond = 0.5 * (of_i - of_j)
+    weights = good / (1.0 + (beyond / _SCALE_PX) ** 2)
+    weight, total = weights.sum(axis=1), (weights * beyond).sum(axis=1)
+    table, wanted = _RIM_PRIOR * np.eye(len(evidence.angle)), np.zeros(len(evidence.angle))
+    for rows, columns, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+        np.add.at(table, (rows, columns), sign * weight)
+    np.add.at(wanted, i, total)
+    np.add.at(wanted, j, -total)
+    rims = np.linalg.solve(table, wanted)
+    apart = (rims[i] - rims[j])[:, None]
+    return of_i - apart, of_j + apart
+
+
+# The fit.
+
+
+def _solve(
+    start: _Numbers,
+    evidence: _Evidence,
+    which: Sequence[int],
+    steps: int,
+    zoom: bool = True,
+    bent: bool = False,
+    slack: bool = False,
+) -> _Numbers:
+    """Least squares over places of the camera, the first of which holds the world in place.
+
+    Args:
+        which: Places that are free.
+        zoom, bent, slack: Whether the focal length, k1 and the angles are free too.
+    """
+    from scipy.optimize import least_squares
+
+    free = np.zeros(start.cameras.shape, bool)
+    free[list(which)] = True
+    free[which[0], 3:] = False
+    few = int(zoom) + int(bent) + int(free.sum())
+    size = np.concatenate([[0.1] * (int(zoom) + int(bent)), np.full(free.sum(), 0.05)])
+    views = len(start.slack) if slack else 0
+
+    def numbers_of(values: np.ndarray) -> _Numbers:
+        cameras, angles = start.cameras.copy(), start.slack.copy()
+        cameras[free] += values[int(zoom) + int(bent) : few]
+        angles[: len(values) - few] += values[few:]
+        focal = start.focal_px * float(np.exp(values[0])) if zoom else start.focal_px
+        return replace(
+            start,
+            focal_px=focal,
+            cameras=cameras,
+            slack=angles,
+            k1=start.k1 + (float(values[int(zoom)]) if bent else 0.0),
+        )
+
+    def flat(numbers: _Numbers, **changes: Any) -> np.ndarray:
+        return np.concatenate([part.ravel() for part in numbers.errors(evidence, **changes)])
+
+    def errors(values: np.ndarray) -> np.ndarray:
+        return np.append(flat(numbers_of(values)), values[few:] / np.radians(_SLACK_DEG))
+
+    def slopes(values: np.ndarray) -> np.ndarray:
+        """Differences; angles act through those of pairs alone, so that one more evaluation gives all of them."""
+        now = flat(numbers_of(values))
+        result = np.zeros((len(now) + views, few + views))
+        for column, length in enumerate(1e-4 * size):
+            result[: len(now), column] = (
+                flat(numbers_of(values + length * (np.arange(len(values)) == column))) - now
+            ) / length
+        if slack:
+            numbers = numbers_of(values)  # rims, which all pairs share, are taken to stay
+            by_turn = (flat(numbers, ahead=1e-5, rims=False) - flat(numbers, rims=False)) / 1e-5
+            rows = np.arange(len(now))
+            ends = np.concatenate(
+                [np.column_stack([evidence.first, evidence.second]), np.repeat(evidence.touched, 4, axis=0)]
+            )
+            result[rows, few + ends[:, 0]] = by_turn
+            result[rows, few + ends[:, 1]] = -by_turn
+            result[len(now) + np.arange(views), few + np.arange(views)] = 1.0 / np.radians(_SLACK_DEG)
+        return result
+
+    scales = np.append(size, np.full(views, 0.005))
+    found = least_squares(
+        errors,
+        np.zeros(len(scales)),
+        jac=slopes,  # type: ignore[arg-type]
+        x_scale=scales,
+        loss="cauchy",
+        f_scale=_SCALE_PX,
+        max_nfev=steps,
+    )
+    return numbers_of(found.x)
+
+
+def _fit(evidence: _Evidence) -> _Numbers:
+    """The numbers that explain the evidence best, from beginnings of many focal lengths and both senses."""
+    rough, fine = evidence.thinned(_MOST_ROUGH), evidence.thinned(_MOST_FINE)
+    longer, everyone = max(evidence.size), range(int(evidence.camera.max()) + 1)
+    ends = []
+    for sense in (1.0, -1.0):
+        begun = [_begin(rough, factor * longer, sense) for factor in _FOCAL_FACTORS]
+        begun.sort(key=lambda start: start.cost(rough))
+        tried = [_solve(start, rough, everyone, steps=15) for start in begun[:2]]
+        ends.append(min(tried, key=lambda found: found.cost(rough)))
+    # From far away, turning the other way and looking up from below gives the same outlines.
+    costs = [end.cost(rough) for end in ends]
+    looks_down = [float(end.cameras[:, 1].mean()) for end in ends]
+    if abs(costs[0] - costs[1]) < _GAIN * max(costs):
+        best = ends[int(np.argmax(looks_down))]
+    else:
+        best = ends[int(np.argmin(costs))]
+    best = _solve(best, fine, everyone, steps=40)
+    bent = _solve(best, fine, everyone, steps=20, bent=True)
+    if bent.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and abs(_bend(bent, evidence.size)) < _GREATEST_BEND:
+        best = bent
+    loose = _solve(best, fine, everyone, steps=20, bent=bool(best.k1), slack=True)
+    return loose if loose.cost(fine) < (1.0 - _SLACK_GAIN) * best.cost(fine) else best
+
+
+def _bend(numbers: _Numbers, size: tuple[int, int]) -> float:
+    """By how much of half the diagonal distortion moves the corners of a picture."""
+    return numbers.k1 * (np.hypot(*size) / 2 / numbers.focal_px) ** 2
+
+
+def _begin(evidence: _Evidence, focal_px: float, sense: float) -> _Numbers:
+    """All places of the camera at one distance from a point of the axis, each turned as its own views have it."""
+    count = int(evidence.camera.max()) + 1
+    start = _Numbers(focal_px, sense, np.zeros((count, 6)), np.zeros(len(evidence.angle)))
+
+    def best_of(camera: int, column: int, degrees: Sequence[float], those: _Evidence) -> None:
+        def cost(value: float) -> float:
+            start.cameras[camera, column] = value
+            return start.cost(those)
+
+        start.cameras[camera, column] = min(np.radians(degrees).tolist(), key=cost)
+
+    for camera in range(count):
+        own = evidence.part(evidence.camera == camera)
+        best_of(camera, _PITCH, _PITCHES_DEG, own)
+        start.cameras[camera, :3] = _solve(start, own, [camera], steps=8, zoom=False).cameras[camera, :3]
+    pitch = start.cameras[:, _PITCH]
+    distance = 1.0 / np.cos(pitch[0])
+    start.cameras[:, 3] = np.log(distance * np.cos(pitch))
+    start.cameras[:, 5] = distance * (np.sin(pitch) - np.sin(pitch[0]))
+    for camera in range(1, count):
+        pair = evidence.part((evidence.camera == camera) | (evidence.camera == 0))
+        best_of(camera, _AZIMUTH, np.arange(0.0, 360.0, 10.0).tolist(), pair)
+    return start
+
+
+# What is refused, and the result.
+
+
+def _refuse_alike(evidence: _Evidence, fits: int) -> None:
+    """Refuse views whose silhouettes tell nothing, where too few matches fit to tell it instead."""
+    if evidence.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(evidence.first)):
+        return
+    told = (
+        f"silhouettes overlap by {evidence.likeness:.1%}" if len(evidence.touched) else "there are no masks"
+    )
+    raise CaptureError(
+        f"the axis can't be told, as all views are alike: {told}, and {fits} of {len(evidence.first)} points that were "
+        "matched and moved fit one; put something uneven or patterned on the turntable, cut out the background, or "
+        "give poses of another program"
+    )
+
+
+def _refuse_unexplained(fitted: _Numbers, evidence: _Evidence) -> None:
+    matched, outlines = fitted.errors(evidence)
+    fits = int((np.abs(matched) < _FITS_PX).sum())
+    _refuse_alike(evidence, fits)
+    compared = np.abs(outlines[outlines != _NOT_COMPARED_PX])
+    off = float(np.percentile(compared, 75)) if len(compared) else np.inf
+    limit = _MOST_OFF * float(np.hypot(*evidence.size))
+    if off <= limit or fits >= max(_ENOUGH_MATCHES, _ENOUGH_FIT * len(matched)):
+        return
+    outline = ""
+    if np.isfinite(off):
+        outline = (
+            f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
+        )
+    raise CaptureError(
+        f"the angles do not explain the pictures: {outline}{fits} of {len(matched)} matched points fit; expected the "
+        "object alone to turn, by the angles given, before a camera and a background that stand still: check --angles, "
+        "and that --mask cuts out the object"
+    )
+
+
+def _pose_set(fitted: _Numbers, evidence: _Evidence, names: Sequence[str]) -> PoseSet:
+    axes, places = fitted.poses(evidence)
+    width, height = evidence.size
+    focal = (fitted.focal_px, fitted.focal_px)
+    lens = Lens(width, height, focal, (width / 2, height / 2), (fitted.k1, 0.0, 0.0, 0.0))
+    cameras = {
+        name: PosedCamera(np.column_stack([axes[index] @ FLIP, places[index]]), lens)
+        for index, name in enumerate(names)
+    }
+    matched, outlines = (np.abs(part) for part in fitted.errors(evidence))
+    notes = [
+        f"the turntable gave poses of {len(names)} of {len(names)} views: {int((matched < _FITS_PX).sum())} of "
+        f"{len(matched)} matched points fit"
+        + (f", outlines are off by {np.median(outlines):.2f} px in the median" if len(outlines) else ""),
+        f"focal length estimated from the turning: {fitted.focal_px:.1f} px; the camera looks down by "
+        + ", ".join(f"{np.degrees(pitch):.1f}" for pitch in fitted.cameras[:, _PITCH])
+        + " degrees",
+        f"the object turned {'against' if fitted.sense > 0 else 'with'} the clock, seen from above",
+    ]
+    if fitted.slack.any():
+        notes.append(f"angles were corrected by up to {np.degrees(np.abs(fitted.slack).max()):.2f} degrees")
+    up = np.array([0.0, 0.0, 1.0])
+    return PoseSet(dict(sorted(cameras.items())), "a turntable", up=up, has_world=False, notes=tuple(notes))
