@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,7 +11,7 @@ from PIL import Image
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Raster
-from unmix_plugin.captures.masks import _find_background, clean, read_labels, read_view_masks
+from unmix_plugin.captures.masks import _find_background, choose_mask, clean, read_labels, read_view_masks
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
@@ -79,3 +81,9 @@ def test_a_scene_without_any_matter_is_refused(tmp_path):
     with pytest.raises(CaptureError, match=r"no view shows anything but background, by its mask \(files\)"):
         process(made.root, tmp_path / "scene", mask="files")
     assert not (tmp_path / "scene").exists()
+
+
+def test_views_of_a_rig_are_never_cut_out_of_a_backdrop_by_themselves():
+    views = [CaptureView(name, CUBE) for name in "ab"]
+    assert choose_mask(views, "auto") == ("auto", [])
+    assert choose_mask([replace(view, release="1") for view in views], "auto") == ("none", [])

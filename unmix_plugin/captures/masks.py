@@ -51,6 +51,8 @@ _BRIGHT_PERCENTILE = 99.0
 def choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind, list[str]]:
     """What tells matter from background, `auto` where files don't, and what a user should know of it.
 
+    The views of a rig are left whole.
+
     Raises:
         CaptureError: opacity is asked of files that some views don't have.
     """
@@ -65,14 +67,16 @@ def choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind
             f"--mask files: view {missing[0]} has no mask; expected a picture with an alpha channel, or a mask that is "
             "white where matter is, for every view"
         )
+    # What the lenses of a rig see from above is ground: a field or water is as plain as a backdrop and is the scene.
+    otherwise: MaskKind = "none" if any(view.release for view in views) else "auto"
     if len(missing) == len(views):
-        return "auto", []
+        return otherwise, []
     has = "has" if len(missing) == 1 else "have"
     note = (
         f"{len(missing)} of {len(views)} views {has} no alpha channel ({name_some(missing)}), so that of the others is "
         "not used: give all views one, or choose --mask"
     )
-    return "auto", [note]
+    return otherwise, [note]
 
 
 @dataclass(frozen=True)

@@ -232,3 +232,14 @@ def test_damaged_numbers_are_reported_in_the_error_alone(tmp_path, capsys):
     with pytest.raises(CaptureError, match=r"a\.exr: damaged: "):
         open_spectral_file(tmp_path / "a.exr").read()
     assert capsys.readouterr().out == ""
+
+
+def test_the_exposure_of_a_picture_is_that_of_its_exif(tmp_path):
+    picture = Image.new("L", (3, 2))
+    exif = picture.getexif()
+    exif[0x8769] = {0x829A: 0.02, 0x8827: 200}
+    picture.save(tmp_path / "a.png", exif=exif)
+    metadata = open_spectral_file(tmp_path / "a.png").metadata
+    assert (metadata["exposure_s"], metadata["gain"]) == (pytest.approx(0.02), 2.0)
+    picture.save(tmp_path / "b.png")
+    assert "exposure_s" not in open_spectral_file(tmp_path / "b.png").metadata

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ _DEPTH_AT, _KIND_AT = 24, 25
 _WITH_COLOURS = (2, 6)
 _ORIENTATION = 0x0112
 """EXIF's code; 1 to 8, where 1 is not turned."""
+_EXIF_DIRECTORY, _EXPOSURE_TIME, _ISO_SPEED = 0x8769, 0x829A, 0x8827
 
 
 def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
@@ -48,7 +49,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         mode, (width, height), info = picture.mode, picture.size, dict(picture.info)
         num_bands = 1 if mode in _GREY else 3
         allow_decoded(path, width * height * num_bands, CaptureError)  # Exif of a PNG is read by decoding it
-        orientation = picture.getexif().get(_ORIENTATION, 1)
+        exif = picture.getexif()
+        orientation, taken = exif.get(_ORIENTATION, 1), exif.get_ifd(_EXIF_DIRECTORY)
     with path.open("rb") as file:
         begin = file.read(_KIND_AT + 1)
     # Pillow would cut the colours of a PNG of 16 bits to 8.
@@ -67,6 +69,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         metadata["encoding"] = "sRGB"
     if orientation in range(2, 9):
         metadata["orientation"] = orientation
+    metadata |= _exposure(taken)
     if alpha:
         metadata["has_alpha"] = True
     return SpectralFile(
@@ -80,6 +83,16 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
         metadata=metadata,
     )
+
+
+def _exposure(taken: Mapping[int, Any]) -> dict[str, Any]:
+    """Time and gain of EXIF's directory."""
+    try:
+        time_s, speed = (float(taken.get(code, 0)) for code in (_EXPOSURE_TIME, _ISO_SPEED))
+    except (TypeError, ValueError, ZeroDivisionError):
+        return {}
+    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"} if time_s > 0 else {}
+    return facts | ({"gain": speed / 100} if facts and speed > 0 else {})
 
 
 def _load(path: Path) -> np.ndarray:
