@@ -119,3 +119,28 @@ def test_views_of_several_sizes_become_sensors(tmp_path):
     process(made.root, tmp_path / "scene")
     sizes = {path.stem: np.load(path).shape[:2] for path in (tmp_path / "scene/cubes").glob("*.npy")}
     assert sizes == {name: (HEIGHT, HEIGHT - 4 if name == "view_01" else WIDTH) for name in made.reflectance}
+
+
+def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_path):
+    write_tree(tmp_path / "tree")
+    write_poses(tmp_path / "poses.json", NAMES)
+    for path in [*tmp_path.glob("tree/*/results/*"), *tmp_path.glob("tree/214/capture/WHITEREF*")]:
+        path.unlink()
+    options = {"poses": str(tmp_path / "poses.json"), "saturation": 60000.0}
+    with pytest.raises(
+        CaptureError, match=r"1 view \(214\) without a white reference of their own, 3 others have"
+    ):
+        process(tmp_path / "tree", tmp_path / "scene", **options)
+    for path in tmp_path.glob("tree/21[35]/capture/WHITEREF*"):
+        path.unlink()
+    process(tmp_path / "tree", tmp_path / "scene", **options)
+    for index, name in enumerate(NAMES):
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
+        np.testing.assert_allclose(stored, (1000 + 100 * index) / 2000, atol=1e-4)
+
+
+def test_references_above_a_tree_are_named(tmp_path):
+    write_tree(tmp_path)
+    write_cube(tmp_path, "white", counts(3000))
+    assert list(stems(tmp_path)) == NAMES
+    assert any(note.startswith("white.hdr was left out") for note in find_cubes(tmp_path, PLAIN).notes)

@@ -30,9 +30,10 @@ from unmix_plugin.captures.calibration.calibration import (
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.exposure import Exposures, compare_exposures
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -280,18 +281,41 @@ def _own_references(
     dark: Reference | None,
     white: WhiteReference | None,
 ) -> dict[Path, OwnReferences]:
-    """References of views that were taken with their own, by cube; what the user names goes before them."""
+    """References of views that were taken with their own, by cube; what the user names goes before them.
+
+    Raises:
+        CaptureError: some views have one of their own and others have none.
+    """
     own = {}
-    for view in views:
+    darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
+    whites = _each_view([view.white for view in views], views, "white reference", white is not None)
+    for view, own_dark, own_white in zip(views, darks, whites, strict=True):
         its_dark, its_white = dark, white
-        if dark is None and view.dark is not None:
-            its_dark = open_reference(view.dark, "dark frame", view.cube)
-        if white is None and view.white is not None:
-            panel = open_reference(view.white, "white reference", view.cube)
+        if own_dark is not None:
+            its_dark = open_reference(own_dark, "dark frame", view.cube)
+        if own_white is not None:
+            panel = open_reference(own_white, "white reference", view.cube)
             its_white = white_reference(panel, its_dark, options.white_reflectance, choice.wavelengths_nm)
         if its_dark is not dark or its_white is not white:
             own[view.cube.path] = OwnReferences(its_dark, its_white)
     return own
+
+
+def _each_view(
+    files: Sequence[SpectralFile | None], views: Sequence[CaptureView], what: str, is_given: bool
+) -> Sequence[SpectralFile | None]:
+    """A reference for each view: its own, or the only one that there is; none where the user gives one for all."""
+    known = {file.path: file for file in files if file is not None}
+    missing = [view.name for view, file in zip(views, files, strict=True) if file is None]
+    if is_given or not known:
+        return [None] * len(files)
+    if missing and len(known) > 1:
+        raise CaptureError(
+            f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {what} of their own, {len(known)} "
+            f"others have one; expected one for each: copy the missing ones, or give one for all (--{what.split()[0]})"
+        )
+    only = next(iter(known.values()))
+    return [only if file is None else file for file in files]
 
 
 def _unit(file: SpectralFile) -> str:

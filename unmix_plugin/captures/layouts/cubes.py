@@ -59,11 +59,11 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
     pictures = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
     cubes = _cubes_among(files)
-    if cubes:
+    if any(not _is_reference(path, ()) for path in cubes):
         return _capture_of_groups(root, {root: cubes}, pictures, options)
     if folders := _band_folders(root, excluded):
         return _capture_of_plain(root, folders, pictures, options)
-    if deeper := _cubes_below(root, excluded):
+    if deeper := _cubes_below(root, excluded):  # among them references that lie in the folder itself
         return _capture_of_groups(root, deeper, {}, options)
     if not pictures:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
