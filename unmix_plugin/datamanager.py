@@ -213,6 +213,10 @@ class HyperspectralDataManager(DataManager):
         check_recorded_scene(metadata)
         check_recorded_scene(summary)
 
+    def reasons(self) -> list[str]:
+        """Why the world is taken to end with the scene box or not, where that was found."""
+        return [] if self.scene.world_reason is None else [self.scene.world_reason]
+
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, cameras at one place, masks that contradict each other, a
         backdrop, sensors that share no band or no place with another, and bad bands and values."""

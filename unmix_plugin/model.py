@@ -41,7 +41,7 @@ from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import choose, preset_for
-from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, reopen_lost, shrinking, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
@@ -99,7 +99,9 @@ class UnmixModel(Model):
         self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(
-            metadata["pixel_size"], float(self.scene_box.size.max()), metadata["has_alpha"]
+            metadata["pixel_size"],
+            float(self.scene_box.size.max()),
+            metadata["has_alpha"] or self.has_backdrop,
         )
         self.field = self._new_field()
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
@@ -127,6 +129,7 @@ class UnmixModel(Model):
         )
         self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self._progress = 0.0
+        self._occupied_share = torch.ones(())
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Endmembers from the training pixels or a file, the light in the dictionary, and the carved grid.
@@ -216,14 +219,26 @@ class UnmixModel(Model):
 
     def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
         """`num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in dB, on black,
-        with how far poses were corrected."""
+        where samples go, and how far poses were corrected."""
         measured = from_batch(batch, len(ray_bundle), self.seen_by.num_channels)
         step = self.training_batch(ray_bundle, measured)
         losses = self.losses(step)
-        metrics = {"psnr": self.comparison.psnr(step.compared), **self._pose_training.figures(step.corrected)}
+        metrics = {
+            "psnr": self.comparison.psnr(step.compared),
+            **self._sample_figures(step.rendered, len(ray_bundle)),
+            **self._pose_training.figures(step.corrected),
+        }
         with torch.no_grad():
             self.learn_from(step)
         return {"num_samples": torch.tensor(step.rendered.num_samples)}, losses, metrics
+
+    def _sample_figures(self, rendered: RenderedRays, num_rays: int) -> dict[str, Tensor]:
+        """Samples a ray evaluated and visible, and the share of the grid's cells that are occupied."""
+        return {
+            "samples_per_ray": torch.tensor(rendered.num_samples / max(num_rays, 1)),
+            "visible_samples_per_ray": torch.tensor(len(rendered.weights) / max(num_rays, 1)),
+            "occupied_share": self._occupied_share,
+        }
 
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
         """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
@@ -255,9 +270,11 @@ class UnmixModel(Model):
     def learn_from(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
-        record_seen(
-            self.grid, step.rendered, step.corrected.rays.camera_indices, visible_weight, self.processes
-        )
+        shrunk = shrinking(self._progress) if self.preset.visible_by_heaviest else None
+        views = step.corrected.rays.camera_indices
+        record_seen(self.grid, step.rendered, views, visible_weight, self.processes, shrunk)
+        if shrunk and visible_weight < 1 and not self.is_unbounded:
+            reopen_lost(self.grid, step.rendered, step.corrected.rays, self.renderer.box)
         if self.grid.observed is not None:
             positions, densities = step.rendered.visible.observed()
             self.grid.record_observed(self.renderer.space.to_unit(positions), densities)
@@ -335,8 +352,14 @@ class UnmixModel(Model):
     @property
     def _training_renderer(self) -> VolumeRenderer:
         """That of the present training step: samples may be farther apart, and shadows softer, than in the end."""
-        step = self.step * self._coarseness(self._progress)
-        return replace(self.renderer, step=step, shadow_detail=ShadowDetail.at(self._progress))
+        preset, progress = self.preset, self._progress
+        smallest = preset.smallest_weight if shrinking(progress) else preset.first_smallest_weight
+        return replace(
+            self.renderer,
+            step=self.step * self._coarseness(progress),
+            smallest_weight=choose(self.config.renderer.smallest_weight, smallest),
+            shadow_detail=ShadowDetail.at(progress),
+        )
 
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
@@ -365,10 +388,11 @@ class UnmixModel(Model):
         )
 
     def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:
-        """Before training. Where nothing was carved, cells are too many to wait until each was probed: what rays meet
+        """Before training. Where little was carved, cells are too many to wait until each was probed: what rays meet
         in them counts as well."""
-        observes = self.is_unbounded or self.config.poses == "refine"
-        return OccupancyGrid(reachable, self._lamp is not None, observes)
+        in_haze = self.preset.visible_by_heaviest
+        observes = in_haze or self.config.poses == "refine"
+        return OccupancyGrid(reachable, self._lamp is not None, observes, one_view=in_haze)
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
@@ -383,6 +407,7 @@ class UnmixModel(Model):
                 self._progress,
                 self.metadata.get("num_train_pixels", 0),
             )
+            self._occupied_share = self.grid.occupied.float().mean()
             self.processes.mean(self.guide.margin_variance)
             self._pose_training.update_weights(self.processes)
 

@@ -2,8 +2,9 @@
 
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
-only cleared by training. In an unbounded world every ray ends on something, if only the sky; where pictures without
-alpha share a plain backdrop, the hull of what is before it is carved as with alpha, and the backdrop is learnt.
+only cleared by training, from what rays meet and where they end. In an unbounded world every ray ends on something, if
+only the sky; where pictures without alpha share a plain backdrop, the hull of what is before it is carved as with alpha,
+and the backdrop is learnt.
 """
 
 from __future__ import annotations
@@ -23,9 +24,13 @@ class AlphaPreset:
     initial_opacity: float
     """Empty space between cameras and walls must start almost clear."""
     smallest_weight: float
-    """Surfaces far behind semi-transparent density must be able to grow."""
+    """Lighter samples have no gradient, so that haze which they are made of fades."""
+    first_smallest_weight: float
+    """The same before haze shrinks: surfaces far behind semi-transparent density must be able to grow."""
     visible_weight: float
-    """1: nothing is left out. In rooms, walls must be found behind semi-transparent density."""
+    visible_by_heaviest: bool
+    """Whether `visible_weight` is a share of the weight of the heaviest sample of the same ray, rather than of all its
+    light. In rooms each ray ends on something, and what it ends on must stay."""
     background: Literal["random", "black"]
     """Random greys would reward floaters before the cameras where alpha is unknown."""
     rgb_loss_weight: float
@@ -42,7 +47,9 @@ WITH_ALPHA = AlphaPreset(
     single_ray_until=0.4,
     initial_opacity=0.05,
     smallest_weight=4e-3,
+    first_smallest_weight=4e-3,
     visible_weight=0.05,
+    visible_by_heaviest=False,
     background="random",
     rgb_loss_weight=0.2,
     opacity_loss_weight=0.0,
@@ -52,11 +59,13 @@ WITH_ALPHA = AlphaPreset(
     specular_endmembers=False,
 )
 WITHOUT_ALPHA = AlphaPreset(
-    grid_resolution=64,
+    grid_resolution=128,
     single_ray_until=0.8,
     initial_opacity=0.01,
-    smallest_weight=1e-3,
-    visible_weight=1.0,
+    smallest_weight=4e-3,
+    first_smallest_weight=1e-3,
+    visible_weight=0.4,
+    visible_by_heaviest=True,
     background="black",
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
@@ -69,7 +78,6 @@ WITHOUT_ALPHA = AlphaPreset(
 
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
-    grid_resolution=128,
     initial_opacity=0.005,
     surface_loss_weight=0.3,
     coarse_samples=64,

@@ -83,7 +83,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     0.4 where alpha is known, otherwise 0.8."""
     grid_resolution: Ours[int | Auto] = "auto"
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
-    128 where alpha is known, otherwise 64: only what few cameras see can be carved then."""
+    128."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
     mend_values: bool = True
@@ -169,17 +169,18 @@ class RendererConfig:
 
     samples_per_pixel: float | Auto = "auto"
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
-    1 where alpha is known and the box is more than 300 pixels long: more rays teach more than closer samples."""
+    1 where alpha is unknown or the box is more than 300 pixels long: more rays teach more than closer samples."""
     coarse_samples: Ours[int | Auto] = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
     smallest_weight: Ours[float | Auto] = "auto"
-    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004 where alpha is
-    known, else 0.001."""
+    """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004,
+    but 0.001 at the start where alpha is unknown."""
     visible_weight: Ours[float | Auto] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
-    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
+    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 0.4 of the heaviest sample of the ray, seen
+    by one view: what a ray ends on must stay."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -203,8 +204,8 @@ class RendererConfig:
         >>> [RendererConfig().sample_distance(1.0, edge, has_alpha=True) for edge in (270.0, 480.0)]
         [0.6666666666666666, 1.0]
         """
-        is_large = has_alpha and longest_edge > _LARGE_BOX * pixel_size
-        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_large else 1.5)
+        is_coarse = not has_alpha or longest_edge > _LARGE_BOX * pixel_size
+        return pixel_size / choose(self.samples_per_pixel, 1.0 if is_coarse else 1.5)
 
     def coarseness(self, samples: float, preset: AlphaPreset, progress: float) -> float:
         """Factor on the distance of samples, of which so many lie along the longest edge of the scene box in the end,

@@ -16,7 +16,7 @@ import torch
 from tests.commands.running import SMALL_METHOD, run
 from tests.formats.cubes import full_disk
 from unmix_plugin.commands import train as train_arguments
-from unmix_plugin.commands.train import _read_remarks, _remarks, parse, train
+from unmix_plugin.commands.train import _read_remarks, _remark_on_passes, _remarks, parse, train
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.load_run import load_model
 from unmix_plugin.engine.training.trainer import Trainer
@@ -320,3 +320,9 @@ def test_poses_that_ran_away_or_are_not_believed_are_said(name, few, many, told)
     assert _remarks([*lines[:-1], {**lines[-1], name: few}]) == []
     (said,) = _remarks([*lines[:-1], {**lines[-1], name: many}])
     assert told in said
+
+
+def test_a_training_that_hardly_saw_each_pixel_says_that_more_will_show_more():
+    assert "0.8 passes over the training pixels" in _remark_on_passes(80_000, 100_000)[0]
+    assert _remark_on_passes(900_000, 100_000) == []
+    assert _remark_on_passes(80_000, 0) == []

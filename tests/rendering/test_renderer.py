@@ -81,7 +81,7 @@ def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ra
     """Every sample takes part although it starts behind semi-transparent density; with alpha, far ones are left out."""
     bundle, found = rays(20), {}
     for preset in (WITHOUT_ALPHA, WITH_ALPHA):
-        renderer, field = make(smallest_weight=preset.smallest_weight, pixel=0.02)
+        renderer, field = make(smallest_weight=preset.first_smallest_weight, pixel=0.02)
         with torch.no_grad():
             field.table.zero_()
             field.log_initial_density = math.log(-math.log1p(-0.01) / renderer.step)

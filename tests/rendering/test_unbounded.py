@@ -118,18 +118,20 @@ def test_what_is_near_a_camera_learns_more_slowly_but_looks_the_same():
     assert values.grad.tolist() == [0.25, 1.0]
 
 
-def test_training_tells_the_grid_what_rays_meet_in_a_world_without_end_and_only_there():
-    boxed = make_model(has_alpha=False).train()
+def test_training_tells_the_grid_what_rays_meet_unless_alpha_carves_it():
+    carved, boxed = make_model().train(), make_model(has_alpha=False).train()
     metadata = {**boxed.metadata, "is_unbounded": True}
     world = CONFIG.setup(scene_box=SMALL_BOX, metadata=metadata).train()
     with torch.no_grad():
         world.initialise(initial_data(), torch.Generator().manual_seed(0))
     rays = make_rays(200)
     batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
-    for model in (boxed, world):
+    for model in (carved, boxed, world):
         model.generator = torch.Generator().manual_seed(0)
         model.get_train_loss_dict(rays, batch)
-    assert boxed.grid.observed is None
+    assert carved.grid.observed is None
+    assert boxed.grid.observed is not None
+    assert bool((boxed.grid.observed >= 0).any())
     assert world.grid.observed is not None
     is_met = world.grid.observed >= 0
     centre = world.renderer.space.to_unit(torch.zeros(1, 3))

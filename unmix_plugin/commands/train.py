@@ -221,8 +221,11 @@ def _run(trainer: Trainer, console: Console) -> None:
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
-    if spectral_scene(trainer.pipeline.datamanager) is not None:  # remarks name settings of spectral methods
-        for remark in _read_remarks(trainer.run.metrics_path):
+    data = trainer.pipeline.datamanager
+    if spectral_scene(data) is not None:  # remarks name settings of spectral methods
+        num_pixels = int(data.metadata().get("num_train_pixels", 0))
+        few = _remark_on_passes(record.total_rays, num_pixels)
+        for remark in [*_read_remarks(trainer.run.metrics_path), *few]:
             say(console, remark)
     averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
     with trainer.control.device.training_turn(), averaged:
@@ -277,6 +280,9 @@ stay below 0.35, also short ones."""
 _STILL_FALLS = 0.3
 """Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
 
+_FEW_PASSES = 3
+"""Rays for each training pixel below which fine detail is still being learnt."""
+
 
 def _read_remarks(metrics_path: Path) -> list[str]:
     """Remarks on a training's `metrics.jsonl`."""
@@ -320,6 +326,19 @@ def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
             "(--max-num-iterations, --max-seconds) will show more"
         )
     return found
+
+
+def _remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
+    """A remark if the training pixels were seen so rarely that more training will show more.
+
+    Args:
+        num_rays: Cast in all.
+        num_pixels: Of the training views; 0 if it is not known.
+    """
+    if num_pixels == 0 or num_rays >= _FEW_PASSES * num_pixels:
+        return []
+    passes = f"{num_rays / num_pixels:.2g} passes over the training pixels"
+    return [f"{passes}: a longer training (--max-num-iterations, --max-seconds) will show finer detail"]
 
 
 def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:

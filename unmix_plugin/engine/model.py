@@ -110,6 +110,10 @@ class DataManager(ABC):
             KeyError, TypeError, ValueError, ConfigError: what is missing or wrong.
         """
 
+    def reasons(self) -> list[str]:
+        """What was decided by the data, and why, in words; asked once, when a new run starts."""
+        return []
+
     def warnings(self) -> list[str]:
         """What looks wrong with the data though it can be trained on; asked once, when a new run starts."""
         return []

@@ -43,12 +43,13 @@ class Pipeline(nn.Module):
         ).to(device)
 
     def initialise(self) -> None:
-        """Let the model of a new run take its first values from the scene; its warnings join `reasons`."""
+        """Let the model of a new run take its first values from the scene; what the data manager decided and all
+        warnings join `reasons`."""
         with torch.no_grad():
             self.model.initialise(self.datamanager.initial_data(), torch.Generator().manual_seed(self.seed))
         said = [*self.datamanager.warnings(), *self.model.warnings()]
         warnings = [f"warning: {warning}" for warning in said]
-        self.reasons = "\n".join(filter(None, [self.reasons, *warnings]))
+        self.reasons = "\n".join(filter(None, [*self.datamanager.reasons(), self.reasons, *warnings]))
 
     def draw_as(self, rank: int) -> None:
         """Draw the rays of process number `rank` from now on; those of the first are the ones of a single process."""

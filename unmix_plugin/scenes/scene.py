@@ -86,6 +86,9 @@ class Scene:
     before_backdrop: list[Bool[np.ndarray, "_ _"]] | None
     """For each training view without alpha, True where something may stand before a plain backdrop that the views
     share; None without one."""
+    world_reason: str | None
+    """Why the world is taken to end with the scene box or not, in words; None where that was set, or follows from alpha
+    or a backdrop."""
     has_labels: bool
     """Every evaluation frame has labels."""
     has_abundances: bool

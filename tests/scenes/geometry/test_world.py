@@ -38,7 +38,12 @@ def test_what_goes_on_behind_the_box_is_found_from_the_views(folders, name, is_u
     scene = load_scene(folders / name)
     assert scene.has_alpha == (name == "table")
     assert scene.is_unbounded == is_unbounded
-    assert not load_scene(folders / name, SceneOptions(world="bounded")).is_unbounded
+    said = scene.world_reason
+    assert (said is None) == scene.has_alpha
+    assert said is None or "taken to go on behind the scene box" in said
+    as_told = load_scene(folders / name, SceneOptions(world="bounded"))
+    assert not as_told.is_unbounded
+    assert as_told.world_reason is None
 
 
 def test_a_room_whose_inside_explains_all_pixels_is_bounded():
@@ -46,6 +51,18 @@ def test_a_room_whose_inside_explains_all_pixels_is_bounded():
     assert _WorldEvidence(num_pixels=1000, num_inside=600, num_behind=300, num_explained=850).goes_on
     assert _WorldEvidence(num_pixels=1000, num_inside=300, num_behind=10, num_explained=350).goes_on
     assert not _WorldEvidence(0, 0, 0, 0).goes_on
+
+
+def test_places_matched_outside_the_box_tell_of_a_world_behind_it_too():
+    closed = _WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850)
+    assert "end with its box" in closed.in_words()
+    within, beyond = torch.tensor([0.5, -0.9, 1.1]), torch.tensor([0.0, 2.0, 0.0])
+    found = closed.with_places(BOX, torch.stack([within] * 9 + [beyond]))
+    assert not found.goes_on
+    assert "1 of 10 places matched between views lie outside it" in found.in_words()
+    found = closed.with_places(BOX, torch.stack([within] * 8 + [beyond] * 2))
+    assert found.goes_on
+    assert "go on behind the scene box: 2 of 10 places" in found.in_words()
 
 
 def test_a_world_behind_what_is_transparent_is_refused(folders):

@@ -365,12 +365,45 @@ class _WorldEvidence:
     """Clearly better explained by places behind it."""
     num_explained: int
     """On which views agree somewhere in the box."""
+    num_places: int = 0
+    """Matched between views, where those were looked for."""
+    num_outside: int = 0
+    """Of these, outside the box."""
+
+    def with_places(self, box: SceneBox, places: Float[Tensor, "P 3"]) -> _WorldEvidence:
+        """With what places say that features matched between views stand at."""
+        outside = ((places - box.aabb.mean(dim=0)).abs() > _BOX_MARGIN * box.size / 2).any(dim=-1)
+        return replace(self, num_places=len(places), num_outside=int(outside.sum()))
 
     @property
     def goes_on(self) -> bool:
         """Whether the views show more than a closed box would."""
-        shows_more = self.num_behind > _MOST_BEHIND * (self.num_behind + self.num_inside)
-        return shows_more or self.num_explained < _LEAST_EXPLAINED * self.num_pixels
+        return self._shows_more or self._is_unexplained or self._has_places_outside
+
+    @property
+    def _shows_more(self) -> bool:
+        return self.num_behind > _MOST_BEHIND * (self.num_behind + self.num_inside)
+
+    @property
+    def _is_unexplained(self) -> bool:
+        return self.num_explained < _LEAST_EXPLAINED * self.num_pixels
+
+    @property
+    def _has_places_outside(self) -> bool:
+        return self.num_outside > _MOST_BEHIND * self.num_places
+
+    def in_words(self) -> str:
+        """Which it is and why, and how to say otherwise."""
+        behind = (
+            f"{self.num_behind} of {self.num_behind + self.num_inside} pixels that tell show places behind it"
+        )
+        explained = f"its inside explains {self.num_explained} of {self.num_pixels} pixels"
+        outside = f"{self.num_outside} of {self.num_places} places matched between views lie outside it"
+        if not self.goes_on:
+            known = [explained, behind] + ([outside] if self.num_places else [])
+            return f"the scene is taken to end with its box: {', '.join(known)} (--world unbounded if not)"
+        why = behind if self._shows_more else explained if self._is_unexplained else outside
+        return f"the world is taken to go on behind the scene box: {why} (--world bounded if not)"
 
 
 def find_world_evidence(box: SceneBox, cameras: Cameras, read_view: ReadView) -> _WorldEvidence:

@@ -139,9 +139,8 @@ def _assemble(
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    normalisation, scene_box, is_unbounded, before = _find_model_space(
-        root, entry, checked, split.train, options
-    )
+    space = _find_model_space(root, entry, checked, split.train, options)
+    normalisation, scene_box, is_unbounded, before, world_reason = space
     inputs = [path for paths in located for key, path in paths.items() if key in _MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
     truths = [path for paths in located for key, path in paths.items() if key not in _MEASURED_KEYS]
@@ -165,6 +164,7 @@ def _assemble(
         has_alpha=checked.foreground is not None,
         is_unbounded=is_unbounded,
         before_backdrop=before,
+        world_reason=world_reason,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
         input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
@@ -389,9 +389,9 @@ def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | No
 
 def _find_model_space(
     root: Path, entry: SceneEntry, checked: _CheckedFiles, train: tuple[int, ...], options: SceneOptions
-) -> tuple[Normalisation, SceneBox, bool, list[Bool[np.ndarray, "_ _"]] | None]:
-    """The box that the training views show, how its longest edge becomes [-1, 1], whether the world goes on, and what
-    may stand before a backdrop, if views without alpha share one.
+) -> tuple[Normalisation, SceneBox, bool, list[Bool[np.ndarray, "_ _"]] | None, str | None]:
+    """The box that the training views show, how its longest edge becomes [-1, 1], whether the world goes on, what may
+    stand before a backdrop, if views without alpha share one, and why the world is taken to end, where that was found.
 
     The similarity starts from the space of transforms.json. The box is found in a space centred on the training
     cameras, where coordinates are of order 1.
@@ -425,15 +425,19 @@ def _find_model_space(
         alike_poses = _world_poses(entry)[[train[row] for row in alike]]
         hint = describe(compare_conventions(alike_poses, cameras[alike], read_view))
         raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
-    is_unbounded = options.world == "unbounded"
+    is_unbounded, reason = options.world == "unbounded", None
     if options.world == "auto" and foreground is None and not (points and points.are_equally_far):
-        is_unbounded = find_world_evidence(first_box, cameras[alike], read_view).goes_on
+        evidence = find_world_evidence(first_box, cameras[alike], read_view)
+        if not evidence.goes_on:
+            places = points or find_matched_points(cameras[alike], read_view)
+            evidence = evidence if places is None else evidence.with_places(first_box, places.places)
+        is_unbounded, reason = evidence.goes_on, evidence.in_words()
     low, high = first_box.aabb.double().numpy()
     scale = float(2.0 / (high - low).max())
     half = 0.5 * scale * (high - low)
     translation = first.translation - 0.5 * (low + high) / first.scale
     box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
-    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded, before
+    return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded, before, reason
 
 
 def _before_backdrop(
