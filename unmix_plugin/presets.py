@@ -3,8 +3,8 @@
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
 only cleared by training, from what rays meet and where they end. In an unbounded world every ray ends on something, if
-only the sky; where pictures without alpha share a plain backdrop, the hull of what is before it is carved as with alpha,
-and the backdrop is learnt.
+only the sky; where pictures without alpha share a plain backdrop, the hull of what is before it is carved as with
+alpha, and the backdrop is learnt.
 """
 
 from __future__ import annotations
