@@ -131,7 +131,10 @@ def measure(folder: Path, max_seconds: float, device: str, runs: Path) -> dict[s
     return {
         "num_endmembers": num_endmembers,
         "load_average_at_start": load_average,
-        "metrics": {key: value for key, value in metrics.items() if key not in ("definitions", "per_view")},
+        "metrics": {
+            **{key: value for key, value in metrics.items() if key not in ("definitions", "per_view")},
+            **samples_at_the_end(trained.run),
+        },
         "per_view": metrics["per_view"],
         "training_peak_gib": trained.peak_bytes / 2**30,
         "training_command_seconds": trained.seconds,
@@ -183,6 +186,14 @@ def segmentation_miou(scene: Scene, spectra: torch.Tensor) -> float:
     return tally.scores().miou
 
 
+def samples_at_the_end(run: Path) -> dict[str, float]:
+    """Samples a ray evaluated and visible, and the share of cells occupied, in the last line of a training."""
+    lines = (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    last = [line for line in map(json.loads, lines) if line["split"] == "train"][-1:]
+    wanted = ("samples_per_ray", "visible_samples_per_ray", "occupied_share")
+    return {key: line[key] for line in last for key in wanted}
+
+
 def judge(name: str, values: dict[str, Any]) -> list[_common.Figure]:
     """The lines of a scene."""
     metrics, limits = values["metrics"], LIMITS.get(name)
@@ -202,8 +213,8 @@ def judge(name: str, values: dict[str, Any]) -> list[_common.Figure]:
 
 def details(measured: dict[str, dict[str, Any]]) -> _common.DetailTable:
     """Every metric of every scene."""
-    names = next(iter(measured.values()))["metrics"]
-    rows = [[name, *(_number(values["metrics"][name]) for values in measured.values())] for name in names]
+    names = {name: None for values in measured.values() for name in values["metrics"]}
+    rows = [[name, *(_number(values["metrics"].get(name)) for values in measured.values())] for name in names]
     rows += [
         [key.replace("_", " "), *(_number(values[key]) for values in measured.values())]
         for key in ("load_average_at_start", "training_command_seconds")
@@ -216,7 +227,7 @@ def _span(values: list[float]) -> str:
 
 
 def _number(value: float | None) -> str:
-    return "no truth" if value is None else f"{value:.4g}"
+    return "" if value is None else f"{value:.4g}"
 
 
 if __name__ == "__main__":
