@@ -183,6 +183,7 @@ def test_a_grid_that_notes_what_rays_meet_loads_one_that_did_not():
     loaded = OccupancyGrid(torch.ones(8, 8, 8, dtype=torch.bool), records_observed=True)
     loaded.load_state_dict(saved.state_dict())
     assert torch.equal(loaded.occupied, saved.occupied)
+    assert loaded.observed is not None
     assert not (loaded.observed >= 0).any()
 
 
