@@ -273,7 +273,7 @@ class UnmixModel(Model):
         shrunk = shrinking(self._progress) if self.preset.visible_by_heaviest else None
         views = step.corrected.rays.camera_indices
         record_seen(self.grid, step.rendered, views, visible_weight, self.processes, shrunk)
-        if shrunk and visible_weight < 1 and not self.is_unbounded:
+        if shrunk and visible_weight < 1:
             reopen_lost(self.grid, step.rendered, step.corrected.rays, self.renderer.box)
         if self.grid.observed is not None:
             positions, densities = step.rendered.visible.observed()

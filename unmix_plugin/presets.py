@@ -79,6 +79,7 @@ WITHOUT_ALPHA = AlphaPreset(
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
     initial_opacity=0.005,
+    visible_weight=1.0,  # what a ray passes on its way to the sky may be far and light
     surface_loss_weight=0.3,
     coarse_samples=64,
 )
