@@ -1,8 +1,11 @@
 """Which outputs become which files."""
 
+import re
+
 import pytest
 
 from tests.method_factory import make_scene
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.products.render.files import choose_formats, file_name
 from unmix_plugin.trained.outputs import OUTPUTS
@@ -72,6 +75,13 @@ def test_a_target_is_named_for_its_file_not_for_where_that_lies(tmp_path):
         for product in choose_formats([f"target:ace:{tmp_path}/paint.csv#gold>0.5"], [], SCENE, False)
     }
     assert file_name(output) == "target-ace-paint.csv-gold-0.5"
+
+
+def test_formulas_that_differ_in_an_operator_have_files_of_their_own():
+    names = {file_name(Output(f"index:r650{sign}r550", "map", "", "")) for sign in "/*+-^"}
+    assert len(names) == 5
+    assert all(re.fullmatch(r"index-r650[+-]r550-[0-9a-f]{8}", name) for name in names)
+    assert file_name(Output("index:ndvi", "map", "", "")) == "index-ndvi"
 
 
 def test_a_long_formula_has_a_file_name_of_its_own():

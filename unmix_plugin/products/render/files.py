@@ -31,6 +31,7 @@ from unmix_plugin.products.render.pictures import (
 )
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -88,12 +89,15 @@ class FormattedOutput:
 def file_name(output: Output) -> str:
     """An output's name as part of a file's: odd characters become `-`, folders of a target's file are left out.
 
+    A formula ends with some letters of its hash, since `r650/r550` and `r650*r550` would have the same name.
+
     >>> file_name(Output("false-colour:860,650,550", "linear", "", ""))
     'false-colour-860-650-550'
     """
     short = re.sub(r"[^:]*/", "", output.name) if output.name.startswith("target:") else output.name
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
-    if len(plain) <= _LONGEST_FILE_NAME:
+    is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES
+    if len(plain) <= _LONGEST_FILE_NAME and not is_formula:
         return plain
     return f"{plain[:_LONGEST_FILE_NAME]}-{hashlib.sha256(output.name.encode()).hexdigest()[:8]}"
 
