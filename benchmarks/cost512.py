@@ -27,8 +27,8 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 PSNR = _common.Limit(34.0, unit=" dB")
-SECONDS = _common.Limit(180.0, 90.0, is_upper=True, unit=" s")
-FRAME_SECONDS = _common.Limit(1.0, 0.5, is_upper=True, unit=" s")
+SECONDS = _common.Limit(180.0, 60.0, is_upper=True, unit=" s")
+FRAME_SECONDS = _common.Limit(1.0, 0.4, is_upper=True, unit=" s")
 
 
 @dataclass(frozen=True)
