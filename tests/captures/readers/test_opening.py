@@ -584,3 +584,21 @@ def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding
     file = open_spectral_file(header)
     np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
     np.testing.assert_array_equal(file.bands.bad, [False, True, False])
+
+
+def test_the_metadata_of_enmap_describe_its_image(tmp_path):
+    tifffile.imwrite(
+        tmp_path / "ENMAP01-L2A-SPECTRAL_IMAGE.TIF", CUBE, planarconfig="contig", photometric="minisblack"
+    )
+    bands = "".join(
+        f'<bandID number="{number}"><wavelengthCenterOfBand>{nm}</wavelengthCenterOfBand><FWHMOfBand>7</FWHMOfBand>'
+        f"<GainOfBand>{gain}</GainOfBand><OffsetOfBand>{offset}</OffsetOfBand></bandID>"
+        for number, nm, gain, offset in zip((1, 2, 3), (450, 550, 1650), GAINS, OFFSETS, strict=True)
+    )
+    text = f"<level_X><specific><bandCharacterisation>{bands}</bandCharacterisation></specific></level_X>"
+    (tmp_path / "ENMAP01-L2A-METADATA.XML").write_text(text)
+    file = open_spectral_file(tmp_path / "ENMAP01-L2A-SPECTRAL_IMAGE.TIF")
+    np.testing.assert_array_equal(centres_nm(file), [450, 550, 1650])
+    np.testing.assert_array_equal(widths_nm(file), 7)
+    assert file.linear is not None
+    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE * GAINS + OFFSETS)

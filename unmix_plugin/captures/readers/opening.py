@@ -70,6 +70,12 @@ _HDF5_STARTS = (512, 1024, 2048, 4096)
 _LARGEST_PROOF = 2**28
 """Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
 _LONGEST_TEXT = 500
+_ENMAP_IMAGE = "SPECTRAL_IMAGE"
+_OF_BANDS = {
+    "Scale": 1.0, "GainOfBand": 1.0, "Offset": 0.0, "OffsetOfBand": 0.0,
+    **dict.fromkeys(("wavelengthCenterOfBand", "FWHMOfBand", "NoDataValue"), math.nan),
+}
+"""What XML beside a file says of a band, and what counts where it doesn't."""
 _LLFF_COLUMNS = 17
 _POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
 
@@ -107,49 +113,63 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
 
 
 def _opened(path: Path, options: ReadOptions) -> SpectralFile:
-    """The file by its reader, with what lies beside it: an ENVI header, or GDAL's .aux.xml."""
+    """The file by its reader, with what lies beside it: an ENVI header, or an XML of GDAL or EnMAP."""
     kind = _file_kind(path)
     described = described_image(path) if kind == "envi" and path.suffix.lower() == ".hdr" else None
     if described is not None:
         path, kind = described, _file_kind(described)
     opened = _READERS[kind](path, options)
     if kind in ("envi", "folder"):
-        return opened if kind == "folder" else _with_aux_xml(opened)
-    return _with_aux_xml(described_by_header(opened))
+        return opened if kind == "folder" else _with_xml_beside(opened)
+    return _with_xml_beside(described_by_header(opened))
 
 
-def _with_aux_xml(file: SpectralFile) -> SpectralFile:
-    """The file with gains, offsets and the no-data value that GDAL keeps in NAME.aux.xml, where it has none itself.
+def _with_xml_beside(file: SpectralFile) -> SpectralFile:
+    """The file with what an XML beside it says of its bands, where it says nothing itself.
+
+    GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; EnMAP's NAME-SPECTRAL_IMAGE.TIF has wavelengths,
+    widths, gains and offsets in NAME-METADATA.XML.
 
     Raises:
         CaptureError: gains are impossible.
     """
     beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
+    beside += [
+        path.with_name(path.stem.removesuffix(_ENMAP_IMAGE) + ending)
+        for path in file.files
+        if path.stem.endswith(_ENMAP_IMAGE)
+        for ending in ("METADATA.XML", "METADATA.xml")
+    ]
     found = next((path for path in beside if path.is_file()), None)
     if found is None:
         return file
     data = read_bounded(found)
     try:
-        bands = [] if b"<!" in data else list(ElementTree.fromstring(data).iter("PAMRasterBand"))
+        root = None if b"<!" in data else ElementTree.fromstring(data)
     except ElementTree.ParseError:
-        return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: gains in it are not used"))
-    columns = {"Scale": np.ones(file.shape[2]), "Offset": np.zeros(file.shape[2])}
-    no_data = None
-    for band in bands:
-        index = int(band.get("band", "0")) - 1
+        root = None
+    if root is None:
+        return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: what it says is not used"))
+    columns = {name: np.full(file.shape[2], usual) for name, usual in _OF_BANDS.items()}
+    for element in [*root.iter("PAMRasterBand"), *root.iterfind(".//bandCharacterisation/bandID")]:
+        index = int(element.get("band") or element.get("number") or 0) - 1
         for name, column in columns.items():
-            text = band.findtext(name)
-            if text is not None and 0 <= index < len(column):
+            text = element.findtext(name)
+            if text and 0 <= index < len(column):
                 column[index] = float(text)
-        text = band.findtext("NoDataValue")
-        no_data = float(text) if text is not None else no_data
-    linear = linear_values(
-        file.path, file.shape[2], columns["Scale"].tolist(), columns["Offset"].tolist(), found.name
-    )
+    gains, offsets = columns["Scale"] * columns["GainOfBand"], columns["Offset"] + columns["OffsetOfBand"]
+    centres, no_data = columns["wavelengthCenterOfBand"], columns["NoDataValue"][0]
+    bands = file.bands
+    if bands.wavelengths_nm is None and np.isfinite(centres).all():
+        bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
+        widths = columns["FWHMOfBand"]
+        bands = replace(bands, fwhm_nm=widths if np.isfinite(widths).all() else bands.fwhm_nm)
     return replace(
         file,
-        linear=file.linear or linear,
-        no_data=no_data if file.no_data is None else file.no_data,
+        bands=bands,
+        linear=file.linear
+        or linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name),
+        no_data=float(no_data) if file.no_data is None and not np.isnan(no_data) else file.no_data,
         sources=(*file.sources, found),
     )
 
