@@ -361,3 +361,16 @@ def test_a_valid_range_is_kept(tmp_path):
         variable.valid_min, variable.valid_max, variable._FillValue = 0, 5000, -1
     found = open_spectral_file(tmp_path / "a.nc")
     assert (found.valid_range, found.no_data) == ((0, 5000), -1)
+
+
+def test_signed_numbers_that_stand_for_unsigned_ones(tmp_path):
+    large = CUBE + np.uint16(50_000)
+    with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
+        for axis, length in zip("yxb", CUBE.shape, strict=True):
+            file.createDimension(axis, length)
+        variable = file.createVariable("cube", "h", tuple("yxb"))
+        variable[:] = large.view(np.int16)
+        variable._Unsigned, variable._FillValue = "true", -1
+    found = open_spectral_file(tmp_path / "a.nc")
+    np.testing.assert_array_equal(found.read(), large)
+    assert (found.dtype.kind, found.no_data) == ("u", 65535)

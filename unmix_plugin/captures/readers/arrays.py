@@ -135,24 +135,36 @@ def image_of_arrays(
     linear = _linear(path, image, of_image[2])
     exposure, exposure_warnings = _exposure(arrays, image)
 
+    dtype, no_data = _dtype_meant(image), _first_number(image.all_attributes, _NO_DATA)
+    if dtype != image.dtype and no_data is not None and no_data < 0:
+        no_data += 256.0**dtype.itemsize
+
     def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
         if take is not None:
-            return take(axes, rows, wanted)
-        return take_part(image.whole().reshape(shape), axes, rows, wanted)
+            return take(axes, rows, wanted).astype(dtype, copy=False)
+        return take_part(image.whole().reshape(shape), axes, rows, wanted).astype(dtype, copy=False)
 
     return SpectralFile(
         path=path,
         reader=reader,
         shape=of_image,
-        dtype=image.dtype,
+        dtype=dtype,
         read_part=read_part,
         bands=bands,
         linear=linear,
-        no_data=_first_number(image.all_attributes, _NO_DATA),
+        no_data=no_data,
         valid_range=_valid_range(image.all_attributes),
         warnings=axis_warnings + band_warnings + exposure_warnings,
         metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )
+
+
+def _dtype_meant(image: FoundArray) -> np.dtype:
+    """The type of the numbers; unsigned where NetCDF says that a signed type holds such (`_Unsigned`)."""
+    said = image.attributes.get("_Unsigned")
+    text = said.decode("utf-8", "replace") if isinstance(said, bytes) else str(said)
+    is_unsigned = image.dtype.kind == "i" and text.lower() == "true"
+    return np.dtype(image.dtype.str.replace("i", "u")) if is_unsigned else image.dtype
 
 
 def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:

@@ -72,7 +72,10 @@ _LARGEST_PROOF = 2**28
 _LONGEST_TEXT = 500
 _ENMAP_IMAGE = "SPECTRAL_IMAGE"
 _OF_BANDS = {
-    "Scale": 1.0, "GainOfBand": 1.0, "Offset": 0.0, "OffsetOfBand": 0.0,
+    "Scale": 1.0,
+    "GainOfBand": 1.0,
+    "Offset": 0.0,
+    "OffsetOfBand": 0.0,
     **dict.fromkeys(("wavelengthCenterOfBand", "FWHMOfBand", "NoDataValue"), math.nan),
 }
 """What XML beside a file says of a band, and what counts where it doesn't."""
