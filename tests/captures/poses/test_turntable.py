@@ -191,3 +191,15 @@ def test_a_table_that_does_not_fit_the_views_is_refused(tmp_path, content, said)
     (tmp_path / "angles.csv").write_text(content)
     with pytest.raises(ConfigError, match=said):
         parse_angles(str(tmp_path / "angles.csv"), ["a", "b", "c"])
+
+
+@pytest.mark.slow
+def test_matches_by_chance_do_not_move_the_cameras():
+    pictures, turns, masks, truth = turned(knobs())
+    evidence = evidence_of(pictures, turns, masks)
+    generator = np.random.default_rng(2)
+    pairs = generator.integers(0, COUNT - 1, 600)
+    points = generator.uniform(70, 130, (600, 2, 2))
+    disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)
+    found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, sorted(pictures))
+    assert align_poses(found, truth).rms_px < 0.5

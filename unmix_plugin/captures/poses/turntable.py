@@ -59,7 +59,8 @@ _LEAST_MATCHES, _LEAST_FIT, _MOST_ALIKE = 30, 0.3, 0.98
 _FITS_PX, _MOST_OFF = 2.0, 0.005
 """Errors of matches that fit; upper quartile of those of outlines, over the diagonal, from which angles are refused."""
 _ENOUGH_MATCHES, _ENOUGH_FIT = 300, 0.5
-"""So many matches that fit, and such a share, are right whatever the outlines say."""
+"""So many matches that fit, and such a share, are right whatever the outlines say; with a smaller share, these decide
+alone."""
 _NOT_COMPARED_PX = 2.0
 """What outlines count that can't be compared in the pose that is tried."""
 _LEAST_APART_DEG = 1.0
@@ -217,6 +218,10 @@ class _Evidence:
         return replace(
             self, first=self.first[keep], second=self.second[keep], points=self.points[keep], touched=touched
         )
+
+    def without_matches(self) -> _Evidence:
+        """That of the outlines alone."""
+        return replace(self, first=self.first[:0], second=self.second[:0], points=self.points[:0])
 
     def thinned(self, most: tuple[int, int]) -> _Evidence:
         """At most so many matches and pairs of outlines, drawn at random."""
@@ -612,6 +617,10 @@ def _fit(evidence: _Evidence) -> _Numbers:
     else:
         best = ends[int(np.argmin(costs))]
     best = _solve(best, fine, everyone, steps=40)
+    fits = np.abs(best.errors(fine)[0]) < _FITS_PX
+    if len(fits) and fits.mean() < _ENOUGH_FIT and len(fine.touched) and evidence.likeness <= _MOST_ALIKE:
+        # On plain things most matches are chance, such as highlights, and would pull the cameras with them.
+        return _fit(evidence.without_matches())
     bent = _solve(best, fine, everyone, steps=20, bent=True)
     if bent.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and abs(_bend(bent, evidence.size)) < _GREATEST_BEND:
         best = bent
@@ -698,10 +707,11 @@ def _pose_set(fitted: _Numbers, evidence: _Evidence, names: Sequence[str]) -> Po
         for index, name in enumerate(names)
     }
     matched, outlines = (np.abs(part) for part in fitted.errors(evidence))
+    compared = outlines[outlines != _NOT_COMPARED_PX]
     notes = [
         f"the turntable gave poses of {len(names)} of {len(names)} views: {int((matched < _FITS_PX).sum())} of "
         f"{len(matched)} matched points fit"
-        + (f", outlines are off by {np.median(outlines):.2f} px in the median" if len(outlines) else ""),
+        + (f", outlines are off by {np.median(compared):.2f} px in the median" if len(compared) else ""),
         f"focal length estimated from the turning: {fitted.focal_px:.1f} px; the camera looks down by "
         + ", ".join(f"{np.degrees(pitch):.1f}" for pitch in fitted.cameras[:, _PITCH])
         + " degrees",
