@@ -26,7 +26,7 @@ from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.lens_models import Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
 
-_LONGEST_SIDE_PX = 480
+_LONGEST_SIDE_PX = 320
 """Of pictures in which features are found."""
 _MOST_FEATURES = 500
 _STARS, _AROUND = 4, 5
