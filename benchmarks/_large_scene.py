@@ -1,7 +1,8 @@
-"""A scene whose cubes are larger than memory, written in moments: where nothing is, its files are holes.
+"""Scenes whose cubes are larger than memory, written in moments.
 
-The table of the built-in scene, seen through a wide lens, so that most of each picture is black. Rays are cast for each
-fourth pixel and each stands for a block of them: cheap, and as large to read and to train on as any other scene.
+Rays are cast for each fourth pixel and each stands for a block of them: cheap, and as large to read and to train on as
+any other scene. One shows the built-in table through a wide lens, so that most of each picture is black and its files
+are holes there. The other shows the built-in room with noise and without alpha, so that every value lies on the disk.
 
 Notation: `B` bands, `H`, `W` rows and columns.
 """
@@ -18,6 +19,7 @@ from jaxtyping import Float16
 from PIL import Image
 
 from unmix_plugin.scenes.demo.scene import (
+    PLACES,
     demo_cameras,
     frame_name,
     lens_entries,
@@ -30,6 +32,9 @@ BLOCK = 4
 """Pixels along an edge that look alike."""
 WIDE = 0.35
 """Focal length in parts of the built-in scene's."""
+NOISE = 0.004
+"""Standard deviation, in parts of what stands for 1."""
+_WHITE, _LARGEST_UINT16 = 60000.0, 65535
 
 
 def write_large_scene(folder: Path, size: int, bands: int, views: int) -> int:
@@ -58,6 +63,37 @@ def write_large_scene(folder: Path, size: int, bands: int, views: int) -> int:
     content = {**lens_entries(cameras), "wavelengths": nm.tolist(), "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
     return sum(512 * path.stat().st_blocks for path in folder.rglob("*") if path.is_file())
+
+
+def write_dense_scene(folder: Path, size: int, bands: int, views: int) -> int:
+    """Write a room without alpha as integers of 16 bits into a new folder; arguments and result as above."""
+    (folder / "cubes").mkdir(parents=True)
+    nm, place = band_centers_nm(bands), PLACES["room"]
+    spectra, lamp = reflectances(nm), lamp_power(nm)
+    cameras, coarse = place.cameras(size, views), place.cameras(size // BLOCK, views)
+    generator, frames = np.random.default_rng(0), []
+    noise = generator.normal(scale=NOISE * _WHITE, size=(BLOCK, size, bands)).astype(np.float32)
+    for index in range(views):
+        view, name = (
+            render_view(coarse, index, subpixels=1, things=place.things, sky=place.sky),
+            frame_name(index),
+        )
+        cube = np.lib.format.open_memmap(
+            folder / f"cubes/{name}.npy", mode="w+", dtype=np.uint16, shape=(size, size, bands)
+        )
+        for row, values in enumerate(_WHITE * radiance_cube(view, spectra, lamp)):
+            shift = int(generator.integers(size))
+            noisy = values.repeat(BLOCK, axis=0) + np.roll(noise, shift, axis=1)
+            cube[BLOCK * row : BLOCK * (row + 1)] = noisy.clip(0, _LARGEST_UINT16)
+        frames.append(
+            {
+                "hyperspectral_file_path": f"cubes/{name}.npy",
+                "transform_matrix": transform_matrix(cameras, index),
+            }
+        )
+    content = {**lens_entries(cameras), "wavelengths": nm.tolist(), "value_scale": _WHITE, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content), encoding="utf-8")
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def few_views(folder: Path, whole: Path, count: int) -> None:

@@ -120,7 +120,7 @@ class HyperspectralDataManager(DataManager):
         if self.scene.is_rig:
             arrays["sensor"] = np.array(self.scene.frames[view].sensor)
         batch = {
-            name: torch.tensor(array, device=self.device)
+            name: torch.from_numpy(np.require(array, requirements="W")).to(self.device)
             for name, array in arrays.items()
             if array is not None
         }

@@ -146,6 +146,43 @@ def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
     assert table.blocks[0].held_bytes == size
 
 
+@pytest.mark.parametrize("components", ["none", 3])
+@pytest.mark.parametrize("stored", ["<f2", "<u2", "<f4"])
+def test_views_are_never_read_whole_and_bad_values_at_the_edges_of_parts_are_found(
+    tmp_path, monkeypatch, stored, components
+):
+    scale = 60000.0 if stored == "<u2" else None
+    folder = make_scene(tmp_path / "scene")
+    folder.edit(lambda content: content.update(wavelengths=[450.0 + 20 * band for band in range(10)]))
+    folder.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
+
+    def write(cube: np.ndarray) -> np.ndarray:
+        bright = 0.5 + 0.1 * np.sin(np.arange(cube.shape[1]) + np.arange(cube.shape[0])[:, None])
+        wide = bright[..., None] * np.linspace(0.9, 1.0, 10)
+        wide[[7, 7, 8, 9], [10, 11, 11, 9], [4, 2, 7, 0]] = 0.0
+        return (wide * (scale or 1.0)).round(5).astype(stored)
+
+    folder.edit_cubes(write)
+    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    whole = PixelTable(scene, CPU, scene.train_indices, mends=True, components=components)
+    assert whole.bad_share == pytest.approx(4 / (320 * 10))
+    monkeypatch.setattr(pixel_block, "_CHUNK_VALUES", 4 * 20 * 10)
+    monkeypatch.setattr(pixel_block, "_FEWEST_ROWS", 1)
+    read, rows = PixelBlock._stored, []
+
+    def stored_rows(block: PixelBlock, view: int, part: tuple) -> torch.Tensor:
+        if isinstance(part[0], slice):
+            rows.append(part[0].stop - part[0].start)
+        return read(block, view, part)
+
+    monkeypatch.setattr(PixelBlock, "_stored", stored_rows)
+    parts = PixelTable(scene, CPU, scene.train_indices, mends=True, components=components)
+    assert max(rows) == (8 if components == 3 else 4)
+    assert parts.bad_share == whole.bad_share
+    everything = torch.arange(len(parts))
+    assert torch.equal(parts.blocks[0].spectra(everything), whole.blocks[0].spectra(everything))
+
+
 def test_a_cube_that_is_cut_short_while_training_goes_on_is_named(tmp_path):
     folder = make_scene(tmp_path / "scene")
     scene = load_scene(folder.root)

@@ -6,7 +6,7 @@ Bands are told apart by their noise, and count alike where none is much noisier.
 import pytest
 import torch
 
-from unmix_plugin.spectral.bad_values import BandNoise, deviation_limits, judge_bands, repaired
+from unmix_plugin.spectral.bad_values import REACH_PX, BandNoise, deviation_limits, judge_bands, repaired
 
 SIDE, NUM_BANDS = 24, 16
 
@@ -24,9 +24,10 @@ def image() -> torch.Tensor:
 
 def mend(seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Which values are bad, and the image without them."""
-    is_bad, values = repaired(seen, deviation_limits(seen.flatten(0, 1)))
-    mended = seen.clone()
-    mended[is_bad] = values
+    places, values = repaired(seen, deviation_limits(seen.flatten(0, 1)))
+    is_bad, mended = torch.zeros_like(seen, dtype=torch.bool), seen.clone()
+    is_bad[places] = True
+    mended[places] = values
     return is_bad, mended
 
 
@@ -52,6 +53,25 @@ def test_a_stripe_is_replaced_and_a_real_line_is_not():
     assert is_bad[:, 11, 6].all()
     assert int(is_bad.sum()) == SIDE
     assert float((mended - sound).abs().max()) < 0.05
+
+
+def test_parts_of_an_image_have_the_bad_values_of_the_whole():
+    seen = image()
+    seen[[0, 7, 8, 9, 23], [3, 4, 4, 20, 0], [5, 5, 9, 0, 15]] += 0.5
+    seen[:, 11, 6] *= 0.2
+    limits = deviation_limits(seen.flatten(0, 1))
+    whole = repaired(seen, limits)
+    rows, columns, bands, values = [], [], [], []
+    for first in range(0, SIDE, 8):
+        above, below = max(first - REACH_PX, 0), min(first + 8 + REACH_PX, SIDE)
+        found, instead = repaired(seen[above:below], limits, range(first - above, first + 8 - above))
+        rows.append(found[0] + above)
+        columns.append(found[1])
+        bands.append(found[2])
+        values.append(instead)
+    assert len(whole[1]) == SIDE + 5
+    for parts, expected in zip((rows, columns, bands, values), (*whole[0], whole[1]), strict=True):
+        assert torch.equal(torch.cat(parts), expected)
 
 
 def test_a_feature_that_the_pixels_around_share_is_real():

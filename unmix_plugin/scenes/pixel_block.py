@@ -27,7 +27,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.bad_values import repaired
+from unmix_plugin.spectral.bad_values import REACH_PX, repaired
 from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
 
 _CHUNK_BYTES = 4 << 20
@@ -45,10 +45,12 @@ _LARGEST_RESIDUAL = 2.0
 """In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
 _UNSATURATED = 0.9999
 """Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
+_WHOLE_RESERVE = 1.2
+"""Room for pixels that are kept whole, in multiples of what some pixels let expect."""
 _COMPACT_TYPES = ("f2", "u1", "i1", "i2", "u2")
 """Of NumPy, at most half as large as float32."""
-_CHUNK_VALUES = 1 << 23
-"""Values of a view in single precision at a time: a view of many bands takes a GB."""
+_CHUNK_VALUES, _FEWEST_ROWS = 1 << 21, 8
+"""Values of a view in single precision at a time, in whole rows: a view of many bands takes a GB."""
 _LARGEST_INT16, _UINT16_VALUES = 2**15 - 1, 2**16
 
 
@@ -181,12 +183,27 @@ class _ProjectedPixels:
     """Spectra of a block's pixels by the components that they have in a subspace."""
 
     def __init__(
-        self, subspace: SpectralSubspace, num_pixels: int, num_channels: int, device: torch.device
+        self,
+        subspace: SpectralSubspace,
+        num_pixels: int,
+        num_channels: int,
+        device: torch.device,
+        num_whole: int = 0,
     ) -> None:
+        """
+        Args:
+            num_whole: Pixels that will be kept whole, as far as one knows.
+        """
         self._subspace = subspace.to(device)
-        self._components = torch.zeros(num_pixels, len(subspace), dtype=torch.float16, device=device)
+        self._components = torch.empty(num_pixels, len(subspace), dtype=torch.float16, device=device)
+        self._room = torch.empty(num_whole, num_channels, dtype=torch.float16, device=device)
+        """Of which the first rows are in use; what isn't takes no memory on a CPU."""
         self._whole = torch.zeros(0, dtype=torch.int64, device=device)
-        self._spectra = torch.zeros(0, num_channels, dtype=torch.float16, device=device)
+
+    @property
+    def _spectra(self) -> Float[Tensor, "whole b"]:
+        """Of pixels kept whole."""
+        return self._room[: len(self._whole)]
 
     @property
     def num_bytes(self) -> int:
@@ -201,8 +218,14 @@ class _ProjectedPixels:
         self._components[first : first + len(spectra)] = components
         residuals = self._subspace.residuals(spectra, components.float())
         whole = _must_stay_whole(spectra, residuals).nonzero()[:, 0]
-        self._whole = torch.cat([self._whole, first + whole])
-        self._spectra = torch.cat([self._spectra, spectra[whole].half()])
+        if len(whole) == 0:
+            return
+        before, self._whole = len(self._whole), torch.cat([self._whole, first + whole])
+        if len(self._whole) > len(self._room):
+            room = self._room.new_empty(len(self._whole) * 5 // 4, self._room.shape[1])
+            room[:before] = self._room[:before]
+            self._room = room
+        self._room[before : len(self._whole)] = spectra[whole].half()
 
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1]."""
@@ -215,7 +238,7 @@ class _ProjectedPixels:
 
 
 def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
-    return (residuals > _LARGEST_RESIDUAL) | (spectra > _UNSATURATED).any(dim=-1)
+    return (residuals > _LARGEST_RESIDUAL) | (spectra.amax(dim=-1) > _UNSATURATED)
 
 
 @dataclass(frozen=True)
@@ -317,7 +340,9 @@ class PixelBlock:
             len(self._views), num_pixels, self.num_channels, device=self._camera_of.device
         )
         for row, view in enumerate(self._views):
-            values[row] = self._stored(view, ())
+            for top, bottom in self._row_ranges():
+                part = slice(top * self._width, bottom * self._width)
+                values[row, part] = self._stored(view, (slice(top, bottom),)).to(values.device)
         self._values = values.flatten(0, 1)
 
     def hold_part(self, num_bytes: int) -> None:
@@ -326,22 +351,19 @@ class PixelBlock:
             pixel_bytes = self.num_channels * self.value_bytes
             self.pool = _PixelPool(self.valid, pixel_bytes, num_bytes, self._read_range)
 
-    def hold_projected(self, subspace: SpectralSubspace, limits: Float[Tensor, " b"] | None) -> None:
+    def hold_projected(self, projection: Projection, limits: Float[Tensor, " b"] | None) -> None:
         """Read all values, and hold of each pixel its components in a subspace.
 
         Args:
             limits: As `mend` takes them; None replaces nothing.
         """
-        num_pixels = self._width * self._height
-        projected = _ProjectedPixels(subspace, len(self), self.num_channels, self._camera_of.device)
-        for row, view in enumerate(self._views):
-            spectra = self._scaled(self._stored(view, ()))
-            if limits is not None:
-                image = spectra.view(self._height, self._width, self.num_channels)
-                is_bad, values = repaired(image, limits)
-                image[is_bad] = values
-                self.num_bad += len(values)
-            projected.put(row * num_pixels, spectra)
+        num_pixels, device = self._width * self._height, self._camera_of.device
+        num_whole = int(_WHOLE_RESERVE * projection.whole_share * len(self))
+        projected = _ProjectedPixels(projection.subspace, len(self), self.num_channels, device, num_whole)
+        for row in range(len(self._views)):
+            for top, image, places, values in self._looked_through(row, limits):
+                image[places] = values
+                projected.put(row * num_pixels + top * self._width, image.flatten(0, 1))
         self._projected = projected
 
     def mend(self, limits: Float[Tensor, " b"]) -> None:
@@ -351,15 +373,50 @@ class PixelBlock:
             limits: As `deviation_limits` gives them.
         """
         assert self._values is not None
-        size = self._width * self._height
-        shape = (self._height, self._width, self.num_channels)
-        for first in range(0, len(self), size):
-            image = self._scaled(self._values[first : first + size]).cpu().view(shape)
-            is_bad, values = repaired(image, limits.cpu())
-            if len(values):
-                view = self._values[first : first + size].view(shape)
-                view[is_bad.to(view.device)] = self._as_stored(values).to(view)
-                self.num_bad += len(values)
+        views = self._values.view(-1, self._height, self._width, self.num_channels)
+        for row, view in enumerate(views):
+            found = [
+                (view[top : top + len(image)], places, self._as_stored(values).to(view))
+                for top, image, places, values in self._looked_through(row, limits)
+                if len(values)
+            ]
+            for part, places, values in found:  # after the whole view was looked through as it was measured
+                part[tuple(index.to(view.device) for index in places)] = values
+
+    def _looked_through(
+        self, row: int, limits: Float[Tensor, " b"] | None
+    ) -> Iterator[
+        tuple[int, Float[Tensor, "n W b"], tuple[Int[Tensor, " values"], ...], Float[Tensor, " values"]]
+    ]:
+        """First row, some rows of spectra from there on, places of bad values in these and what is around them.
+
+        Args:
+            row: Which of the block's views.
+            limits: As `mend` takes them; None finds none.
+        """
+        none = torch.zeros(0, dtype=torch.int64)
+        for top, bottom in self._row_ranges():
+            above = top if limits is None else max(top - REACH_PX, 0)
+            below = bottom if limits is None else min(bottom + REACH_PX, self._height)
+            size = self._width * self._height
+            if self._values is None:
+                stored = self._stored(self._views[row], (slice(above, below),))
+            else:
+                stored = self._values[
+                    row * size + above * self._width : row * size + below * self._width
+                ].cpu()
+            image = self._scaled(stored).view(below - above, self._width, self.num_channels)
+            lines = range(top - above, bottom - above)
+            (rows, *others), values = (
+                ((none,) * 3, none.float()) if limits is None else repaired(image, limits.cpu(), lines)
+            )
+            self.num_bad += len(values)
+            yield top, image[lines.start : lines.stop], (rows - lines.start, *others), values
+
+    def _row_ranges(self) -> list[tuple[int, int]]:
+        """First row, and the one after the last, of parts of a view that are looked at together."""
+        step = max(_FEWEST_ROWS, _CHUNK_VALUES // (self._width * self.num_channels))
+        return [(top, min(top + step, self._height)) for top in range(0, self._height, step)]
 
     def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
@@ -372,10 +429,9 @@ class PixelBlock:
     def _scaled(self, values: Tensor) -> Float[Tensor, "R b"]:
         if not self._is_compact:
             return values
-        if self._is_unsigned:
-            values = values.to(torch.int32) & 0xFFFF
-        values, scale = values.float(), self._scene.options.value_scale
-        return (values if scale is None else values / scale).clamp(0.0, 1.0)
+        values = (values.view(torch.uint16) if self._is_unsigned else values).float()
+        scale = self._scene.options.value_scale
+        return (values if scale is None else values.div_(scale)).clamp_(0.0, 1.0)
 
     def _as_stored(self, values: Float[Tensor, " values"]) -> Tensor:
         """Spectra as `_scaled` takes them, not yet of the type that is stored."""
@@ -395,11 +451,10 @@ class PixelBlock:
             of: From spectra (n, b), alpha and which pixels are valid (n) to n values.
         """
         size = self._width * self._height
-        step = self._width * max(1, _CHUNK_VALUES // (self._width * self.num_channels))
         for first in range(0, len(self), size):
             parts = []
-            for start in range(first, first + size, step):
-                end = min(start + step, first + size)
+            for top, bottom in self._row_ranges():
+                start, end = first + top * self._width, first + bottom * self._width
                 if self.pool is None:
                     spectra = self.spectra(torch.arange(start, end, device=self.alpha.device)).cpu()
                 else:

@@ -37,7 +37,7 @@ _USABLE_SHARE = 0.8
 _LARGEST_POOL = 2**30
 """Of pixels on disk; more in memory would not be drawn from more evenly."""
 _PIXELS_TO_JUDGE_BY = 20_000
-_MOST_LISTED = 1 << 24
+_MOST_LISTED = 1 << 22
 """Pixels of a block that are listed one by one to sample from; of larger blocks some are."""
 
 
@@ -147,7 +147,7 @@ class PixelTable:
         for block in self.blocks:
             limits = self._limits(block)
             if block.sensor in found:
-                block.hold_projected(found[block.sensor][0].subspace, limits)
+                block.hold_projected(found[block.sensor][0], limits)
                 continue
             block.hold()
             if limits is not None:
@@ -198,7 +198,7 @@ class PixelTable:
     @cached_property
     def _valid(self) -> list[Int[Tensor, " valid"] | None]:
         """Of each block, the indices of its valid pixels; None if all are."""
-        return [None if bool(b.valid.all()) else b.valid.nonzero()[:, 0] for b in self.blocks]
+        return [None if bool(b.valid.all()) else b.valid.nonzero()[:, 0].int() for b in self.blocks]
 
     def draw(
         self,
@@ -234,7 +234,7 @@ class PixelTable:
         drawn = torch.randint(
             len(self.blocks[block]) if valid is None else len(valid), (count,), generator=generator
         )
-        return drawn if valid is None else valid[drawn]
+        return drawn if valid is None else valid[drawn].long()
 
     def _counts(self, count: int, generator: torch.Generator, shares: Mapping[int, float]) -> list[int]:
         """As many pixels of each block as chance gives its sensor."""
@@ -248,7 +248,7 @@ class PixelTable:
         pool: Int[Tensor, " pool"]
         if len(block) > _MOST_LISTED:
             some = torch.Generator().manual_seed(seed)
-            pool = torch.randint(len(block), (_MOST_LISTED // 8,), generator=some).unique()
+            pool = torch.randint(len(block), (_MOST_LISTED // 2,), generator=some).unique()
             pool = pool[block.valid[pool]]
         else:
             pool = torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]

@@ -20,7 +20,7 @@ _PEAK = 1.2
 """By how much a bad value deviates more than the values in the bands beside it, which deviate because of it."""
 _END_FACTOR = 0.75
 """Of a deviation at either end of the spectrum, from the one band beside it."""
-_REACH_PX = 2
+REACH_PX = 2
 """Pixels around one that it is compared with."""
 _MOST_ALIKE = 5
 """Of these 24, so many may deviate like a bad value, as those of its line do; at the corner of a real thing, 8 do."""
@@ -40,7 +40,9 @@ _SIGMA_OF_MAD = 1.4826
 def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"]:
     """Of each value from the mean of the bands beside it; at the ends 0.75 of that from the one band beside it."""
     found = torch.empty_like(spectra)
-    found[..., 1:-1] = spectra[..., 1:-1] - 0.5 * (spectra[..., :-2] + spectra[..., 2:])
+    inner = found[..., 1:-1]  # filled in place: temporaries as large as an image took longer than the sums
+    torch.add(spectra[..., :-2], spectra[..., 2:], out=inner)
+    torch.add(spectra[..., 1:-1], inner, alpha=-0.5, out=inner)
     found[..., 0] = _END_FACTOR * (spectra[..., 0] - spectra[..., 1])
     found[..., -1] = _END_FACTOR * (spectra[..., -1] - spectra[..., -2])
     return found
@@ -59,39 +61,48 @@ def deviation_limits(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "B"]:
 
 
 def repaired(
-    image: Float[Tensor, "H W B"], limits: Float[Tensor, "B"]
-) -> tuple[Bool[Tensor, "H W B"], Float[Tensor, "values"]]:
-    """Which values of an image are bad, and what the bands beside them and the pixels around them say instead.
+    image: Float[Tensor, "H W B"], limits: Float[Tensor, "B"], lines: range | None = None
+) -> tuple[tuple[Int[Tensor, "values"], ...], Float[Tensor, "values"]]:
+    """Rows, columns and bands of bad values, and what the bands beside them and the pixels around them say instead.
 
     Args:
         limits: As `deviation_limits` gives them.
+        lines: Rows to look at, all by default. Those of a part of a larger image are `REACH_PX` from where it is cut.
     """
+    lines = range(len(image)) if lines is None else lines
     found = deviations(image)
-    size = found.abs()
+    inner = found[lines.start : lines.stop]
+    # One number a pixel first: in a sound image this ends the search, and of few others all bands are looked at.
+    is_suspect = inner.abs().sub_(limits).amax(dim=-1) > 0
+    rows, columns = is_suspect.nonzero().unbind(dim=-1)
+    size = inner[rows, columns].abs()
     beside = torch.nn.functional.pad(size, (1, 1))
     is_peak = size > _PEAK * torch.maximum(beside[..., :-2], beside[..., 2:])
-    candidates = (is_peak & (size > limits)).nonzero()
-    rows, columns, bands = candidates.unbind(dim=-1)
-    around = _around(found, candidates)
+    suspects, bands = (is_peak & (size > limits)).nonzero().unbind(dim=-1)
+    rows, columns = rows[suspects] + lines.start, columns[suspects]
+    around = _around(found, rows, columns, bands)
     differences = (found[rows, columns, bands][:, None] - around).abs().sort(dim=1).values
     kept = differences[:, _MOST_ALIKE] > limits[bands]
     excess = found[rows, columns, bands] - around.median(dim=1).values
     rows, columns, bands, excess = (part[kept] for part in (rows, columns, bands, excess))
-    is_bad = torch.zeros_like(image, dtype=torch.bool)
-    is_bad[rows, columns, bands] = True
     is_end = (bands == 0) | (bands == image.shape[-1] - 1)
     values = image[rows, columns, bands] - excess / torch.where(is_end, _END_FACTOR, 1.0)
-    return is_bad, values.clamp(min=0)
+    return (rows, columns, bands), values.clamp(min=0)
 
 
-def _around(found: Float[Tensor, "H W B"], candidates: Int[Tensor, "C 3"]) -> Float[Tensor, "C 24"]:
+def _around(
+    found: Float[Tensor, "H W B"],
+    rows: Int[Tensor, " C"],
+    columns: Int[Tensor, " C"],
+    bands: Int[Tensor, " C"],
+) -> Float[Tensor, "C 24"]:
     """Deviations in the same band of the pixels around candidates."""
-    reach = torch.arange(-_REACH_PX, _REACH_PX + 1)
+    reach = torch.arange(-REACH_PX, REACH_PX + 1)
     shifts = torch.cartesian_prod(reach, reach)
     shifts = shifts[(shifts != 0).any(dim=1)]
-    rows = _mirrored(candidates[:, None, 0] + shifts[:, 0], found.shape[0])
-    columns = _mirrored(candidates[:, None, 1] + shifts[:, 1], found.shape[1])
-    return found[rows, columns, candidates[:, None, 2]]
+    rows = _mirrored(rows[:, None] + shifts[:, 0], found.shape[0])
+    columns = _mirrored(columns[:, None] + shifts[:, 1], found.shape[1])
+    return found[rows, columns, bands[:, None]]
 
 
 def _mirrored(places: Int[Tensor, "C 24"], size: int) -> Int[Tensor, "C 24"]:

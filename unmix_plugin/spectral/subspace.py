@@ -97,7 +97,8 @@ class SpectralSubspace:
         self, spectra: Float[Tensor, "N B"], components: Float[Tensor, "N P"]
     ) -> Float[Tensor, "N"]:
         """What components miss of spectra: root mean square over weighted bands, in multiples of the noise."""
-        return brightness((spectra - self.spectra(components)) * self.weights) / self.noise
+        missed = torch.addmm(spectra, components, self.basis / -self.weights).mul_(self.weights)
+        return torch.linalg.vector_norm(missed, dim=-1) / (missed.shape[1] ** 0.5 * self.noise)
 
 
 def find_subspace(pixels: Float[Tensor, "N B"], num_components: int | None = None) -> SpectralSubspace:

@@ -158,6 +158,7 @@ def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: Invalid
     cube = map_array(path)
     height, width, bands = cube.shape
     rows = max(1, _BLOCK_VALUES // max(1, width * bands))
+    scale = np.float32(1.0 if value_scale is None else value_scale)
     digest, is_in_file_order = hashlib.sha256(), cube.flags.c_contiguous
     head, end = (cube.offset, cube.offset + cube.nbytes) if is_in_file_order else (-1, 0)  # type: ignore[attr-defined]
     digest.update(_read_bytes(path, 0, head))
@@ -169,12 +170,13 @@ def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: Invalid
         if is_in_file_order:
             digest.update(raw.view(np.uint8).data)
         with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite and is counted as such
-            stored = np.asarray(raw, dtype=np.float32)
-            block = stored if value_scale is None else stored / np.float32(value_scale)
-        low, high = float(block.min()), float(block.max())
-        if low >= 0.0 and high <= 1.0:  # false with any NaN; most blocks of a sound scene end here
-            greatest = max(greatest, float(stored.max()))
-            continue
+            compared = raw if cube.dtype.kind in "iu" else np.asarray(raw, dtype=np.float32)
+            low, high = np.float32(compared.min()), np.float32(compared.max())
+            if low >= 0.0 and high <= scale:  # false with any NaN; most blocks of a sound scene end here
+                greatest = max(greatest, float(high))
+                continue
+            stored = np.asarray(compared, dtype=np.float32)
+            block = stored if value_scale is None else stored / scale
         finite = np.isfinite(block)
         totals += (
             np.isnan(block).sum(),
@@ -227,7 +229,12 @@ def read_invalid(
     path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
 ) -> Bool[np.ndarray, "H W"]:
     """Pixels that `read_cube` sets to 0."""
-    return _find_invalid(_read_scaled(path, value_scale), invalid_pixels)
+    height, width, bands = map_array(path).shape
+    rows, invalid = max(1, _BLOCK_VALUES // max(1, width * bands)), np.empty((height, width), bool)
+    for first in range(0, height, rows):
+        part = (slice(first, first + rows),)
+        invalid[first : first + rows] = _find_invalid(_read_scaled(path, value_scale, part), invalid_pixels)
+    return invalid
 
 
 def _read_scaled(
