@@ -1,0 +1,88 @@
+"""Endmembers on which several searches agree."""
+
+import pytest
+import torch
+from torch.nn.functional import normalize
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
+from tests.spectral.unmixing.surface_pixels import surface_pixels
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.unmixing.pooled_search import _archetypes, _ranked, pooled_search
+
+
+def angles(found, materials):
+    """Of each material to the nearest found spectrum."""
+    return spectral_angle(materials[:, None].double(), found[None].double()).amin(1)
+
+
+def dark_water(seed=0):
+    """Two bright materials that meet, and a dark one whose shape varies more than they differ: as water under haze."""
+    generator = seeded(seed)
+    bright = smooth_endmembers(3)[:2]
+    water = torch.linspace(0.08, 0.004, 24, dtype=torch.float64) ** 1.5 * 2
+    haze = torch.rand(700, 1, dtype=torch.float64, generator=generator) * 0.012
+    share = torch.rand(700, 1, dtype=torch.float64, generator=generator).round(decimals=1)
+    land = share * bright[0] + (1 - share) * bright[1]
+    pixels = torch.cat([land, water + haze])
+    pixels = pixels + 0.0007 * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    return pixels.clamp(min=0).float(), torch.stack([*bright, water + 0.006])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_dark_material_whose_shape_varies_costs_no_bright_one(seed):
+    pixels, materials = dark_water(seed)
+    found = pooled_search(pixels, 3, seeded(seed)).endmembers
+    assert float(angles(found, materials).max()) < 0.12
+
+
+def test_materials_are_found_among_smooth_mixtures_and_among_edges_whatever_the_seed():
+    materials = smooth_endmembers(4)
+    shares = torch.rand(1500, 4, dtype=torch.float64, generator=seeded()) ** 8
+    gradual = (shares / shares.sum(dim=1, keepdim=True)) @ materials
+    for pixels in (gradual, surface_pixels(materials)):
+        first, second = (pooled_search(pixels.float(), 4, seeded(seed)).endmembers for seed in (1, 2))
+        assert float(angles(first, materials).max()) < 0.06
+        assert float(angles(first, second).max()) < 0.02
+
+
+def test_spectra_have_length_one_and_the_best_sets_the_same_order():
+    pixels = mixed_pixels(smooth_endmembers(3), 800, seed=0).float()
+    found = pooled_search(pixels, 3, seeded())
+    assert found.endmembers.dtype == torch.float32
+    assert float(found.endmembers.min()) >= 0
+    assert_close(found.endmembers.norm(dim=1), torch.ones(3))
+    assert found.others.shape == (5, 3, pixels.shape[1])
+    assert float(spectral_angle(found.others, found.endmembers).mean(dim=1).min()) < 0.06
+    again = pooled_search(pixels, 3, seeded())
+    assert torch.equal(found.endmembers, again.endmembers)
+
+
+def test_archetypes_are_corners_of_the_pixels_that_make_all_of_them_up():
+    materials = normalize(smooth_endmembers(3), dim=1)
+    shares = torch.rand(900, 3, dtype=torch.float64, generator=seeded()) ** 4
+    pixels = (shares / shares.sum(dim=1, keepdim=True)) @ materials
+    runs = _archetypes(pixels.float(), 3, seeded())
+    worst = torch.stack([angles(run, materials).max() for run in runs])
+    assert float(worst.median()) < 0.1
+
+
+def test_of_sets_that_do_as_well_the_one_that_most_searches_found_is_chosen():
+    seen = normalize(torch.rand(50, 6, dtype=torch.float64, generator=seeded()), dim=1)
+    lonely = normalize(torch.eye(6, dtype=torch.float64)[:3] + 0.1, dim=1)
+    common = [
+        normalize(torch.eye(6, dtype=torch.float64)[3:] + 0.1 + 0.001 * step, dim=1) for step in range(3)
+    ]
+    weights = torch.ones(50, dtype=torch.float64)
+    # The price of pixels explained as well by all: the first two are the same pixels, mirrored.
+    mirrored = torch.cat([seen, seen.flip(1)])
+    ranked = _ranked([lonely, *common], mirrored, torch.cat([weights, weights]))
+    assert float(spectral_angle(ranked[0], common[1]).max()) < 0.01
+
+
+def test_few_shapes_are_searched_in_pairs_and_too_many_endmembers_refused():
+    pixels = smooth_endmembers(3).repeat(30, 1).float()
+    assert float(angles(pooled_search(pixels, 3, seeded()).endmembers, smooth_endmembers(3)).max()) < 1e-3
+    with pytest.raises(SpectrumError, match="ask for at most 3"):
+        pooled_search(pixels, 4, seeded())
