@@ -41,7 +41,7 @@ from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import choose, preset_for
-from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, reopen_lost, shrinking, update_grid
+from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
@@ -54,6 +54,8 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
 
 _FEWEST_RAYS, _MOST_RAYS = 64, 8192
+_FIRST_PART = 0.05
+"""Part of the training in which lighter samples may have gradients than later."""
 _COARSEST_REFINED = 4
 """Cells along the scene box on the coarsest level at most where poses are refined: a pose that is off by a cell still
 finds its way."""
@@ -270,11 +272,9 @@ class UnmixModel(Model):
     def learn_from(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
-        shrunk = shrinking(self._progress) if self.preset.visible_by_heaviest else None
-        views = step.corrected.rays.camera_indices
-        record_seen(self.grid, step.rendered, views, visible_weight, self.processes, shrunk)
-        if shrunk and visible_weight < 1:
-            reopen_lost(self.grid, step.rendered, step.corrected.rays, self.renderer.box)
+        record_seen(
+            self.grid, step.rendered, step.corrected.rays.camera_indices, visible_weight, self.processes
+        )
         if self.grid.observed is not None:
             positions, densities = step.rendered.visible.observed()
             self.grid.record_observed(self.renderer.space.to_unit(positions), densities)
@@ -353,7 +353,8 @@ class UnmixModel(Model):
     def _training_renderer(self) -> VolumeRenderer:
         """That of the present training step: samples may be farther apart, and shadows softer, than in the end."""
         preset, progress = self.preset, self._progress
-        smallest = preset.smallest_weight if shrinking(progress) else preset.first_smallest_weight
+        is_first = progress < _FIRST_PART
+        smallest = preset.first_smallest_weight if is_first else preset.smallest_weight
         return replace(
             self.renderer,
             step=self.step * self._coarseness(progress),
@@ -390,9 +391,10 @@ class UnmixModel(Model):
     def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:
         """Before training. Where little was carved, cells are too many to wait until each was probed: what rays meet
         in them counts as well."""
-        in_haze = self.preset.visible_by_heaviest
-        observes = in_haze or self.config.poses == "refine"
-        return OccupancyGrid(reachable, self._lamp is not None, observes, one_view=in_haze)
+        is_carved = self.metadata["has_alpha"] or self.has_backdrop
+        return OccupancyGrid(
+            reachable, self._lamp is not None, not is_carved or self.config.poses == "refine"
+        )
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress

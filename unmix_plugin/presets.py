@@ -2,7 +2,7 @@
 
 With alpha, space outside the objects' visual hull is carved away before training, and a transparent pixel is known to
 be empty. Without it, as in a closed room, a black pixel may show a black thing or nothing at all, and free space is
-only cleared by training, from what rays meet and where they end. In an unbounded world every ray ends on something, if
+only cleared by training, from what rays meet. In an unbounded world every ray ends on something, if
 only the sky; where pictures without alpha share a plain backdrop, the hull of what is before it is carved as with
 alpha, and the backdrop is learnt.
 """
@@ -26,11 +26,9 @@ class AlphaPreset:
     smallest_weight: float
     """Lighter samples have no gradient, so that haze which they are made of fades."""
     first_smallest_weight: float
-    """The same before haze shrinks: surfaces far behind semi-transparent density must be able to grow."""
+    """The same at the start: surfaces far behind semi-transparent density must be able to grow."""
     visible_weight: float
-    visible_by_heaviest: bool
-    """Whether `visible_weight` is a share of the weight of the heaviest sample of the same ray, rather than of all its
-    light. In rooms each ray ends on something, and what it ends on must stay."""
+    """1: nothing is left out. In rooms, walls must be found behind semi-transparent density."""
     background: Literal["random", "black"]
     """Random greys would reward floaters before the cameras where alpha is unknown."""
     rgb_loss_weight: float
@@ -49,7 +47,6 @@ WITH_ALPHA = AlphaPreset(
     smallest_weight=4e-3,
     first_smallest_weight=4e-3,
     visible_weight=0.05,
-    visible_by_heaviest=False,
     background="random",
     rgb_loss_weight=0.2,
     opacity_loss_weight=0.0,
@@ -64,8 +61,7 @@ WITHOUT_ALPHA = AlphaPreset(
     initial_opacity=0.01,
     smallest_weight=4e-3,
     first_smallest_weight=1e-3,
-    visible_weight=0.4,
-    visible_by_heaviest=True,
+    visible_weight=1.0,
     background="black",
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
@@ -79,7 +75,6 @@ WITHOUT_ALPHA = AlphaPreset(
 UNBOUNDED = replace(
     WITHOUT_ALPHA,
     initial_opacity=0.005,
-    visible_weight=1.0,  # what a ray passes on its way to the sky may be far and light
     surface_loss_weight=0.3,
     coarse_samples=64,
 )

@@ -179,8 +179,7 @@ class RendererConfig:
     but 0.001 at the start where alpha is unknown."""
     visible_weight: Ours[float | Auto] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
-    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 0.4 of the heaviest sample of the ray, seen
-    by one view: what a ray ends on must stay. It is 1 in an unbounded world."""
+    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.

@@ -167,17 +167,6 @@ def test_what_one_view_sees_however_often_is_closed():
     assert not cells.visible[6, 6, 6]
 
 
-def test_what_one_view_sees_stays_where_that_is_enough():
-    grid = OccupancyGrid(torch.ones(8, 8, 8, dtype=torch.bool), one_view=True)
-    points = (torch.tensor([[1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [6.0, 6.0, 6.0]]) + 0.5) / 8
-    views, seen = torch.tensor([0, 1, 1]), torch.ones(3, dtype=torch.bool)
-    grid.visibility.record(points, views, seen, 100_000)
-    grid.visibility.update()
-    assert grid.visibility.visible[1, 1, 1]
-    assert grid.visibility.visible[6, 6, 6]
-    assert not grid.visibility.visible[3, 3, 3]
-
-
 def test_a_grid_that_notes_what_rays_meet_loads_one_that_did_not():
     saved = updated(full(), ball, times=3)
     loaded = OccupancyGrid(torch.ones(8, 8, 8, dtype=torch.bool), records_observed=True)

@@ -72,10 +72,9 @@ class VisibleCells(nn.Module):
     highest_view: UInt8[Tensor, "X Y Z"]
     num_rays: Int[Tensor, ""]
 
-    def __init__(self, shape: Sequence[int], one_view: bool = False) -> None:
-        """Start with every cell of a grid of this shape visible; with `one_view` what one view saw stays too."""
+    def __init__(self, shape: Sequence[int]) -> None:
+        """Start with every cell of a grid of this shape visible."""
         super().__init__()
-        self.one_view = one_view
         self.register_buffer("visible", torch.ones(*shape, dtype=torch.bool))
         self.register_buffer("lowest_view", torch.full(tuple(shape), _NO_VIEW, dtype=torch.uint8))
         self.register_buffer("highest_view", torch.zeros(*shape, dtype=torch.uint8))
@@ -104,9 +103,7 @@ class VisibleCells(nn.Module):
 
     @torch.no_grad()
     def update(self, fewest_rays: int = 0) -> None:
-        """Keep only what two views saw, or one if that is enough, and start over.
-
-        Nothing is done before `fewest_rays` and enough for each cell were cast.
+        """Keep only what two views saw, if `fewest_rays` and enough for each cell were cast, and start over.
 
         Where two views saw no cell, what one saw is kept; where none saw any, as in thin semi-transparent density, all
         that was visible.
@@ -115,8 +112,7 @@ class VisibleCells(nn.Module):
         if int(self.num_rays) < max(_RAYS_A_CELL * sides[1] * sides[2], fewest_rays):
             return
         seen_by_two = self.lowest_view < self.highest_view
-        is_strict = not self.one_view and bool(seen_by_two.any())
-        seen = seen_by_two if is_strict else self.lowest_view <= self.highest_view
+        seen = seen_by_two if bool(seen_by_two.any()) else self.lowest_view <= self.highest_view
         if bool(seen.any()):
             self.visible.copy_(_with_neighbours(seen))
         self.lowest_view.fill_(_NO_VIEW)
@@ -157,21 +153,16 @@ class OccupancyGrid(nn.Module):
     """As `skip_distances` says, of the cells that cast shadows."""
 
     def __init__(
-        self,
-        reachable: Bool[Tensor, "X Y Z"],
-        casts_shadows: bool = False,
-        records_observed: bool = False,
-        one_view: bool = False,
+        self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_observed: bool = False
     ) -> None:
         """Start with every cell occupied that `reachable` allows; the others always stay empty.
 
         Args:
             casts_shadows: Whether to keep the cells that are opaque, none at the start.
             records_observed: Whether densities that rays meet are noted, so that updates need not probe those cells.
-            one_view: Whether cells stay visible that only one view saw.
         """
         super().__init__()
-        self.visibility = VisibleCells(reachable.shape, one_view)
+        self.visibility = VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.occupancy import OccupancyGrid
@@ -36,15 +35,6 @@ _SHARE_OF_PIXELS = 0.07
 """Of the pixels of the training views, that must be cast before it is decided anew what is visible. In large
 pictures a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good.
 """
-
-_SHRINKING = (0.05, 0.3)
-"""Parts of the training without alpha between which haze shrinks: rays must first have found about where they end, and
-what is shrunk too early stands in the wrong place."""
-
-_LOST = 0.8
-"""Opacity of a ray below which it lost what it ended on."""
-_MOST_LOST = 64
-"""Such rays of a batch that are followed."""
 
 
 def is_due(step: int) -> bool:
@@ -120,51 +110,9 @@ def record_seen(
     views: Int[Tensor, "N"],
     visible_weight: float,
     processes: Processes,
-    shrunk: float | None = None,
 ) -> None:
-    """Note which cells the rays of a batch saw, each of a view; nothing where all cells stay visible.
-
-    Args:
-        grid: That notes it.
-        rendered: The batch.
-        views: Of its rays.
-        visible_weight: Share of its ray's light from which a sample counts as seen; 1: all stay visible.
-        processes: That train together.
-        shrunk: None, or how far haze is to shrink to the surfaces in it, as `shrinking` says. Then the share is one of
-            the weight of the heaviest sample of the ray, so that no ray loses what it ends on.
-    """
-    if visible_weight >= 1 or shrunk == 0:
+    """Note which cells the rays of a batch saw, each of a view; nothing where all cells stay visible."""
+    if visible_weight >= 1:
         return
-    rays, weights = rendered.ray_indices, rendered.weights.detach()
-    least: Tensor | float = visible_weight
-    if shrunk is not None:
-        heaviest = weights.new_zeros(len(views)).scatter_reduce_(0, rays, weights, "amax")
-        least = visible_weight * shrunk * heaviest.index_select(0, rays)
-    own = views.index_select(0, rays)
-    grid.visibility.record(rendered.positions, own, weights > least, len(views) * processes.count)
-
-
-def reopen_lost(grid: OccupancyGrid, rendered: RenderedRays, rays: RayBundle, box: SceneBox) -> None:
-    """Let cells on rays that lost what they ended on stay visible, so that they find it again.
-
-    Args:
-        grid: Whose cells they are.
-        rendered: Rays of a bounded scene without alpha, all of which end on something.
-        rays: The same rays.
-        box: Of the grid.
-    """
-    lost = (rendered.coefficients.accumulation.detach() < _LOST).nonzero()[:_MOST_LOST, 0]
-    origins, directions = rays.origins.detach()[lost], rays.directions.detach()[lost]
-    t_near, t_far = box.intersect(origins, directions)
-    count = 2 * max(grid.occupied.shape)
-    along = (torch.arange(count, device=lost.device) + 0.5) / count
-    t = t_near[:, None] + along * (t_far - t_near).clamp(min=0.0)[:, None]
-    points = box.normalise(origins[:, None] + t[..., None] * directions[:, None]).flatten(0, 1)
-    own = rays.camera_indices[lost].repeat_interleave(count)
-    grid.visibility.record(points, own, torch.ones_like(own, dtype=torch.bool), 0)
-
-
-def shrinking(progress: float) -> float:
-    """How far haze is to shrink when that part of the training is over: 0 at first, 1 in the end."""
-    start, end = _SHRINKING
-    return min(max((progress - start) / (end - start), 0.0), 1.0)
+    own, is_seen = views.index_select(0, rendered.ray_indices), rendered.weights > visible_weight
+    grid.visibility.record(rendered.positions, own, is_seen, len(views) * processes.count)
