@@ -49,7 +49,7 @@ class Options:
     """A scene of an object on a turntable, views in the order of its frames."""
     basil: Path | None = None
     """The files of "Basil" of HS-NeRF: images/ and colmap/."""
-    steps: int = 1000
+    steps: int = 600
     """Of each training on the turntable."""
     board: Path | None = None
     """A raw capture with a board (unmix-demo-scene --raw --markers), if it is there already."""
@@ -83,7 +83,7 @@ def main(options: Options) -> None:
     report = _common.Report(
         "found_poses", question, setting, _machine.describe_machine(), judge(measured), measured, ()
     )
-    _common.publish(report, options.results)
+    _common.publish(report, _common.results_folder(options.results, quick=False))
 
 
 def with_board(options: Options) -> dict[str, Any]:
@@ -168,14 +168,14 @@ def process(capture: Path, scene: Path, *poses: str) -> str | None:
 
 
 def attempt(words: list[str]) -> str | None:
-    """Run unmix-process; the message if it refuses."""
+    """Run unmix-process; the first sentence of the message if it refuses."""
     from tests.commands.running import run
     from unmix_plugin.commands.process import process as command
 
     ended = run(command, *words)
     if ended.status not in (0, 2):
         raise RuntimeError(ended.err)
-    return ended.err.strip() if ended.status else None
+    return ended.err.split(". ")[0] if ended.status else None
 
 
 def errors(scene: Path, truth_file: Path) -> dict[str, Any]:
