@@ -195,6 +195,6 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     path = tmp_path / "path.json"
-    path.write_bytes(b"\xff\xfe\x00 not text \x80")
+    path.write_bytes(b"\x80\x00 not text \xff")
     with pytest.raises(ConfigError, match="is not readable as JSON"):
         read_camera_file(path, FRAME)
