@@ -81,8 +81,9 @@ def test_poses_of_other_pictures_do_not_fit(pinhole_views):
     assert "do not fit their poses" in finding
 
 
-def test_views_without_features_are_not_judged(tmp_path, pinhole_views):
-    Image.new("L", (SIZE, SIZE), 128).save(tmp_path / "grey.png")
+@pytest.mark.parametrize("size", [(SIZE, SIZE), (7, 5)])
+def test_views_without_features_are_not_judged(tmp_path, pinhole_views, size):
+    Image.new("L", size, 128).save(tmp_path / "grey.png")
     plain = [replace(view, picture=tmp_path / "grey.png") for view in pinhole_views]
     found, said = check_matches(plain, ANGLES)
     assert found == []

@@ -190,7 +190,7 @@ def _features_of(view: MatchedView) -> tuple[Points, np.ndarray] | None:
     sift = SIFT(upsampling=2 if max(size) < _LONGEST_SIDE_PX else 1)
     try:
         sift.detect_and_extract(np.where(matter, grey, 0.0))
-    except (RuntimeError, ValueError):  # nothing stands out, or the view is too small
+    except (RuntimeError, ValueError, IndexError):  # nothing stands out, or the view is too small
         return None
     places = np.asarray(sift.keypoints, np.float64)[:, ::-1]
     some = np.unique(np.linspace(0, len(places) - 1, _MOST_FEATURES).round().astype(int))

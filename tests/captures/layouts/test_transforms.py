@@ -80,6 +80,16 @@ def test_wavelengths_are_those_of_the_file_unless_given(tmp_path):
     assert bands.wavelengths_nm.tolist() == [400.0, 410.0, 420.0, 430.0]
 
 
+def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
+    write_unmix(tmp_path)
+    edit(tmp_path, lambda content: content.update(wavelengths=np.linspace(400, 900, 40).tolist()))
+    for path in tmp_path.rglob("*.npy"):
+        np.save(path, np.random.default_rng(0).random((6, 8, 40)))  # more bands than rows
+    for view in find_unmix_nerf(tmp_path, PLAIN).views:
+        assert view.cube.shape == (6, 8, 40)
+        assert view.cube.warnings == ()
+
+
 @pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
 def test_wavelengths_are_never_made_up(tmp_path, stated):
     write_unmix(tmp_path, wavelengths=stated)

@@ -269,6 +269,10 @@ def _in_eval(text: str) -> str:
 def _open_cube(path: Path, wavelengths: np.ndarray | None, options: ReadOptions) -> SpectralFile:
     """A cube; numbers of 8 bits stand for fractions of 255."""
     file = open_spectral_file(path, options)
+    if wavelengths is not None and len(wavelengths) == file.shape[2] and file.warnings:
+        # transforms.json settles which axis is that of bands, which the array alone leaves in doubt.
+        sure = open_spectral_file(path, replace(options, axes="yxb"))
+        file = sure if sure.shape == file.shape and options.axes is None else file
     if file.dtype == np.uint8 and file.linear is None:
         linear = linear_values(path, file.shape[2], [1 / 255], [], "numbers of 8 bits")
         file = replace(file, linear=linear)
