@@ -118,7 +118,7 @@ def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Feature
     sift = SIFT(upsampling=1)
     try:
         sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
-    except (RuntimeError, ValueError):  # nothing stands out, or the view is too small for it
+    except (RuntimeError, ValueError, IndexError):  # nothing stands out, or the view is too small for it
         return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32))
     coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
     return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32))
