@@ -30,7 +30,8 @@ from unmix_plugin.captures.poses.marker_detection import (
 )
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.captures.poses.turntable import Turn, parse_angles, poses_from_turntable
+from unmix_plugin.captures.poses.turntable import poses_from_turntable
+from unmix_plugin.captures.poses.turntable_evidence import Turn, parse_angles
 from unmix_plugin.captures.posing import ESTIMATE, FROM_PICTURES, MARKERS, TURNTABLE, lens_of_view
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord

@@ -13,6 +13,7 @@ from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses import markers as markers_module
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import FAMILIES, count_markers, find_markers, parse_family
+from unmix_plugin.captures.poses.marker_map import MarkerMap, _slopes
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
@@ -171,7 +172,7 @@ def test_slopes_are_those_of_the_errors():
     gathered = markers_module._gather(seen(truth, corners), dict.fromkeys(truth.cameras, 0))
     start = markers_module._Chain(gathered, (LENS,)).grow()
     columns = [np.arange(18).reshape(3, 6), 18 + np.arange(14).reshape(2, 7), 32 + np.arange(3).reshape(1, 3)]
-    exact = markers_module._slopes(start, gathered, np.zeros(35), columns)
+    exact = _slopes(start, gathered, np.zeros(35), columns)
     step, sighting = 1e-6, 0
     view, marker = gathered.view[sighting], gathered.marker[sighting]
     for column in range(16):
@@ -194,7 +195,7 @@ def test_slopes_are_those_of_the_errors():
                 bent = list(LENS.distortion)
                 bent[column - 14] += sign
                 lens = replace(LENS, distortion=tuple(bent))
-            changed = markers_module._Map(cameras_now, placed, sizes, (lens,))
+            changed = MarkerMap(cameras_now, placed, sizes, (lens,))
             turned.append(changed.errors(gathered)[sighting].ravel())
         expected = (turned[0] - turned[1]) / (2 * step)
         np.testing.assert_allclose(exact[sighting, :, column], expected, rtol=1e-4, atol=1e-4)

@@ -10,7 +10,8 @@ from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses import turntable as turntable_module
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.poses.turntable import Turn, parse_angles, poses_from_turntable
+from unmix_plugin.captures.poses.turntable import poses_from_turntable
+from unmix_plugin.captures.poses.turntable_evidence import Turn, gather, parse_angles
 from unmix_plugin.errors import CaptureError, ConfigError
 
 cv2 = pytest.importorskip("cv2")
@@ -95,7 +96,7 @@ def test_masks_that_are_too_wide_do_not_move_the_cameras():
 def evidence_of(pictures, turns, masks):
     names = sorted(pictures)
     columns = ([values[name] for name in names] for values in (pictures, turns, masks))
-    return turntable_module._gather(cv2, *columns)
+    return gather(cv2, *columns)
 
 
 def true_numbers(sense: float = 1.0):

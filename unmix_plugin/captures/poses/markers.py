@@ -15,21 +15,27 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int
+from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import Sightings, require_opencv
+from unmix_plugin.captures.poses.marker_map import (
+    SQUARE,
+    MarkerMap,
+    Seen,
+    Transforms,
+    rms,
+    solve,
+    transformed,
+)
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, name_some
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.placement import Placement
 
 LEAST_VIEWS = 3
-_SQUARE = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
-"""Corners of a marker in its own coordinates, over its side; +z points away from the printed side."""
 _FOCAL_FACTORS = (0.7, 1.0, 1.5, 2.3, 3.5, 6.0, 11.0)
 """First focal lengths to try, over the longer side."""
 _WORST_PX = 20.0
@@ -48,43 +54,6 @@ _CLEAR = 3.0
 """How many times better one of a single marker's two poses has to fit to be taken."""
 _ONE_PLANE = np.cos(np.radians(10.0))
 """Between normals of markers that lie in one plane."""
-
-_Transforms: TypeAlias = Float64[np.ndarray, "*n 4 4"]
-
-
-@dataclass(frozen=True)
-class _Seen:
-    """All sightings, in the order of their views."""
-
-    views: tuple[str, ...]
-    numbers: tuple[int, ...]
-    """Of the markers."""
-    view: Int[np.ndarray, " S"]
-    marker: Int[np.ndarray, " S"]
-    corners: Float64[np.ndarray, "S 4 2"]
-    """Pixels."""
-    sensor: Int[np.ndarray, " N"]
-    """Index of the lens of each view."""
-
-    def part(self, keep: Bool[np.ndarray, " S"]) -> _Seen:
-        return replace(self, view=self.view[keep], marker=self.marker[keep], corners=self.corners[keep])
-
-
-@dataclass(frozen=True)
-class _Map:
-    """Where everything is; NaN where it is not known."""
-
-    camera_from_world: Float64[np.ndarray, "N 4 4"]
-    world_from_marker: Float64[np.ndarray, "M 4 4"]
-    sizes: Float64[np.ndarray, " M"]
-    """Sides of the markers, the first one's is 1."""
-    lenses: tuple[Lens, ...]
-
-    def errors(self, seen: _Seen) -> Float64[np.ndarray, "S 4 2"]:
-        """Pixels by which corners are missed."""
-        corners = _transformed(self.world_from_marker, self.sizes[:, None, None] * _SQUARE)
-        local = _transformed(self.camera_from_world[seen.view], corners[seen.marker])
-        return _pixels(local, seen, self.lenses) - seen.corners
 
 
 def poses_from_markers(
@@ -127,7 +96,7 @@ def poses_from_markers(
     return _pose_set(found, seen, kept, sightings, marker_size, free)
 
 
-def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> _Seen:
+def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
     """Sightings of markers that at least two views have.
 
     Raises:
@@ -152,16 +121,16 @@ def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> _Seen:
     ]
     view, marker, corners = zip(*rows, strict=True)
     sensors = np.array([sensor_of[name] for name in views])
-    return _Seen(tuple(views), tuple(numbers), np.array(view), np.array(marker), np.array(corners), sensors)
+    return Seen(tuple(views), tuple(numbers), np.array(view), np.array(marker), np.array(corners), sensors)
 
 
 # The map's beginning: poses of single squares, and what they agree on.
 
 
-def _begin(seen: _Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> _Map:
+def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> MarkerMap:
     """A map with the focal length that explains the corners best."""
     factors = _FOCAL_FACTORS if free.any() else (1.0,)
-    begun: list[tuple[float, float, _Map]] = []
+    begun: list[tuple[float, float, MarkerMap]] = []
     for factor in factors:
         tried = tuple(
             replace(lens, focal_px=(factor * max(lens.width, lens.height),) * 2) if is_free else lens
@@ -170,7 +139,7 @@ def _begin(seen: _Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) ->
         start = _Chain(seen, tried).grow()
         usable = _usable(start, seen)
         if usable.sum() >= LEAST_VIEWS:
-            misses = np.minimum(_rms(start.errors(seen.part(usable))), _WORST_PX)
+            misses = np.minimum(rms(start.errors(seen.part(usable))), _WORST_PX)
             begun.append((float(usable.mean()), float(misses.mean()), start))
     if not begun:
         raise CaptureError(
@@ -183,22 +152,22 @@ def _begin(seen: _Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) ->
     return min(tried_out, key=lambda found: _robust_cost(found, seen))
 
 
-def _usable(found: _Map, seen: _Seen) -> Bool[np.ndarray, " S"]:
+def _usable(found: MarkerMap, seen: Seen) -> Bool[np.ndarray, " S"]:
     """Sightings whose view and marker are in the map."""
     return np.isfinite(found.camera_from_world[seen.view, 0, 0]) & np.isfinite(
         found.world_from_marker[seen.marker, 0, 0]
     )
 
 
-def _robust_cost(found: _Map, seen: _Seen) -> float:
+def _robust_cost(found: MarkerMap, seen: Seen) -> float:
     usable = _usable(found, seen)
-    return float(np.minimum(_rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
+    return float(np.minimum(rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
 
 
 class _Chain:
     """A map that grows marker by marker, each put where the views that see it beside known ones agree."""
 
-    def __init__(self, seen: _Seen, lenses: tuple[Lens, ...]) -> None:
+    def __init__(self, seen: Seen, lenses: tuple[Lens, ...]) -> None:
         self._seen, self._lenses = seen, lenses
         self._focal = np.array([lens.focal_px[0] for lens in lenses])[seen.sensor][seen.view]
         self._ideal = np.stack(
@@ -207,10 +176,10 @@ class _Chain:
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""
         self._placed = np.full((len(seen.numbers), 4, 4), np.nan)
-        self._options: list[_Transforms] = [np.zeros((0, 4, 4))] * len(seen.views)
+        self._options: list[Transforms] = [np.zeros((0, 4, 4))] * len(seen.views)
         """Poses that each view may have, camera from world: two where it shows one known marker."""
 
-    def grow(self) -> _Map:
+    def grow(self) -> MarkerMap:
         marker: int | None = int(np.bincount(self._seen.marker).argmax())
         self._placed[marker] = np.eye(4)
         while marker is not None:
@@ -221,16 +190,16 @@ class _Chain:
         for view, options in enumerate(self._options):
             if len(options) == 1 or (len(options) > 1 and self._is_clear(view)):
                 poses[view] = options[0]
-        return _Map(poses, self._placed, np.ones(len(self._placed)), self._lenses)
+        return MarkerMap(poses, self._placed, np.ones(len(self._placed)), self._lenses)
 
     def _known(self, view: int) -> list[int]:
         """Sightings of the view of markers that are placed."""
         those = np.flatnonzero(self._seen.view == view).tolist()
         return [s for s in those if np.isfinite(self._placed[self._seen.marker[s], 0, 0])]
 
-    def _misses(self, camera_from_marker: _Transforms, sighting: int) -> Float64[np.ndarray, "*n"]:
+    def _misses(self, camera_from_marker: Transforms, sighting: int) -> Float64[np.ndarray, "*n"]:
         """Mean pixels by which the corners of a sighting are missed."""
-        local = _transformed(camera_from_marker, _SQUARE)
+        local = transformed(camera_from_marker, SQUARE)
         depth = np.where(local[..., 2:] > 1e-6, local[..., 2:], np.nan)
         away = np.linalg.norm(local[..., :2] / depth - self._ideal[sighting], axis=-1).mean(axis=-1)
         return np.minimum(np.nan_to_num(away * self._focal[sighting], nan=_WORST_PX), _WORST_PX)
@@ -246,7 +215,7 @@ class _Chain:
             misses = np.sum(
                 [self._misses(options @ pose, s) for s, pose in zip(known, placed, strict=True)], axis=0
             )
-            corners = np.concatenate([_transformed(pose, _SQUARE) for pose in placed])
+            corners = np.concatenate([transformed(pose, SQUARE) for pose in placed])
             ideal = np.concatenate([self._ideal[s] for s in known])
             options = _resected(options[int(np.argmin(misses))], corners, ideal)[None]
         self._options[view] = options
@@ -282,7 +251,7 @@ def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4
     """Both poses of a square of side 1, the better first."""
     cv2 = require_opencv()
     _, turns, shifts, _ = cv2.solvePnPGeneric(
-        _SQUARE, ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        SQUARE, ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
     poses = np.tile(np.eye(4), (2, 1, 1))
     for pose, turn, shift in zip(poses, turns, shifts, strict=False):
@@ -311,203 +280,38 @@ def _ideal(lens: Lens, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray
     return ideal
 
 
-# Bundle adjustment.
+# Bundle adjustment, sightings that don't fit, and distortion.
 
 
 def _adjust(
-    found: _Map,
-    seen: _Seen,
+    found: MarkerMap,
+    seen: Seen,
     free: Bool[np.ndarray, " L"],
     same_size: bool = False,
     steps: int = 60,
-) -> tuple[_Map, Bool[np.ndarray, " S"]]:
+) -> tuple[MarkerMap, Bool[np.ndarray, " S"]]:
     """The map that explains most sightings, and which these are."""
     usable = _usable(found, seen)
-    found = _solve(found, seen.part(usable), free, same_size, loss="soft_l1", steps=steps)
+    found = solve(found, seen.part(usable), free, same_size, loss="soft_l1", steps=steps)
     misses = np.full(len(usable), np.inf)
-    misses[usable] = _rms(found.errors(seen.part(usable)))
+    misses[usable] = rms(found.errors(seen.part(usable)))
     kept = misses < max(_OUTLIER_PX, _OUTLIER_FACTOR * float(np.median(misses[usable])))
-    return _solve(found, seen.part(kept), free, same_size, steps=steps), kept
+    return solve(found, seen.part(kept), free, same_size, steps=steps), kept
 
 
-def _solve(
-    found: _Map,
-    seen: _Seen,
-    free: Bool[np.ndarray, " L"],
-    same_size: bool,
-    loss: str = "linear",
-    steps: int = 60,
-    bent: bool = False,
-) -> _Map:
-    """Least squares over the views and markers of the sightings, and over lenses that are free.
-
-    Columns are 6 for each view and 7 for each marker (a rotation vector, a shift, the logarithm of the size) and 3 for
-    each lens (the logarithm of the focal length, k1, k2); what is fixed has no column.
-    """
-    from scipy.optimize import least_squares
-    from scipy.sparse import csr_matrix
-    from scipy.spatial.transform import Rotation
-
-    views, markers = np.unique(seen.view), np.unique(seen.marker)
-    reference = markers[np.bincount(seen.marker)[markers].argmax()]  # holds the world in place
-    count = (len(found.camera_from_world), len(found.world_from_marker), len(found.lenses))
-    columns = [np.full((count[0], 6), -1), np.full((count[1], 7), -1), np.full((count[2], 3), -1)]
-    columns[0][views] = 0
-    columns[1][np.setdiff1d(markers, [reference]), : 6 if same_size else 7] = 0
-    columns[2][free, : 3 if bent else 1] = 0
-    total = 0
-    for block in columns:
-        block[block == 0] = np.arange(total, total + (block == 0).sum())
-        total += int((block >= 0).sum())
-
-    def state(values: np.ndarray) -> _Map:
-        """The map after steps from where it was."""
-        step = [np.where(block < 0, 0.0, np.append(values, 0.0)[block]) for block in columns]
-        cameras, placed = found.camera_from_world.copy(), found.world_from_marker.copy()
-        for transforms, by in ((cameras, step[0]), (placed, step[1])):
-            transforms[:, :3, :3] = Rotation.from_rotvec(by[:, :3]).as_matrix() @ transforms[:, :3, :3]
-            transforms[:, :3, 3] += by[:, 3:6]
-        lenses = tuple(
-            replace(
-                lens,
-                focal_px=(lens.focal_px[0] * float(np.exp(by[0])), lens.focal_px[1] * float(np.exp(by[0]))),
-                distortion=(
-                    lens.distortion[0] + float(by[1]),
-                    lens.distortion[1] + float(by[2]),
-                    *lens.distortion[2:],
-                ),
-            )
-            if is_free
-            else lens
-            for lens, by, is_free in zip(found.lenses, step[2], free, strict=True)
-        )
-        return _Map(cameras, placed, found.sizes * np.exp(step[1][:, 6]), lenses)
-
-    where = [columns[0][seen.view], columns[1][seen.marker], columns[2][seen.sensor[seen.view]]]
-    column = np.concatenate(where, axis=1)[:, None].repeat(8, axis=1)
-    row = np.arange(8 * len(seen.view)).reshape(-1, 8, 1).repeat(16, axis=2)
-    is_free = column >= 0
-
-    def slopes(values: np.ndarray) -> Any:
-        parts = _slopes(state(values), seen, values, columns)
-        return csr_matrix(
-            (parts[is_free], (row[is_free], column[is_free])), shape=(8 * len(seen.view), total)
-        )
-
-    result = least_squares(
-        lambda values: state(values).errors(seen).ravel(),
-        np.zeros(total),
-        jac=slopes,  # type: ignore[arg-type]
-        loss=loss,
-        x_scale="jac",
-        tr_solver="lsmr",
-        max_nfev=steps,
-    )
-    return state(result.x)
-
-
-def _slopes(
-    found: _Map, seen: _Seen, values: np.ndarray, columns: Sequence[np.ndarray]
-) -> Float64[np.ndarray, "S 8 16"]:
-    """Derivatives of the pixels of each sighting's corners by the columns of its view, marker and lens."""
-    padded = np.append(values, 0.0)
-    square = found.sizes[seen.marker, None, None] * _SQUARE
-    placed, camera = found.world_from_marker[seen.marker], found.camera_from_world[seen.view]
-    turned = _transformed(placed, square) - placed[:, None, :3, 3]
-    world = turned + placed[:, None, :3, 3]
-    swung = world @ camera[:, :3, :3].transpose(0, 2, 1)
-    local = swung + camera[:, None, :3, 3]
-    view_turn = np.where(columns[0] < 0, 0.0, padded[columns[0]])[seen.view, :3]
-    marker_turn = np.where(columns[1] < 0, 0.0, padded[columns[1]])[seen.marker, :3]
-    by_local, by_lens = _lens_slopes(local, seen, found.lenses)
-    into_camera = camera[:, None, :3, :3]
-    by_view = np.concatenate(
-        [-_cross(swung) @ _left(view_turn)[:, None], np.eye(3) + 0 * _cross(swung)], axis=-1
-    )
-    by_marker = np.concatenate(
-        [-_cross(turned) @ _left(marker_turn)[:, None], np.eye(3) + 0 * _cross(turned), turned[..., None]],
-        axis=-1,
-    )
-    parts = [by_local @ by_view, by_local @ (into_camera @ by_marker), by_lens]
-    return np.concatenate(parts, axis=-1).reshape(len(seen.view), 8, 16)
-
-
-def _cross(vectors: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """Matrices that take the cross product with vectors from the left."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _left(turns: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """How rotation vectors turn further with a small step of theirs (the left Jacobian of SO(3))."""
-    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
-    cross = _cross(turns)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) + first * cross + second * cross @ cross
-
-
-def _lens_slopes(
-    local: Float64[np.ndarray, "S 4 3"], seen: _Seen, lenses: Sequence[Lens]
-) -> tuple[Float64[np.ndarray, "S 4 2 3"], Float64[np.ndarray, "S 4 2 3"]]:
-    """Derivatives of pixels by the point before the camera, and by log f, k1, k2; tangential terms left out."""
-    sensor = seen.sensor[seen.view]
-    focal = np.array([lens.focal_px for lens in lenses])[sensor][:, None]
-    radial = np.array([lens.radial for lens in lenses])[sensor]
-    depth = local[..., 2:]
-    ideal = local[..., :2] / depth
-    squared = (ideal**2).sum(axis=-1)
-    powers = squared[..., None] ** np.arange(1, 5)
-    grown = 1.0 + (powers * radial[:, None]).sum(axis=-1)
-    growth = (np.arange(1, 5) * squared[..., None] ** np.arange(4) * radial[:, None]).sum(axis=-1)
-    by_ideal = grown[..., None, None] * np.eye(2) + 2 * growth[..., None, None] * (
-        ideal[..., :, None] * ideal[..., None, :]
-    )
-    by_point = np.concatenate([np.eye(2) + 0 * by_ideal, -ideal[..., None]], axis=-1) / depth[..., None]
-    by_lens = np.stack([ideal * grown[..., None], ideal * powers[..., :1], ideal * powers[..., 1:2]], axis=-1)
-    return focal[..., None] * (by_ideal @ by_point), focal[..., None] * by_lens
-
-
-def _with_distortion(found: _Map, seen: _Seen, free: Bool[np.ndarray, " L"]) -> _Map:
+def _with_distortion(found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"]) -> MarkerMap:
     """The map with k1 and k2 estimated too, where that is better."""
     if not free.any():
         return found
-    bent = _solve(found, seen, free, same_size=True, bent=True)
+    bent = solve(found, seen, free, same_size=True, bent=True)
     before, after = (float(np.sqrt(np.mean(one.errors(seen) ** 2))) for one in (found, bent))
     return bent if after < (1.0 - _GAIN) * before else found
-
-
-def _pixels(
-    local: Float64[np.ndarray, "S 4 3"], seen: _Seen, lenses: Sequence[Lens]
-) -> Float64[np.ndarray, "S 4 2"]:
-    """Where lenses see points; points behind the camera are taken far off the picture."""
-    ideal = local[..., :2] / np.maximum(local[..., 2:], 1e-3)
-    pixels = np.empty_like(ideal)
-    sensor = seen.sensor[seen.view]
-    for index, lens in enumerate(lenses):
-        pixels[sensor == index] = lens.pixels_of(ideal[sensor == index].reshape(-1, 2)).reshape(-1, 4, 2)
-    return pixels
-
-
-def _transformed(
-    transforms: _Transforms, points: Float64[np.ndarray, "*n P 3"]
-) -> Float64[np.ndarray, "*n P 3"]:
-    return points @ np.swapaxes(transforms[..., :3, :3], -1, -2) + transforms[..., None, :3, 3]
-
-
-def _rms(errors: Float64[np.ndarray, "S 4 2"]) -> Float64[np.ndarray, " S"]:
-    """Root mean square distance of each sighting's corners."""
-    return np.sqrt((errors**2).sum(axis=-1).mean(axis=-1))
 
 
 # What is refused, and the result.
 
 
-def _refuse_several_sizes(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]) -> None:
+def _refuse_several_sizes(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) -> None:
     markers = np.flatnonzero(np.bincount(seen.marker[kept], minlength=len(seen.numbers)) > 1)
     relative = found.sizes[markers] / np.median(found.sizes[markers])
     odd = np.abs(relative - 1.0) > _SIZE_TOLERANCE
@@ -519,9 +323,9 @@ def _refuse_several_sizes(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]
         )
 
 
-def _refuse_moved(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]) -> None:
+def _refuse_moved(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) -> None:
     usable = _usable(found, seen)
-    misses, lost = _rms(found.errors(seen.part(usable))), ~kept[usable]
+    misses, lost = rms(found.errors(seen.part(usable))), ~kept[usable]
     diagonal = max(float(np.hypot(lens.width, lens.height)) for lens in found.lenses)
     typical, limit = float(np.median(misses)), max(_MOST_OFF_PX, _MOST_OFF * diagonal)
     if typical <= limit and lost.mean() <= _MOST_LEFT_OUT:
@@ -544,8 +348,8 @@ def _refuse_moved(found: _Map, seen: _Seen, kept: Bool[np.ndarray, " S"]) -> Non
 
 
 def _pose_set(
-    found: _Map,
-    seen: _Seen,
+    found: MarkerMap,
+    seen: Seen,
     kept: Bool[np.ndarray, " S"],
     sightings: Sightings,
     marker_size: float | None,
@@ -554,7 +358,7 @@ def _pose_set(
     """Cameras in the world that stands on the markers, those without enough markers named."""
     views = np.unique(seen.view[kept])
     markers = np.unique(seen.marker[kept])
-    corners = _transformed(found.world_from_marker[markers], np.broadcast_to(_SQUARE, (len(markers), 4, 3)))
+    corners = transformed(found.world_from_marker[markers], np.broadcast_to(SQUARE, (len(markers), 4, 3)))
     to_board, up, how_up = stand_on_markers(corners, marker_size or 1.0)
     cameras = {}
     for view in views:
@@ -562,7 +366,7 @@ def _pose_set(
         position = to_board.to_scene(pose[:3, 3])
         matrix = np.column_stack([to_board.rotation @ pose[:3, :3] @ FLIP, position])
         cameras[seen.views[view]] = PosedCamera(matrix, found.lenses[seen.sensor[view]])
-    error = float(np.sqrt(np.mean(_rms(found.errors(seen.part(kept))) ** 2)))
+    error = float(np.sqrt(np.mean(rms(found.errors(seen.part(kept))) ** 2)))
     notes = []
     notes.append(
         f"markers gave poses of {len(cameras)} of {len(sightings)} views: {counted(len(markers), 'marker')} in "
@@ -679,7 +483,7 @@ def _located(
             table = table + across
             wanted = wanted + across @ pose[:, 3]
         points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
-        misses = [_rms((camera.pixels_of(points) - pixels)[None])[0] for camera, pixels in left]
+        misses = [rms((camera.pixels_of(points) - pixels)[None])[0] for camera, pixels in left]
         if max(misses) < 2.0 * _OUTLIER_PX:
             return points
         left.pop(int(np.argmax(np.nan_to_num(misses, nan=np.inf))))

@@ -14,11 +14,8 @@ Notation: `N` views, `V` corners of a hull, `Q` pairs of views, `F` matches. Cam
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -26,23 +23,12 @@ from jaxtyping import Bool, Float64, Int, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import require_opencv
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, name_some
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.turntable_evidence import Evidence, Turn, gather
+from unmix_plugin.errors import CaptureError
 
 _LEAST_VIEWS = 3
 """Of each place of the camera."""
-_MOST_MATCHED_DEG, _MOST_TOUCHED_DEG = 30.0, 130.0
-"""Between views whose points, and whose outlines, are compared."""
-_RIM_PX = 4
-"""Beside the edge of a mask, where features are those of the silhouette and not of the surface."""
-_RATIO = 0.8
-"""Of the nearest to the second nearest descriptor (Lowe 2004)."""
-_MOST_FEATURES, _ENLARGED_PX = 2000, 600
-"""Of a picture; ones with a shorter longer side are doubled first."""
-_STILL_PX = 2.0
-"""Matches of views that moved less stand still as the object turns: stains, noise, the background."""
-_LEAST_PART = 0.02
-"""Of the matter of a view: smaller parts of its mask are specks."""
 _SCALE_PX = 1.0
 """Errors beyond count less and less."""
 _RIM_PRIOR = 1.0
@@ -63,8 +49,6 @@ _ENOUGH_MATCHES, _ENOUGH_FIT = 300, 0.5
 alone."""
 _NOT_COMPARED_PX = 2.0
 """What outlines count that can't be compared in the pose that is tried."""
-_LEAST_APART_DEG = 1.0
-"""Views of one place that differ by less tell nothing."""
 _GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
 _PITCH, _AZIMUTH = 1, 4
@@ -72,80 +56,6 @@ _PITCH, _AZIMUTH = 1, 4
 _FOCAL_FACTORS = (1.2, 2.0, 3.5, 7.0)
 _PITCHES_DEG = (0.0, 8.0, 16.0, 24.0, 32.0, 40.0, 48.0, 56.0, 64.0, 72.0)
 """How far the camera may look down, to begin with."""
-
-
-@dataclass(frozen=True)
-class Turn:
-    """How a view was taken."""
-
-    angle_deg: float
-    """By which the object was turned."""
-    camera: int = 0
-    """Which of the places of the camera it was taken from."""
-
-
-def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
-    """Angles of views as a user gives them.
-
-    Args:
-        text: START:STOP:STEP in degrees without the end, one for each place of the camera, with commas between; or a
-            CSV file with columns view, angle and, if there are several places, camera.
-        names: Of the views, in their order.
-    Raises:
-        ConfigError: it is neither, or there are not as many angles as views.
-
-    >>> parse_angles("0:360:120", ["a", "b", "c"])["b"]
-    Turn(angle_deg=120.0, camera=0)
-    """
-    if Path(text).suffix.lower() == ".csv" or Path(text).is_file():
-        return _read_angles(Path(text), names)
-    turns: list[Turn] = []
-    for camera, part in enumerate(text.split(",")):
-        try:
-            start, stop, step = (float(number) for number in part.split(":"))
-            count = int(np.ceil((stop - start) / step - 1e-9))
-        except (ValueError, ZeroDivisionError, OverflowError) as error:
-            raise ConfigError(
-                f"--angles {text}: expected START:STOP:STEP in degrees, such as 0:360:10, or a CSV file with the "
-                "columns view and angle"
-            ) from error
-        turns += [Turn(start + index * step, camera) for index in range(max(count, 0))]
-    if len(turns) != len(names):
-        raise ConfigError(
-            f"--angles {text} gives {len(turns)} angles (the end of a range is none of them) for {len(names)} views; "
-            "expected one a view: give other steps, or a CSV file with the columns view and angle"
-        )
-    return dict(zip(names, turns, strict=True))
-
-
-def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"--angles {path}: it can't be read ({error}); give a CSV file") from error
-    found: dict[str, Turn] = {}
-    places: dict[str, int] = {}
-    for line, row in enumerate(rows, start=2):
-        try:
-            name, angle = (row["view"] or "").strip(), float(row["angle"])
-            if not np.isfinite(angle):
-                raise ValueError
-        except (KeyError, TypeError, ValueError) as error:
-            raise ConfigError(
-                f"--angles {path}, line {line}: expected the columns view and angle (degrees), and camera if it stood "
-                "in several places"
-            ) from error
-        key = name if name in names else Path(name).stem
-        found[key] = Turn(angle, places.setdefault((row.get("camera") or "").strip(), len(places)))
-    missing, unknown = [n for n in names if n not in found], [n for n in found if n not in names]
-    if missing or unknown:
-        lacking = f"no angle for {name_some(missing)}; " if missing else ""
-        other = f"no view is called {name_some(unknown)}; " if unknown else ""
-        raise ConfigError(
-            f"--angles {path} has {len(found)} angles for {len(names)} views: {lacking}{other}expected one a view"
-        )
-    return found
 
 
 def poses_from_turntable(
@@ -165,7 +75,7 @@ def poses_from_turntable(
     cv2 = require_opencv()
     names = sorted(pictures, key=lambda name: (turns[name].camera, name))
     _refuse_few(turns)
-    evidence = _gather(
+    evidence = gather(
         cv2,
         [pictures[name] for name in names],
         [turns[name] for name in names],
@@ -184,160 +94,6 @@ def _refuse_few(turns: Mapping[str, Turn]) -> None:
             f"{counts.min()} views were taken from place {int(counts.argmin()) + 1} of the camera; expected at least "
             f"{_LEAST_VIEWS} of each: leave it out, or give its views the place that they were taken from"
         )
-
-
-# Evidence.
-
-
-@dataclass(frozen=True)
-class _Evidence:
-    """What pictures tell of the cameras."""
-
-    angle: Float64[np.ndarray, " N"]
-    """Radians."""
-    camera: Int[np.ndarray, " N"]
-    """Which place it stood in."""
-    size: tuple[int, int]
-    """Width, height."""
-    first: Int[np.ndarray, " F"]
-    second: Int[np.ndarray, " F"]
-    """Views of each match."""
-    points: Float64[np.ndarray, "F 2 2"]
-    """In both, pixels."""
-    hulls: Float64[np.ndarray, "N V 2"]
-    """Corners, the last one repeated; no corners where masks are not known."""
-    touched: Int[np.ndarray, "Q 2"]
-    """Pairs of views whose outlines are compared."""
-    likeness: float
-    """Mean overlap of silhouettes with what most views of their place show, intersection over union."""
-
-    def part(self, views: Bool[np.ndarray, " N"]) -> _Evidence:
-        """That between some views alone; the numbers of views stay."""
-        keep = views[self.first] & views[self.second]
-        touched = self.touched[views[self.touched].all(axis=1)]
-        return replace(
-            self, first=self.first[keep], second=self.second[keep], points=self.points[keep], touched=touched
-        )
-
-    def without_matches(self) -> _Evidence:
-        """That of the outlines alone."""
-        return replace(self, first=self.first[:0], second=self.second[:0], points=self.points[:0])
-
-    def thinned(self, most: tuple[int, int]) -> _Evidence:
-        """At most so many matches and pairs of outlines, drawn at random."""
-        generator = np.random.default_rng(0)
-        keep, pairs = (
-            np.sort(generator.permutation(count)[:limit])
-            for count, limit in zip((len(self.first), len(self.touched)), most, strict=True)
-        )
-        return replace(
-            self,
-            first=self.first[keep],
-            second=self.second[keep],
-            points=self.points[keep],
-            touched=self.touched[pairs],
-        )
-
-
-def _gather(
-    cv2: Any,
-    pictures: Sequence[UInt8[np.ndarray, "H W"]],
-    turns: Sequence[Turn],
-    masks: Sequence[Bool[np.ndarray, "H W"]] | None,
-) -> _Evidence:
-    height, width = pictures[0].shape
-    angle = np.radians([turn.angle_deg for turn in turns])
-    camera = np.array([turn.camera for turn in turns])
-    features = [
-        _features(cv2, picture, None if masks is None else masks[index])
-        for index, picture in enumerate(pictures)
-    ]
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    first, second, touched = [], [], []
-    points = [np.zeros((0, 2, 2))]
-    for i, j in combinations(range(len(pictures)), 2):
-        apart = np.degrees(abs(np.angle(np.exp(1j * (angle[i] - angle[j])))))
-        if camera[i] == camera[j] and apart < _LEAST_APART_DEG:
-            continue
-        if masks is not None and apart <= _MOST_TOUCHED_DEG:
-            touched.append((i, j))
-        if apart <= _MOST_MATCHED_DEG:
-            points.append(_matches(matcher, features[i], features[j]))
-            first += [i] * len(points[-1])
-            second += [j] * len(points[-1])
-    return _Evidence(
-        angle,
-        camera,
-        (width, height),
-        np.array(first, np.int64),
-        np.array(second, np.int64),
-        np.concatenate(points),
-        np.zeros((len(pictures), 0, 2)) if masks is None else _hulls(cv2, masks),
-        np.array(touched, np.int64).reshape(-1, 2),
-        1.0 if masks is None else _likeness(np.stack(masks), camera),
-    )
-
-
-def _features(
-    cv2: Any, picture: UInt8[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"] | None
-) -> tuple[Float64[np.ndarray, "K 2"], Any]:
-    """Where a picture has features, and their descriptors."""
-    from scipy.ndimage import binary_erosion
-
-    factor = 2 if max(picture.shape) < _ENLARGED_PX else 1
-    enlarged = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
-    shown = None
-    if mask is not None:
-        inner = 255 * binary_erosion(mask, iterations=_RIM_PX).astype(np.uint8)
-        shown = inner.repeat(factor, axis=0).repeat(factor, axis=1)
-    found, descriptors = cv2.SIFT_create(nfeatures=_MOST_FEATURES).detectAndCompute(enlarged, shown)
-    return (np.array([key.pt for key in found]).reshape(-1, 2) + 0.5) / factor, descriptors
-
-
-def _matches(
-    matcher: Any, one: tuple[np.ndarray, Any], other: tuple[np.ndarray, Any]
-) -> Float64[np.ndarray, "F 2 2"]:
-    """Points that are each other's nearest, by far, and that moved."""
-    if one[1] is None or other[1] is None or min(len(one[0]), len(other[0])) < 2:
-        return np.zeros((0, 2, 2))
-    near = [a for a, b in matcher.knnMatch(one[1], other[1], k=2) if a.distance < _RATIO * b.distance]
-    back = {found.queryIdx: found.trainIdx for found in matcher.match(other[1], one[1])}
-    mutual = [(a.queryIdx, a.trainIdx) for a in near if back.get(a.trainIdx) == a.queryIdx]
-    pairs = np.array([(one[0][i], other[0][j]) for i, j in mutual]).reshape(-1, 2, 2)
-    return pairs[np.linalg.norm(pairs[:, 0] - pairs[:, 1], axis=1) > _STILL_PX]
-
-
-def _hulls(cv2: Any, masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float64[np.ndarray, "N V 2"]:
-    """Convex hulls of silhouettes without specks."""
-    from scipy.ndimage import label
-
-    found = []
-    around = np.array([[np.cos(turn), np.sin(turn)] for turn in np.arange(8) * np.pi / 4], np.float32)
-    for mask in masks:
-        parts, count = label(mask)  # type: ignore[misc]
-        sizes = np.bincount(parts.ravel(), minlength=count + 1)
-        sizes[0] = 0
-        rows, columns = np.nonzero((sizes > _LEAST_PART * sizes.sum())[parts])
-        middles = np.column_stack([columns, rows]).astype(np.float32) + 0.5
-        if not len(middles):
-            middles = np.array([mask.shape[::-1]], np.float32) / 2
-        # Outlines run half a pixel outside the middles of the outermost pixels.
-        hull = (cv2.convexHull(middles)[:, 0][:, None] + 0.5 * around).reshape(-1, 2)
-        found.append(cv2.convexHull(hull)[:, 0].astype(np.float64))
-    longest = max(map(len, found))
-    return np.stack(
-        [np.concatenate([hull, np.repeat(hull[-1:], longest - len(hull), axis=0)]) for hull in found]
-    )
-
-
-def _likeness(masks: Bool[np.ndarray, "N H W"], camera: Int[np.ndarray, " N"]) -> float:
-    overlaps = []
-    for place in np.unique(camera):
-        own = masks[camera == place]
-        usual = own.mean(axis=0) >= 0.5
-        both, either = (own & usual).sum(axis=(1, 2)), (own | usual).sum(axis=(1, 2))
-        overlaps.append(both / np.maximum(either, 1))
-    return float(np.concatenate(overlaps).mean())
 
 
 # Cameras from few numbers, and what of the evidence they leave unexplained.
@@ -360,7 +116,7 @@ class _Numbers:
     """To add to the angles."""
     k1: float = 0.0
 
-    def poses(self, evidence: _Evidence) -> _Poses:
+    def poses(self, evidence: Evidence) -> _Poses:
         """Axes of all cameras in the world, as columns, and where they stand."""
         from scipy.spatial.transform import Rotation
 
@@ -386,7 +142,7 @@ class _Numbers:
         return np.concatenate([ideal, np.ones((*ideal.shape[:-1], 1))], axis=-1)
 
     def errors(
-        self, evidence: _Evidence, ahead: float = 0.0, rims: bool = True
+        self, evidence: Evidence, ahead: float = 0.0, rims: bool = True
     ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, "Q 4"]]:
         """Distances of matched points from epipolar lines, and of outlines from tangents, pixels.
 
@@ -401,7 +157,7 @@ class _Numbers:
             _tangential(self, evidence, first, second, rims),
         )
 
-    def cost(self, evidence: _Evidence) -> float:
+    def cost(self, evidence: Evidence) -> float:
         """Mean of the robust errors."""
         errors = np.concatenate([part.ravel() for part in self.errors(evidence)])
         return float(np.mean(np.log1p((errors / _SCALE_PX) ** 2)))
@@ -417,7 +173,7 @@ def _essential(first: _Poses, second: _Poses) -> Float64[np.ndarray, "P 3 3"]:
 
 
 def _epipolar(
-    ideal: Float64[np.ndarray, "F 2 3"], evidence: _Evidence, first: _Poses, second: _Poses
+    ideal: Float64[np.ndarray, "F 2 3"], evidence: Evidence, first: _Poses, second: _Poses
 ) -> Float64[np.ndarray, " F"]:
     """Distances of matched points from each other's epipolar lines, over the focal length (Sampson 1982)."""
     i, j = evidence.first, evidence.second
@@ -429,7 +185,7 @@ def _epipolar(
 
 
 def _tangential(
-    numbers: _Numbers, evidence: _Evidence, first: _Poses, second: _Poses, rims: bool
+    numbers: _Numbers, evidence: Evidence, first: _Poses, second: _Poses, rims: bool
 ) -> Float64[np.ndarray, "Q 4"]:
     """How far outlines reach beyond the tangents of the others, pixels; what can't be compared counts as off."""
     if not len(evidence.touched):
@@ -503,7 +259,7 @@ def _without_rims(
     of_i: Float64[np.ndarray, "Q 2"],
     of_j: Float64[np.ndarray, "Q 2"],
     good: Bool[np.ndarray, "Q 2"],
-    evidence: _Evidence,
+    evidence: Evidence,
 ) -> tuple[Float64[np.ndarray, "Q 2"], Float64[np.ndarray, "Q 2"]]:
     """Distances less what comes of masks that are too wide or too narrow, each by a length of its own."""
     i, j = evidence.touched.T
@@ -525,7 +281,7 @@ def _without_rims(
 
 def _solve(
     start: _Numbers,
-    evidence: _Evidence,
+    evidence: Evidence,
     which: Sequence[int],
     steps: int,
     zoom: bool = True,
@@ -599,7 +355,7 @@ def _solve(
     return numbers_of(found.x)
 
 
-def _fit(evidence: _Evidence) -> _Numbers:
+def _fit(evidence: Evidence) -> _Numbers:
     """The numbers that explain the evidence best, from beginnings of many focal lengths and both senses."""
     rough, fine = evidence.thinned(_MOST_ROUGH), evidence.thinned(_MOST_FINE)
     longer, everyone = max(evidence.size), range(int(evidence.camera.max()) + 1)
@@ -633,12 +389,12 @@ def _bend(numbers: _Numbers, size: tuple[int, int]) -> float:
     return numbers.k1 * (np.hypot(*size) / 2 / numbers.focal_px) ** 2
 
 
-def _begin(evidence: _Evidence, focal_px: float, sense: float) -> _Numbers:
+def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:
     """All places of the camera at one distance from a point of the axis, each turned as its own views have it."""
     count = int(evidence.camera.max()) + 1
     start = _Numbers(focal_px, sense, np.zeros((count, 6)), np.zeros(len(evidence.angle)))
 
-    def best_of(camera: int, column: int, degrees: Sequence[float], those: _Evidence) -> None:
+    def best_of(camera: int, column: int, degrees: Sequence[float], those: Evidence) -> None:
         def cost(value: float) -> float:
             start.cameras[camera, column] = value
             return start.cost(those)
@@ -662,7 +418,7 @@ def _begin(evidence: _Evidence, focal_px: float, sense: float) -> _Numbers:
 # What is refused, and the result.
 
 
-def _refuse_alike(evidence: _Evidence, fits: int) -> None:
+def _refuse_alike(evidence: Evidence, fits: int) -> None:
     """Refuse views whose silhouettes tell nothing, where too few matches fit to tell it instead."""
     if evidence.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(evidence.first)):
         return
@@ -676,7 +432,7 @@ def _refuse_alike(evidence: _Evidence, fits: int) -> None:
     )
 
 
-def _refuse_unexplained(fitted: _Numbers, evidence: _Evidence) -> None:
+def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
     matched, outlines = fitted.errors(evidence)
     fits = int((np.abs(matched) < _FITS_PX).sum())
     _refuse_alike(evidence, fits)
@@ -697,7 +453,7 @@ def _refuse_unexplained(fitted: _Numbers, evidence: _Evidence) -> None:
     )
 
 
-def _pose_set(fitted: _Numbers, evidence: _Evidence, names: Sequence[str]) -> PoseSet:
+def _pose_set(fitted: _Numbers, evidence: Evidence, names: Sequence[str]) -> PoseSet:
     axes, places = fitted.poses(evidence)
     width, height = evidence.size
     focal = (fitted.focal_px, fitted.focal_px)
