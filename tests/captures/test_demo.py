@@ -15,11 +15,17 @@ from tests.commands.running import run
 from unmix_plugin.captures import demo as demo_capture
 from unmix_plugin.captures.demo import (
     FULL_WELL,
+    MARKER_FAMILY,
+    MARKER_SIZE,
     READ_NOISE,
     WHITE_SHARE,
     _demo_line_camera,
     make_demo_capture,
+    marked_place,
 )
+from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.marker_detection import find_markers
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.commands.process import process
 from unmix_plugin.errors import ConfigError
@@ -174,6 +180,27 @@ def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path):
     with pytest.raises(ConfigError, match="is not empty"):
         make_demo_capture(tmp_path, 16, 10, 4)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_board_of_markers_lies_around_the_plate_where_it_is_asked_for():
+    pytest.importorskip("cv2")
+    place = marked_place()
+    cameras = place.cameras(240, VIEWS)
+    view = render_view(cameras, 2, subpixels=2, things=place.things)
+    light = reflected(view, reflectances(band_centers_nm(BANDS))).mean(axis=-1)
+    found, _ = find_markers({"view": light}, MARKER_FAMILY)
+    assert len(found["view"]) >= 6
+    camera = PosedCamera(cameras.camera_to_world[2].double().numpy(), lens_of(cameras))
+    steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) == 3]
+    square = MARKER_SIZE * np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+    for number, pixels in found["view"].items():
+        corners = np.column_stack([0.553 * np.array(steps[number]) + square, np.full(4, -0.12)])
+        assert np.median(np.abs(camera.pixels_of(corners) - pixels)) < 0.5
+
+
+def lens_of(cameras):
+    (across, down), (x, y) = cameras.focal_px[0].tolist(), cameras.center_px[0].tolist()
+    return Lens(cameras.width, cameras.height, (across, down), (x, y))
 
 
 WHOLE_SIZE, WHOLE_BANDS, WHOLE_VIEWS = 192, 12, 24

@@ -69,3 +69,10 @@ def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp
     assert all(f"  {tmp_path / 'capture' / name}  " in printed for name in shown)
     assert f"unmix-process cubes --data {tmp_path / 'capture'} --output-dir SCENE" in printed
     assert not (tmp_path / "capture" / "transforms.json").exists()
+
+
+def test_markers_are_for_raw_captures(tmp_path):
+    ended = run(write_demo_scene, tmp_path / "scene", *SMALL, "--markers")
+    assert ended.status == 2
+    assert "give --raw too" in ended.err
+    assert not (tmp_path / "scene").exists()
