@@ -231,3 +231,14 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     assert "- bands left out: 400 nm, 509.091 nm (marked as bad in the file)\n" in report
     assert "- bands left out: 618.182 nm (noisy)\n" in report
     assert "- saturation: from 65535 (" in report
+
+
+def test_a_backdrop_shines_past_the_things(tmp_path, folder, truth):
+    make_demo_capture(
+        tmp_path / "grey", SIZE, BANDS, VIEWS, backdrop=lambda _, directions: np.full(len(directions), 0.2)
+    )
+    bare, grey = (read_counts(path / "view_000.raw")[..., GOOD] for path in (folder, tmp_path / "grey"))
+    white, dark = (read_counts(folder / f"{name}.raw")[..., GOOD].mean(axis=0) for name in ("white", "dark"))
+    added = (grey - bare) / (white - dark)
+    assert added[truth.alpha == 0].mean() == pytest.approx(0.2, abs=0.005)
+    assert abs(added[truth.alpha == 1].mean()) < 0.005

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -83,6 +83,8 @@ _BOARD_REACH, _BOARD_STEP, _BOARD_TOP = 1.96, 0.553, -0.12
 _BOARD_ANGLE_DEG = 52.0
 """Between the edges of a picture that shows most of the board."""
 POSES = "poses-true.json"
+Backdrop = Callable[[Float[np.ndarray, "R 3"], Float[np.ndarray, "R 3"]], Float[np.ndarray, " R"]]
+"""From origins and directions of rays to the light that a grey backdrop sends along them."""
 _OURS = re.compile(r"(view_\d{3,}|white|dark)\.(hdr|raw)|view_\d{3,}\.png")
 
 
@@ -94,6 +96,7 @@ def make_demo_capture(
     overwrite: bool = False,
     illuminant: str | Path = RAW_LAMP,
     place: Place | None = None,
+    backdrop: Backdrop | None = None,
 ) -> None:
     """Write the demo capture. It is built beside the folder and moved in when complete.
 
@@ -103,6 +106,7 @@ def make_demo_capture(
             stay.
         illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
         place: What there is to see, and from where; None is the table with speckles on every surface.
+        backdrop: What is behind all things; None is nothing.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
@@ -128,7 +132,7 @@ def make_demo_capture(
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
         write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
         instrument = _demo_line_camera(size, sampling.centers_nm, lamp)
-        _write_images(staging, cameras, place.things, spectra, instrument, sampling)
+        _write_images(staging, cameras, place.things, spectra, instrument, sampling, backdrop)
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
@@ -183,6 +187,7 @@ def _write_images(
     spectra: Float[np.ndarray, "K B"],
     camera: _LineCamera,
     bands: Bands,
+    backdrop: Backdrop | None = None,
 ) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
@@ -193,7 +198,12 @@ def _write_images(
         _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
     for index in range(len(cameras)):
         view, name = render_view(cameras, index, things=things), f"view_{index:03d}"
-        counts = camera.expose(reflected(view, spectra), generator)
+        light = reflected(view, spectra)
+        if backdrop is not None:
+            rays = cameras.image_rays(index)
+            behind = backdrop(rays.origins.double().numpy(), rays.directions.double().numpy())
+            light += ((1 - view.alpha) * behind.reshape(view.alpha.shape))[..., None].astype(np.float32)
+        counts = camera.expose(light, generator)
         _write_counts(folder / name, counts, bands, camera, "a view of the demo scene")
         Image.fromarray(label_image(view)).save(folder / "truth" / f"{name}.png")
 
