@@ -235,8 +235,11 @@ class UnmixModel(Model):
         return {"num_samples": torch.tensor(step.rendered.num_samples)}, losses, metrics
 
     def _sample_figures(self, rendered: RenderedRays, num_rays: int) -> dict[str, Tensor]:
-        """Samples a ray evaluated and visible, and the share of the grid's cells that are occupied."""
+        """Samples a ray evaluated and visible, and the share of the grid's cells that are occupied; in an unbounded
+        world the share of light that comes from matter rather than from the sky."""
+        matter = rendered.coefficients.accumulation.detach().mean()
         return {
+            **({"matter_share": matter} if self.is_unbounded else {}),
             "samples_per_ray": torch.tensor(rendered.num_samples / max(num_rays, 1)),
             "visible_samples_per_ray": torch.tensor(len(rendered.weights) / max(num_rays, 1)),
             "occupied_share": self._occupied_share,

@@ -326,3 +326,10 @@ def test_a_training_that_hardly_saw_each_pixel_says_that_more_will_show_more():
     assert "0.8 passes over the training pixels" in _remark_on_passes(80_000, 100_000)[0]
     assert _remark_on_passes(900_000, 100_000) == []
     assert _remark_on_passes(80_000, 0) == []
+
+
+def test_a_world_of_nothing_but_sky_is_said():
+    lines = course(1.0, 0.2, 0.1, 0.09)
+    assert _remarks([*lines[:-1], {**lines[-1], "matter_share": 0.3}]) == []
+    (said,) = _remarks([*lines[:-1], {**lines[-1], "matter_share": 0.01}])
+    assert "99% of what the views show was learnt as sky" in said

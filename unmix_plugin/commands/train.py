@@ -280,6 +280,8 @@ stay below 0.35, also short ones."""
 _STILL_FALLS = 0.3
 """Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
 
+_LITTLE_MATTER = 0.02
+"""Share of light from matter below which a world has nothing but a sky."""
 _FEW_PASSES = 3
 """Rays for each training pixel below which fine detail is still being learnt."""
 
@@ -312,6 +314,12 @@ def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
         found.append(
             f"{outliers:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
             "hardly shape the scene: their poses are off by more than was found, or they show something else"
+        )
+    matter = known[-1].get("matter_share")
+    if matter is not None and matter < _LITTLE_MATTER:
+        found.append(
+            f"{1 - matter:.0%} of what the views show was learnt as sky: they agree on nothing nearer. If they show a "
+            "scene, look whether poses belong to their pictures, or train with --world bounded"
         )
     if last > _HARDLY_FELL * first:
         found.append(
