@@ -12,7 +12,7 @@ from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 HEIGHT, WIDTH, BANDS, VIEWS = 90, 120, 6, 5
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 COLOUR = np.linspace(1.0, 0.8, BANDS)
-STRIPES = 0.01 * np.random.default_rng(7).standard_normal((WIDTH, BANDS))
+STRIPES = 0.02 * np.random.default_rng(7).standard_normal((WIDTH, BANDS))
 
 Light = Callable[[int, np.random.Generator], np.ndarray]
 
@@ -107,6 +107,8 @@ def test_a_plain_backdrop_is_found_and_cut_out_with_soft_edges(name: str):
         assert seen is not None
         opacity = seen.opacity(~seen.shown)
         assert ((opacity > 0.5) != (cover > 0.5)).mean() < 0.012
+        sides = np.r_[0:3, WIDTH - 3 : WIDTH]
+        assert (opacity[:, sides] > 0).mean() < 0.05  # stripes at the ends of a line too
         edge = (cover > 0.2) & (cover < 0.8)
         assert np.abs(opacity - cover)[edge].mean() < 0.2
         assert np.abs(opacity - (cover > 0.5))[edge].mean() > 0.2  # not a step

@@ -357,7 +357,7 @@ def _stripes(features: Sequence[Float32[np.ndarray, "h W k"]]) -> Float32[np.nda
 
     width = max(1, round(_BORDER_SHARE * len(features[0])))
     lines = [side.mean(axis=0) for image in features for side in (image[:width], image[-width:])]
-    narrow = [line - ndimage.median_filter(line, (_STRIPE_WINDOW, 1), mode="nearest") for line in lines]
+    narrow = [line - ndimage.median_filter(line, (_STRIPE_WINDOW, 1), mode="mirror") for line in lines]
     return np.median(narrow, axis=0).astype(np.float32)
 
 
