@@ -13,6 +13,7 @@ HEIGHT, WIDTH, BANDS, VIEWS = 90, 120, 6, 5
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
 COLOUR = np.linspace(1.0, 0.8, BANDS)
 STRIPES = 0.02 * np.random.default_rng(7).standard_normal((WIDTH, BANDS))
+STRIPES[[0, 1, -1]] = 0.05
 
 Light = Callable[[int, np.random.Generator], np.ndarray]
 
