@@ -12,6 +12,8 @@ import pytest
 from PIL import Image
 
 from tests.commands.browser import CHROMIUM, FLAGS
+from tests.viewer.pages import serving
+from tests.viewer.view_factory import make_source
 from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.rendering.painting import LAYERS
@@ -164,3 +166,25 @@ def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):
         assert picture.size == (240, 160)
         assert np.asarray(picture).std() > LEAST_SPREAD
     browser.keep("captured")
+
+
+@pytest.mark.slow
+def test_a_browser_gives_the_token_once_and_is_let_in(tmp_path):
+    from playwright.sync_api import sync_playwright
+
+    source = make_source(tmp_path)
+    with serving(source, token="sésame") as (viewer, _), sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        page = chromium.new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.goto(f"http://127.0.0.1:{viewer.port}")
+        page.get_by_label("token").fill("barley")
+        page.get_by_role("button").click()
+        page.get_by_text("That is not the token.").wait_for()
+        page.get_by_label("token").fill("sésame")
+        page.get_by_role("button").click()
+        page.get_by_role("tab", name="capture").wait_for()
+        page.reload()
+        page.get_by_role("tab", name="capture").wait_for()
+        assert page.title() == "unmix-nerf"
+        chromium.close()
