@@ -143,6 +143,10 @@ def expanded_tensor(path: Path) -> None:
     torch.save(torch.zeros(1).expand(2000, 2000, 500), path)
 
 
+def long_word(path: Path) -> None:
+    path.write_bytes(b"\x80\x02" + b"c" + b"x" * 100_000 + b"\nname\n.")
+
+
 HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "loop.tif": (looping_pages, "page 2 leads back to an earlier one"),
     "big-loop.tif": (looping_big_pages, "page 1 leads back to an earlier one"),
@@ -160,6 +164,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "packed.mat": (packed_variable, "decode to 810,000"),
     "variables.mat": (many_variables, "4097 variables"),
     "packed.exr": (packed_channels, "decode to 3,240,000"),
+    "word.pt": (long_word, "a word of 100005 letters"),
     "expanded.pt": (expanded_tensor, "decode to 8,000,000,000"),
 }
 

@@ -167,7 +167,10 @@ def _matrix(image: _Image, where: str) -> Float64[np.ndarray, "3 4"]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    return np.column_stack([to_camera.T @ FLIP, -to_camera.T @ np.array(image.translation)])
+    with np.errstate(
+        invalid="ignore"
+    ):  # places that are not finite are refused where all poses are looked at
+        return np.column_stack([to_camera.T @ FLIP, -to_camera.T @ np.array(image.translation)])
 
 
 def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:

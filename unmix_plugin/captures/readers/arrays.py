@@ -7,13 +7,14 @@ Notation: `H` rows, `W` columns, `B` bands.
 from __future__ import annotations
 
 import pickle
+import pickletools
 import re
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from unmix_plugin.captures.spectral_file import (
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import allow_decoded, allow_parts, open_zip
+from unmix_plugin.limits import allow_decoded, allow_parts, open_zip, refuse
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
     UnreadableArrayError,
@@ -442,6 +443,8 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
     """
     import torch
 
+    _check_pickle(path)
+
     def tensors() -> dict[str, Any]:
         """By name, mapped where the file allows it."""
         with path.open("rb") as file:
@@ -475,6 +478,34 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
         for name, tensor in found.items()
     ]
     return image_of_arrays(path, "torch", arrays, options)
+
+
+_MOST_OPERATIONS, _LONGEST_WORD = 1 << 20, 1024
+"""Of a pickle of tensors. What torch says of words that it refuses takes time that grows with the square of them."""
+_PICKLES = 5
+"""In a row, in files of old torch: two numbers, facts of the machine, the tensors, the names of their numbers."""
+
+
+def _check_pickle(path: Path) -> None:
+    """Look through what the file would have loaded, without loading any of it."""
+
+    def look(stream: IO[bytes]) -> None:
+        for number, (_, word, _) in enumerate(pickletools.genops(stream)):
+            if number >= _MOST_OPERATIONS:
+                refuse(path, f"more than {number} steps of a pickle", "those of tensors", CaptureError)
+            if isinstance(word, str | bytes) and len(word) > _LONGEST_WORD:
+                refuse(path, f"a word of {len(word)} letters", f"at most {_LONGEST_WORD}", CaptureError)
+
+    with path.open("rb") as file:
+        if file.read(2) == b"PK":
+            with open_zip(path, CaptureError) as archive:
+                name = next(name for name in archive.namelist() if name.endswith("/data.pkl"))
+                with archive.open(name) as stream:
+                    look(stream)
+            return
+        file.seek(0)
+        for _ in range(_PICKLES):
+            look(file)
 
 
 # NetCDF of the classic kind, mapped by SciPy.
