@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ class Options:
 
 def main(options: Options) -> None:
     """Search until the time is up or a fault is found; the process ends with it."""
-    import atheris  # pyright: ignore[reportMissingImports] - installed by those who search
+    atheris: Any = import_module("atheris")  # installed by those who search
 
     with atheris.instrument_imports(include=[f"unmix_plugin.{part}" for part in READING]):
         from tests.fuzz.fuzzing import prepare
