@@ -131,6 +131,16 @@ def test_rooms_and_landscapes_have_none(name: str):
     assert judge(pictures(NO_BACKDROP[name])[0]) is None
 
 
+def test_plain_ground_with_little_on_it_is_no_backdrop():
+    images, _ = pictures(BACKDROPS["grey"], matter=False)
+    for view, image in enumerate(images):
+        image[20 + view : 34 + view, 30:60] = 0.7  # a tenth of the height and a quarter of the width
+    assert judge(images) is None
+    for view, image in enumerate(images):
+        image[10 + view : 60 + view, 20:80] = 0.7
+    assert judge(images) is not None
+
+
 def test_a_view_that_matter_fills_keeps_all_of_it():
     images, _ = pictures(BACKDROPS["grey"])
     backdrop = judge(images)

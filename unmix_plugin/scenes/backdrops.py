@@ -69,6 +69,9 @@ _MOST_VIEWS = 0.8
 """Share of the views that this holds for."""
 _LEAST_SHARE = 0.1
 """Of the pixels; less than that is not worth a mask."""
+_MOST_SHARE, _ALL = 0.9, 0.995
+"""Of the pixels: a plain field with little in it is ground seen from above, not what stands behind an object; and where
+there is nothing else at all, there is no object, which is refused."""
 _MOST_DISTANCE = 0.012
 """Median distance of a backdrop's pixels from its surfaces; more is a texture."""
 _MOST_UNLIKE = 0.12
@@ -337,6 +340,7 @@ def judge_backdrop(
         or np.median(explained) < _LEAST_EXPLAINED
         or np.mean(np.array(explained) >= _LEAST_IN_A_VIEW) < _MOST_VIEWS
         or np.median(shares) < _LEAST_SHARE
+        or _MOST_SHARE < np.median(shares) < _ALL
         or np.median(distances) > _MOST_DISTANCE
     ):
         return None
