@@ -478,4 +478,4 @@ def _border(shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
 
 
 def _norm(values: Float32[np.ndarray, "*pixels k"]) -> Float32[np.ndarray, "*pixels"]:
-    return np.sqrt(np.square(values).sum(axis=-1))
+    return np.asarray(np.sqrt(np.square(values).sum(axis=-1)))

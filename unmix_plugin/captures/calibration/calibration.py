@@ -317,7 +317,7 @@ class Raster:
     def lens(self, lens: Lens) -> Lens:
         """The intrinsics of the result from those of the whole image in the file."""
         scale = 1.0 / self.binning
-        return lens.seen_as(self.width, self.height, (self.left, self.top), (scale, scale))
+        return lens.seen_as(self.width, self.height, (float(self.left), float(self.top)), (scale, scale))
 
     def lens_of_file(self, lens: Lens, height: int, width: int) -> Lens:
         """The inverse of `lens`: intrinsics of the whole image, of this size, from those of the result."""

@@ -211,7 +211,7 @@ def _pixels(
 
 
 def transformed(
-    transforms: Transforms, points: Float64[np.ndarray, "*n P 3"]
+    transforms: Transforms, points: Float64[np.ndarray, "#*n P 3"]
 ) -> Float64[np.ndarray, "*n P 3"]:
     return points @ np.swapaxes(transforms[..., :3, :3], -1, -2) + transforms[..., None, :3, 3]
 

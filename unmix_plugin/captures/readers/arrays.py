@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
 
@@ -243,7 +243,7 @@ def _find_vector(
 def _counts(array: FoundArray) -> bool:
     """Whether a list counts instead of measuring: whole numbers one apart."""
     numbers = array.whole().reshape(-1)
-    return bool((np.diff(numbers) == 1).all()) and numbers[0] < 100
+    return bool((np.diff(numbers) == 1).all() and numbers[0] < 100)
 
 
 def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands:
@@ -489,7 +489,7 @@ _PICKLES = 5
 def _check_pickle(path: Path) -> None:
     """Look through what the file would have loaded, without loading any of it."""
 
-    def look(stream: IO[bytes]) -> None:
+    def look(stream: BinaryIO | zipfile.ZipExtFile) -> None:
         for number, (_, word, _) in enumerate(pickletools.genops(stream)):
             if number >= _MOST_OPERATIONS:
                 refuse(path, f"more than {number} steps of a pickle", "those of tensors", CaptureError)

@@ -62,19 +62,19 @@ class UnmixedImage:
 
 
 def unmix_image(
-    cube: Shaped[np.ndarray, "H W B"],
+    cube: Shaped[np.ndarray, "..."],
     endmembers: int | Literal["auto"] = "auto",
     *,
-    mask: Bool[np.ndarray, "H W"] | None = None,
+    mask: Bool[np.ndarray, "..."] | None = None,
     shares: Shares = "auto",
     seed: int = 0,
 ) -> UnmixedImage:
     """Find the spectra of an image's materials, and how much of each every pixel shows.
 
     Args:
-        cube: Radiance or reflectance in any unit, in whole numbers too; negative values count as 0.
+        cube: (H, W, B), radiance or reflectance in any unit, in whole numbers too; negative values count as 0.
         endmembers: How many materials to find; auto proposes a number.
-        mask: Pixels to use; None takes all.
+        mask: (H, W), pixels to use; None takes all.
         shares: What abundances are shares of.
         seed: Everything random follows from it.
     Raises:

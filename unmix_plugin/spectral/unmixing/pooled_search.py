@@ -27,7 +27,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -219,6 +218,8 @@ def _ranked(
 
 def _matched(best: Float[Tensor, "K d"], other: Float[Tensor, "K d"]) -> Float[Tensor, "K d"]:
     """Another set in the order of the best."""
+    from scipy.optimize import linear_sum_assignment
+
     return other[linear_sum_assignment(-(best @ other.T).cpu().numpy())[1]]
 
 
