@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
+from unmix_plugin.field import CoefficientField
 from unmix_plugin.losses.comparison import ComparedPixels
 from unmix_plugin.model import TrainingBatch, UnmixModel
 from unmix_plugin.poses.training import CorrectedRays
@@ -65,6 +67,24 @@ def make_model(
 def scene_of(model: UnmixModel, cameras: Cameras = CAMERA) -> TrainedScene:
     """The scene of a model as it is now, whose training and evaluation views are `cameras`."""
     return unmix_scene(model, SceneRecord(BOX, dict(model.metadata), cameras, cameras, {}))
+
+
+class _BlackSky(torch.nn.Module):
+    """Sends no light along any direction."""
+
+    def __init__(self, num_endmembers: int) -> None:
+        super().__init__()
+        self.outputs = torch.tensor([*[0.0] * num_endmembers, -100.0])
+
+    def forward(self, directions: torch.Tensor) -> torch.Tensor:
+        return self.outputs.expand(len(directions), -1)
+
+
+def with_a_sky(field: Any) -> CoefficientField:
+    """The field with a black sky behind all that is rendered."""
+    world = copy.deepcopy(field)
+    world.sky_network = _BlackSky(field.num_endmembers)
+    return world
 
 
 def make_scene(

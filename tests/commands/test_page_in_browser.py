@@ -33,7 +33,7 @@ NAME = '<b>matt</b> & "bright"</script>'
 def exported(tmp_path_factory):
     """A trained run and its page, with markup in its title."""
     folder = tmp_path_factory.mktemp("page")
-    make_demo_scene(folder / "scene", 96, 32, 8)
+    make_demo_scene(folder / "scene", 96, 8, 32)
     given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 400]
     ended = run(train, "unmix-nerf", *given, "--pipeline.model.num-endmembers=5")
     assert ended.status == 0, ended.err

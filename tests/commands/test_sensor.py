@@ -134,8 +134,7 @@ def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_p
     assert f"{words[0]} compares with what is known in the run's own bands" in said
     assert (
         "It goes with abundances, cubes, endmembers, mesh, page, pca, point-cloud, poses, segmentation, splats, "
-        "volume"
-        in said
+        "volume" in said
     )
     assert not (tmp_path / "out").exists()
 

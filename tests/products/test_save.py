@@ -8,7 +8,7 @@ import pytest
 import spectral.io.envi as envi
 from PIL import Image
 
-from tests.method_factory import make_scene
+from tests.method_factory import make_scene, with_a_sky
 from unmix_plugin import save
 from unmix_plugin.errors import ConfigError, RunError
 
@@ -49,7 +49,7 @@ def test_png_is_a_picture_of_the_views_size_or_of_tiles_of_it(view, tmp_path, na
 
 
 def test_pixels_of_a_world_with_a_sky_are_opaque_where_they_show_light(view, tmp_path):
-    world = replace(view, scene=replace(view.scene, renderer=replace(view.scene.renderer, is_unbounded=True)))
+    world = replace(view, scene=replace(view.scene, field=with_a_sky(view.scene.field)))
     with Image.open(save(world, "rgb", tmp_path / "world.png")) as picture:
         pixels = np.asarray(picture) / 255
     assert (pixels[..., 3] == 1).all()

@@ -199,7 +199,7 @@ def _features_of(view: MatchedView) -> tuple[Points, np.ndarray] | None:
 
 
 def _find_star(
-    views: Sequence[MatchedView], features: Sequence[tuple[Points, np.ndarray] | None]
+    views: Sequence[MatchedView], features: Sequence[tuple[np.ndarray, np.ndarray] | None]
 ) -> _Star | None:
     """Points of the first view that enough of the others show; None without any."""
     first, lenses = features[0], [view.camera.lens for view in views]
@@ -228,7 +228,9 @@ def _find_star(
 
 
 def _matches(
-    one: tuple[Points, np.ndarray], other: tuple[Points, np.ndarray], shrunk: float
+    one: tuple[Points, np.ndarray],
+    other: tuple[Float64[np.ndarray, "Q 2"], np.ndarray],
+    shrunk: float,
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """Indices of features of two views that match and that a fundamental matrix explains; none if those are few."""
     from skimage.feature import match_descriptors

@@ -101,7 +101,7 @@ def test_shapes_that_differ_only_in_brightness_are_one():
 
 
 def test_zero_spectra_are_refused():
-    with pytest.raises(SpectrumError, match="non-zero length; found 1 zero ones"):
+    with pytest.raises(SpectrumError, match="non-zero length; found 1 that are zero"):
         normalised_kmeans(torch.tensor([[0.0, 0.0], [0.1, 0.2]]), 1, seeded())
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.testing import assert_close
 
+from tests.method_factory import with_a_sky
 from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
@@ -200,8 +201,7 @@ def test_colour_is_the_output_of_renders(frame, aids):
 
 @pytest.mark.parametrize("layer", ["rgb", "false-colour", "band", "diffuse"])
 def test_nothing_shines_through_a_sky(frame, aids, layer):
-    renderer = replace(frame.scene.renderer, is_unbounded=True)
-    world = replace(frame, scene=replace(frame.scene, renderer=renderer))
+    world = replace(frame, scene=replace(frame.scene, field=with_a_sky(frame.scene.field)))
     for view, is_alike in ((frame, False), (world, True)):
         black, white = (
             painted(view, aids, layer, background=name, value_range=(0.0, 1.0), colour_map="gray")[0]

@@ -322,7 +322,7 @@ class Raster:
     def lens_of_file(self, lens: Lens, height: int, width: int) -> Lens:
         """The inverse of `lens`: intrinsics of the whole image, of this size, from those of the result."""
         n = self.binning
-        return lens.seen_as(width, height, (-self.left / n, -self.top / n), (n, n))
+        return lens.seen_as(width, height, (-self.left / n, -self.top / n), (float(n), float(n)))
 
 
 @dataclass(frozen=True)

@@ -353,7 +353,7 @@ def _terms(listed: list[Any], what: str, where: str) -> tuple[float, ...]:
 
 
 def _make_lens(
-    given: Intrinsics, model: str, terms: tuple[float, ...], size: _Size, where: str
+    given: Intrinsics, model: Any, terms: tuple[float, ...], size: _Size, where: str
 ) -> tuple[Lens | None, str | None]:
     """The lens, None without a focal length, and a note if it is not exactly the one of the file."""
     width, height = size
