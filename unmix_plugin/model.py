@@ -128,6 +128,7 @@ class UnmixModel(Model):
             self.guide,
             self.view_gains,
             config.as_published,
+            self.field.has_sky,
         )
         self._pose_training = PoseTraining(config.pose_refinement, self.poses)
         self._progress = 0.0
@@ -237,9 +238,11 @@ class UnmixModel(Model):
     def _sample_figures(self, rendered: RenderedRays, num_rays: int) -> dict[str, Tensor]:
         """Samples a ray evaluated and visible, and the share of the grid's cells that are occupied; in an unbounded
         world the share of light that comes from matter rather than from the sky."""
-        matter = rendered.coefficients.accumulation.detach().mean()
+        matter = {}
+        if self.is_unbounded:
+            matter = {"matter_share": rendered.coefficients.accumulation.detach().mean()}
         return {
-            **({"matter_share": matter} if self.is_unbounded else {}),
+            **matter,
             "samples_per_ray": torch.tensor(rendered.num_samples / max(num_rays, 1)),
             "visible_samples_per_ray": torch.tensor(len(rendered.weights) / max(num_rays, 1)),
             "occupied_share": self._occupied_share,

@@ -323,7 +323,7 @@ def test_poses_that_ran_away_or_are_not_believed_are_said(name, few, many, told)
 
 
 def test_a_training_that_hardly_saw_each_pixel_says_that_more_will_show_more():
-    assert "0.8 passes over the training pixels" in _remark_on_passes(80_000, 100_000)[0]
+    assert "0.8 rays for each training pixel" in _remark_on_passes(80_000, 100_000)[0]
     assert _remark_on_passes(900_000, 100_000) == []
     assert _remark_on_passes(80_000, 0) == []
 

@@ -167,15 +167,6 @@ def test_what_one_view_sees_however_often_is_closed():
     assert not cells.visible[6, 6, 6]
 
 
-def test_a_grid_that_notes_what_rays_meet_loads_one_that_did_not():
-    saved = updated(full(), ball, times=3)
-    loaded = OccupancyGrid(torch.ones(8, 8, 8, dtype=torch.bool), records_observed=True)
-    loaded.load_state_dict(saved.state_dict())
-    assert torch.equal(loaded.occupied, saved.occupied)
-    assert loaded.observed is not None
-    assert not (loaded.observed >= 0).any()
-
-
 def test_of_a_single_view_all_that_it_sees_stays():
     cells = looked_at(((1, 1, 1), 0), ((6, 6, 6), 0))
     assert cells.visible[1, 1, 1]

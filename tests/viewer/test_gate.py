@@ -167,3 +167,11 @@ def test_a_name_is_own_if_the_viewer_listens_there_and_this_machines_name_if_it_
     assert is_own_page(page_at("lab.example"), "lab.example")
     assert not is_own_page(page_at("lab.example"), "0.0.0.0")
     assert is_own_page(page_at(socket.gethostname()), "0.0.0.0")
+
+
+def test_a_malformed_cookie_of_another_program_does_not_hide_ours(ask):
+    gate = Gate("127.0.0.1", "sesame")
+    ours = ask(gate, with_word("sesame")).headers["Set-Cookie"].partition(";")[0]
+    for other in ('a={"x":1}', "flag", "a=b c", "é=1"):
+        assert ask(gate, {**HERE, "cookie": f"{other}; {ours}"}) is None
+    assert ask(gate, {**HERE, "cookie": f"{ours}x"}).status == HTTPStatus.UNAUTHORIZED

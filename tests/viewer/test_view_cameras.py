@@ -1,6 +1,7 @@
 """Between a browser's camera and ours: conversions undo each other, nothing absurd gets in; paths of cameras."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,13 @@ def test_a_picture_never_has_more_pixels_than_allowed_nor_none(height, aspect):
 
 def test_up_is_the_axis_of_the_world_that_the_cameras_hold_upright():
     assert up_direction(ring(8)) == (0.0, 0.0, 1.0)
+
+
+def test_up_is_z_where_cameras_look_down_whatever_their_pictures_have_on_top():
+    poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
+    poses[::2, :2, :2] *= -1  # flight lines there and back
+    for chosen in (poses, poses[::2]):
+        assert up_direction(replace(ring(len(chosen)), camera_to_world=chosen)) == (0.0, 0.0, 1.0)
 
 
 def test_a_path_goes_through_its_key_frames_in_their_order():

@@ -63,7 +63,7 @@ def image(argv: list[str]) -> None:
     from unmix_plugin.products.unmixed_image import BandAxis, unmixed_image_paths, write_unmixed_image
     from unmix_plugin.spectral.unmixing.image import unmix_image
 
-    folder = options.output_dir / (options.file.stem or "image")
+    folder = options.output_dir / (options.file.resolve().stem or "image")
     refuse_to_overwrite(unmixed_image_paths(folder), options.overwrite)
     opened = open_spectral_file(options.file, _reading(options))
     bands, wavelengths = _good_bands(opened)

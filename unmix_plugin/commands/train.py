@@ -221,15 +221,15 @@ def _run(trainer: Trainer, console: Console) -> None:
         sys.exit(INTERRUPTED)
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
+    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
+    with trainer.control.device.training_turn(), averaged:
+        trainer.pipeline.model.write_results(trainer.run.path)
     data = trainer.pipeline.datamanager
     if spectral_scene(data) is not None:  # remarks name settings of spectral methods
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = _remark_on_passes(record.total_rays, num_pixels)
         for remark in [*_read_remarks(trainer.run.metrics_path), *few]:
             say(console, remark)
-    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
-    with trainer.control.device.training_turn(), averaged:
-        trainer.pipeline.model.write_results(trainer.run.path)
 
 
 @contextmanager
@@ -345,8 +345,8 @@ def _remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
     """
     if num_pixels == 0 or num_rays >= _FEW_PASSES * num_pixels:
         return []
-    passes = f"{num_rays / num_pixels:.2g} passes over the training pixels"
-    return [f"{passes}: a longer training (--max-num-iterations, --max-seconds) will show finer detail"]
+    rays = f"{num_rays / num_pixels:.2g} rays for each training pixel"
+    return [f"{rays}: a longer training (--max-num-iterations, --max-seconds) will show finer detail"]
 
 
 def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:

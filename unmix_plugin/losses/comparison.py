@@ -102,6 +102,8 @@ class BatchComparison:
     guide: AbundanceGuide
     view_gains: ViewGains | None
     as_published: bool = False
+    has_sky: bool = False
+    """Whether something is behind all matter: no background shines through."""
 
     def compare(
         self,
@@ -189,7 +191,8 @@ class BatchComparison:
         measured, exposure = part.measured, choose(self.config.exposure, 1.0)
         grey = self._background(measured, generator)
         target = over_background(exposure * measured.spectra, measured.alpha, grey)
-        predicted = over_background(exposure * part.spectra, part.opacities, grey)
+        covered = torch.ones_like(part.opacities) if self.has_sky else part.opacities
+        predicted = over_background(exposure * part.spectra, covered, grey)
         predicted = forgive_saturation(predicted, target, measured.spectra)
         bound = _NO_OUTLIER if self.as_published else _OUTLIER
         outliers = torch.where(is_blown_out(measured.spectra), bound / exposure, bound)[:, None]

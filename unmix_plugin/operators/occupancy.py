@@ -174,7 +174,6 @@ class OccupancyGrid(nn.Module):
         )
         self.register_buffer("skips", skip_distances(reachable), persistent=False)
         self.register_buffer("reachable_cells", _flat_indices(reachable), persistent=False)
-        self.register_load_state_dict_pre_hook(_complete)
         self.register_load_state_dict_post_hook(lambda grid, _: grid._follow())
 
     @torch.no_grad()
@@ -271,12 +270,6 @@ class OccupancyGrid(nn.Module):
         _, side_y, side_z = self.occupied.shape
         x, rest = cells // (side_y * side_z), cells % (side_y * side_z)
         return torch.stack([x, rest // side_z, rest % side_z], dim=-1).float()
-
-
-def _complete(grid: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
-    """Let a grid that notes what rays meet load one that did not, as earlier versions saved."""
-    if isinstance(grid, OccupancyGrid) and grid.observed is not None:
-        state.setdefault(f"{prefix}observed", torch.full_like(grid.observed, _NOT_OBSERVED))
 
 
 def _decayed(peaks: Float[Tensor, "*cells"], decay: float) -> Float[Tensor, "*cells"]:

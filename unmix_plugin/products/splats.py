@@ -20,7 +20,7 @@ from unmix_plugin.formats.meshes import Splats, write_splats_glb, write_splats_p
 from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import Coefficients
-from unmix_plugin.trained.run_views import directions_to_world, world_up
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_at
 
 _WIDTH = 0.75
@@ -51,7 +51,7 @@ def export_splats(
             scene, torch.from_numpy(mesh.vertices).float(), torch.from_numpy(-normals).float()
         ).map(lambda packed: packed.cpu() / packed[:, :1].clamp(min=1e-6).cpu())
         looks = _as_seen(job, seen)
-    world = TriangleMesh(frame.to_world(mesh.vertices), mesh.faces)
+    world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     positions, numbers, extras = gltf_content(world, looks, _WHAT)
     widths = _WIDTH * np.sqrt(_vertex_areas(world))
     splats = Splats(
@@ -68,6 +68,8 @@ def export_splats(
     if "ply" in paths:
         own = {name.lower().lstrip("_"): values for name, values in numbers.items()}
         comments = looks.comments(_WHAT)
+        if "offset" in extras:
+            comments.append(f"less the offset {extras['offset']}, since coordinates are large")
         if up == "y":
             splats = _turned(splats, axis)
             comments.append("turned so that -y is up; --up z keeps the axes of the world")

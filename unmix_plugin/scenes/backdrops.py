@@ -282,7 +282,8 @@ def find_before_backdrop(
         seen = backdrop.find(backdrop.features(image), np.ones(image.shape[:2], bool))
         matter = np.ones(image.shape[:2], bool) if seen is None else _without_specks(~seen.shown)
         masks.append(matter.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
-    return masks if any(mask.any() for mask in masks) else None
+    matter = np.mean([mask.mean() for mask in masks])
+    return masks if matter > 1 - _ALL else None
 
 
 def _without_specks(matter: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

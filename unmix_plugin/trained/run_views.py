@@ -85,11 +85,18 @@ def resized_views(views: Sequence[RunView], size: tuple[int, int] | None = None)
     )
 
 
+_LEAST_UPWARD, _LOOKING_DOWN = 0.3, 0.8
+"""Length of the mean upward axis that tells what is up; height of the mean viewing axis that tells a flight."""
+
+
 def up_direction(cameras: Cameras) -> tuple[float, float, float]:
-    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is."""
-    mean = cameras.camera_to_world[:, :, 1].double().mean(dim=0)
+    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is.
+
+    Where cameras look down on average, as in flights, or upward axes cancel, it is +z.
+    """
+    mean, back = (cameras.camera_to_world[:, :, axis].double().mean(dim=0) for axis in (1, 2))
     length = float(mean.norm())
-    if length < 1e-3:
+    if length < _LEAST_UPWARD or abs(float(back[2])) > _LOOKING_DOWN:
         return (0.0, 0.0, 1.0)
     up = (mean / length).cpu().numpy()
     axis = int(np.abs(up).argmax())

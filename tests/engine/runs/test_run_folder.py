@@ -260,7 +260,9 @@ def test_a_scene_of_another_shape_is_refused(trained: RunFolder, name: str):
     "value", ["[" * 100 + "]" * 100, "[" * 200_000, "NaN", "1e999", '"\\u0000"', '"\\ud800"']
 )
 def test_json_that_no_run_writes_is_refused(trained: RunFolder, name: str, value: str):
-    (trained.path / name).write_text(f'{{"format_version": 3, "config": {value}, "scene_box": {value}}}')
+    (trained.path / name).write_text(
+        f'{{"format_version": {RUN_FORMAT}, "config": {value}, "scene_box": {value}}}'
+    )
     with pytest.raises(RunError, match=name):
         load_model(trained.path, "cpu")
 

@@ -37,7 +37,7 @@
       return how.is_root ? scale * value * value : scale * value;
     });
   };
-  const [positions, normals, materials, confidence] = ["positions", "normals", "materials", "confidence"].map(read);
+  const [positions, materials, confidence] = ["positions", "materials", "confidence"].map(read);
   const [scaled, abundances, gloss, tints] = ["scaled", "abundances", "gloss", "tints"].map(read);
   const faces = Uint32Array.from(read("faces"));
   for (let i = 1; i < faces.length; i++) faces[i] += faces[i - 1];
@@ -90,26 +90,30 @@
     let at = 0;
     const fail = (what) => { throw new Error(`${what}; allowed are numbers, r800 (the reflectance at 800 nm), + - * / ^, parentheses, sqrt log exp abs min max`); };
     const expect = (sign) => tokens[at++] === sign || fail(`${sign} is missing`);
-    const functions = { sqrt: Math.sqrt, log: Math.log, exp: Math.exp, abs: Math.abs, min: Math.min, max: Math.max };
+    const functions = new Map(Object.entries({ sqrt: [Math.sqrt, 1], log: [Math.log, 1], exp: [Math.exp, 1], abs: [Math.abs, 1], min: [Math.min, 2], max: [Math.max, 2] }));
+    const finite = (value) => (Number.isFinite(value) ? value : NaN);
     const operand = () => {
       const token = tokens[at++];
       if (token === undefined) fail("the formula ends too early");
       if (token === "(") { const inner = sum(); expect(")"); return inner; }
       if (/^[\d.]/.test(token)) { const value = Number(token); return () => value; }
       if (/^r\d+(\.\d+)?$/.test(token)) return reflectanceAt(Number(token.slice(1)));
-      if (!functions[token]) fail(`${token} is unknown`);
+      if (!functions.has(token)) fail(`${token} is unknown`);
+      const [apply, least] = functions.get(token);
       expect("(");
       const values = [sum()];
       while (tokens[at] === ",") { at++; values.push(sum()); }
       expect(")");
-      return (r) => functions[token](...values.map((value) => value(r)));
+      if (least === 1 ? values.length !== 1 : values.length < 2) fail(`${token} takes ${least === 1 ? "one value" : "two values or more"}`);
+      return (r) => finite(apply(...values.map((value) => value(r))));
     };
     const power = () => {
       const base = operand();
       if (tokens[at] !== "**" && tokens[at] !== "^") return base;
       at++;
       const exponent = sign();
-      return (r) => base(r) ** exponent(r);
+      // The zeros carry what is undefined: alone, NaN ** 0 is 1.
+      return (r) => finite(base(r) ** exponent(r) + 0 * base(r) + 0 * exponent(r));
     };
     const sign = () => {
       if (tokens[at] === "-") { at++; const inner = sign(); return (r) => -inner(r); }
@@ -117,15 +121,15 @@
     };
     const chain = (next, signs) => () => {
       let left = next();
-      while (tokens[at] in signs) {
-        const [apply, before] = [signs[tokens[at++]], left];
+      while (signs.has(tokens[at])) {
+        const [apply, before] = [signs.get(tokens[at++]), left];
         const right = next();
-        left = (r) => apply(before(r), right(r));
+        left = (r) => finite(apply(before(r), right(r)));
       }
       return left;
     };
-    const product = chain(sign, { "*": (a, b) => a * b, "/": (a, b) => a / b });
-    const sum = chain(product, { "+": (a, b) => a + b, "-": (a, b) => a - b });
+    const product = chain(sign, new Map([["*", (a, b) => a * b], ["/", (a, b) => a / b]]));
+    const sum = chain(product, new Map([["+", (a, b) => a + b], ["-", (a, b) => a - b]]));
     const formula = sum();
     if (at < tokens.length) fail(`${tokens[at]} is not expected there`);
     return formula;
@@ -331,6 +335,8 @@
       $("legend").replaceChildren();
       $("about").textContent = painters[state.layer]();
     } catch (error) {
+      lightOf.array.fill(0.6);
+      paintedFlat();
       $("about").textContent = error.message;
     }
     const notes = facts.lights[$("light").value].notes;
@@ -479,7 +485,7 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   };
-  const quoted = (text) => `"${text.replaceAll('"', '""').replace(/^[=+\-@]/, "'$&")}"`;
+  const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
   const csvText = () => {
     const head = points.map((_, index) => `point ${index + 1}`);
     const rows = [["quantity", ...head]];
@@ -504,7 +510,7 @@
     $("known").hidden = !isWhole;
     $("length").textContent = isWhole ? unitText(rulerEnds[0].distanceTo(rulerEnds[1])) : isMeasuring ? "click two points" : "";
   };
-  const measure = (on) => { isMeasuring = on; $("ruler").setAttribute("aria-pressed", on); if (on) rulerEnds.length = 0; showLength(); showMarks(); };
+  const measure = (on) => { isMeasuring = on; $("hint").textContent = on ? "Click two points of the object." : ""; $("ruler").setAttribute("aria-pressed", on); if (on) rulerEnds.length = 0; showLength(); showMarks(); };
   $("ruler").onclick = () => measure(!isMeasuring);
   $("true-length").onchange = () => {
     const metres = Number($("true-length").value);
@@ -528,9 +534,12 @@
 
   // ---- hands and keys -----------------------------------------------------------------------------------------------
   let pressed = null;
-  canvas.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
+  // A second finger begins a pinch, which picks nothing.
+  canvas.addEventListener("pointerdown", (event) => { pressed = event.isPrimary ? [event.clientX, event.clientY] : null; });
   canvas.addEventListener("pointerup", (event) => {
-    if (!pressed || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 5 || event.button) return;
+    const from = pressed;
+    pressed = null;
+    if (!from || Math.hypot(event.clientX - from[0], event.clientY - from[1]) > 5 || event.button) return;
     const found = pick(event.clientX, event.clientY);
     if (!found) return;
     if (isMeasuring) {
@@ -542,6 +551,8 @@
       const free = markColours.find((colour) => !points.some((point) => point.colour === colour));
       points.push({ ...found, colour: free });
       listPoints();
+      if ($("panel").classList.contains("folded")) fold();
+      if (innerWidth <= 700) $("points").scrollIntoView();
     }
     showMarks();
   });
@@ -558,12 +569,15 @@
   const keys = { 0: wholeObject, t: theme, p: fold, r: () => measure(!isMeasuring), "[": () => step(-1), "]": () => step(1), Escape: () => $("clear").click() };
   layers.forEach(([layer], index) => (keys[index + 1] = () => choose(layer)));
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-    keys[event.key]?.();
+    const isAlt = (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
+    if (isAlt || event.target.matches("select, input[type='text'], input[type='number']")) return;
+    keys[event.key.length === 1 ? event.key.toLowerCase() : event.key]?.();
   });
 
+  $("camera").append(make("option", { value: "", text: "choose a view" }));
   facts.cameras.forEach((view, value) => $("camera").append(make("option", { value, text: view.name })));
-  $("camera").onchange = () => lookThrough(Number($("camera").value));
+  $("camera").onchange = () => { if ($("camera").value) lookThrough(Number($("camera").value)); };
+  controls.addEventListener("start", () => { $("camera").value = ""; });
   $("whole").onclick = wholeObject;
   $("picture").onclick = () => { draw(); canvas.toBlob((blob) => save("picture.png", blob)); };
 

@@ -47,6 +47,8 @@ MOST_BYTES = 20_000_000
 
 _COARSER = 0.75
 """Part of the resolution that is tried next where a page would be too large."""
+_COARSEST = 16
+_LARGEST_PICTURE_PX = 900
 
 _LIGHTS = ("D65", "D50", "A", "FL2", "FL11", "LED-B3")
 _MOST_CAMERAS = 200
@@ -68,12 +70,13 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
     """
     path = job.folder / "page.html"
     job.claim([path])
+    pictures = _pictures(job)
     while True:
         mesh = find_surface(job, resolution)[0]
-        page = _page(job, mesh, title)
-        if len(page) <= MOST_BYTES:
-            break
+        page = _page(job, mesh, title, pictures)
         coarser = int(resolution * _COARSER)
+        if len(page) <= MOST_BYTES or coarser < _COARSEST:
+            break
         job.say(
             f"a page of {len(mesh.faces)} triangles would have {len(page) / 1e6:.1f} MB, more than the "
             f"{MOST_BYTES / 1e6:g} MB that a mail takes: made again with {coarser} cells along the longest edge"
@@ -83,7 +86,7 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
     return [write_file(path, page)]
 
 
-def _page(job: Job, mesh: TriangleMesh, title: str) -> bytes:
+def _page(job: Job, mesh: TriangleMesh, title: str, pictures: list[dict[str, str]]) -> bytes:
     """The whole page."""
     with job.working("looking at the surface's points"):
         arrays, layout = _packed(_vertex_arrays(job.scene, mesh, job.frame))
@@ -98,7 +101,7 @@ def _page(job: Job, mesh: TriangleMesh, title: str) -> bytes:
         "up": _rounded(world_up(job.scene.views, job.frame)),
         "cameras": _camera_facts(job.views("all"), job.frame),
     }
-    return _fill(facts, arrays, _pictures(job))
+    return _fill(facts, arrays, pictures)
 
 
 def _spectral_facts(materials: Materials) -> dict[str, Any]:
@@ -144,7 +147,7 @@ def _camera_facts(views: list[RunView], frame: Normalisation) -> list[dict[str, 
     cameras = []
     for view in shown:
         pose = view.camera.camera_to_world[0].double().cpu().numpy()
-        focal, centre = view.camera.focal_px[0].tolist(), view.camera.center_px[0].tolist()
+        focal = view.camera.focal_px[0].tolist()
         cameras.append(
             {
                 "name": view.name,
@@ -152,7 +155,6 @@ def _camera_facts(views: list[RunView], frame: Normalisation) -> list[dict[str, 
                 "axes": directions_to_world(frame, pose[:, :3].T).tolist(),
                 "size": [view.camera.width, view.camera.height],
                 "focal_px": focal,
-                "centre_px": centre,
             }
         )
     return cameras
@@ -184,7 +186,6 @@ def _vertex_arrays(
             fit.add(part, _harmonics(along), gloss.sum(dim=1))
     arrays = {
         "positions": frame.to_world(mesh.vertices),
-        "normals": directions_to_world(frame, mesh.normals),
         "faces": mesh.faces,
         "scaled": found.scaled_abundances.numpy(),
         "abundances": found.abundances.numpy(),
@@ -241,7 +242,6 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
             {"scale": extent / 65535, "offset": low.tolist()},
         ),
         "faces": (np.diff(faces.reshape(-1), prepend=0).astype("<i4"), {}),
-        "normals": (np.round(arrays.pop("normals") * 127).astype("i1"), {"scale": 1 / 127}),
         "materials": (np.asarray(arrays.pop("materials")).astype("u1"), {"scale": 1}),
     }
     if "gloss" in arrays:
@@ -303,7 +303,9 @@ def _pictures(job: Job) -> list[dict[str, str]]:
     pictures = []
     for caption, pixels in shown.items():
         content = io.BytesIO()
-        Image.fromarray(pixels).convert("RGB").save(content, format="JPEG", quality=85)
+        picture = Image.fromarray(pixels).convert("RGB")
+        picture.thumbnail((_LARGEST_PICTURE_PX, _LARGEST_PICTURE_PX))
+        picture.save(content, format="JPEG", quality=85)
         pictures.append({"caption": caption, "data": base64.b64encode(content.getvalue()).decode()})
     return pictures
 
