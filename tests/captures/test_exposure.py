@@ -98,3 +98,9 @@ def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
     for view in made.reflectance:
         stored = np.load(tmp_path / "scene" / "cubes" / f"{view}.npy") / 65535
         np.testing.assert_allclose(stored, made.reflectance[view], atol=1e-3)
+
+
+def test_long_texts_and_impossible_gains_are_no_exposures():
+    facts, _ = exposure_facts({"exposure": "1" * 100_000 + "!", "gain": "99999 dB"}, "header field")
+    assert "exposure_s" not in facts
+    assert "gain" not in facts

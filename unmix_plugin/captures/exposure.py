@@ -36,6 +36,8 @@ _SECONDS = {
     **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
     **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
 }
+_LONGEST_VALUE = 64
+_MOST_DB = 200.0
 _VALUE = re.compile(
     r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.IGNORECASE
 )
@@ -109,7 +111,7 @@ def _items(value: Any) -> list[str]:
 
 def _number(text: str, unit: str, name: str) -> tuple[float, bool] | None:
     """A time in seconds or a gain as a factor, and whether a unit was there; None for anything else."""
-    match = _VALUE.fullmatch(text.strip())
+    match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
     if match is None:
         return None
     number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
@@ -118,7 +120,7 @@ def _number(text: str, unit: str, name: str) -> tuple[float, bool] | None:
         factor = _SECONDS.get(unit, None if unit else _TIMES[name])
         return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
     if unit == "db":
-        return 10.0 ** (number / 20.0), True
+        return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
     # A gain of 0 without a unit can only be in decibels.
     return None if unit or not number >= 0 else (number or 1.0, False)
 

@@ -204,3 +204,14 @@ def test_matches_by_chance_do_not_move_the_cameras():
     disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)
     found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, sorted(pictures))
     assert align_poses(found, truth).rms_px < 0.5
+
+
+def test_a_view_with_two_angles_is_refused(tmp_path):
+    (tmp_path / "angles.csv").write_text("view,angle\na,0\nb,10\na,20\n")
+    with pytest.raises(ConfigError, match=r"line 4: the view a has an angle already"):
+        parse_angles(str(tmp_path / "angles.csv"), ["a", "b"])
+
+
+def test_a_range_of_endless_angles_is_counted_and_not_listed():
+    with pytest.raises(ConfigError, match=r"gives 360000000000 angles"):
+        parse_angles("0:360:1e-9", ["a", "b"])

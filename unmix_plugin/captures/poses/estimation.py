@@ -8,6 +8,7 @@ Notation: `H x W` pixels, `B` bands.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.util
 import json
@@ -144,7 +145,8 @@ def _run(settings: _Settings, folder: Path) -> dict[str, Any]:
     result, asked = folder / _RESULT, folder.resolve() / "settings.json"
     told = json.dumps(asdict(settings))
     if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == told:
-        return json.loads(result.read_text(encoding="utf-8"))
+        with contextlib.suppress(ValueError):  # cut short by a kill: found anew
+            return json.loads(result.read_text(encoding="utf-8"))
     result.unlink(missing_ok=True)
     asked.write_text(json.dumps(asdict(settings)), encoding="utf-8")
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]

@@ -330,8 +330,13 @@ def _other_model(
     values = {**top, **frame}
     if values.get("ftheta_p0") is not None:
         listed = [values.get(f"ftheta_p{power}", 0.0) for power in range(6)]
-        return "ftheta", _terms(listed, "'ftheta_p0' to 'ftheta_p5'", where), (top, frame)
-    if values.get("camera_model") != "FISHEYE624":
+        terms = _terms(listed, "'ftheta_p0' to 'ftheta_p5'", where)
+        if not terms[1] > 0:
+            raise CaptureError(
+                f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian, greater than 0"
+            )
+        return "ftheta", terms, (top, frame)
+    if str(values.get("camera_model")).upper() != "FISHEYE624":
         return None, (), (top, frame)
     listed = values.get("distortion_params")
     terms = _terms(listed if isinstance(listed, list) else [], "'distortion_params' of FISHEYE624", where)

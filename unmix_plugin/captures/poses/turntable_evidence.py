@@ -61,6 +61,7 @@ def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
     if Path(text).suffix.lower() == ".csv" or Path(text).is_file():
         return _read_angles(Path(text), names)
     turns: list[Turn] = []
+    total = 0
     for camera, part in enumerate(text.split(",")):
         try:
             start, stop, step = (float(number) for number in part.split(":"))
@@ -70,10 +71,11 @@ def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
                 f"--angles {text}: expected START:STOP:STEP in degrees, such as 0:360:10, or a CSV file with the "
                 "columns view and angle"
             ) from error
-        turns += [Turn(start + index * step, camera) for index in range(max(count, 0))]
-    if len(turns) != len(names):
+        total += max(count, 0)
+        turns += [Turn(start + index * step, camera) for index in range(min(count, len(names)))]
+    if total != len(names):
         raise ConfigError(
-            f"--angles {text} gives {len(turns)} angles (the end of a range is none of them) for {len(names)} views; "
+            f"--angles {text} gives {total} angles (the end of a range is none of them) for {len(names)} views; "
             "expected one a view: give other steps, or a CSV file with the columns view and angle"
         )
     return dict(zip(names, turns, strict=True))
@@ -98,6 +100,10 @@ def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
                 "in several places"
             ) from error
         key = name if name in names else Path(name).stem
+        if key in found:
+            raise ConfigError(
+                f"--angles {path}, line {line}: the view {key} has an angle already; expected one a view"
+            )
         found[key] = Turn(angle, places.setdefault((row.get("camera") or "").strip(), len(places)))
     missing, unknown = [n for n in names if n not in found], [n for n in found if n not in names]
     if missing or unknown:

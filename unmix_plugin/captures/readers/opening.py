@@ -148,7 +148,11 @@ def _with_xml_beside(file: SpectralFile) -> SpectralFile:
         return file
     data = read_bounded(found)
     try:
-        root = None if b"<!" in data else ElementTree.fromstring(data)
+        root = (
+            None
+            if any(word in data for word in (b"<!DOCTYPE", b"<!ENTITY"))
+            else ElementTree.fromstring(data)
+        )
     except ElementTree.ParseError:
         root = None
     if root is None:

@@ -149,4 +149,11 @@ def keys_to_say(
 
 def _is_set(value: Any) -> bool:
     """Whether a value is more than zero, false or nothing, also in a list."""
-    return any(map(_is_set, value)) if isinstance(value, list) else bool(value)
+    left = [value]
+    while left:
+        one = left.pop()
+        if isinstance(one, list):
+            left += one
+        elif one:
+            return True
+    return False
