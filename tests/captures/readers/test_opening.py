@@ -540,6 +540,9 @@ def test_a_linear_calibration_of_the_whole_file(tmp_path):
     assert (
         open_spectral_file(calibrated_hdf5(tmp_path, {"scale_factor": 1.0, "add_offset": 0.0})).linear is None
     )
+    multiplied = open_spectral_file(calibrated_hdf5(tmp_path, {"scale_factor": 2.0, "add_offset": 0.0}))
+    assert multiplied.linear is not None
+    np.testing.assert_allclose(multiplied.linear.apply(multiplied.read(), slice(None)), 2 * CUBE)
 
 
 @pytest.mark.parametrize(

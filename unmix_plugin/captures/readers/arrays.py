@@ -300,7 +300,8 @@ def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     gains, offsets = columns
     if len(gains) == 1 and not offsets and evidence[0].lower() == "'gain'":  # that of a camera
         gains, evidence = [], []
-    is_divisor = len(gains) == 1 and gains[0] > 1 and not any(offsets)
+    # An offset, 0 too, is CF's, whose factors multiply whatever they are.
+    is_divisor = len(gains) == 1 and gains[0] > 1 and not offsets
     if is_divisor or (gains and evidence[0].strip("'").lower() in _DIVISORS):
         gains = [1.0 / gain if gain else np.nan for gain in gains]
     if not evidence and (prisma := _prisma(image)) is not None:
