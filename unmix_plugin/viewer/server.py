@@ -141,9 +141,11 @@ class Viewer:
             if self._stopped.is_set() or client.client_id in self._sessions:
                 return
             self._sessions[client.client_id] = session
-        session.open(panels_of(self.services))
-        if self._server is not None and client.client_id not in self._server.get_clients():
-            self._disconnected(client)  # it left before it was noted
+        try:
+            session.open(panels_of(self.services))
+        finally:  # where the page left meanwhile, opening may have failed for it
+            if self._server is not None and client.client_id not in self._server.get_clients():
+                self._disconnected(client)  # it left before it was noted
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         with self._lock:
