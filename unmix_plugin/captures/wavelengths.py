@@ -71,10 +71,9 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
             if factor is None:
                 notes.append(found)
             else:
-                # An unused band gets the wavelength of the nearest band that is used.
-                nearest = np.abs(np.subtract.outer(np.arange(num_bands), np.flatnonzero(~unused))).argmin(
-                    axis=1
-                )
+                nearest = np.arange(num_bands)
+                if unused.any():  # an unused band gets the wavelength of the nearest band that is used
+                    nearest = np.abs(np.subtract.outer(nearest, np.flatnonzero(~unused))).argmin(axis=1)
                 centres, evidence = used[nearest] * factor, found
                 evidence += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
     named = None if centres is not None or names is None else wavelengths_in_names(list(map(str, names)))

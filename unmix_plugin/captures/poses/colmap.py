@@ -105,7 +105,12 @@ def find_models(folder: Path) -> list[Path]:
         places.append(here)
         if len(here.relative_to(folder).parts) == _DEEPEST:
             folders.clear()
-    return [place for place in dict.fromkeys(places) if _suffix(place) is not None]
+    return [place for place in dict.fromkeys(places) if is_model(place)]
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder itself holds a COLMAP model; deeper ones are not looked for."""
+    return _suffix(folder) is not None
 
 
 def read_colmap(folder: Path) -> PoseSet:

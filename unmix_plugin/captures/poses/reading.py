@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.colmap import find_models, read_colmap
+from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
 from unmix_plugin.captures.poses.lens_models import (
     Points,
@@ -78,7 +78,7 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
 
 def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
     start = _first_bytes(path).lstrip(b"\xef\xbb\xbf\xff\xfe\0\t\r\n ")
-    if path.suffix in (".bin", ".txt") and find_models(path.parent)[:1] == [path.parent]:
+    if path.suffix in (".bin", ".txt") and is_model(path.parent):
         return read_colmap(path.parent)
     if start[:1] in (b"{", b"["):
         return _read_json(path, given)
