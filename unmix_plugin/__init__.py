@@ -8,6 +8,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from unmix_plugin.commands.training import train
     from unmix_plugin.editing.apply import edit_scene
     from unmix_plugin.editing.recipe import Light, Recipe
     from unmix_plugin.editing.recipe_files import read_recipe
@@ -31,6 +32,7 @@ __all__ = [
     "open_run",
     "read_recipe",
     "save",
+    "train",
     "unmix_image",
 ]
 
@@ -45,6 +47,7 @@ _MODULES = {
     "open_run": "trained.open_run",
     "read_recipe": "editing.recipe_files",
     "save": "products.save",
+    "train": "commands.training",
     "unmix_image": "spectral.unmixing.image",
 }
 

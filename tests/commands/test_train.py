@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 import torch
 
+import unmix_plugin
 from tests.commands.running import SMALL_METHOD, run
 from tests.formats.cubes import full_disk
-from unmix_plugin.commands import train as train_arguments
-from unmix_plugin.commands.train import _read_remarks, _remark_on_passes, _remarks, parse, train
+from unmix_plugin.commands.train import parse, train
+from unmix_plugin.commands.training import _read_remarks, _remark_on_passes, _remarks
 from unmix_plugin.engine import registry
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
@@ -239,11 +240,9 @@ def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_tra
     assert ended.last_line == f"run: {run_copy}"
 
 
-def test_a_run_of_another_method_is_not_gone_on_with(run_copy, monkeypatch):
-    ours = registry.discover_methods()[0]["unmix-nerf"]
-    monkeypatch.setattr(train_arguments, "find_method", lambda _name: ours)
-    with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of other-nerf"):
-        parse(["other-nerf", "--load-run", str(run_copy)])
+def test_a_run_of_another_method_is_not_gone_on_with(run_copy):
+    with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of neumatex"):
+        parse(["neumatex", "--load-run", str(run_copy)])
 
 
 def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeypatch):
@@ -258,6 +257,54 @@ def test_a_full_disk_while_saving_exits_2_and_says_so(trained, tmp_path, monkeyp
     assert "No space left on device" in ended.err
     assert not list(tmp_path.rglob("*.tmp"))
     assert not list(tmp_path.rglob("step-*"))
+
+
+def test_training_from_python_takes_the_names_of_the_flags_and_gives_the_scene_of_its_run(
+    trained, tmp_path, capsys
+):
+    small = {name.lstrip("-"): value for name, value in (word.split("=") for word in SMALL_METHOD)}
+    numbers = {name: json.loads(value) for name, value in small.items() if name != "device"}
+    given = {"endmembers": 3, "max_num_iterations": np.int64(5), "device": "cpu", **numbers}
+    scene = unmix_plugin.train(trained.scene, output_dir=tmp_path, **given)
+    assert isinstance(scene, unmix_plugin.TrainedScene)
+    path = Path(capsys.readouterr().out.splitlines()[-1].removeprefix("run: "))
+    words = [f"--{name}={value}" for name, value in given.items()]
+    config = load_config(path)
+    assert config == replace(
+        parse(["unmix-nerf", "--data", str(trained.scene), "--output-dir", str(tmp_path), *words]),
+        load_run=path,
+        pipeline=config.pipeline,
+    )
+    assert config.pipeline.model.num_endmembers == len(scene.materials.names) == 3
+    again = unmix_plugin.train(None, load_run=path, max_num_iterations=6)
+    assert isinstance(again, unmix_plugin.TrainedScene)
+    assert json.loads((path / "training.json").read_text())["steps"] == 6
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"endmember": 3}, "unmix-nerf has no setting endmember; did you mean endmembers"),
+        ({"num_endmembers": 3}, "has no setting num_endmembers; did you mean endmembers?"),
+        ({"pipeline.model.loses.rgb": 1}, "did you mean pipeline.model.losses.rgb"),
+        ({"qqq": 1}, "has no setting qqq; unmix-train unmix-nerf --help-all lists all"),
+        ({"endmembers": 3, "pipeline.model.num-endmembers": 3}, "are the same setting: give one"),
+        (
+            {"endmembers": "six"},
+            "num_endmembers: expected an integer or one of 'auto' or null, found str 'six'",
+        ),
+        ({"max_seconds": -1}, "max-seconds above 0"),
+        ({"seed": object()}, "seed: a config holds a object"),
+        ({"data": "other"}, "the scene is demo, and data is other"),
+        ({"machine.num-devices": 2}, "one Python process trains on one device"),
+    ],
+)
+def test_training_from_python_refuses_a_setting_in_one_message(monkeypatch, tmp_path, settings, said):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        unmix_plugin.train("demo", **settings)
+    assert said in str(refused.value)
+    assert not list(tmp_path.iterdir())
 
 
 def course(*quarters: float) -> list[dict]:

@@ -3,6 +3,7 @@
 import inspect
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from unmix_plugin import read_recipe
 def test_the_public_names_are_those_that_the_page_lists():
     table = text_of("docs/guides/python.md").split("\n## ")[0]
     assert sorted(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == sorted(unmix_plugin.__all__)
-    assert len(unmix_plugin.__all__) <= 11
+    assert len(unmix_plugin.__all__) <= 12
     assert sorted(unmix_plugin._MODULES) == sorted(unmix_plugin.__all__)
 
 
@@ -36,16 +37,20 @@ def test_no_other_name_is_public():
         _ = unmix_plugin.Trainer
 
 
-def test_the_examples_run_one_after_the_other(home):
+def test_the_examples_run_one_after_the_other(home, trained):
+    shutil.copytree(trained.scene, home / "my-scene")
     names = {}
     for code in blocks_of("docs/guides/python.md", "python"):
-        exec(compile(code, "docs/guides/python.md", "exec"), names)
+        short = code.replace("(4, 6)", "(6,)").replace("max_seconds=120", "max_num_iterations=2")
+        exec(compile(short, "docs/guides/python.md", "exec"), names)
     height, width = names["rgb"].shape[:2]
     assert names["cube"].shape == (height, width, len(names["wavelengths"]))
     assert names["edited"].materials.names[2] == "wood"
     assert not np.allclose(names["picture"], names["rgb"], atol=0.05)
     np.testing.assert_allclose(np.load(home / "abundances.npy"), names["abundances"], atol=1e-6)
     assert picture_size(home / "view.png") == (width, height)
+    assert len(list(home.glob("sweep/*/my-scene/unmix-nerf/*/endmembers.csv"))) == 1
+    assert picture_size(home / "sweep" / "6.png") == (width, height)
     assert {path.name for path in home.glob("view.*")} == {"view.png", "view.hdr", "view.img"}
 
 

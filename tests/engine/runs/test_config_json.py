@@ -89,8 +89,8 @@ def test_what_the_file_lacks_is_the_default():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"count": "three"}, r"config\.count: expected an integer, found str 'three'"),
-        ({"count": True}, r"config\.count: expected an integer, found bool True"),
+        ({"count": "three"}, r"config\.count: expected an integer or null, found str 'three'"),
+        ({"count": True}, r"config\.count: expected an integer or null, found bool True"),
         ({"flag": 1}, r"config\.flag: expected true or false, found int 1"),
         ({"number": None}, r"config\.number: expected a number, found NoneType None"),
         ({"kind": "most"}, r"config\.kind: expected one of 'none', 'some', 'full', found str 'most'"),

@@ -99,6 +99,11 @@ def _read_union(value: Any, choices: tuple[Any, ...], default: Any, where: str) 
             return _read(value, choice, default, where)
         except ConfigError as error:  # noqa: PERF203
             problems.append(str(error))
+    head, tail = f"{where}: expected ", f", found {_shown(value)}"
+    if all(problem.startswith(head) and problem.endswith(tail) for problem in problems):
+        expected = [problem.removeprefix(head).removesuffix(tail) for problem in problems]
+        expected.sort(key=lambda kind: kind == "null")
+        raise ConfigError(f"{head}{' or '.join(expected)}{tail}")
     raise ConfigError("; or ".join(problems))
 
 

@@ -1,0 +1,287 @@
+"""A training from its settings to its run: what `unmix-train` and `unmix_plugin.train` share.
+
+After training the course of the loss is told in words: whether it settled, and what to try where it did not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import tyro
+
+from unmix_plugin.engine.configs import TrainerConfig
+from unmix_plugin.engine.registry import MethodSpecification, find_method
+from unmix_plugin.errors import ConfigError, counted, did_you_mean
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from unmix_plugin.engine.processes import Processes
+    from unmix_plugin.engine.training.trainer import Trainer
+    from unmix_plugin.trained.protocol import RenderableScene
+
+
+def train(
+    scene: str | Path | None,
+    method: str = "unmix-nerf",
+    *,
+    load_run: str | Path | None = None,
+    **settings: Any,
+) -> RenderableScene:
+    """Train a method on a scene, as `unmix-train METHOD --data SCENE` does, and open the run.
+
+    Progress, remarks and the run folder are printed as the command prints them. Ctrl-C saves and raises
+    KeyboardInterrupt.
+
+    Args:
+        scene: Its folder, or `demo`; None with `load_run`: where it was.
+        method: A name that `unmix-train --help` lists.
+        load_run: Run folder to go on with instead of starting a new one.
+        settings: By the names of the flags, as in `endmembers=4, max_seconds=60`; those with dots as in
+            `**{"pipeline.model.losses.rgb": 0.5}`. Of the two limits, one given alone is the only one.
+    Returns:
+        A `TrainedScene`, or what another method shows.
+    Raises:
+        ConfigError: an unknown method or setting (with the nearest names), an impossible value, or no scene.
+        SceneError, RunError: as the command would end with.
+    """
+    from unmix_plugin.engine.training.progress import ProgressConsole
+    from unmix_plugin.engine.training.training_control import Interrupted
+    from unmix_plugin.trained.open_run import load_run as open_loaded
+
+    if scene is not None and settings.setdefault("data", scene) != scene:
+        raise ConfigError(f"the scene is {scene}, and data is {settings['data']}: give one of them")
+    first = first_config(find_method(method), None if load_run is None else Path(load_run))
+    config = with_settings(first, settings)
+    if config.machine.num_devices > 1:
+        raise ConfigError("machine.num_devices is for unmix-train: one Python process trains on one device")
+    console = ProgressConsole()
+    trainer = prepare(config, console)
+    try:
+        finish(trainer, console)
+    except Interrupted as stop:
+        raise KeyboardInterrupt(
+            f"{stop}; go on with train(None, {method!r}, load_run={str(stop.run)!r})"
+        ) from stop
+    print(f"run: {trainer.run.path}", flush=True)
+    return open_loaded(trainer.run.path, config.device).scene
+
+
+def first_config(method: MethodSpecification, load_run: Path | None) -> TrainerConfig:
+    """The method's defaults, or the settings of the run to go on with.
+
+    Raises:
+        ConfigError: the run is of another method.
+        RunError: it is unusable.
+    """
+    if load_run is None:
+        return method.config
+    from unmix_plugin.engine.runs.load_run import load_config
+
+    config = load_config(load_run)
+    if config.method_name != method.name:
+        raise ConfigError(
+            f"{load_run} is a run of {config.method_name}, not of {method.name}; go on with its own method"
+        )
+    return config
+
+
+def with_limits_given(config: TrainerConfig, *, steps: bool, seconds: bool) -> TrainerConfig:
+    """The settings with a limit that was given alone as the only one: that of the method, or of the run to go on with,
+    no longer ends training."""
+    if seconds and not steps and config.max_seconds is not None:
+        return replace(config, max_num_iterations=None)
+    if steps and not seconds and config.max_num_iterations is not None:
+        return replace(config, max_seconds=None)
+    return config
+
+
+def with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> TrainerConfig:
+    """The settings changed by name, as the command line names them; hyphens and underscores are alike.
+
+    Raises:
+        ConfigError: an unknown name, one setting by two names, or a value that doesn't fit.
+    """
+    from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+
+    known, tree, given = dict(_names(config)), {}, {}
+    for name, value in settings.items():
+        plain = name.replace("-", "_")
+        path = known.get(plain)
+        if path is None:
+            same = [found for found, at in known.items() if at[-1] == plain]
+            near = (
+                f"; did you mean {min(same, key=len)}?" if same else did_you_mean(plain, known, form="; {}")
+            )
+            listed = f"; unmix-train {config.method_name} --help-all lists all"
+            raise ConfigError(f"{config.method_name} has no setting {name}{near or listed}")
+        if path in given:
+            raise ConfigError(f"{name} and {given[path]} are the same setting: give one of them")
+        given[path] = name
+        branch = tree
+        for key in path[:-1]:
+            branch = branch.setdefault(key, {})
+        try:
+            branch[path[-1]] = config_to_json(value.item() if hasattr(value, "item") else value)
+        except TypeError as error:
+            raise ConfigError(f"{name}: {error}") from error
+    changed = config_from_json(tree, config, "settings")
+    return with_limits_given(
+        changed, steps=("max_num_iterations",) in given, seconds=("max_seconds",) in given
+    )
+
+
+def _names(config: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """What a setting can be called, and where in the tree it is."""
+    hints = get_type_hints(type(config), include_extras=True)
+    for entry in fields(config):
+        marks = getattr(hints[entry.name], "__metadata__", ())
+        value, here = getattr(config, entry.name), (*path, entry.name)
+        if is_dataclass(value):
+            yield from _names(value, here)
+        elif tyro.conf.Suppress not in marks and not entry.name.startswith("_"):
+            yield ".".join(here), here
+            for mark in marks:
+                for alias in getattr(mark, "aliases", None) or ():
+                    yield alias.lstrip("-").replace("-", "_"), here
+
+
+def prepare(config: TrainerConfig, console: Console, processes: Processes | None = None) -> Trainer:
+    """The trainer, with everything read and compiled that training needs."""
+    from unmix_plugin.commands.reporting import announce_kernel_compilation, say, working
+    from unmix_plugin.engine.processes import ALONE
+    from unmix_plugin.engine.training.trainer import Trainer
+
+    with nullcontext() if config.data is None else working(console, f"reading {config.data}"):
+        trainer = Trainer(config, console=console, processes=processes or ALONE)
+    if trainer.pipeline.reasons:
+        say(console, trainer.pipeline.reasons)
+    with announce_kernel_compilation(console):
+        trainer.warm_up()
+    data = trainer.pipeline.datamanager
+    say(
+        console,
+        f"{counted(len(data.train_cameras), 'view')} to train on, {len(data.eval_cameras)} for evaluation; "
+        f"computing on {trainer.pipeline.model.device}",
+    )
+    if trainer.limits.reached(trainer.step, trainer.clock.seconds):
+        say(
+            console,
+            f"nothing to train: the run is at its limit, with {trainer.step} steps in {trainer.clock.seconds:.1f} s; "
+            "give a larger --max-num-iterations or --max-seconds",
+        )
+    return trainer
+
+
+def finish(trainer: Trainer, console: Console) -> None:
+    """Train to the end, write what the model has found, and say how it went.
+
+    Raises:
+        Interrupted: training was stopped on request.
+    """
+    from unmix_plugin.commands.reporting import say, spectral_scene
+
+    record = trainer.train()
+    speed = f"{record.train_rays_per_second:,.0f} rays/s"
+    say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
+    averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
+    with trainer.control.device.training_turn(), averaged:
+        trainer.pipeline.model.write_results(trainer.run.path)
+    data = trainer.pipeline.datamanager
+    if spectral_scene(data) is not None:  # remarks name settings of spectral methods
+        num_pixels = int(data.metadata().get("num_train_pixels", 0))
+        few = _remark_on_passes(record.total_rays, num_pixels)
+        for remark in [*_read_remarks(trainer.run.metrics_path), *few]:
+            say(console, remark)
+
+
+_FEWEST_LINES = 8
+"""Lines of metrics below which nothing is said."""
+_OUTLIERS = 0.02
+"""Share of poses that are not believed, of which more is said."""
+_HARDLY_FELL = 0.6
+"""Loss in the last quarter of the training, over that in the first, above which it hardly fell. Trainings that settle
+stay below 0.35, also short ones."""
+_STILL_FALLS = 0.3
+"""Share by which the loss fell from the third to the last quarter, above which more steps are worthwhile."""
+
+_LITTLE_MATTER = 0.02
+"""Share of light from matter below which a world has nothing but a sky."""
+_FEW_PASSES = 3
+"""Rays for each training pixel below which fine detail is still being learnt."""
+
+
+def _read_remarks(metrics_path: Path) -> list[str]:
+    """Remarks on a training's `metrics.jsonl`."""
+    from unmix_plugin.engine.training.progress import read_metrics
+
+    return _remarks([line for line in read_metrics(metrics_path) if line.get("split") == "train"])
+
+
+def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Sentences on lines of training batches in order, each with `step` and `loss` (None: not finite)."""
+    known = [line for line in lines if line.get("loss") is not None]
+    if len(known) < _FEWEST_LINES:
+        return []
+    first, third, last = (_typical_loss(known, quarter) for quarter in (1, 3, 4))
+    if None in (first, third, last) or not first or not third or last is None:
+        return []
+    found = []
+    undone = int(known[-1].get("poses_undone") or 0)
+    if undone:
+        found.append(
+            f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
+            "or too far a turn and were undone: look whether these views belong to the scene, or train with "
+            "--poses fixed"
+        )
+    outliers = float(known[-1].get("pose_outliers") or 0)
+    if outliers > _OUTLIERS:
+        found.append(
+            f"{outliers:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
+            "hardly shape the scene: their poses are off by more than was found, or they show something else"
+        )
+    matter = known[-1].get("matter_share")
+    if matter is not None and matter < _LITTLE_MATTER:
+        found.append(
+            f"{1 - matter:.0%} of what the views show was learnt as sky: they agree on nothing nearer. If they show a "
+            "scene, look whether poses belong to their pictures, or train with --world bounded"
+        )
+    if last > _HARDLY_FELL * first:
+        found.append(
+            f"the loss hardly fell: in the last quarter of the training it was {last / first:.0%} of that in the "
+            "first. The views don't agree on one scene. Look at the pictures of unmix-eval: double edges mean wrong "
+            "poses; blurred brightness, a light that moves (try --light camera, or --light per-view where exposures "
+            "differ); bright specks, blown-out pixels or background within the masks"
+        )
+    elif 1 - last / third > _STILL_FALLS:
+        found.append(
+            f"the loss still fell by {1 - last / third:.0%} from the third to the last quarter: a longer training "
+            "(--max-num-iterations, --max-seconds) will show more"
+        )
+    return found
+
+
+def _remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
+    """A remark if the training pixels were seen so rarely that more training will show more.
+
+    Args:
+        num_rays: Cast in all.
+        num_pixels: Of the training views; 0 if it is not known.
+    """
+    if num_pixels == 0 or num_rays >= _FEW_PASSES * num_pixels:
+        return []
+    rays = f"{num_rays / num_pixels:.2g} rays for each training pixel"
+    return [f"{rays}: a longer training (--max-num-iterations, --max-seconds) will show finer detail"]
+
+
+def _typical_loss(lines: Sequence[Mapping[str, Any]], quarter: int) -> float | None:
+    """Median over a quarter of the lines' time, 1 to 4; None without lines in it."""
+    start, end = (lines[at]["step"] for at in (0, -1))
+    low, high = (start + (end - start) * part / 4 for part in (quarter - 1, quarter))
+    losses = [float(line["loss"]) for line in lines if low < line["step"] <= high]
+    return median(losses) if losses else None
