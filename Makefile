@@ -9,7 +9,7 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum audit lint format bench clean help
+.PHONY: demo test test-all test-minimum audit lint format bench site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
@@ -20,6 +20,7 @@ help:
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
 	@echo "make bench   run every benchmark, results into benchmarks/results"
+	@echo "make site    build the site from docs/ into build/site/html, and check its links"
 	@echo "make clean   remove the virtual environment and caches"
 
 $(BIN)/python:
@@ -76,6 +77,9 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	@set -e; for benchmark in $(BENCHMARKS); do echo "== $$benchmark"; $(BIN)/python $$benchmark; done
+
+site: $(VENV)/.installed-dev
+	PYTHON=$(BIN)/python scripts/build_site.sh
 
 clean:
 	rm -rf $(VENV) $(MINIMUM) build .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -1,0 +1,54 @@
+"""The site: it builds without a warning, its links lead somewhere, and it loads nothing from elsewhere."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.check_site import faults_of
+from tests.docs.pages import ROOT
+
+PAGE = "<html><head><script src='{load}'></script></head><body><article><a href='{link}'>x</a></article></body></html>"
+
+
+@pytest.mark.slow
+def test_it_builds_and_has_every_command_and_every_public_name(tmp_path):
+    pytest.importorskip("furo")
+    pytest.importorskip("myst_nb")
+    built = subprocess.run(
+        [str(ROOT / "scripts/build_site.sh"), str(tmp_path / "html")],
+        env={**os.environ, "PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stderr + built.stdout
+    commands = tmp_path / "html/reference/commands"
+    assert "--max-seconds FLOAT" in (commands / "unmix-train.html").read_text()
+    assert "--unseen {drop,keep}" in (commands / "unmix-export.html").read_text()
+    names = (tmp_path / "html/reference/python-api.html").read_text()
+    assert 'id="unmix_plugin.TrainedScene.probe"' in names
+
+
+@pytest.mark.parametrize(
+    ("link", "load", "fault"),
+    [
+        ("two.html", "a.js", None),
+        ("none.html", "a.js", "index.html links to none.html, which is not there"),
+        ("two.html#none", "a.js", "index.html links to two.html#none, a heading that is not there"),
+        (
+            "two.html",
+            "https://cdn.example/a.js",
+            "index.html loads https://cdn.example/a.js from another server",
+        ),
+        ("#", "a.js", "two.html is more than two clicks from the front page"),
+    ],
+)
+def test_faults_of_a_site_are_named(tmp_path: Path, link: str, load: str, fault: str | None):
+    (tmp_path / "index.html").write_text(PAGE.format(link=link, load=load))
+    (tmp_path / "two.html").write_text(PAGE.format(link="index.html", load="a.js"))
+    (tmp_path / "a.js").touch()
+    assert fault is None or fault in faults_of(tmp_path)
+    assert (faults_of(tmp_path) == []) == (fault is None)
