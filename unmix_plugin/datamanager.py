@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -41,6 +41,7 @@ from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
 from unmix_plugin.sensors.batches import MeasuredPixels, to_batch
 from unmix_plugin.settings import HyperspectralDataManagerConfig
 from unmix_plugin.spectral.bad_values import BandNoise
+from unmix_plugin.spectral.evidence import exposure_of
 from unmix_plugin.spectral.unmixing.endmembers import typical_spectrum
 
 _MANY_PIXELS = 4_000_000
@@ -164,6 +165,7 @@ class HyperspectralDataManager(DataManager):
         """`pixels`: spectra pooled over all training views; `reachable`: where something may be; `knots`: where cameras
         stand whose poses may be corrected; `light`: fixed, camera or per-view, as far as pictures with alpha tell;
         `lamp`: numbers of the lamp that moves with the camera, none if it is not known;
+        `exposure`, the factor that makes matter as bright as errors are meant for;
         `band_weights`, of squared errors, mean 1; `relative`, the power of brightness by which these are divided.
 
         Of a rig, pixels of the sensor with most channels, and of those the one with most pixels; `sensor`, which that
@@ -181,6 +183,7 @@ class HyperspectralDataManager(DataManager):
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
             "pixels": opaque,
+            "exposure": np.array(self._exposure(chosen, opaque)),
             "relative": np.array(relative_power(self.scene, opaque)),
             "reachable": reachable,
             "band_weights": band_weights(self.scene, self._noise),
@@ -218,16 +221,17 @@ class HyperspectralDataManager(DataManager):
         return [] if self.scene.world_reason is None else [self.scene.world_reason]
 
     def warnings(self) -> list[str]:
-        """Poses that seem to follow another convention, cameras at one place, masks that contradict each other, a
-        backdrop, sensors that share no band or no place with another, and bad bands and values."""
+        """Poses that seem to follow another convention, cameras far off or at one place, masks that contradict
+        each other, a backdrop, sensors that share no band or no place with another, and bad bands and values."""
         wrong_poses = check_scene_poses(self.scene)
         found = [self._carved[1] if wrong_poses is None else wrong_poses, *self._pixels.notes]
+        found += self.scene.warnings
         found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         if self.scene.has_backdrop:
             found.append(
                 "pictures have no alpha, but share a plain backdrop: it is learnt as what lies behind the scene, and "
-                "no matter is sought where they show it (--world unbounded does without)"
+                "no matter is sought where they show it (--world bounded or unbounded does without)"
             )
         found += rig_warnings(self.scene, self._initial_data["reachable"]) if self.scene.is_rig else []
         return [warning for warning in found if warning is not None]
@@ -275,7 +279,9 @@ class HyperspectralDataManager(DataManager):
     @property
     def _foreground(self) -> list[Bool[np.ndarray, "_ _"]] | None:
         """For each training view True where something may be, by alpha or by a backdrop; None where neither tells."""
-        return self._evidence.foreground() if self.scene.has_alpha else self.scene.before_backdrop
+        if self.scene.has_alpha:
+            return self._evidence.foreground()
+        return None if self.scene.before_backdrop is None else self.scene.before_backdrop.masks()
 
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:
@@ -305,6 +311,15 @@ class HyperspectralDataManager(DataManager):
     @property
     def _grid_resolution(self) -> int:
         return choose(self.options.grid_resolution, self._preset.grid_resolution)
+
+    def _exposure(self, sensor: int, opaque: Float[np.ndarray, "P b"]) -> float:
+        """By opaque pixels of a sensor, but not by those that show a backdrop."""
+        if self.scene.before_backdrop is not None:
+            kept = np.concatenate([mask.reshape(-1) for mask in self.scene.before_backdrop.masks()])
+            opaque = self._pixels.sample_opaque(
+                sensor, _MOST_INITIAL_PIXELS, self.seed, torch.from_numpy(kept)
+            )
+        return exposure_of(torch.from_numpy(opaque))
 
     def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
         """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""

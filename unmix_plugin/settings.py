@@ -80,7 +80,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     is 2, but 1 where the training views have more than 4 million pixels: more pixels teach more than exact ones."""
     single_ray_until: Ours[float | Auto] = "auto"
     """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
-    0.4 where alpha is known, otherwise 0.8."""
+    0.4 with alpha or before a backdrop, otherwise 0.8."""
     grid_resolution: Ours[int | Auto] = "auto"
     """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
     128."""
@@ -169,17 +169,17 @@ class RendererConfig:
 
     samples_per_pixel: float | Auto = "auto"
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
-    1 where alpha is unknown or the box is more than 300 pixels long: more rays teach more than closer samples."""
+    1 where neither alpha nor a backdrop is known, or the box is more than 300 pixels long: more rays teach more."""
     coarse_samples: Ours[int | Auto] = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
     smallest_weight: Ours[float | Auto] = "auto"
     """Samples that contribute less than this share of their ray's light are left out. Auto is 0.004,
-    but 0.001 at the start where alpha is unknown."""
+    but 0.001 at the start where neither alpha nor a backdrop is known."""
     visible_weight: Ours[float | Auto] = "auto"
     """Share of its ray's light from which a sample counts as seen. Cells that no two training views have lately seen
-    are left out; 1 leaves none out. Auto is 0.05 where alpha is known, else 1."""
+    are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
 
     def __post_init__(self) -> None:
         """Refuse impossible settings.
@@ -223,8 +223,8 @@ class LossConfig:
     spectral: Ours[float] = 1.0
     """Weight of the mean squared error of spectra."""
     rgb: float | Auto = "auto"
-    """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 where alpha
-    is known, otherwise 0: where black may be the void, it costs quality."""
+    """Weight of the mean squared error of their sRGB colours, in which dark pixels count more. Auto is 0.2 with
+    alpha or before a backdrop, otherwise 0: where black may be the void, it costs quality."""
     band_weights: tuple[float, ...] | Auto = "auto"
     """Weight of the squared error in each band of the scene; none are equal weights. Auto gives less to bands that are
     much noisier than the others, or dead: the reciprocal of their noise's variance. The mean is 1."""
@@ -307,7 +307,8 @@ class UnmixModelConfig(ModelConfig):
     """View-dependent part: none, multiples of a few spectra, or one value a band as published."""
     num_specular_spectra: Ours[int | Auto] = "auto"
     """Spectra of the specular dictionary. The first is the light's, a highlight's colour on anything but metal; then
-    come the endmembers', as light that they send on has. Auto is 1 where alpha is known, else all."""
+    come the endmembers', as light that they send on has. Auto is 1 with alpha or before a
+    backdrop, else all."""
     train_endmembers: bool = True
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
     light: Annotated[Light | Auto, Common, short("light")] = "auto"
@@ -327,8 +328,8 @@ class UnmixModelConfig(ModelConfig):
     samples_per_step: int = 25_000
     """Samples of rays that a training step looks at; the number of rays adapts to it."""
     initial_opacity: Ours[float | Auto] = "auto"
-    """Opacity of one sample's interval in the untrained field. Auto is 0.05 where alpha is known, else 0.01: space
-    between cameras and walls must stay clear."""
+    """Opacity of one sample's interval in the untrained field. Auto is 0.05 with alpha or before a backdrop, else
+    0.01: space between cameras and walls must stay clear."""
     as_published: Ours[bool] = False
     """Whether the field is that of the method's authors, and losses compare spectra alone."""
     field: UnmixFieldConfig = UnmixFieldConfig()
@@ -436,13 +437,10 @@ def _resolved_losses(
 ) -> tuple[LossConfig, list[str]]:
     """With what follows from the brightness and the noise of the scene, and the evidence for it."""
     import numpy as np
-    import torch
-
-    from unmix_plugin.spectral.evidence import exposure_of
 
     reasons = []
     if losses.exposure == "auto":
-        exposure = round(exposure_of(torch.from_numpy(initial_data()["pixels"])), 3)
+        exposure = round(float(initial_data().get("exposure", 1.0)), 3)
         losses = replace(losses, exposure=exposure)
         if exposure > 1:
             reasons.append(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
+from unmix_plugin.scenes.backdrops import Backdrop, find_before_backdrop, judge_backdrop
 
 HEIGHT, WIDTH, BANDS, VIEWS = 90, 120, 6, 5
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
@@ -181,3 +181,15 @@ def test_its_colour_is_said():
         backdrop = judge(pictures(BACKDROPS[name])[0])
         assert backdrop is not None
         assert backdrop.in_words.startswith(word)
+
+
+def test_a_backdrop_of_large_views_is_kept_thinned_out():
+    views = [np.full((450, 500, 4), 0.3, np.float32) for _ in range(5)]
+    for shift, view in enumerate(views):
+        view[100 : 300 + 10 * shift, 150:350] = np.linspace(0.05, 0.9, 200)[:, None]
+    found = find_before_backdrop([(500, 450)] * 5, lambda view, part: views[view][part], [None] * 5)
+    assert found is not None
+    assert sum(mask.size for mask in found.thinned) == 5 * 150 * 167
+    for mask, view in zip(found.masks(), views, strict=True):
+        assert mask.shape == (450, 500)
+        assert (mask != (view != np.float32(0.3)).any(axis=-1)).mean() < 0.05

@@ -15,14 +15,12 @@ written.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
-
-from unmix_plugin.scenes.geometry.view_agreement import ReadView
 
 _NUM_FEATURES = 4
 """Coordinates of spectra along which those of the capture differ most."""
@@ -256,14 +254,40 @@ class LookedAt:
         return opacity
 
 
+@dataclass(frozen=True)
+class BeforeBackdrop:
+    """Of each training view, where something may stand before a backdrop that all share."""
+
+    thinned: tuple[Bool[np.ndarray, "_ _"], ...]
+    """Of every `stride`-th row and column."""
+    stride: int
+    sizes: tuple[tuple[int, int], ...]
+    """Width and height of each view."""
+
+    @property
+    def shows_matter(self) -> bool:
+        """Whether there is anything but the backdrop."""
+        return bool(np.mean([mask.mean() for mask in self.thinned]) > 1 - _ALL)
+
+    def masks(self) -> list[Bool[np.ndarray, "_ _"]]:
+        """Of whole views, which are much larger than what is kept."""
+        return [
+            mask.repeat(self.stride, axis=0).repeat(self.stride, axis=1)[:height, :width]
+            for mask, (width, height) in zip(self.thinned, self.sizes, strict=True)
+        ]
+
+
 def find_before_backdrop(
-    sizes: Sequence[tuple[int, int]], read_view: ReadView
-) -> list[Bool[np.ndarray, "_ _"]] | None:
-    """Of each view, pixels where something may stand before a backdrop that all views share; None if there is none.
+    sizes: Sequence[tuple[int, int]],
+    read_view: Callable[[int, tuple[slice, ...]], np.ndarray],
+    unknown: Sequence[Bool[np.ndarray, "_ _"] | None],
+) -> BeforeBackdrop | None:
+    """Where something may stand before a backdrop that all views share; None if there is none.
 
     Args:
         sizes: Width and height of each view.
-        read_view: Reads a part of a view.
+        read_view: From a view, and the rows, columns and bands wanted, to its picture.
+        unknown: Of each view, pixels that are not valid or masked out, before which anything may stand; None without.
     """
     stride = -(-max(max(size) for size in sizes) // _LONGEST_SIDE_PX)
     bands = read_view(0, (slice(1), slice(1))).shape[2]
@@ -271,19 +295,25 @@ def find_before_backdrop(
     chosen = np.unique(
         np.linspace(0, len(sizes) - 1, min(len(sizes), LOOKED_AT)).round().astype(int)
     ).tolist()
+
+    def known(view: int, image: np.ndarray) -> np.ndarray:
+        missing = unknown[view]
+        return np.ones(image.shape[:2], bool) if missing is None else ~missing[part[:2]]
+
     images = [read_view(view, part) for view in chosen]
-    sample = np.concatenate([image[::4, ::4].reshape(-1, image.shape[-1]) for image in images])
-    backdrop = judge_backdrop(images, [np.ones(image.shape[:2], bool) for image in images], sample)
+    is_known = [known(view, image) for view, image in zip(chosen, images, strict=True)]
+    sample = np.concatenate(
+        [image[::4, ::4][mask[::4, ::4]] for image, mask in zip(images, is_known, strict=True)]
+    )
+    backdrop = judge_backdrop(images, is_known, sample)
     if backdrop is None:
         return None
     masks = []
-    for view, (width, height) in enumerate(sizes):
+    for view in range(len(sizes)):
         image = read_view(view, part)
-        seen = backdrop.find(backdrop.features(image), np.ones(image.shape[:2], bool))
-        matter = np.ones(image.shape[:2], bool) if seen is None else _without_specks(~seen.shown)
-        masks.append(matter.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width])
-    matter = np.mean([mask.mean() for mask in masks])
-    return masks if matter > 1 - _ALL else None
+        seen, mask = backdrop.find(backdrop.features(image), known(view, image)), known(view, image)
+        masks.append(np.ones_like(mask) if seen is None else _without_specks(~seen.shown) | ~mask)
+    return BeforeBackdrop(tuple(masks), stride, tuple(sizes))
 
 
 def _without_specks(matter: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:

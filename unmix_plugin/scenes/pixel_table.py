@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -242,8 +242,10 @@ class PixelTable:
         places = torch.rand(count, generator=generator).clamp(max=float(bounds[-1]) - 1e-6)
         return torch.bincount(torch.searchsorted(bounds, places), minlength=len(self.blocks)).tolist()
 
-    def sample_opaque(self, sensor: int, count: int, seed: int) -> Float[np.ndarray, "pixels b"]:
-        """Spectra of at most `count` random valid pixels of a sensor that are opaque."""
+    def sample_opaque(
+        self, sensor: int, count: int, seed: int, kept: Bool[Tensor, " pixels"] | None = None
+    ) -> Float[np.ndarray, "_ b"]:
+        """Spectra of at most `count` random valid pixels of a sensor that are opaque, and `kept` if that is given."""
         block = next(block for block in self.blocks if block.sensor == sensor)
         pool: Int[Tensor, " pool"]
         if len(block) > _MOST_LISTED:
@@ -252,6 +254,7 @@ class PixelTable:
             pool = pool[block.valid[pool]]
         else:
             pool = torch.arange(len(block)) if bool(block.valid.all()) else block.valid.nonzero()[:, 0]
+        pool = pool if kept is None else pool[kept[pool]]
         opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
         return block.spectra(chosen.to(block.alpha.device)).cpu().numpy()

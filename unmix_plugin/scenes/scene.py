@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
+from unmix_plugin.scenes.backdrops import BeforeBackdrop
 from unmix_plugin.scenes.placement import Normalisation, Placement
 from unmix_plugin.scenes.reading.cubes import map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
@@ -83,12 +84,13 @@ class Scene:
     """Every picture has an alpha channel and at least one pixel of one is not opaque."""
     is_unbounded: bool
     """Pictures show a world behind the scene box, up to the sky."""
-    before_backdrop: list[Bool[np.ndarray, "_ _"]] | None
-    """For each training view without alpha, True where something may stand before a plain backdrop that the views
-    share; None without one."""
+    before_backdrop: BeforeBackdrop | None
+    """Where something may stand before a plain backdrop that training views without alpha share; None without one."""
     world_reason: str | None
     """Why the world is taken to end with the scene box or not, in words; None where that was set, or follows from alpha
     or a backdrop."""
+    warnings: tuple[str, ...]
+    """What was left out, or makes the scene doubtful, one sentence each."""
     has_labels: bool
     """Every evaluation frame has labels."""
     has_abundances: bool

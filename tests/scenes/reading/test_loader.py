@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene
+from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene, ring_poses
 from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading import loader
 from unmix_plugin.scenes.reading.faults import find_named
@@ -331,3 +331,19 @@ def test_cubes_are_hashed_while_they_are_checked_and_not_read_again(tmp_path, mo
     assert not any(path.parent.name == "cubes" for path in hashed)
     for name in ("cubes/view_1.npy", "cubes/view_2.npy"):
         assert hashes[name] == hashlib.sha256((folder.root / name).read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize("away", [0.0, 5.0, 200.0])
+def test_a_view_that_is_far_off_is_left_out_and_named(tmp_path, away):
+    poses = ring_poses(16)
+    poses[4][:3, 3] += away
+    scene = load_scene(make_scene(tmp_path / "scene", alpha=False, poses=poses).root)
+    assert (4 in scene.train_indices) == (away < 100)
+    is_said = ["view_4.npy" in said and "its pose must be wrong" in said for said in scene.warnings]
+    assert any(is_said) == (away > 100)
+
+
+def test_a_scene_of_nothing_but_sky_is_said_to_be_one(tmp_path):
+    scene = load_scene(make_scene(tmp_path / "scene", alpha=False).root)
+    assert not scene.has_backdrop
+    assert "nothing but a plain backdrop or sky" in scene.warnings[0]

@@ -18,11 +18,10 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError, SpectrumError
-from unmix_plugin.scenes.backdrops import find_before_backdrop
+from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.view_agreement import (
-    ReadView,
     commonest,
     compare_conventions,
     describe,
@@ -46,6 +45,12 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
 from unmix_plugin.spectral.sensor import SceneSensor
 
+_FAR_OFF, _MOST_FAR_OFF = 20.0, 0.1
+"""Distance of a camera from the others' middle, in the distance within which most others are, from which on its pose is
+taken for wrong; and the largest share of the views that this may hold for."""
+_NOTHING_TO_SEE = (
+    "the training views show nothing but a plain backdrop or sky: there is no shape that could be learnt"
+)
 _MEASURED_KEYS = ("hyperspectral_file_path", "file_path", "mask_path", "responses_path")
 """Files of a frame that a training reads; the others are the truth, for evaluation only."""
 
@@ -139,8 +144,11 @@ def _assemble(
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    space = _find_model_space(root, entry, checked, split.train, options)
+    train, warnings = _without_far_off(entry, located, split.train)
+    space = _find_model_space(root, entry, checked, train, options)
     normalisation, scene_box, is_unbounded, before, world_reason = space
+    if before is not None and not before.shows_matter:
+        before, warnings = None, (*warnings, _NOTHING_TO_SEE)
     inputs = [path for paths in located for key, path in paths.items() if key in _MEASURED_KEYS]
     inputs += [root / FILE_NAME, *truth.light_paths]
     truths = [path for paths in located for key, path in paths.items() if key not in _MEASURED_KEYS]
@@ -153,7 +161,7 @@ def _assemble(
         sensors=checked.sensors,
         frames=_name_frames(entry, located, checked.sensor_indices),
         cameras=make_cameras(entry, checked.sizes, normalisation),
-        train_indices=split.train,
+        train_indices=train,
         eval_indices=split.evaluation,
         scene_box=scene_box,
         normalisation=normalisation.after(entry.placement),
@@ -165,6 +173,7 @@ def _assemble(
         is_unbounded=is_unbounded,
         before_backdrop=before,
         world_reason=world_reason,
+        warnings=warnings,
         has_labels=all("seg_file_path" in paths for paths in evaluated),
         has_abundances=all("abundance_file_path" in paths for paths in evaluated),
         input_hashes={_relative(path, root): hashes.get(path) or sha256_of(path) for path in inputs},
@@ -226,6 +235,8 @@ class _CheckedFiles:
     foreground: tuple[Bool[np.ndarray, "_ _"], ...] | None
     """For each frame the pixels that may show something: not fully transparent, or not to be trusted. None where the
     scene has no alpha."""
+    unknown: tuple[Bool[np.ndarray, "_ _"] | None, ...]
+    """For each frame the pixels that are not valid or masked out; None without."""
     cube_hashes: dict[Path, str]
     """SHA-256 of each cube, in the order of the frames."""
 
@@ -280,18 +291,20 @@ def _check_files(
     known_operators = [operator for operator in operators if operator is not None]
     if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
         return None
+    unknown = tuple(
+        cube.invalid if mask is None else ~mask if cube.invalid is None else cube.invalid | ~mask
+        for cube, mask in zip(cubes, masks, strict=True)
+    )
     foreground = None
     if seen is not None:
         foreground = tuple(
-            (np.ones(size, bool) if shown is None else shown)
-            | (False if cube.invalid is None else cube.invalid)
-            | (False if mask is None else ~mask)
-            for shown, cube, mask, size in zip(seen, cubes, masks, known_sizes, strict=True)
+            (np.ones(size, bool) if shown is None else shown) | (False if missing is None else missing)
+            for shown, missing, size in zip(seen, unknown, known_sizes, strict=True)
         )
     paths = [paths["hyperspectral_file_path"] for paths in located]
     sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
     hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
-    return _CheckedFiles(known_sizes, sensors, indices, foreground, hashes)
+    return _CheckedFiles(known_sizes, sensors, indices, foreground, unknown, hashes)
 
 
 def _read_illuminant(
@@ -387,9 +400,27 @@ def _key_poses(entry: SceneEntry, normalisation: Normalisation) -> KeyPoses | No
     return KeyPoses.join(parts)
 
 
+def _without_far_off(
+    entry: SceneEntry, located: tuple[dict[str, Path], ...], train: tuple[int, ...]
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Training views without those whose cameras are so far off that only a wrong pose explains it, and what to say."""
+    positions = _world_poses(entry)[list(train), :, 3]
+    distances = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    usual = float(np.quantile(distances, 1 - _MOST_FAR_OFF, method="lower"))
+    is_off = (distances > _FAR_OFF * usual) & (usual > 0)
+    if not is_off.any():
+        return train, ()
+    names = ", ".join(located[train[row]]["hyperspectral_file_path"].name for row in np.flatnonzero(is_off))
+    said = (
+        f"left out of training: {names}, {distances.max() / usual:.0f} times as far from the middle of the cameras as "
+        "nearly all others: its pose must be wrong"
+    )
+    return tuple(view for view, off in zip(train, is_off, strict=True) if not off), (said,)
+
+
 def _find_model_space(
     root: Path, entry: SceneEntry, checked: _CheckedFiles, train: tuple[int, ...], options: SceneOptions
-) -> tuple[Normalisation, SceneBox, bool, list[Bool[np.ndarray, "_ _"]] | None, str | None]:
+) -> tuple[Normalisation, SceneBox, bool, BeforeBackdrop | None, str | None]:
     """The box that the training views show, how its longest edge becomes [-1, 1], whether the world goes on, what may
     stand before a backdrop, if views without alpha share one, and why the world is taken to end, where that was found.
 
@@ -411,22 +442,27 @@ def _find_model_space(
     def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
         return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
 
-    before = None
-    if foreground is None and options.world != "unbounded" and len(alike) == len(train):
-        before = _before_backdrop(root, cameras, read_view)
-    foreground = foreground or before
-    points = None
-    if foreground is None and meeting_point(cameras.camera_to_world.double().numpy()) is None:
+    before = first_box = points = None
+    if foreground is None and options.world == "auto" and len(alike) == len(train):
+        sizes, unknown = [cameras.size(row) for row in alike], [checked.unknown[index] for index in train]
+        before = find_before_backdrop(sizes, read_view, unknown)
+    if before is not None and before.shows_matter:
+        try:
+            first_box = find_bounds(root, cameras, before.masks())
+        except SceneError:  # poses contradict it
+            before = None
+    has_masks = first_box is not None or foreground is not None
+    if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
         points = find_matched_points(cameras[alike], read_view)
         points = None if points is None else replace(points, views=torch.tensor(alike)[points.views])
     try:
-        first_box = find_bounds(root, cameras, foreground, points)
+        first_box = first_box or find_bounds(root, cameras, foreground, points)
     except SceneError as error:
         alike_poses = _world_poses(entry)[[train[row] for row in alike]]
         hint = describe(compare_conventions(alike_poses, cameras[alike], read_view))
         raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
     is_unbounded, reason = options.world == "unbounded", None
-    if options.world == "auto" and foreground is None and not (points and points.are_equally_far):
+    if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
         evidence = find_world_evidence(first_box, cameras[alike], read_view)
         if not evidence.goes_on:
             places = points or find_matched_points(cameras[alike], read_view)
@@ -438,16 +474,3 @@ def _find_model_space(
     translation = first.translation - 0.5 * (low + high) / first.scale
     box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
     return Normalisation(first.rotation, translation, first.scale * scale), box, is_unbounded, before, reason
-
-
-def _before_backdrop(
-    root: Path, cameras: Cameras, read_view: ReadView
-) -> list[Bool[np.ndarray, "_ _"]] | None:
-    """What may stand before a backdrop in each view; None if there is none, or poses contradict it."""
-    before = find_before_backdrop([cameras.size(view) for view in range(len(cameras))], read_view)
-    if before is not None:
-        try:
-            find_bounds(root, cameras, before)
-        except SceneError:
-            return None
-    return before
