@@ -216,3 +216,25 @@ def test_the_gain_of_an_evaluation_view_does_not_count(tmp_path):
     halved, _ = evaluated_psnr(scene, tmp_path / "halved")
     # Half the light has half the error after alignment: 6 dB.
     assert abs(halved - plain - 6.02) < 0.5
+
+
+def test_several_runs_are_compared_in_one_table(run_copy, tmp_path):
+    other = Path(shutil.copytree(run_copy, tmp_path / "other"))
+    ended = run(evaluate, run_copy, other, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    folder = run_copy / "exports" / "comparison"
+    assert str(folder) in ended.out
+    rows = (folder / "figures.csv").read_text().splitlines()[1:]
+    assert {row.split(",")[0] for row in rows} == set(KEYS)
+    assert all(row.endswith(",+0") for row in rows)
+    assert len(list(folder.rglob("*.png"))) == 6
+    errors = [float(row.split(",")[2]) for row in (folder / "band_rmse.csv").read_text().splitlines()[1:]]
+    per_view = np.square(errors).reshape(2, 8).mean(axis=1) ** 0.5
+    assert [one["rmse"] for one in metrics(other / "eval")["per_view"]] == pytest.approx(per_view, rel=1e-4)
+    for words, said in (
+        ([run_copy, run_copy], "a run is named twice"),
+        (["--run", run_copy, other], "either with --run or without it"),
+        ([run_copy, tmp_path / "nothing"], "no run folder at"),
+    ):
+        ended = run(evaluate, *words)
+        assert (ended.status, said in ended.err) == (2, True)

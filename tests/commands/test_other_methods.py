@@ -51,6 +51,10 @@ def test_it_is_rendered_and_evaluated_from_the_command_line(ball_run, tmp_path):
     assert figures["psnr"] > 3
     assert [image["name"] for image in figures["per_image"]] == ["eval_000", "eval_001"]
     assert (ball_run / "eval" / "rgb" / "eval_001.png").is_file()
+    other = shutil.copytree(ball_run, tmp_path / "other")
+    ended = run(evaluate, ball_run, other, "--device", "cpu")
+    assert ended.status == 0, ended.err
+    assert (ball_run / "exports" / "comparison" / "rgb" / "eval_001.png").is_file()
 
 
 def test_what_needs_endmembers_is_refused_in_one_sentence(ball_run, tmp_path):

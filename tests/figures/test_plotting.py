@@ -9,7 +9,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.figures.plotting import ChartLine, LineChart, distinct_colours, draw_chart, own_colours
+from unmix_plugin.figures.plotting import (
+    RIGHT,
+    WRONG,
+    ChartLine,
+    LineChart,
+    distinct_colours,
+    draw_chart,
+    own_colours,
+)
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 
@@ -101,6 +109,8 @@ def test_colours_differ_and_stand_out_from_white_paper_and_black_text(own):
     assert least_difference(colours) > 0.1
     assert luminance(colours).max() < 0.68
     assert luminance(colours).min() > 0.055
+    for mark in (RIGHT, WRONG):
+        assert np.abs(colours - mark).max(axis=1).min() > 0.15
 
 
 def test_colours_that_are_told_apart_already_stay():

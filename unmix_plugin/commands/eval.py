@@ -1,9 +1,9 @@
-"""`unmix-eval --run PATH`: measure a trained run on its evaluation views."""
+"""`unmix-eval [RUN ...]`: measure trained runs on their evaluation views, and compare several."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,13 +11,15 @@ import tyro
 
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.errors import counted
+from unmix_plugin.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.processes import Processes
     from unmix_plugin.engine.runs.load_run import LoadedPipeline
+    from unmix_plugin.products.comparison import ComparedRun
+    from unmix_plugin.products.evaluation import Evaluated
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 
@@ -26,11 +28,14 @@ class EvalOptions:
     """Measure a trained run on its evaluation views: metrics.json, a table, and prediction beside truth as pictures.
 
     They are written to `eval/` in the run folder, in place of an earlier evaluation; those of an edited run to a folder
-    of its own in `exports/`.
+    of its own in `exports/`. Several runs are compared: one table with the differences to the first, also as CSV by
+    view and band, and their pictures one above the other, in `exports/comparison/` of the first.
     """
 
+    runs: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """Run folders, as training printed them; none takes the newest under --output-dir."""
     run: Path | None = None
-    """Run folder, as training printed it; None takes the newest under --output-dir."""
+    """The same for one run."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     edits: Path | None = None
@@ -65,18 +70,65 @@ def evaluate(argv: list[str]) -> None:
 
 
 def _evaluate(options: EvalOptions, processes: Processes) -> None:
-    from functools import partial
-
-    from unmix_plugin.commands.reporting import CommandConsole, chosen_run, follow, spectral_scene, working
-    from unmix_plugin.editing.apply import edit_scene, light_factors
-    from unmix_plugin.editing.edited_run import requested_recipe
-    from unmix_plugin.editing.recipe_files import recipe_to_yaml
-    from unmix_plugin.engine.runs.load_run import load_pipeline
-    from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene
+    from unmix_plugin.commands.reporting import CommandConsole, chosen_run
 
     console = CommandConsole(quiet=not processes.is_first)
     with processes.together():
-        path = chosen_run(options.run, options.output_dir)
+        if options.run is not None and options.runs:
+            raise ConfigError("name runs either with --run or without it")
+        if len({run.resolve() for run in options.runs}) < len(options.runs):
+            raise ConfigError("a run is named twice; a comparison needs different runs")
+    if len(options.runs) > 1:
+        found = [_evaluate_run(run, options, console, processes, show=False) for run in options.runs]
+        if processes.is_first:
+            _compare(console, [run for run in found if run is not None])
+        return
+    with processes.together():
+        path = chosen_run(options.runs[0] if options.runs else options.run, options.output_dir)
+    _evaluate_run(path, options, console, processes, show=True)
+
+
+def _compare(console: Console, runs: list[ComparedRun]) -> None:
+    from rich.table import Table
+
+    from unmix_plugin.commands.reporting import say
+    from unmix_plugin.products.comparison import compare_runs, difference, shown
+
+    folder = runs[0].path / "exports" / "comparison"
+    found = compare_runs(runs, folder)
+    table = Table(title=f"{counted(len(runs), 'run')}, with differences to the first", title_justify="left")
+    table.add_column("setting or figure", overflow="fold")
+    for label in found.labels:
+        table.add_column(label, justify="right", overflow="fold")
+    for name, values in found.rows:
+        told = [f"{one:.4g}" if isinstance(one, float) else shown(one) or "-" for one in values]
+        more = [f" ({difference(one, values[0])})" if one != values[0] else "" for one in values]
+        table.add_row(name, *(one + by.replace(" ()", "") for one, by in zip(told, more, strict=True)))
+    console.print(table)
+    for remark in found.remarks:
+        say(console, remark)
+    print(
+        f"{folder}  differences as CSV, of views and bands too, and {counted(found.num_pictures, 'picture')}"
+    )
+
+
+def _evaluate_run(
+    path: Path, options: EvalOptions, console: Console, processes: Processes, *, show: bool
+) -> ComparedRun | None:
+    """Measure one run and write what was found into its folder; None in all processes but the first."""
+    from functools import partial
+
+    from unmix_plugin.commands.reporting import follow, spectral_scene, working
+    from unmix_plugin.editing.apply import edit_scene, light_factors
+    from unmix_plugin.editing.edited_run import requested_recipe
+    from unmix_plugin.editing.recipe_files import recipe_to_yaml
+    from unmix_plugin.engine.processes import flat_settings
+    from unmix_plugin.engine.runs.config_json import config_to_json
+    from unmix_plugin.engine.runs.load_run import load_pipeline
+    from unmix_plugin.products.comparison import ComparedRun
+    from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene
+
+    with processes.together():
         recipe = requested_recipe(options.edits, options.illuminant)
         with working(console, f"reading {path} and its scene"):
             loaded = load_pipeline(path, options.device, options.data)
@@ -95,25 +147,42 @@ def _evaluate(options: EvalOptions, processes: Processes) -> None:
     else:
         found = evaluate_images(loaded.pipeline, folder, shown) if processes.is_first else None
     if found is None:
-        return
+        return None
     if recipe is not None:
         found.more["edits"] = recipe_to_yaml(recipe)
     times = {"train_seconds": loaded.training.train_seconds}
     if found.has_materials:
         times["train_rays_per_second"] = loaded.training.train_rays_per_second
     figures = found.write(folder / "metrics.json", times)
+    config = replace(loaded.config, data=None, output_dir=Path(), load_run=None)
+    compared = ComparedRun(
+        loaded.run.path,
+        config.method_name,
+        figures,
+        {view["name"]: view for view in found.per_image},
+        found.bands,
+        loaded.scene.eval_cameras.camera_to_world.numpy(),
+        folder,
+        flat_settings(config_to_json(config)),
+    )
+    if show:
+        _report(console, compared, found, recipe is not None, factors is not None)
+    return compared
+
+
+def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: bool, is_relit: bool) -> None:
     for what, how in _ALIGNED.items():
         if what in found.more.get("aligned", ()):
             print(f"each evaluation view was aligned first: {how}")
-    of = "" if recipe is None else ", edited, against the scene as measured"
-    of += "" if factors is None else " (in the same light)"
-    _show(console, figures, f"{loaded.run.path.name}: {counted(figures['views'], 'evaluation view')}", of)
-    print(f"{folder / 'metrics.json'}  these figures, and those of each view")
+    of = "" if not is_edited else ", edited, against the scene as measured"
+    of += "" if not is_relit else " (in the same light)"
+    _show(console, run.figures, f"{run.path.name}: {counted(run.figures['views'], 'evaluation view')}", of)
+    print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
     if found.num_pictures:
         kinds = (
             ": rgb/, segmentation/ and abundances/, truth beside prediction" if found.has_materials else ""
         )
-        print(f"{folder}  {counted(found.num_pictures, 'picture')}{kinds}")
+        print(f"{run.pictures}  {counted(found.num_pictures, 'picture')}{kinds}")
 
 
 _ALIGNED = {
@@ -150,8 +219,12 @@ def _show(console: Console, figures: dict[str, Any], title: str, of: str) -> Non
     for name, value in figures.items():
         is_common = "bands" in figures or name in ("views", "train_seconds")
         what = DEFINITIONS.get(name, "") if is_common else ""
-        table.add_row(name, "no truth" if value is None else f"{value:.4g}", what)
+        if value is not None:
+            table.add_row(name, f"{value:.4g}", what)
     console.print(table)
+    unknown = [name for name, value in figures.items() if value is None]
+    if unknown:
+        print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
 
 
 def main() -> None:

@@ -243,7 +243,7 @@ def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) ->
         ConfigError: in the first process, with the settings that differ.
         Follower: in the others.
     """
-    told = processes.gather({**_flat(settings), "torch": torch.__version__})
+    told = processes.gather({**flat_settings(settings), "torch": torch.__version__})
     for rank, other in enumerate(told):
         names = told[0].keys() | other.keys()
         different = sorted(name for name in names if told[0].get(name) != other.get(name))
@@ -257,10 +257,13 @@ def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) ->
             raise Follower(2)
 
 
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by their dotted names."""
     found: dict[str, Any] = {}
     for name, value in settings.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        found |= (
+            flat_settings(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        )
     return found
 
 

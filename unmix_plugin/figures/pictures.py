@@ -14,6 +14,7 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from unmix_plugin.figures.plotting import FIGURE_DPI, Colour, draw_colour_bar, draw_swatch, figure_bytes
+from unmix_plugin.formats.files import rgba_png_bytes
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 
 NEUTRAL = 0.92
@@ -146,6 +148,25 @@ def draw_panels(
     return figure_bytes(figure)
 
 
+def one_above_the_other(paths: Sequence[Path], captions: Sequence[str]) -> bytes:
+    """Pictures in files as one PNG, each below its caption."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    sizes = []
+    for path in paths:
+        with Image.open(path) as picture:
+            sizes.append(picture.size)
+    height = sum(high + _STRIP_PX for _, high in sizes)
+    page = Image.new("RGB", (max(wide for wide, _ in sizes), height), "white")
+    draw, top = ImageDraw.Draw(page), 0
+    for path, caption, (_, high) in zip(paths, captions, sizes, strict=True):
+        draw.text((20, top + 8), caption, fill=(20, 20, 20), font=ImageFont.load_default(_STRIP_PX / 2))
+        with Image.open(path) as picture:
+            page.paste(picture, (0, top + _STRIP_PX))
+        top += high + _STRIP_PX
+    return rgba_png_bytes(np.asarray(page))
+
+
 def _draw_panel(
     figure: Any, panel: TitledPicture, box: tuple[float, float, float, float], page: tuple[float, float]
 ) -> None:
@@ -176,6 +197,7 @@ def _legend_width(legend: Sequence[tuple[str, Colour]]) -> float:
     return 0.52 + _LETTER * max((len(name) for name, _ in legend), default=8)
 
 
+_STRIP_PX = 40
 _CAPTION_PX, _GAP_PX, _FONT_PX = 18, 2, 11
 _SWATCH_PX = 14
 """Width of a swatch and the space behind it."""

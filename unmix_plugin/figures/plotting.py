@@ -27,8 +27,8 @@ from unmix_plugin.spectral.colour.conversion import (
 )
 
 FIGURE_DPI = 130
-RIGHT, WRONG = (0.80, 0.84, 0.80), (0.80, 0.15, 0.15)
-"""sRGB of pixels with the right and with the wrong material."""
+RIGHT, WRONG = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+"""sRGB of pixels with the right and with the wrong material: white and black, which no material has."""
 
 Colour = Sequence[float] | np.ndarray
 """sRGB in [0, 1]."""

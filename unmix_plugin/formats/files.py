@@ -5,9 +5,10 @@ Notation: `H x W` pixels, `N` colours.
 
 from __future__ import annotations
 
+import csv
 import io
 import os
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = [
     "RowSink",
     "array_bytes",
+    "csv_bytes",
     "indexed_png_bytes",
     "make_folder",
     "npy_rows",
@@ -56,6 +58,13 @@ def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
         raise ConfigError(
             f"{existing[0]}{others} exist already; give --overwrite to replace them or another --output"
         )
+
+
+def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
+    """A table as the bytes of a CSV file; numbers come as text in the precision wanted."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
 
 
 def array_bytes(array: np.ndarray) -> bytes:

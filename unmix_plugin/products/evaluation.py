@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.alignment import align_gain, align_pose, align_rows
 from unmix_plugin.trained.evaluation import (
     DEFINITIONS,
+    BandErrors,
     Evaluation,
     PredictedView,
     ViewTruth,
@@ -67,7 +68,7 @@ _Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
 
 
 @dataclass(frozen=True)
-class _Evaluated:
+class Evaluated:
     """What was found of a run."""
 
     figures: dict[str, float | None]
@@ -79,6 +80,8 @@ class _Evaluated:
     num_pictures: int
     has_materials: bool = True
     """Whether the figures are those of `DEFINITIONS`."""
+    bands: dict[str, BandErrors] = field(default_factory=dict)
+    """Of each view, where the figures are those."""
 
     def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, Any]:
         """Write metrics.json; its figures, those of training among them."""
@@ -91,7 +94,7 @@ class _Evaluated:
         return figures
 
 
-def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> _Evaluated:
+def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> Evaluated:
     """What a model says of its own images, and its pictures of each: KIND/NAME.png in the folder.
 
     Raises:
@@ -108,7 +111,7 @@ def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> _Evalu
     means = average_metrics([metrics for _, metrics in found])
     figures = {**finite_or_none(means), "views": len(pipeline.datamanager.eval_cameras)}
     per_image = [{"name": name, **finite_or_none(metrics)} for name, metrics in found]
-    return _Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
+    return Evaluated(figures, per_image, {}, num_pictures, has_materials=False)
 
 
 def evaluate_scene(
@@ -118,7 +121,7 @@ def evaluate_scene(
     folder: Path,
     follow: _Follow,
     processes: Processes,
-) -> _Evaluated | None:
+) -> Evaluated | None:
     """Measure a scene of mixed materials on the evaluation views of what was measured, and draw each view.
 
     Args:
@@ -173,7 +176,9 @@ def evaluate_scene(
     aligned = [*(["pose"] if "pose" in scene.fitted else []), *(["gain"] if fits_gain else [])]
     more |= {"aligned": aligned} if aligned else {}
     per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
-    return _Evaluated(finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids))
+    return Evaluated(
+        finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids), bands=evaluation.bands
+    )
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,6 @@ library that reach all of the run's visible bands; the other bands play no part.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
-from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
@@ -179,12 +177,10 @@ def _surfaces(
 
 
 def _table(found: _Metamers) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     shown = [f"CIEDE2000 in {light}" for light in found.lights]
-    writer.writerow(["first", "second", "alike in", "different in", *shown])
+    rows = [["first", "second", "alike in", "different in", *shown]]
     for pair in found.pairs:
         lights = [found.lights[index] for index in (pair.alike_in, pair.different_in)]
         differences = [f"{value:.3f}" for value in pair.differences]
-        writer.writerow([found.names[pair.first], found.names[pair.second], *lights, *differences])
-    return text.getvalue().encode()
+        rows.append([found.names[pair.first], found.names[pair.second], *lights, *differences])
+    return csv_bytes(rows)

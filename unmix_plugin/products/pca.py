@@ -5,8 +5,6 @@ Notation: `H x W` pixels, `C` bands or endmembers, `N` pixels.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +17,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.pictures import over_neutral
-from unmix_plugin.formats.files import rgba_png_bytes, write_file
+from unmix_plugin.formats.files import csv_bytes, rgba_png_bytes, write_file
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours
@@ -112,15 +110,13 @@ def _write_components(folder: Path, components: _Components, materials: Material
     colours = components.colours
     of_spectra = components.of == "spectra"
     names = [f"{nm:g}" for nm in materials.bands.centers_nm] if of_spectra else list(materials.names)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["wavelength" if of_spectra else "endmember", "mean", "red", "green", "blue"])
+    rows = [["wavelength" if of_spectra else "endmember", "mean", "red", "green", "blue"]]
     for name, mean, axes in zip(names, colours.mean.tolist(), colours.axes.tolist(), strict=True):
-        writer.writerow([name, f"{mean:.9g}", *(f"{value:.9g}" for value in axes)])
+        rows.append([name, f"{mean:.9g}", *(f"{value:.9g}" for value in axes)])
     for name, row in (
         ("value of 0", colours.low.tolist()),
         ("value of 1", colours.high.tolist()),
         ("explained variance", components.explained),
     ):
-        writer.writerow([name, "", *(f"{value:.9g}" for value in row)])
-    return write_file(_components_path(folder), text.getvalue().encode())
+        rows.append([name, "", *(f"{value:.9g}" for value in row)])
+    return write_file(_components_path(folder), csv_bytes(rows))

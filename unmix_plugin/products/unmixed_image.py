@@ -5,8 +5,6 @@ Notation: `H x W` pixels, `B` bands, `K` materials.
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from jaxtyping import Float64, Int
 from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panels, in_rows, paint
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
-from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.products.endmembers import draw_spectra
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -74,13 +72,9 @@ def write_unmixed_image(folder: Path, found: UnmixedImage, axis: BandAxis) -> li
 
 
 def _numbered_table(names: list[str], spectra: np.ndarray, numbers: np.ndarray) -> bytes:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["band", *names])
-    writer.writerows(
-        [number, *(f"{value:.9g}" for value in row)] for number, row in zip(numbers, spectra.T, strict=True)
-    )
-    return text.getvalue().encode()
+    bands = zip(numbers, spectra.T, strict=True)
+    rows = [[number, *(f"{value:.9g}" for value in row)] for number, row in bands]
+    return csv_bytes([["band", *names], *rows])
 
 
 def _colours(found: UnmixedImage, bands: Bands | None) -> np.ndarray:

@@ -226,6 +226,19 @@ class _SceneTruth:
         return replace(self, endmembers=self.endmembers * torch.from_numpy(factors))
 
 
+@dataclass(frozen=True)
+class BandErrors:
+    """One view band by band, over its valid pixels."""
+
+    nm: Float[np.ndarray, " b"]
+    """Centres of the bands that its sensor sees."""
+    mean: Float[np.ndarray, " b"]
+    """Of what was measured."""
+    mse: Float[np.ndarray, " b"]
+    """Mean squared error of what was predicted."""
+    num_pixels: int
+
+
 class Evaluation:
     """Figures of merit of one scene, fed view by view; keeps no image."""
 
@@ -242,6 +255,8 @@ class Evaluation:
         """Predicted and true endmembers, paired by spectral angle; None without true ones."""
         self.per_view: dict[str, dict[str, float]] = {}
         """`_VIEW_FIGURES` of each view; NaN where it has no truth."""
+        self.bands: dict[str, BandErrors] = {}
+        """Of each view."""
         self.sensors: dict[str, str] = {}
         """Name of the sensor of each view of a rig."""
         self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
@@ -282,12 +297,24 @@ class Evaluation:
             counted = torch.where(view.valid, view.labels, torch.full_like(view.labels, NOTHING_ID))
             self._tally.add(predicted.segmentation, counted)
         self.per_view[view.name] = figures
+        centers = torch.tensor(self.truth.bands.centers_nm)
+        measured, error = (
+            view.spectra[view.valid].double(),
+            spectra[view.valid].double() - view.spectra[view.valid],
+        )
+        self.bands[view.name] = BandErrors(
+            as_numpy(view.seen(centers)),
+            as_numpy(measured.mean(dim=0)),
+            as_numpy(error.square().mean(dim=0)),
+            len(measured),
+        )
         return figures
 
     def merge(self, others: Iterable[Evaluation], order: Iterable[str]) -> None:
         """Count the views of others of the same scene, too; `order` has the names of all views."""
         for other in others:
             self.per_view |= other.per_view
+            self.bands |= other.bands
             self.sensors |= other.sensors
             if self._tally is not None and other._tally is not None:
                 self._tally.confusion += other._tally.confusion

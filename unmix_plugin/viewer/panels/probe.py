@@ -5,8 +5,6 @@ Notation: `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +15,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
@@ -106,7 +104,7 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
         if one.measured is not None:
             header.append(f"probe_{one.number}_measured")
             columns.append(one.measured)
-    return _csv(header, [[f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1)])
+    return csv_bytes([header, *([f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1))])
 
 
 def _abundances_csv(probes: Sequence[_ProbedPoint]) -> bytes:
@@ -122,7 +120,7 @@ def _abundances_csv(probes: Sequence[_ProbedPoint]) -> bytes:
         ]
         for one in probes
     ]
-    return _csv(header, rows)
+    return csv_bytes([header, *rows])
 
 
 _MOST_PROBES = 12
@@ -235,12 +233,6 @@ class ProbePanel:
     def _drop(self, one: _ProbedPoint) -> None:
         self._probes.remove(one)
         self._markers.pop(one.number).remove()
-
-
-def _csv(header: Sequence[str], rows: Sequence[Sequence[str]]) -> bytes:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([header, *rows])
-    return text.getvalue().encode()
 
 
 def _on_click(session: Session, work: Callable[[Cameras, tuple[float, float]], None]) -> None:

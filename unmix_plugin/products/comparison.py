@@ -1,0 +1,217 @@
+"""Runs side by side: figures with their differences, errors by view and band, pictures one above the other.
+
+What is compared is what the runs share: evaluation views of one name that show the same measurements, and bands of one
+wavelength.
+
+Notation: `V` evaluation views, `S` bands that a view has in all runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from unmix_plugin.errors import ConfigError, counted
+from unmix_plugin.figures.pictures import one_above_the_other
+from unmix_plugin.formats.files import csv_bytes, write_file
+from unmix_plugin.trained.evaluation import BandErrors
+
+_SAME_NM = 0.01
+"""Difference of wavelengths below which bands are the same."""
+_SAME_MEAN = 1e-4
+"""Relative difference of a band's mean over a view below which measurements are the same."""
+_Row = tuple[str, list[Any]]
+"""What is compared, and its value in each run."""
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """What was found of one run."""
+
+    path: Path
+    method: str
+    figures: dict[str, Any]
+    """By name; None where there is no truth."""
+    views: dict[str, dict[str, Any]]
+    """Figures of each view, by its name."""
+    bands: dict[str, BandErrors]
+    """Of each view; empty of methods that measure their images themselves."""
+    cameras: Float[np.ndarray, "V 3 4"]
+    """Camera to model space, of the evaluation views."""
+    pictures: Path
+    """Holds KIND/NAME.png."""
+    settings: dict[str, Any]
+    """By dotted name."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs side by side."""
+
+    labels: list[str]
+    """Of each run, what tells its path from the others."""
+    rows: list[_Row]
+    """Settings that differ, then figures."""
+    remarks: list[str]
+    """What is left out, and why."""
+    num_pictures: int
+
+
+def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
+    """Compare, and write figures.csv, views.csv, band_rmse.csv and KIND/NAME.png.
+
+    Raises:
+        ConfigError: methods that measure differently, or nothing that the runs share.
+        RunError: the disk is full or refuses.
+    """
+    first, labels = runs[0], _labels([run.path for run in runs])
+    names, remarks = _shared_views(runs)
+    bands = {name: _shared_bands([run.bands[name] for run in runs]) for name in names if first.bands}
+    num_bands = [len(nm) for nm, _ in bands.values()]
+    if num_bands and not max(num_bands):
+        raise ConfigError("the runs share no band: all their wavelengths differ")
+    squared = {
+        name: np.stack([run.bands[name].mse[rows] for run, rows in zip(runs, at, strict=True)], axis=1)
+        for name, (_, at) in bands.items()
+    }
+    if any(len(run.views) > len(names) for run in runs) or any(
+        len(run.bands[name].nm) > len(nm) for run in runs for name, (nm, _) in bands.items()
+    ):
+        shared = f"{counted(len(names), 'view')} and {counted(max(num_bands), 'band')}"
+        remarks.append(f"runs differ in views or bands: psnr and rmse of what they share alone, {shared}")
+        of_views = np.stack([errors.mean(axis=0) for errors in squared.values()])
+        figures: list[_Row] = [
+            ("psnr", (-10 * np.log10(of_views.clip(1e-12))).mean(axis=0).tolist()),
+            ("rmse", np.sqrt(of_views).mean(axis=0).tolist()),
+        ]
+    else:
+        figures = _rows([run.figures for run in runs])
+    settings = _rows([run.settings for run in runs])
+    rows = [row for row in settings if any(value != row[1][0] for value in row[1])] + figures
+    views = [(name, *row) for name in names for row in _rows([run.views[name] for run in runs])]
+    errors = [
+        (name, f"{nm:g}", np.sqrt(row).tolist())
+        for name in names
+        if bands
+        for nm, row in zip(bands[name][0], squared[name], strict=True)
+    ]
+    for file, keys, table in (
+        ("figures", ["figure"], rows),
+        ("views", ["view", "figure"], views),
+        ("band_rmse", ["view", "wavelength_nm"], errors),
+    ):
+        header = [*keys, *labels, *(f"{label} minus {labels[0]}" for label in labels[1:])]
+        lines = [
+            [*keyed, *map(shown, values), *(difference(one, values[0]) for one in values[1:])]
+            for *keyed, values in table
+        ]
+        write_file(folder / f"{file}.csv", csv_bytes([header, *lines]))
+    for earlier in folder.glob("*/*.png"):
+        earlier.unlink()
+    kinds = sorted({path.parent.name for path in first.pictures.glob("*/*.png")})
+    drawn = 0
+    for kind, name in ((kind, name) for kind in kinds for name in names):
+        pictures = [run.pictures / kind / f"{name}.png" for run in runs]
+        if all(path.is_file() for path in pictures):
+            write_file(
+                folder / kind / f"{name}.png",
+                one_above_the_other(pictures, [f"run {label}" for label in labels]),
+            )
+            drawn += 1
+    return Comparison(labels, rows, remarks, drawn)
+
+
+def shown(value: Any) -> str:
+    """A value in a table; nothing for None."""
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def difference(value: Any, reference: Any) -> str:
+    """With its sign; empty where one of them is no number.
+
+    >>> difference(0.5, 0.75), difference(None, 0.5)
+    ('-0.25', '')
+    """
+    known = all(isinstance(one, int | float) and not isinstance(one, bool) for one in (value, reference))
+    return f"{value - reference:+.4g}" if known else ""
+
+
+def _rows(runs: Sequence[dict[str, Any]]) -> list[_Row]:
+    """What some run knows."""
+    names = dict.fromkeys(name for run in runs for name in run if name != "name")
+    rows = [(name, [run.get(name) for run in runs]) for name in names]
+    return [row for row in rows if any(value is not None for value in row[1])]
+
+
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """What tells each path from the others: as few as possible of the parts that differ, from the left.
+
+    >>> _labels([Path("/sweep/4/demo/unmix-nerf/a"), Path("/sweep/6/demo/unmix-nerf/b")])
+    ['4', '6']
+    """
+    depth = max(len(path.parts) for path in paths)
+    parts = [[*path.parts, *[""] * (depth - len(path.parts))] for path in paths]
+    differ = [at for at in range(depth) if len({own[at] for own in parts}) > 1]
+    for count in range(1, len(differ) + 1):
+        labels = ["/".join(filter(None, (own[at] for at in differ[:count]))) for own in parts]
+        if len(set(labels)) == len(labels):
+            return labels
+    return [str(path) for path in paths]
+
+
+def _shared_views(runs: Sequence[ComparedRun]) -> tuple[list[str], list[str]]:
+    """Names of the views that show the same in all runs, and what is said of the others.
+
+    Raises:
+        ConfigError: methods that measure differently, or no such view.
+    """
+    first, remarks = runs[0], []
+    for other in runs[1:]:
+        if bool(other.bands) != bool(first.bands):
+            raise ConfigError(
+                f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure their views by "
+                "different definitions; compare runs of methods that measure alike"
+            )
+    names = [name for name in first.views if all(name in run.views for run in runs)]
+    others = len({name for run in runs for name in run.views}) - len(names)
+    if others:
+        remarks.append(f"left out: {counted(others, 'view')} that not all runs have")
+    if first.bands:
+        same = [name for name in names if _is_same([run.bands[name] for run in runs])]
+    else:
+        alike = [
+            run.cameras.shape == first.cameras.shape and np.allclose(run.cameras, first.cameras, atol=1e-4)
+            for run in runs
+        ]
+        same = names if all(alike) and not others else []
+    if len(same) < len(names):
+        remarks.append(
+            f"left out: {counted(len(names) - len(same), 'view')} of one name with other measurements"
+        )
+    if not same:
+        raise ConfigError(
+            f"{' and '.join(str(run.path) for run in runs)} are runs of different scenes: no evaluation view shows the "
+            "same in all of them"
+        )
+    return same, remarks
+
+
+def _shared_bands(views: Sequence[BandErrors]) -> tuple[Float[np.ndarray, " S"], list[Int[np.ndarray, " S"]]]:
+    """Wavelengths that all have, nm, and where each has them."""
+    first = views[0].nm
+    distances = [np.abs(view.nm - first[:, None]) for view in views]
+    kept = np.logical_and.reduce([distance.min(axis=1) < _SAME_NM for distance in distances])
+    return first[kept], [distance.argmin(axis=1)[kept] for distance in distances]
+
+
+def _is_same(views: Sequence[BandErrors]) -> bool:
+    """Whether a view was measured alike: as many pixels, with the same mean in every band that all have."""
+    means = [view.mean[rows] for view, rows in zip(views, _shared_bands(views)[1], strict=True)]
+    return len({view.num_pixels for view in views}) == 1 and all(
+        np.allclose(mean, means[0], rtol=_SAME_MEAN, atol=1e-7) for mean in means
+    )
