@@ -25,6 +25,7 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
+from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
@@ -40,7 +41,7 @@ SMALL = {
     "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
     "volume": ["--resolution", 8],
 }
-NAMES = [product.name for product in PRODUCTS]
+NAMES = [product.name for product in PRODUCTS if isinstance(product, RunProduct)]
 
 
 def words(name, *more):
@@ -439,6 +440,31 @@ def test_every_product_can_be_edited_and_relit(solid, tmp_path, name):
         assert "old oak" in page
         assert "Edited: what is rendered here" in page
         assert "Worst views" not in page
+
+
+def test_a_known_distance_is_kept_and_exports_say_it(solid_copy, tmp_path):
+    two = ["scale", "--run", solid_copy, "--points", "eval_002:7,8", "eval_002:9,8", "--distance"]
+    ended = run(export, *two, 0)
+    assert (ended.status, "must be greater than 0" in ended.err) == (2, True)
+    assert run(export, *two, 0.12).status == 0
+    scene = open_run(solid_copy, "cpu")
+    view = next(view for view in scene.views if view.name == "eval_002")
+    ends = [scene.probe(view.camera, column, 8).world_position for column in (7, 9)]
+    assert scene.scale is not None
+    assert ends[0] is not None
+    assert ends[1] is not None
+    assert scene.scale.metres_per_unit * np.linalg.norm(ends[1] - ends[0]) == pytest.approx(0.12)
+    assert run(export, *words("poses", "--run", solid_copy, "--output", tmp_path)).status == 0
+    written = json.loads((tmp_path / "transforms.json").read_text())
+    assert written["metres_per_unit"] == scene.scale.metres_per_unit
+    assert scene.scale.said in run(export, "scale", "--run", solid_copy).out
+    for words_given, message in (
+        (["--points", "0 0 90", "eval_002:9,8", "--distance", 1], "is not on the object"),
+        (["--points", "0 0", "0 0 1", "--distance", 1], "is no point: expected x y z"),
+        (["--distance", 1], "give both"),
+    ):
+        ended = run(export, "scale", "--run", solid_copy, *words_given)
+        assert (ended.status, message in ended.err) == (2, True), ended.err
 
 
 def test_removed_matter_leaves_the_surface(solid, tmp_path):

@@ -222,7 +222,8 @@ def test_the_file_says_what_it_is(cloud):
         "coordinates: world of the given poses, or of transforms.json if they were estimated"
         in ply.comments[1]
     )
-    assert ply.comments[2:] == [f"material {index}: endmember_{index}" for index in range(3)]
+    assert ply.comments[2] == "lengths are in units of the scene, of unknown size"
+    assert ply.comments[3:] == [f"material {index}: endmember_{index}" for index in range(3)]
 
 
 def test_indices_and_targets_are_written_for_each_point(points, tmp_path):

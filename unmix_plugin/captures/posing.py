@@ -26,7 +26,7 @@ from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.scenes.placement import METRES_KEY, Placement
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
 """Words that ask to find poses instead of reading them."""
@@ -128,6 +128,8 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     ]
     placed = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     keys = placed.placement.to_json() if poses.has_world else {}
+    if poses.has_world and poses.metres_per_unit is not None:
+        keys[METRES_KEY] = poses.metres_per_unit
     notes = (*poses.notes, *matched, *completed, *resampled, *placed.notes)
     findings = [*_unposed(views, posed, poses.source), *_other_sizes(posed, cameras)]
     return PosedViews(posed, placed.poses, tuple(findings), keys, notes)

@@ -16,7 +16,7 @@ import tyro
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.registry import BrokenPlugin, discover_methods
 from unmix_plugin.errors import ConfigError, counted
-from unmix_plugin.products.product import Job, Product, RunProduct, ViewProduct
+from unmix_plugin.products.product import Job, Product, RunProduct, RunWork, ViewProduct
 from unmix_plugin.products.scene_products import PRODUCTS
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def export(argv: list[str]) -> None:
         {product.name: product for product in offered},
         {product.name: inspect.getdoc(product) or "" for product in offered},
     )
-    product: RunProduct = tyro.cli(
+    product: RunWork = tyro.cli(
         choices, prog="unmix-export", description="Write products of a run as files.", args=argv
     )
     from unmix_plugin.engine.processes import joined, start_together
@@ -105,7 +105,7 @@ def export(argv: list[str]) -> None:
         _write(product, own, processes)
 
 
-def _write(product: RunProduct, own: dict[str, OwnProduct], processes: Processes) -> None:
+def _write(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -> None:
     if not isinstance(product, ViewProduct) and processes.count > 1:
         raise ConfigError(f"unmix-export {product.name} runs in one process; start it once")
     with processes.together():
@@ -115,10 +115,11 @@ def _write(product: RunProduct, own: dict[str, OwnProduct], processes: Processes
         return
     for file in written:
         print(file)
-    print(f"{counted(len(written), 'file')} written to {job.folder}")
+    if written:
+        print(f"{counted(len(written), 'file')} written to {job.folder}")
 
 
-def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes) -> Job:
+def _open(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -> Job:
     """Load the run that a product is of."""
     from functools import partial
 
@@ -127,7 +128,9 @@ def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes)
     from unmix_plugin.trained.open_run import load_run
 
     if isinstance(product, Product) and product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
-        able = ", ".join(one.name for one in PRODUCTS if one.name not in _IN_THE_RUNS_BANDS)
+        able = ", ".join(
+            one.name for one in PRODUCTS if isinstance(one, Product) and one.name not in _IN_THE_RUNS_BANDS
+        )
         raise ConfigError(
             f"{product.name} compares with what is known in the run's own bands and can't be seen through another "
             f"sensor; leave out --sensor. It goes with {able}"
@@ -141,13 +144,15 @@ def _open(product: RunProduct, own: dict[str, OwnProduct], processes: Processes)
             loaded = load_run(path, product.device)
     if product.name in own:
         own[product.name].require(loaded.config.method_name)
-    folder = (product.output or loaded.folder.exports / product.name).resolve()
+    folder = loaded.folder.path
+    if isinstance(product, RunProduct):
+        folder = (product.output or folder.joinpath("exports", product.name)).resolve()
     for line in loaded.scene.notes:
         say(console, line)
     return Job(
         loaded,
         folder,
-        product.overwrite,
+        isinstance(product, RunProduct) and product.overwrite,
         partial(say, console),
         partial(working, console),
         partial(follow, console),

@@ -305,7 +305,7 @@ def _write_mesh(
     normals = mesh.normals
     positions = torch.from_numpy(mesh.vertices).float()
     seen = look_from_above(scene, positions, torch.from_numpy(normals).float())
-    looks = SurfaceAppearance(scene.materials, *seen)
+    looks = SurfaceAppearance(scene.materials, *seen, scale=scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
     glb = partial(_write_glb, up=world_up(scene.views, frame) if up == "y" else (0.0, 1.0, 0.0))
@@ -365,7 +365,9 @@ def gltf_content(
     for name, values in looks.properties().items():
         if name.startswith("abundance_"):
             numbers[f"_{name.upper()}"] = values
-    extras: dict[str, Any] = {"materials": list(looks.materials.names), "about": looks.comments(what)[:2]}
+    extras: dict[str, Any] = {"materials": list(looks.materials.names), "about": looks.comments(what)[:3]}
+    if looks.scale is not None:
+        extras["metres_per_unit"] = looks.scale.metres_per_unit
     vertices = mesh.vertices
     if vertices.dtype == np.float64:
         extras["offset"] = np.round(vertices.mean(axis=0)).tolist()

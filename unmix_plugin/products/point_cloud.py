@@ -30,6 +30,7 @@ from unmix_plugin.spectral.maps.reflectance_maps import (
     seen_reflectance,
 )
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
 
@@ -179,7 +180,9 @@ def export_point_cloud(job: Job, num_points: int, outputs: Sequence[str]) -> lis
     job.claim([_point_cloud_path(job.folder)])
     surface = job.surface(_RAYS_PER_POINT * count)
     with job.working("cleaning and thinning the points"):
-        path, written = _write_point_cloud(job.folder, surface.points(), count, materials, job.frame, scores)
+        path, written = _write_point_cloud(
+            job.folder, surface.points(), count, materials, job.frame, scores, job.scene.scale
+        )
     job.say(counted(written, "point"))
     return [path]
 
@@ -204,6 +207,7 @@ def _write_point_cloud(
     materials: Materials,
     frame: Normalisation,
     scores: Sequence[_PointScore] = (),
+    scale: Scale | None = None,
 ) -> tuple[Path, int]:
     """Write `points.ply`, binary, in world coordinates.
 
@@ -223,7 +227,7 @@ def _write_point_cloud(
     normals = _plane_normals(positions, -points.directions.double().numpy(), chosen)
     kept = points.select(torch.from_numpy(chosen))
     diffuse = kept.diffuse(materials)
-    looks = SurfaceAppearance(materials, kept.abundances, diffuse)
+    looks = SurfaceAppearance(materials, kept.abundances, diffuse, scale)
     world = positions_for_files(frame.to_world(positions[chosen]))
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {

@@ -9,6 +9,7 @@ from typing import Any
 
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job
+from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import camera_entry
 from unmix_plugin.trained.run_views import RunView
@@ -23,6 +24,8 @@ def export_poses(job: Job) -> list[Path]:
     scene = job.loaded.scene
     is_refined = isinstance(scene, TrainedScene) and "pose" in scene.fitted
     content = _poses_json(scene.views, scene.frame, is_refined)
+    if job.loaded.scale is not None:
+        content[METRES_KEY] = job.loaded.scale.metres_per_unit
     return [write_file(path, (json.dumps(content, indent=1) + "\n").encode())]
 
 

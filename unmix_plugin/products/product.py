@@ -26,22 +26,18 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RunProduct(ABC):
-    """Options that every product of any method has."""
+class RunWork(ABC):
+    """What is done with a run of any method: a product, or what is kept in its folder."""
 
     name: ClassVar[str]
     """Of the product, and of its folder."""
 
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
-    output: Path | None = None
-    """Folder to write to; None: exports/ and the product's name, in the run folder."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace files of an earlier export."""
 
     @abstractmethod
     def write(self, job: Job) -> list[Path]:
@@ -52,6 +48,16 @@ class RunProduct(ABC):
         Raises:
             UnmixError: something that a user can fix.
         """
+
+
+@dataclass(frozen=True)
+class RunProduct(RunWork):
+    """Options that every product of any method has."""
+
+    output: Path | None = None
+    """Folder to write to; None: exports/ and the product's name, in the run folder."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace files of an earlier export."""
 
 
 @dataclass(frozen=True)

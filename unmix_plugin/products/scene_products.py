@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from unmix_plugin.products.product import Job, Product, ViewProduct
+from unmix_plugin.products.product import Job, Product, RunWork, ViewProduct
 
 
 @dataclass(frozen=True)
@@ -214,6 +214,28 @@ class Report(Product):
 
 
 @dataclass(frozen=True)
+class Scale(RunWork):
+    """How long things are: keeps with the run how long a unit of its world is, by two points and their distance, or
+    says what is kept. What measures or exports lengths and areas then does so in metres."""
+
+    name = "scale"
+
+    points: tuple[str, str] | None = None
+    """Two points on the object: in the world, as probes and exports give them ("0.1 0.2 0.5"), or by the pixel in
+    which a view shows them (VIEW:column,row)."""
+    distance: float | None = None
+    """How far apart they are, metres."""
+    metres_per_unit: float | None = None
+    """Instead of points: the length of a unit of the world, such as 0.001 where poses are in millimetres."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Find the points, set the scale."""
+        from unmix_plugin.products.measuring import set_scale
+
+        return set_scale(job, self.points, self.distance, self.metres_per_unit)
+
+
+@dataclass(frozen=True)
 class Segmentation(ViewProduct):
     """Material of each pixel: labels/VIEW.png with ids and their palette (255: nothing), VIEW.npy with scores (H, W, K)
     float32, VIEW.png, a figure with a legend, and legend.csv, which names the ids."""
@@ -293,7 +315,7 @@ class Volume(Product):
         return export_volume(job, self.resolution)
 
 
-PRODUCTS: tuple[Product, ...] = (
+PRODUCTS: tuple[RunWork, ...] = (
     Abundances(),
     Cubes(),
     Endmembers(),
@@ -304,9 +326,10 @@ PRODUCTS: tuple[Product, ...] = (
     PointCloud(),
     Poses(),
     Report(),
+    Scale(),
     Segmentation(),
     Spectrum(),
     Splats(),
     Volume(),
 )
-"""All that scenes of mixed materials have, with the defaults of its options."""
+"""All that scenes of mixed materials have, and what runs of any method have, with the defaults of its options."""

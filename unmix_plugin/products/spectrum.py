@@ -22,6 +22,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.trained.measures import describe_scale
 from unmix_plugin.trained.open_run import find_scene
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_materials import (
@@ -34,6 +35,7 @@ from unmix_plugin.trained.run_materials import (
     shown_matches,
 )
 from unmix_plugin.trained.run_views import RunView, find_view
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _MOST_BARS = 12
 
@@ -85,7 +87,7 @@ def export_spectrum(
         spectra, bands = probe.spectra["predicted"][None], job.materials.bands
         [matches] = shown_matches(spectra, bands, light, library_with(library), comparison=comparison)
     probed = _ProbedPlace(title, facts, probe, measured, matches)
-    return _write_spectrum(job.folder, name, probed, job.materials)
+    return _write_spectrum(job.folder, name, probed, job.scene)
 
 
 def _measured(
@@ -125,17 +127,19 @@ def _spectrum_paths(folder: Path, name: str) -> list[Path]:
     return [folder / f"{name}.{kind}" for kind in ("csv", "json", "png")]
 
 
-def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, materials: Materials) -> list[Path]:
+def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: TrainedScene) -> list[Path]:
     """Write NAME.csv (`wavelength,predicted,...`, `measured` where it is known), NAME.json (where the place is, its
     opacity, abundances and nearest known materials) and NAME.png, a plot.
     """
+    materials = scene.materials
     table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), name)
     columns = dict(place.probe.spectra)
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
     table = SpectraTable(materials.bands, tuple(columns), np.stack(list(columns.values())))
     write_spectra_csv(table_path, table)
-    content = json.dumps(_facts(place, materials), indent=1, allow_nan=False) + "\n"
+    facts = {**_facts(place, materials), "scale": describe_scale(scene.scale)}
+    content = json.dumps(facts, indent=1, allow_nan=False) + "\n"
     write_file(facts_path, content.encode())
     return [table_path, facts_path, write_file(plot_path, _draw_spectrum(place, materials))]
 

@@ -81,7 +81,7 @@ def export_splats(
 def _as_seen(job: Job, seen: Coefficients) -> SurfaceAppearance:
     """The looks of the vertices, gloss from straight above included."""
     materials = job.materials.to("cpu")
-    return SurfaceAppearance(materials, seen.abundances, materials.spectra(seen))
+    return SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), job.scene.scale)
 
 
 def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:

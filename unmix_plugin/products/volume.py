@@ -41,13 +41,15 @@ def _write_volume(
     """Write `volume.npz`, of which one slice is in memory at a time, and all densities.
 
     Arrays: `density` (X, Y, Z) float32 per world unit; `abundances` (X, Y, Z, K) float32, summing to 1; both are 0 in
-    cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points.
+    cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points, of which a
+    unit is `metres_per_unit` long (NaN where unknown).
     `endmember_names`, `endmembers` (K, B) float32 and `wavelengths_nm` (B,) say what the abundances are of.
     """
     path, materials = _volume_path(folder), scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {
         "index_to_world": affine_to_world(frame, grid.origin.astype(np.float64), grid.cell),
+        "metres_per_unit": np.array(np.nan if scene.scale is None else scene.scale.metres_per_unit),
         "endmember_names": np.array(materials.names),
         "endmembers": materials.endmembers.detach().cpu().numpy().astype(np.float32),
         "wavelengths_nm": np.asarray(materials.bands.centers_nm),

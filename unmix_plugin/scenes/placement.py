@@ -15,6 +15,8 @@ from jaxtyping import Float, Float64
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
 
 _TRANSFORM_KEY, _SCALE_KEY, _OFFSET_KEY = "applied_transform", "applied_scale", "offset"
+METRES_KEY, METRES_RANGE = "metres_per_unit", (1e-9, 1e9)
+"""Of transforms.json and of a run's record: metres in a unit of the source's world; least and greatest."""
 _ROTATION_TOLERANCE = 1e-5
 """Largest element of R^T R - 1 that passes as rounding of printed digits."""
 _SCALE_RANGE = (1e-12, 1e12)
@@ -136,6 +138,20 @@ def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Place
         faults.add(where, f"'{_OFFSET_KEY}' is {describe(content[_OFFSET_KEY])}; expected 3 finite numbers")
         offset = np.zeros(3)
     return Placement(transform[:, :3], transform[:, 3], scale, offset)
+
+
+def read_metres_per_unit(content: dict[str, Any], faults: Faults, where: str) -> float | None:
+    """Metres in a unit of the source's world, as transforms.json may say; with a noted fault where that is wrong."""
+    metres = None if content.get(METRES_KEY) is None else read_number(content[METRES_KEY])
+    if content.get(METRES_KEY) is None:
+        return None
+    if metres is None or not METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
+        faults.add(
+            where,
+            f"'{METRES_KEY}' is {describe(content[METRES_KEY])}; expected 1e-9 to 1e9, such as 0.001 for mm",
+        )
+        return None
+    return metres
 
 
 def _is_rotation(matrix: Float64[np.ndarray, "3 3"]) -> bool:

@@ -19,7 +19,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.backdrops import BeforeBackdrop
-from unmix_plugin.scenes.placement import Normalisation, Placement
+from unmix_plugin.scenes.placement import METRES_KEY, Normalisation, Placement
 from unmix_plugin.scenes.reading.cubes import map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.scenes.reading.transforms_json import FILE_NAME
@@ -74,6 +74,8 @@ class Scene:
     """From world to model space."""
     placement: Placement
     """From world space to that of transforms.json."""
+    metres_per_unit: float | None
+    """Metres in a unit of world space; None where that is unknown."""
     material_names: tuple[str, ...] | None
     """True materials in the order of labels and abundances."""
     illuminant: Float64[np.ndarray, " B"] | None
@@ -192,6 +194,7 @@ class Scene:
             "material_names": None if self.material_names is None else list(self.material_names),
             "illuminant": None if self.illuminant is None else self.illuminant.tolist(),
             "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
+            **({} if self.metres_per_unit is None else {METRES_KEY: self.metres_per_unit}),
             **rig,  # nothing for the scenes of one ordinary camera, so that their records stay as they are
             "has_alpha": self.has_alpha,
             "is_unbounded": self.is_unbounded,

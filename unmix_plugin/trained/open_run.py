@@ -23,6 +23,7 @@ from unmix_plugin.model import UnmixModel
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene, scene_identity
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.trained.measures import Measures, Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
@@ -71,6 +72,7 @@ def unmix_scene(
             *(["pose"] if model.poses is not None else []),
             *(["gain"] if model.view_gains is not None else []),
         ),
+        scale=recorded_scale(record.summary),
     )
 
 
@@ -127,6 +129,17 @@ class LoadedRun:
     """What the run keeps of its input."""
     training: TrainingRecord
     scene: RenderableScene
+    measures: Measures = Measures()
+    """What a user measured in it."""
+
+    @property
+    def scale(self) -> Scale | None:
+        """How long a unit of its world is, as it was set for the run, or else as its scene says; None where unknown.
+
+        Raises:
+            RunError: the record is damaged.
+        """
+        return self.measures.scale or recorded_scale(self.record.summary)
 
     @property
     def materials_scene(self) -> TrainedScene:
@@ -147,7 +160,10 @@ def load_run(path: str | Path, device: str = "auto") -> LoadedRun:
     """
     loaded = load_model(Path(path), device)
     scene = snapshot(loaded.model, loaded.config.method_name, loaded.scene)
-    return LoadedRun(loaded.run, loaded.config, loaded.scene, loaded.training, scene)
+    run = LoadedRun(
+        loaded.run, loaded.config, loaded.scene, loaded.training, scene, read_measures(loaded.run)
+    )
+    return replace(run, scene=replace(scene, scale=run.scale)) if isinstance(scene, TrainedScene) else run
 
 
 def open_run(path: str | Path, device: str = "auto") -> TrainedScene:

@@ -25,6 +25,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
+from unmix_plugin.trained.measures import Scale, describe_scale
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -277,6 +278,8 @@ class SurfaceAppearance:
     """Summing to 1."""
     diffuse: Float[Tensor, "P B"]
     """Spectra without the view-dependent part."""
+    scale: Scale | None = None
+    """Of the world that the points are written in."""
 
     @property
     def linear_rgb(self) -> Float32[np.ndarray, "P 3"]:
@@ -317,6 +320,7 @@ class SurfaceAppearance:
         return [
             what,
             f"coordinates: world of the given poses, or of transforms.json if they were estimated; {colours}",
+            describe_scale(self.scale),
             *materials,
         ]
 

@@ -25,6 +25,7 @@ from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.outputs import OUTPUTS, MaterialOutput, MaterialView, find_output
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView
@@ -74,6 +75,8 @@ class TrainedScene:
     """What a user has to be told of how it was edited."""
     fitted: tuple[Literal["pose", "gain"], ...] = ()
     """What training found for each of its views, so that other views are aligned before they are measured."""
+    scale: Scale | None = None
+    """How long a unit of its world is; None where that is unknown."""
 
     @property
     def bands(self) -> Bands:

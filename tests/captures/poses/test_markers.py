@@ -151,6 +151,7 @@ def test_a_lens_that_is_given_stays_and_markers_may_lie_anywhere():
     assert {camera.lens for camera in found.cameras.values()} == {LENS}
     assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
     assert not found.has_world
+    assert found.metres_per_unit is None
     assert any("no scale: give --marker-size" in note for note in found.notes)
 
 

@@ -91,9 +91,11 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
         applied_transform=np.column_stack([turn, shift]).tolist(),
         applied_scale=scale,
         ply_file_path="sparse.ply",
+        metres_per_unit=0.001,
     )
     found = read(tmp_path, content)
     assert_same_poses(found, ring())
+    assert found.metres_per_unit == 0.001
     assert found.points is not None
     np.testing.assert_allclose(found.points, points, atol=1e-12)
     assert found.colours is not None
@@ -234,6 +236,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
             "'applied_transform'.*a rotation",
         ),
         ({"applied_scale": 0}, "'applied_scale' is 0"),
+        ({"metres_per_unit": -1}, "'metres_per_unit' is -1; expected 1e-9 to 1e9"),
         ({"applied_scale": 2, "offset": [1, 2]}, "'offset' is a list of 2; expected 3"),
     ],
 )

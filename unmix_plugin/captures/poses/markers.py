@@ -388,6 +388,7 @@ def _pose_set(
         to_board.to_scene(corners.reshape(-1, 3)),
         up=up,
         has_world=marker_size is not None,
+        metres_per_unit=None if marker_size is None else 1.0,
         notes=tuple(notes),
     )
 
@@ -462,6 +463,7 @@ def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> Po
         points=None if poses.points is None else way.to_scene(poses.points),
         up=up,
         has_world=True,
+        metres_per_unit=1.0,
         notes=(*poses.notes, how_up, _how_large(marker_size)),
     )
 

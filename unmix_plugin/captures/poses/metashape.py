@@ -9,6 +9,7 @@ which are OpenCV's p2, p1.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -84,7 +85,8 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
     has_world = any(np.abs(world - np.eye(4)).max() > 0 for world in worlds.values())
     up = middle if is_geocentric else np.array([0.0, 0.0, 1.0]) if has_world else None
-    return make_pose_set(raw, f"Metashape's {path.name}", str(path), None, up, dict.fromkeys(notes))
+    found = make_pose_set(raw, f"Metashape's {path.name}", str(path), None, up, dict.fromkeys(notes))
+    return replace(found, metres_per_unit=1.0 if is_geocentric else None)
 
 
 def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[ElementTree.Element]:

@@ -5,6 +5,7 @@ Rotations are axis and angle from world to camera (OpenCV axes); lengths on the 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,10 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
         raw.append((name, PosedCamera(matrix, lenses[camera])))
     notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
     up = np.array([0.0, 0.0, 1.0])
-    return make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
+    found = make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
+    origin = best.get("reference_lla")  # of metres to the east, north and up; 0 where pictures had no place
+    has_place = isinstance(origin, dict) and any(origin.get(key) for key in ("latitude", "longitude"))
+    return replace(found, metres_per_unit=1.0 if has_place else None)
 
 
 def _world_to_camera(

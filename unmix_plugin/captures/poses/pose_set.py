@@ -78,6 +78,8 @@ class PoseSet:
     """Unit vector against gravity, where the source's coordinates tell it (geo-referenced, or +z by convention)."""
     has_world: bool = True
     """Whether the coordinates mean something to the user. Those of estimated poses don't."""
+    metres_per_unit: float | None = None
+    """Metres in a unit of the source, where that is known: printed markers, geo-referenced coordinates."""
     notes: tuple[str, ...] = ()
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
     warnings: tuple[str, ...] = ()

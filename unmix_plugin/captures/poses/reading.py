@@ -39,7 +39,7 @@ from unmix_plugin.captures.poses.pose_set import (
 from unmix_plugin.errors import CaptureError, SceneError, counted
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
-from unmix_plugin.scenes.placement import Placement, read_placement
+from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number
 from unmix_plugin.scenes.reading.foreign_keys import keys_to_say
@@ -227,6 +227,7 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
     points: SparsePoints | None = None
     warnings: list[str] = []
     up = np.array([0.0, 0.0, 1.0])
+    metres: set[float | None] = set()
     for path, content in contents.items():
         top = content if isinstance(content, dict) else {}
         listed = top.get("frames") if top else content
@@ -236,6 +237,7 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
         notes += [f"{path.name}: {text}" for text in said]
         faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
+        metres.add(read_metres_per_unit(top, faults, path.name))
         found = _read_frames(path, content, sizes, faults, notes)
         try:
             faults.raise_if_any()
@@ -251,7 +253,8 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
         up = placement.rotation.T @ np.array([0.0, 0.0, 1.0])
     where = ", ".join(str(path) for path in contents)
     source = " and ".join(path.name for path in contents)
-    return make_pose_set(cameras, source, where, points, up, dict.fromkeys(notes), dict.fromkeys(warnings))
+    made = make_pose_set(cameras, source, where, points, up, dict.fromkeys(notes), dict.fromkeys(warnings))
+    return replace(made, metres_per_unit=metres.pop() if len(metres) == 1 else None)
 
 
 def _read_frames(

@@ -69,6 +69,7 @@ _KNOWN = {
         "datadir",
     ),
     *("applied_transform", "applied_scale", "offset", "ply_file_path", "wavelengths", "fwhm", "value_scale"),
+    "metres_per_unit",
     *(
         "train_filenames",
         "val_filenames",

@@ -166,6 +166,7 @@ def _assemble(
         scene_box=scene_box,
         normalisation=normalisation.after(entry.placement),
         placement=entry.placement,
+        metres_per_unit=entry.metres_per_unit,
         material_names=truth.material_names,
         illuminant=truth.illuminant,
         endmembers=truth.endmembers,

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.scenes.placement import Placement, read_placement
+from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.faults import (
     Faults,
     UnreadableJsonError,
@@ -427,6 +427,8 @@ class SceneEntry:
     """How the poses were moved from where they come from."""
     value_scale: float | None = None
     """What cubes are divided by, where the options don't say."""
+    metres_per_unit: float | None = None
+    """Metres in a unit of the world that the poses come from."""
 
 
 def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:
@@ -457,6 +459,7 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
         split_lists=_read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
+        metres_per_unit=read_metres_per_unit(content, faults, FILE_NAME),
     )
 
 

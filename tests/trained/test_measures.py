@@ -1,0 +1,88 @@
+"""The scale of a run: what sets it, what is kept, and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.products.ball_model import RADIUS, ball_scene, cameras_around
+from tests.trained.camera_scenes import FRAME
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.trained.measures import (
+    Scale,
+    describe_area,
+    describe_length,
+    keep_scale,
+    read_measures,
+    recorded_scale,
+    require_on_surface,
+    scale_between,
+)
+from unmix_plugin.trained.run_views import RunView
+
+VIEWS = tuple(
+    RunView(f"view_{index}", camera)
+    for index, camera in enumerate(cameras_around([(1.0, 0.2, 0.3), (-1.0, 0.1, 0.5)]))
+)
+BALL = replace(ball_scene(), frame=FRAME, views=VIEWS)
+
+
+def test_two_points_and_their_distance_tell_the_unit(tmp_path):
+    scale = scale_between((1.0, 2.0, 3.0), (1.0, 2.0, 3.5), 0.12)
+    assert scale.metres_per_unit == pytest.approx(0.24)
+    assert (describe_length(0.5, scale), describe_area(0.5, scale)) == ("12 cm", "288 cm²")
+    assert "0.12 m between 1 2 3 and 1 2 3.5" in scale.said
+    run = RunFolder(tmp_path)
+    assert read_measures(run).scale is None
+    keep_scale(run, scale)
+    assert read_measures(run).scale == scale
+
+
+@pytest.mark.parametrize(
+    ("second", "distance", "message"),
+    [
+        ((0.0, 0.0, 1.0), 0.0, "the distance is 0 m; it must be greater than 0"),
+        ((0.0, 0.0, 1.0), float("nan"), "the distance is nan m"),
+        ((0.0, 0.0, 0.0), 0.1, "the two points are the same"),
+        ((0.0, 0.0, 1.0), 1e12, "a unit of the scene would be 1e\\+12 m long"),
+    ],
+)
+def test_no_distance_and_no_two_points_are_refused(second, distance, message):
+    with pytest.raises(ConfigError, match=message):
+        scale_between((0.0, 0.0, 0.0), second, distance)
+
+
+def test_points_count_on_the_surface_that_views_show():
+    facing = np.array([1.0, 0.2, 0.3]) / np.linalg.norm([1.0, 0.2, 0.3])
+    require_on_surface(BALL, FRAME.to_world(RADIUS * facing).tolist())
+    for place, reason in (((RADIUS + 0.3) * facing, "pixels off"), (np.array([0.0, 0, 90]), "no view shows")):
+        with pytest.raises(ConfigError, match=f"not on the object: .*{reason}"):
+            require_on_surface(BALL, FRAME.to_world(place).tolist())
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [
+        {"metres_per_unit": -1.0, "how": "x"},
+        {"metres_per_unit": "0.1", "how": "x"},
+        {"metres_per_unit": True, "how": "x"},
+        {"metres_per_unit": 0.1, "how": "x" * 10_000},
+        {"how": "x"},
+        [0.1],
+    ],
+)
+def test_a_damaged_file_is_refused(scale, tmp_path):
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "scale": scale}))
+    with pytest.raises(RunError, match=r"measures\.json is damaged"):
+        read_measures(RunFolder(tmp_path))
+
+
+def test_a_scene_may_know_its_unit():
+    assert recorded_scale({}) is None
+    found = recorded_scale({"metres_per_unit": 0.001})
+    assert isinstance(found, Scale)
+    assert found.metres_per_unit == 0.001
+    with pytest.raises(RunError, match=r"scene\.json is damaged"):
+        recorded_scale({"metres_per_unit": "a metre"})

@@ -1,0 +1,208 @@
+"""What a user measured in a run, kept in its folder as `measures.json`: how long a unit of its world is.
+
+The world is that of the scene's poses, in which probes and exports give positions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
+from unmix_plugin.trained.protocol import RenderableScene
+
+_LONGEST_TEXT = 200
+_CENTIMETRES_FROM_M, _METRES_FROM_M = 0.01, 1.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How long a unit of a scene's world is."""
+
+    metres_per_unit: float
+    """Metres."""
+    how: str
+    """Where this is known from, for people."""
+
+    def __post_init__(self) -> None:
+        low, high = METRES_RANGE
+        if not low <= self.metres_per_unit <= high:
+            raise ConfigError(
+                f"a unit of the scene would be {self.metres_per_unit:g} m long; expected {low:g} to {high:g}: is the "
+                "distance in metres?"
+            )
+
+    @property
+    def said(self) -> str:
+        """The scale as a line for people and for headers of files."""
+        return f"1 unit is {self.metres_per_unit:.6g} m ({self.how})"
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is kept with a run."""
+
+    scale: Scale | None = None
+    """As it was set for the run; None: as its scene says, if it does."""
+
+
+def describe_scale(scale: Scale | None) -> str:
+    """What headers of exported files say of lengths."""
+    return "lengths are in units of the scene, of unknown size" if scale is None else scale.said
+
+
+def describe_length(units: float, scale: Scale | None) -> str:
+    """A length of the world in metres, centimetres or millimetres, or in its units where their size is unknown.
+
+    >>> describe_length(0.5, Scale(0.1, "")), describe_length(0.5, None)
+    ('5 cm', '0.5 units')
+    """
+    if scale is None:
+        return f"{units:.4g} units"
+    metres = units * scale.metres_per_unit
+    if metres >= _METRES_FROM_M:
+        return f"{metres:.4g} m"
+    return f"{100 * metres:.4g} cm" if metres >= _CENTIMETRES_FROM_M else f"{1000 * metres:.4g} mm"
+
+
+def describe_area(square_units: float, scale: Scale | None) -> str:
+    """An area of the world in square metres or centimetres, or in its units where their size is unknown.
+
+    >>> describe_area(0.5, Scale(0.1, "")), describe_area(0.5, None)
+    ('50 cm²', '0.5 square units')
+    """
+    if scale is None:
+        return f"{square_units:.4g} square units"
+    square_metres = square_units * scale.metres_per_unit**2
+    return f"{square_metres:.4g} m²" if square_metres >= 1.0 else f"{1e4 * square_metres:.4g} cm²"
+
+
+def recorded_scale(summary: Mapping[str, Any]) -> Scale | None:
+    """What the scene of a run said of its world's units; None where it did not.
+
+    Raises:
+        RunError: the record is damaged.
+    """
+    metres = summary.get(METRES_KEY)
+    if metres is None:
+        return None
+    if type(metres) is not float and type(metres) is not int:
+        raise RunError(f"the run's scene.json is damaged: its {METRES_KEY} is {str(metres)[:40]!r}")
+    try:
+        return Scale(float(metres), "as the scene's poses say")
+    except ConfigError as error:
+        raise RunError(f"the run's scene.json is damaged: {error}") from error
+
+
+def read_measures(run: RunFolder) -> Measures:
+    """What is kept with a run; nothing where nothing was measured.
+
+    Raises:
+        RunError: the file is damaged.
+    """
+    path = _path(run)
+    if not path.exists() and not path.is_symlink():
+        return Measures()
+    values = read_run_json(path)
+    try:
+        return Measures(_scale_from_json(values.get("scale")))
+    except (LookupError, TypeError, ValueError, OverflowError, ConfigError) as error:
+        raise RunError(f"{path} is damaged: {error}; remove it, and measure again") from error
+
+
+def write_measures(run: RunFolder, measures: Measures) -> Path:
+    """Keep measures with a run, in place of those before.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    scale = measures.scale
+    values = {} if scale is None else {"scale": {"metres_per_unit": scale.metres_per_unit, "how": scale.how}}
+    write_run_json(_path(run), values)
+    return _path(run)
+
+
+def keep_scale(run: RunFolder, scale: Scale) -> Path:
+    """Set the scale of a run, in place of the one before; the file."""
+    return write_measures(run, replace(read_measures(run), scale=scale))
+
+
+def scale_between(first: Sequence[float], second: Sequence[float], distance_m: float) -> Scale:
+    """The scale of a world in which two points are so far apart.
+
+    Args:
+        first, second: x, y, z in the world.
+        distance_m: Metres.
+    Raises:
+        ConfigError: no distance, or no two points.
+    """
+    if not 0 < distance_m < math.inf:
+        raise ConfigError(f"the distance is {distance_m:g} m; it must be greater than 0")
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    units = float(np.linalg.norm(b - a))
+    if not units > 1e-9 * max(1.0, float(np.abs(a).max())):
+        raise ConfigError("the two points are the same; choose two that are a known distance apart")
+    return Scale(distance_m / units, f"{distance_m:g} m between {_text(a)} and {_text(b)}")
+
+
+_TOLERANCE_PX = 4.0
+"""By which a point may be before or behind what a view shows, in pixels as large as they are there."""
+
+
+def require_on_surface(scene: RenderableScene, point: Sequence[float]) -> None:
+    """Refuse a point of the world that lies on nothing that the scene's views show.
+
+    Raises:
+        ConfigError: no view sees a surface there.
+    """
+    import torch
+
+    world = np.asarray(point, dtype=np.float64)
+    place = torch.from_numpy(scene.frame.to_model(world)).float()[None]
+    nearest = math.inf
+    for view in scene.views:
+        camera = view.camera.to("cpu")
+        coords, depths = camera.project(place, 0)
+        column, row = (int(value) if math.isfinite(value) else -1 for value in coords[0].tolist())
+        width, height = camera.size(0)
+        if not (depths[0] > 0 and 0 <= column < width and 0 <= row < height):
+            continue
+        found = scene.probe(camera, column, row)
+        if found.world_position is None:
+            continue
+        pixel = float(depths[0] / camera.focal_px[0].min()) / scene.frame.scale
+        nearest = min(nearest, float(np.linalg.norm(found.world_position - world)) / pixel)
+        if nearest <= _TOLERANCE_PX:
+            return
+    seen = (
+        "no view shows anything there" if math.isinf(nearest) else f"the nearest is {nearest:.0f} pixels off"
+    )
+    raise ConfigError(
+        f"the point {_text(world)} is not on the object: {seen}; give a point as probes give it"
+    )
+
+
+def _text(point: Float64[np.ndarray, "3"]) -> str:
+    return " ".join(f"{value:.6g}" for value in point)
+
+
+def _scale_from_json(values: Any) -> Scale | None:
+    if values is None:
+        return None
+    metres, how = values["metres_per_unit"], values["how"]
+    if type(metres) not in (int, float) or not isinstance(how, str) or len(how) > _LONGEST_TEXT:
+        raise ValueError(f"its scale is {str(values)[:80]}")
+    return Scale(float(metres), "".join(letter for letter in how if letter.isprintable()))
+
+
+def _path(run: RunFolder) -> Path:
+    return run.path / "measures.json"
