@@ -1,7 +1,8 @@
 # One virtual environment for everything; each part of it is installed once, and again when its pins change.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+SCRIPTS := $(if $(filter Windows_NT,$(OS)),Scripts,bin)
+BIN := $(VENV)/$(SCRIPTS)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 DEMO_SECONDS := 45
 BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmarks/[a-z]*.py)))
@@ -9,13 +10,15 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum audit lint format bench site clean help
+.PHONY: demo test test-all test-minimum wheel platforms audit lint format bench site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
 	@echo "make test    run the tests, less the slow ones"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
+	@echo "make wheel   build sdist and wheel into dist, and use the wheel without the repository"
+	@echo "make platforms   look whether every dependency has wheels on every system (needs the network)"
 	@echo "make audit   look for known holes in what is pinned (needs the network)"
 	@echo "make lint    check format, lint rules, types and the import law"
 	@echo "make format  rewrite the code in the one format"
@@ -37,11 +40,7 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	@touch $@
 
 demo: $(VENV)/.installed
-	$(BIN)/unmix-train unmix-nerf --data demo --max-seconds $(DEMO_SECONDS) --pipeline.model.num-endmembers 6
-	@set -e; run=$$(ls -td outputs/demo/unmix-nerf/*/ | head -n 1); \
-	$(BIN)/unmix-eval --run "$$run"; \
-	$(BIN)/unmix-export abundances --run "$$run"; \
-	echo; echo "pictures: $${run}eval (true, predicted, error) and $${run}exports (abundance maps)"
+	$(BIN)/unmix-demo --seconds $(DEMO_SECONDS)
 
 # A browser, where it can be had; tried once.
 $(VENV)/.system-packages: scripts/install_system_packages.sh | $(BIN)/python
@@ -57,9 +56,22 @@ test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 # Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
 test-minimum:
 	$(PYTHON) -m venv $(MINIMUM)
-	$(MINIMUM)/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints-minimum.txt \
+	$(MINIMUM)/$(SCRIPTS)/python -m pip install --quiet --disable-pip-version-check --constraint constraints-minimum.txt \
 	  --editable '.[captures]' hypothesis imageio plyfile pytest spectral trimesh
-	$(MINIMUM)/bin/python -m pytest -W default --override-ini addopts=--import-mode=importlib $(MINIMUM_TESTS)
+	$(MINIMUM)/$(SCRIPTS)/python -m pytest -W default --override-ini addopts=--import-mode=importlib $(MINIMUM_TESTS)
+
+# What they need comes as wheels, so that no compiler is needed; spectral, of the tests, is plain Python.
+platforms: | $(BIN)/python
+	$(INSTALL) uv
+	@set -e; for system in linux macos windows; do for python in 3.10 3.14; do \
+	  echo "wheels for Python $$python on $$system"; \
+	  MACOSX_DEPLOYMENT_TARGET=14.0 $(BIN)/uv pip compile --quiet --only-binary :all: --python-platform $$system \
+	    --python-version $$python --constraint constraints.txt --extra captures --extra sfm --extra lmrm \
+	    --extra reference --extra tensorboard --extra docs --output-file /dev/null pyproject.toml; done; done
+
+wheel: | $(BIN)/python
+	$(INSTALL) build twine
+	$(BIN)/python scripts/check_wheel.py $(WHEEL_OPTIONS)
 
 audit: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
@@ -82,4 +94,4 @@ site: $(VENV)/.installed-dev
 	PYTHON=$(BIN)/python scripts/build_site.sh
 
 clean:
-	rm -rf $(VENV) $(MINIMUM) build .pytest_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf $(VENV) $(MINIMUM) build dist .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -15,7 +15,7 @@ HEAVY = (
     *("colour", "scipy", "skimage", "matplotlib", "warp", "OpenEXR", "viser", "pandas", "tensorboard"),
     *("h5py", "tifffile", "PIL", "pycolmap", "cv2"),
 )
-COMMANDS = ("train", "eval", "render", "demo_scene", "process", "view", "export")
+COMMANDS = ("train", "eval", "render", "demo_scene", "demo", "process", "view", "export")
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
         "unmix-export": "unmix_plugin.commands.scripts:export",
         "unmix-render": "unmix_plugin.commands.scripts:render",
         "unmix-image": "unmix_plugin.commands.scripts:image",
+        "unmix-demo": "unmix_plugin.commands.scripts:demo",
         "unmix-demo-scene": "unmix_plugin.commands.scripts:demo_scene",
         "unmix-process": "unmix_plugin.commands.scripts:process",
         "unmix-view": "unmix_plugin.commands.scripts:view",

@@ -7,6 +7,7 @@ import pytest
 
 from tests.commands.running import run
 from tests.docs.pages import ROOT, text_of
+from unmix_plugin.commands.demo import demo
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export, own_products
@@ -43,7 +44,7 @@ OF_LAUNCHERS = {
 @pytest.fixture(scope="module")
 def flags():
     """Every flag of every command."""
-    asked = [(command, ["--help"]) for command in (evaluate, image, render, view, write_demo_scene)]
+    asked = [(command, ["--help"]) for command in (demo, evaluate, image, render, view, write_demo_scene)]
     asked += [(process, ["--help"]), (inspect_command, ["--help"])]
     asked += [
         (train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published", "neumatex")

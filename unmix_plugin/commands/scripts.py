@@ -36,6 +36,11 @@ def render() -> NoReturn:
     _run("render", "render")
 
 
+def demo() -> NoReturn:
+    """`unmix-demo`."""
+    _run("demo", "demo")
+
+
 def demo_scene() -> NoReturn:
     """`unmix-demo-scene`."""
     _run("demo_scene", "write_demo_scene")

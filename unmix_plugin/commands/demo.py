@@ -1,0 +1,42 @@
+"""`unmix-demo`: does it work here, and what comes out? Train on the built-in scene, evaluate, export abundance maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from unmix_plugin.engine.configs import DeviceName
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Train on the built-in scene, evaluate the run, export its abundance maps, and say where the pictures are."""
+
+    seconds: float = 45.0
+    """Time to train."""
+    output_dir: Path = Path("outputs")
+    """Folder for the run."""
+    device: DeviceName = "auto"
+    """Where to compute; auto takes CUDA where there is one."""
+
+
+def demo(arguments: list[str]) -> None:
+    """Parse the arguments, do what the three commands do, say what to look at."""
+    options = tyro.cli(DemoOptions, prog="unmix-demo", args=arguments)
+
+    from unmix_plugin.commands.eval import evaluate
+    from unmix_plugin.commands.export import export
+    from unmix_plugin.commands.train import train
+    from unmix_plugin.engine.runs.run_folder import newest_run
+
+    where = ["--output-dir", str(options.output_dir), "--device", options.device]
+    train(
+        ["unmix-nerf", "--data", "demo", "--max-seconds", str(options.seconds), "--endmembers", "6", *where]
+    )
+    run = newest_run(options.output_dir)
+    evaluate(["--run", str(run.path), "--device", options.device])
+    export(["abundances", "--run", str(run.path), "--device", options.device])
+    print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
+    print(f"look around in it: unmix-view --run {run.path}")
