@@ -6,7 +6,7 @@ traceback and exit with status 2; anything else that escapes is an internal erro
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -56,6 +56,15 @@ def counted(number: int, noun: str) -> str:
     ('1 view', '12000 pixels')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def name_some(names: Sequence[str], most: int = 3) -> str:
+    """A few names for a message, and how many more there are.
+
+    >>> name_some(["a", "b", "c"], most=2)
+    'a, b and 1 more'
+    """
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def require(what: str, settings: Any, rules: dict[str, bool]) -> None:

@@ -10,6 +10,7 @@ import stat
 import zipfile
 from pathlib import Path
 from typing import BinaryIO, NoReturn
+from xml.etree import ElementTree
 
 from unmix_plugin.errors import UnmixError
 
@@ -138,3 +139,18 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     if size > most or len(data) > most:
         raise OSError(None, f"has {max(size, len(data)):,} bytes, and {most:,} at most are read", str(path))
     return data
+
+
+def parse_xml(data: bytes | str) -> ElementTree.Element:
+    """The root of an XML text.
+
+    Raises:
+        ValueError: it is damaged, or declares entities, which can grow without end.
+    """
+    found = data.encode() if isinstance(data, str) else data
+    if b"<!DOCTYPE" in found or b"<!ENTITY" in found:
+        raise ValueError("it declares a DOCTYPE or entities")
+    try:
+        return ElementTree.fromstring(data)
+    except (ElementTree.ParseError, LookupError) as error:  # LookupError: an unknown encoding
+        raise ValueError(str(error)) from error

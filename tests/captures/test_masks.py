@@ -11,7 +11,7 @@ from PIL import Image
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Raster
-from unmix_plugin.captures.masks import _find_background, choose_mask, clean, read_labels, read_view_masks
+from unmix_plugin.captures.masks import background_rule, choose_mask, clean, read_labels, read_view_masks
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.errors import CaptureError
@@ -22,13 +22,13 @@ GENERATOR = np.random.default_rng(0)
 @pytest.mark.parametrize(("kind", "level", "matter"), [("black", 0.03, 0.12), ("white", 0.95, 0.8)])
 def test_the_threshold_lies_beyond_the_noise_of_the_border(kind, level: float, matter: float):
     border = level + 0.01 * GENERATOR.standard_normal((5000, 8)).astype(np.float32)
-    rule = _find_background(kind, border, 1.0)
+    rule = background_rule(kind, border, np.ones((500, 8), np.float32))
     assert rule.matter(border[None]).mean() < 1e-3
     assert rule.matter(np.full((1, 10, 8), matter, np.float32)).all()
 
 
 def test_a_white_background_is_bright_in_every_band():
-    rule = _find_background("white", np.full((100, 8), 0.98, np.float32), 1.0)
+    rule = background_rule("white", *2 * [np.full((100, 8), 0.98, np.float32)])
     leaf = np.full((1, 1, 8), 0.98, np.float32)
     leaf[..., 3] = 0.4
     assert rule.matter(leaf).all()
@@ -37,7 +37,7 @@ def test_a_white_background_is_bright_in_every_band():
 @pytest.mark.parametrize(("kind", "level"), [("black", 0.5), ("white", 0.2)])
 def test_a_border_of_another_kind_is_refused(kind, level: float):
     with pytest.raises(CaptureError, match=f"--mask {kind}: the border of the views is at {level:.0%}"):
-        _find_background(kind, np.full((100, 8), level, np.float32), 1.0)
+        background_rule(kind, np.full((100, 8), level, np.float32), np.ones((9, 8), np.float32))
 
 
 def test_large_holes_and_parts_stay():

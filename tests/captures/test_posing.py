@@ -24,8 +24,8 @@ FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 
 
 def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
-    placed = _place_poses(elsewhere(ring_set(12)))
-    stacked = np.stack([camera.camera_to_world for camera in placed.poses.cameras.values()])
+    placed, placement, notes = _place_poses(elsewhere(ring_set(12)))
+    stacked = np.stack([camera.camera_to_world for camera in placed.cameras.values()])
     np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
     np.testing.assert_allclose(stacked[:, 2, 0], 0, atol=1e-9)  # horizontal axes lie flat
     assert (stacked[:, 2, 1] > 0).all()
@@ -35,26 +35,24 @@ def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
 
 def test_what_was_placed_returns_to_the_source():
     poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
-    placed = _place_poses(poses)
-    for name, camera in placed.poses.cameras.items():
-        back = placed.placement.to_source(camera.camera_to_world[:, 3])
+    placed, placement, notes = _place_poses(poses)
+    for name, camera in placed.cameras.items():
+        back = placement.to_source(camera.camera_to_world[:, 3])
         np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
-    assert placed.poses.points is not None
+    assert placed.points is not None
     assert poses.points is not None
-    np.testing.assert_allclose(
-        placed.placement.to_source(placed.poses.points), poses.points + FAR, rtol=0, atol=1e-8
-    )
+    np.testing.assert_allclose(placement.to_source(placed.points), poses.points + FAR, rtol=0, atol=1e-8)
 
 
 def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
     row = in_a_row()
-    placed = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
-    np.testing.assert_array_equal(placed.placement.rotation, np.eye(3))
-    assert "up is the source's" in placed.notes
-    placed = _place_poses(type(row)(row.cameras, row.source, points))
-    np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), [2, 2, -3])
-    assert "up is the mean of the cameras' up vectors" in placed.notes
+    placed, placement, notes = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
+    np.testing.assert_array_equal(placement.rotation, np.eye(3))
+    assert "up is the source's" in notes
+    placed, placement, notes = _place_poses(type(row)(row.cameras, row.source, points))
+    np.testing.assert_allclose(placement.to_source(np.zeros(3)), [2, 2, -3])
+    assert "up is the mean of the cameras' up vectors" in notes
 
 
 def flight_over(points):
@@ -65,19 +63,18 @@ def flight_over(points):
 
 def test_land_lies_level_below_the_cameras_of_a_flight():
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)) * np.array([1, 1, 0.01])
-    placed = _place_poses(flight_over(points), is_flight=True)
-    assert placed.poses.points is not None
-    assert np.ptp(placed.poses.points[:, 2]) < 0.1 * np.ptp(placed.poses.points[:, 0])
-    assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.poses.cameras.values())
-    assert any("up is against where the cameras look" in note for note in placed.notes)
-    np.testing.assert_allclose(placed.placement.to_source(np.zeros(3)), np.median(points, axis=0), atol=1e-9)
+    placed, placement, notes = _place_poses(flight_over(points), is_flight=True)
+    assert placed.points is not None
+    assert np.ptp(placed.points[:, 2]) < 0.1 * np.ptp(placed.points[:, 0])
+    assert all(camera.camera_to_world[2, 3] > 0.5 for camera in placed.cameras.values())
+    assert any("up is against where the cameras look" in note for note in notes)
+    np.testing.assert_allclose(placement.to_source(np.zeros(3)), np.median(points, axis=0), atol=1e-9)
 
 
 def test_cameras_turned_about_a_subject_are_no_flight_whatever_took_them():
     given = elsewhere(ring_set(12))
-    np.testing.assert_array_equal(
-        _place_poses(given, is_flight=True).placement.rotation, _place_poses(given).placement.rotation
-    )
+    flown, turned = _place_poses(given, is_flight=True), _place_poses(given)
+    np.testing.assert_array_equal(flown[1].rotation, turned[1].rotation)
 
 
 def test_sparse_points_are_written_with_their_colours(tmp_path):
@@ -93,11 +90,9 @@ def test_sparse_points_are_written_with_their_colours(tmp_path):
 
 def test_written_placements_are_read_back_to_the_source(tmp_path):
     poses = elsewhere(ring_set(offset=FAR))
-    placed = _place_poses(poses)
-    stacked = {name: camera.camera_to_world for name, camera in placed.poses.cameras.items()}
-    found = read_poses(
-        write_json(tmp_path / "transforms.json", transforms(stacked, **placed.placement.to_json()))
-    )
+    placed, placement, notes = _place_poses(poses)
+    stacked = {name: camera.camera_to_world for name, camera in placed.cameras.items()}
+    found = read_poses(write_json(tmp_path / "transforms.json", transforms(stacked, **placement.to_json())))
     for name, camera in poses.cameras.items():
         mine = found.cameras[name].camera_to_world
         np.testing.assert_allclose(mine[:, :3], camera.camera_to_world[:, :3], atol=1e-9)

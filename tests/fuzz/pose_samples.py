@@ -47,9 +47,9 @@ COLMAP_POINTS = b"1 0.5 0.25 1 255 0 7 0.3 1 0 2 0\n2 1 2 3 1 2 3 0.5\n"
 def read_and_place(path: Path) -> None:
     """Read poses and do with them what a scene needs."""
     poses = read_poses(path)
-    placed = _place_poses(poses)
+    placed, _, _ = _place_poses(poses)
     match_poses(poses, [(name, []) for name in poses.cameras])
-    for camera in placed.poses.cameras.values():
+    for camera in placed.cameras.values():
         assert np.isfinite(camera.camera_to_world).all()
         np.testing.assert_allclose(np.linalg.det(camera.camera_to_world[:, :3]), 1.0, atol=1e-6)
 

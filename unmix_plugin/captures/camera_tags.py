@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import DEEPEST
 
 FactorOf: TypeAlias = Callable[[Int[np.ndarray, "h 1"], Int[np.ndarray, "1 W"]], Float64[np.ndarray, "h W"]]
@@ -50,10 +50,7 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 def parse_xmp(packet: bytes | str) -> XmpTags:
-    """Tags of an XMP packet, elements and attributes alike; empty if it is damaged.
-
-    A packet that declares entities is taken as damaged: no camera writes one.
-    """
+    """Tags of an XMP packet, elements and attributes alike; empty if it is damaged, or declares entities."""
     text = packet.decode("utf-8", "replace") if isinstance(packet, bytes) else packet
     start, end = text.find("<rdf:RDF"), text.rfind("</rdf:RDF>")
     opening = text.find("<x:xmpmeta")
@@ -206,29 +203,16 @@ class RadiometricModel:
         unit = "relative radiance" if self.unit == "relative" else f"radiance in {self.unit}"
         return f"{unit} by {self.maker}'s calibration in the file, black level {self.black_level:g}"
 
-    def apply(
-        self, values: Float[np.ndarray, "h W b"], rows: slice = slice(None), columns: slice = slice(None)
-    ) -> Float32[np.ndarray, "h W b"]:
-        """Radiance of some rows; a little below 0 where noise goes below the black level.
-
-        Args:
-            values: Stored numbers of these rows and columns; every band is treated alike.
-            rows, columns: Which ones of the file they are.
-        """
-        y, x = (
-            (part.start or 0) + (part.step or 1) * np.arange(count)
-            for part, count in zip((rows, columns), values.shape, strict=False)
-        )
-        factor = self.factor_of(y[:, None], x[None, :])
+    def apply(self, values: Float[np.ndarray, "h W b"], rows: slice) -> Float32[np.ndarray, "h W b"]:
+        """Radiance of stored numbers of some rows; a little below 0 where noise goes below the black level."""
+        y = (rows.start or 0) + (rows.step or 1) * np.arange(len(values))
+        factor = self.factor_of(y[:, None], np.arange(values.shape[1])[None, :])
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
 def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
-    """The calibration that a file carries in `metadata["xmp"]` and `metadata["exif"]`; None where there is none.
-
-    Raises:
-        CaptureError: the file has a calibration that lacks a number, or one that can't be.
-    """
+    """The calibration that a file carries in `metadata["xmp"]` and `metadata["exif"]`; None where there is none. Raises
+    CaptureError: the file has a calibration that lacks a number, or one that can't be."""
     tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
     read = next((read for mark, read in _MAKERS.items() if tag_numbers(tags, mark) is not None), None)
     if read is None:
@@ -237,8 +221,8 @@ def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
     probe = model.factor_of(np.array([[0], [file.shape[0] - 1]]), np.arange(file.shape[1])[None, :])
     if not (np.isfinite(probe).all() and (probe > 0.0).all()):
         raise CaptureError(
-            f"{file.path}: the calibration in its XMP gives factors from {probe.min():g} to {probe.max():g} in the "
-            "first and last row; expected positive numbers: the tags of exposure, gain or vignetting are damaged"
+            f"{file.path}: the calibration in its XMP gives factors from {probe.min():g} to {probe.max():g}; expected "
+            "positive numbers: the tags of exposure, gain or vignetting are damaged"
         )
     return model
 
@@ -333,9 +317,8 @@ def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Radiomet
     (gain,) = _xmp(file, tags, 1, "drone-dji:SensorGain", positive=True)
     (microseconds,) = _xmp(file, tags, 1, "drone-dji:ExposureTime", positive=True)
     adjustment = tag_numbers(tags, "drone-dji:SensorGainAdjustment") or [1.0]
-    levels = exif.get("BlackLevel") or _xmp(
-        file, tags, 1, "drone-dji:BlackLevel", "BlackLevel", "BlackCurrent"
-    )
+    names = ("drone-dji:BlackLevel", "BlackLevel", "BlackCurrent")
+    levels = exif.get("BlackLevel") or _xmp(file, tags, 1, *names)
     polynomial = tag_numbers(tags, "VignettingData", "VignettingPolynomial") or []
     centre = [0.0, 0.0]
     if polynomial:
@@ -363,8 +346,8 @@ def _required(
         kind = "positive number" if positive else "number"
         found = "it is absent" if numbers is None else f"found {numbers}"
         raise CaptureError(
-            f"{file.path}: the tag {name} should hold {count} {kind}{'s' if count > 1 else ''}; {found}. "
-            "Without it the stored numbers can't become radiance: export the image with its metadata"
+            f"{file.path}: the tag {name} should hold {counted(count, kind)}; {found}. Without it the stored numbers "
+            "can't become radiance: export the image with its metadata"
         )
     return numbers
 

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -24,7 +25,7 @@ from jaxtyping import Bool, Float32, Float64
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
-from unmix_plugin.errors import counted
+from unmix_plugin.errors import counted, name_some
 
 _FEW_VIEWS = 15
 _NARROW_DEG = 12.0
@@ -120,27 +121,12 @@ class SeenView:
             return np.log(found)
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """What the checks say, one sentence each."""
-
-    findings: tuple[str, ...]
-    """What looks wrong."""
-    measured: tuple[str, ...]
-    """What was looked at, with its numbers."""
-
-    def with_more(self, findings: Sequence[str], measured: Sequence[str]) -> _Checked:
-        """These and others, found elsewhere."""
-        return _Checked((*self.findings, *findings), (*self.measured, *measured))
+_Checked: TypeAlias = tuple[list[str], list[str]]
+"""What looks wrong, and what was looked at with its numbers, one sentence each."""
 
 
 def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
-    """All checks.
-
-    Args:
-        views: Of one sensor, in order.
-        points: Sparse points, if there are any.
-    """
+    """All checks of the views of one sensor, in order, with the sparse points, if there are any."""
     findings, measured = [], []
     if len(views) < _FEW_VIEWS:
         findings.append(
@@ -156,24 +142,14 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
     ):
         findings += found
         measured.append(said)
-    return _Checked(tuple(findings), tuple(measured))
+    return findings, measured
 
 
 def report_text(title: str, checked: _Checked, done: Sequence[str]) -> str:
-    """One page of text: what looks wrong, what was measured, what was done.
-
-    Args:
-        title: First line.
-        checked: Of the checks.
-        done: What was done, one sentence each.
-    """
-    wrong = checked.findings or ("nothing that these checks can see",)
-    parts = [title, ""]
-    for heading, lines in (
-        ("What looks wrong", wrong),
-        ("What was measured", checked.measured),
-        ("What was done", done),
-    ):
+    """One page of text: what looks wrong, what was measured, what was done."""
+    wrong, parts = checked[0] or ["nothing that these checks can see"], [title, ""]
+    headings = ("What looks wrong", "What was measured", "What was done")
+    for heading, lines in zip(headings, (wrong, checked[1], done), strict=True):
         parts.append(heading)
         parts += [
             textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
@@ -190,7 +166,7 @@ def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
 
 
 def _some(names: list[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    return name_some(names, 5)
 
 
 def _pixels(views: Sequence[SeenView]) -> list[str]:
@@ -263,19 +239,20 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
         seen = [np.isfinite(views[other]._pixels_of(points)).all(axis=1).mean() for other in near]
         shares[index] = max(seen, default=0.0)
     alone = [index for index in range(len(views)) if shares[index] < _LEAST_OVERLAP]
-    findings = []
-    if alone:
-        worst = min(alone, key=lambda index: shares[index])
-        names = ", ".join(views[index].name for index in alone[:5]) + (" and more" if len(alone) > 5 else "")
-        findings.append(
-            f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of "
-            f"{views[worst].name} at most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from "
-            f"{nearest[worst]:.0f} degrees away; take views in smaller steps"
-        )
-    return findings, (
+    said = (
         f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "
         f"looks from {np.median(nearest):.0f} degrees away (median; most {nearest.max():.0f})"
     )
+    if not alone:
+        return [], said
+    worst = min(alone, key=lambda index: shares[index])
+    names = _some([views[index].name for index in alone])
+    finding = (
+        f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of {views[worst].name} at "
+        f"most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from {nearest[worst]:.0f} degrees away; "
+        "take views in smaller steps"
+    )
+    return [finding], said
 
 
 def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
@@ -311,10 +288,7 @@ def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
 def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
     """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
     if points is None or len(points) < _LEAST_SHARED_POINTS or len(views) < _LEAST_VIEWS:
-        missing = (
-            "exposure is not compared: it takes sparse points, which come with estimated poses and COLMAP"
-        )
-        return [], missing
+        return [], "exposure is not compared: it takes sparse points, as of estimated poses and COLMAP"
     angles = angles_between(views) + 360.0 * np.eye(len(views))
     before = [view._has_before_it(points) for view in views]
     gains = np.full(len(views), np.nan)  # logarithms, against the views around
@@ -346,10 +320,7 @@ def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[li
     """Whether the light moves with the camera, as on a turntable."""
     found = _slope_of_light(views, points)
     if found is None:
-        return (
-            [],
-            "whether light moves with the camera is not measured: it takes sparse points and near views",
-        )
+        return [], "whether light moves with the camera is not measured: too few sparse points or near views"
     slope, error, pairs = found
     said = (
         f"the brightness of sparse points has a slope of {slope:.2f} +- {error:.2f} along the movement of "
@@ -357,11 +328,8 @@ def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[li
     )
     if abs(slope) <= max(_LEAST_SLOPE, _CERTAINTY * error):
         return [], said
-    finding = (
-        f"light moves with the camera, as when an object is turned before fixed lamps: {said}. Shading of a point then "
-        "changes from view to view"
-    )
-    return [finding], said
+    moves = "light moves with the camera, as when an object is turned before fixed lamps"
+    return [f"{moves}: {said}. Shading of a point then changes from view to view"], said
 
 
 def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:

@@ -98,12 +98,11 @@ def make_demo_capture(
     place: Place | None = None,
     backdrop: Backdrop | None = None,
 ) -> None:
-    """Write the demo capture. It is built beside the folder and moved in when complete.
+    """Write the demo capture, in place of an older one. It is built beside the folder and moved in when complete.
 
     Args:
         directory: Made if absent, parents too.
-        overwrite: Whether a folder with something in it is accepted: an older capture there is replaced, other files
-            stay.
+        overwrite: Whether a folder with something in it is accepted; files that are not ours stay.
         illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
         place: What there is to see, and from where; None is the table with speckles on every surface.
         backdrop: What is behind all things; None is nothing.
@@ -113,12 +112,12 @@ def make_demo_capture(
         SceneError: the folder can't be written, or the disk is full.
     """
     place = place or Place(speckled_things(), demo_cameras)
-    numbers = {
+    bounds = {
         "size": (size, SIZE_BOUNDS),
         "bands": (bands, _RAW_BANDS_BOUNDS),
         "views": (views, VIEWS_BOUNDS),
     }
-    check_bounds("a demo capture", numbers)
+    check_bounds("a demo capture", bounds)
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
     cameras, spectra = place.cameras(size, views), reflectances(sampling.centers_nm)
@@ -139,13 +138,8 @@ def make_demo_capture(
 
 
 def marked_place(things: Sequence[Thing] | None = None) -> Place:
-    """The table with a board of markers around the plate, as seen by a lens that is wide enough for it.
-
-    Args:
-        things: What there is besides; None is the speckled things of the demo.
-    Raises:
-        ConfigError: OpenCV, which knows the markers, is not installed.
-    """
+    """The table (or other things) with a board of markers around the plate, as seen by a lens that is wide enough.
+    Raises ConfigError: OpenCV, which knows the markers, is not installed."""
     placement = Placement("box", (0.0, 0.0, _BOARD_TOP - 0.02), (_BOARD_REACH, _BOARD_REACH, 0.02))
     board = Thing(placement, Surface("white", "purple", _print_of_markers()))
     cameras = partial(demo_cameras, angle_deg=_BOARD_ANGLE_DEG)
@@ -158,7 +152,7 @@ def _print_of_markers() -> Blend:
         import cv2
     except ImportError as error:
         raise ConfigError(
-            "the board of markers can't be printed: OpenCV is not installed; pip install 'unmix-nerf[sfm]'"
+            "OpenCV, which prints markers, is not installed; pip install 'unmix-nerf[sfm]'"
         ) from error
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, MARKER_FAMILY))
     cells = dictionary.markerSize + 2  # with the black border
@@ -284,13 +278,7 @@ class _LineCamera:
 def _demo_line_camera(
     width: int, wavelengths_nm: Float[np.ndarray, " B"], lamp: Float[np.ndarray, " B"]
 ) -> _LineCamera:
-    """The demo's line camera.
-
-    Args:
-        width: Columns of its images.
-        wavelengths_nm: Band centres.
-        lamp: Power of the lamp in each band, in any unit.
-    """
+    """The demo's line camera, of so many columns, under a lamp of this power in each band, in any unit."""
     generator = np.random.default_rng(8)
     bands = len(wavelengths_nm)
     # Silicon behind a grating: most sensitive in the green, a third of that at 400 nm.

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32
 
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.options import ProcessOptions
@@ -31,7 +31,7 @@ from unmix_plugin.captures.poses.marker_detection import (
 from unmix_plugin.captures.poses.markers import metric_poses, poses_from_markers
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.poses.turntable import poses_from_turntable
-from unmix_plugin.captures.poses.turntable_evidence import Turn, parse_angles
+from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.captures.posing import ESTIMATE, FROM_PICTURES, MARKERS, TURNTABLE, lens_of_view
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
@@ -45,29 +45,21 @@ _BLOCK_VALUES = 1 << 22
 
 
 def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
-    """Refuse what does not fit together, before anything is read.
-
-    Raises:
-        ConfigError: a flag is wrong, or asks for what this way of finding poses does not use.
-        CaptureError: OpenCV is not installed.
-    """
+    """Refuse what does not fit together, before anything is read. Raises ConfigError: a flag is wrong, or asks for what
+    this way of finding poses does not use. Raises CaptureError: OpenCV is not installed."""
     found = options.poses in FROM_PICTURES
     for flag, value in (("--marker-size", options.marker_size), ("--marker-family", options.marker_family)):
         if value is not None and not found:
-            raise ConfigError(
-                f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; leave it out, or give one of them"
-            )
+            raise ConfigError(f"{flag} goes with --poses {', '.join(FROM_PICTURES)}; give one of them")
     if options.marker_family is not None and options.marker_size is None and options.poses != MARKERS:
         raise ConfigError("--marker-family needs --marker-size, the side of a marker in metres")
     low, high = _MARKER_SIZES_M
     if options.marker_size is not None and not low <= options.marker_size <= high:
-        raise ConfigError(
-            f"--marker-size {options.marker_size:g}: expected the side of a marker in metres, {low} to {high:g}"
-        )
+        raise ConfigError(f"--marker-size {options.marker_size:g}: expected metres, {low} to {high:g}")
     parse_family(options.marker_family)
     if (options.angles is None) == (options.poses == TURNTABLE):
         raise ConfigError(
-            f"--poses {TURNTABLE} and --angles go together; give the angles of the views, such as --angles 0:360:10"
+            f"--poses {TURNTABLE} and --angles go together; give both, such as --angles 0:360:10"
         )
     if options.angles is not None:
         parse_angles(options.angles, [view.name for view in capture.views])
@@ -132,29 +124,16 @@ def poses_of_written_views(
     masks = shown if plan.mask != "none" or any(view.alpha is not None for view in plan.views) else None
     if options.poses == ESTIMATE:
         poses = estimate_poses(pictures, work, {view.name: view.sensor for view in plan.views}, masks)
+    elif len(plan.sensors) > 1:
+        raise CaptureError(f"--poses {TURNTABLE} knows one camera; process the views of one lens alone")
     else:
-        assert options.angles is not None
-        poses = _turned_poses(
-            plan, pictures, masks, parse_angles(options.angles, [view.name for view in plan.capture.views])
-        )
+        turns = parse_angles(options.angles or "", [view.name for view in plan.capture.views])
+        poses = poses_from_turntable(pictures, turns, masks)
     if options.marker_size is not None:
         sightings, notes = _sightings(plan, options)
         poses = metric_poses(poses, sightings, options.marker_size)
         poses = replace(poses, notes=(*poses.notes, *notes))
     return _in_files(plan, poses)
-
-
-def _turned_poses(
-    plan: Plan,
-    pictures: Mapping[str, UInt8[np.ndarray, "H W"]],
-    masks: Mapping[str, Bool[np.ndarray, "H W"]] | None,
-    turns: Mapping[str, Turn],
-) -> PoseSet:
-    if len({view.sensor for view in plan.views}) > 1:
-        raise CaptureError(
-            f"--poses {TURNTABLE} knows one camera; expected views of one sensor: process the views of one lens alone"
-        )
-    return poses_from_turntable(pictures, turns, masks)
 
 
 def _in_files(plan: Plan, poses: PoseSet) -> PoseSet:
@@ -195,18 +174,14 @@ def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str
         pictures = {view.name: _light(view, calibration, [band])[0] for view in views}
         found, said = find_markers(pictures, chosen)
         sightings |= found
-        where = (
-            "the mean of all bands"
-            if band is None
-            else f"the band at {plan.sensors[sensor].centers_nm[band]:g} nm"
-        )
+        light = "the mean of all bands" if band is None else f"{plan.sensors[sensor].centers_nm[band]:g} nm"
+        where = light if band is None else f"the band at {light}"
         notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *said]
     if not sightings:
         others = _other_families(plan) if family is not None else ""
         asked = "no markers are" if family is None else f"no markers of {family} are"
         raise CaptureError(
-            f"{asked} in the pictures{others}; expected printed markers of OpenCV, sharp, with a white rim, at least "
-            "20 pixels wide"
+            f"{asked} in the pictures{others}; expected sharp ones, with a white rim, at least 20 pixels wide"
         )
     return {view.name: sightings.get(view.name, {}) for view in plan.views}, notes
 
@@ -223,9 +198,7 @@ def _choose(
     family = family or _family_of(sample)
     if family is None:
         return None, None
-    counts = [
-        count_markers([pictures[index] for pictures in sample], family)[family] for index in range(len(bands))
-    ]
+    counts = [count_markers([pictures[i] for pictures in sample], family)[family] for i in range(len(bands))]
     best = int(np.argmax(counts))
     return (family, bands[best]) if counts[best] else (None, None)
 

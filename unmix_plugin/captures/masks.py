@@ -20,10 +20,9 @@ from jaxtyping import Bool, Float32, UInt8
 from unmix_plugin.captures.calibration.calibration import Raster
 from unmix_plugin.captures.calibration.sensor import Sensor, sampled_rows
 from unmix_plugin.captures.options import MaskKind
-from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import CaptureView
-from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.images import UnreadableImageError, white_of
+from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_picture, white_of
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -49,13 +48,8 @@ _BRIGHT_PERCENTILE = 99.0
 
 
 def choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind, list[str]]:
-    """What tells matter from background, `auto` where files don't, and what a user should know of it.
-
-    The views of a rig are left whole.
-
-    Raises:
-        CaptureError: opacity is asked of files that some views don't have.
-    """
+    """What tells matter from background, `auto` where files don't, and what a user should know of it; the views of a
+    rig are left whole. CaptureError where opacity is asked of files that some views don't have."""
     if asked not in ("auto", "files"):
         return asked, []
     found = [has_opacity(view, alpha_only=asked == "auto") for view in views]
@@ -64,8 +58,8 @@ def choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind
         return "files", []
     if asked == "files":
         raise CaptureError(
-            f"--mask files: view {missing[0]} has no mask; expected a picture with an alpha channel, or a mask that is "
-            "white where matter is, for every view"
+            f"--mask files: view {missing[0]} has no mask; expected an alpha channel, or a mask that is white where "
+            "matter is, for every view"
         )
     # What the lenses of a rig see from above is ground: a field or water is as plain as a backdrop and is the scene.
     otherwise: MaskKind = "none" if any(view.release for view in views) else "auto"
@@ -107,19 +101,14 @@ def _brightness(kind: _Background, values: Float32[np.ndarray, "*pixels B"]) -> 
     return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
-def _find_background(
-    kind: _Background, border: Float32[np.ndarray, "N B"], brightest: float
+def background_rule(
+    kind: _Background, border: Float32[np.ndarray, "M c"], sample: Float32[np.ndarray, "N c"]
 ) -> BackgroundRule:
-    """The rule that fits pixels at the border of the views.
-
-    Args:
-        kind: What the background is said to be.
-        border: Spectra at the border of all views.
-        brightest: A high percentile of what the kind is judged by, over whole views.
-    Raises:
-        CaptureError: most of the border is not white or black.
-    """
+    """The rule that fits the border of the views, beside a sample of all their pixels. CaptureError where most of the
+    border is not of this kind."""
     brightness = _brightness(kind, border)
+    everywhere = np.concatenate([_brightness(kind, sample), brightness])
+    brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHT_PERCENTILE))
     level = float(np.median(brightness))
     deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
     distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)
@@ -134,33 +123,7 @@ def _find_background(
     return BackgroundRule(kind, threshold, level, deviation)
 
 
-def background_rule(
-    sensor: Sensor,
-    views: Sequence[CaptureView],
-    scale: float,
-    kind: _Background,
-    sample: Float32[np.ndarray, "N c"],
-) -> BackgroundRule:
-    """The rule that fits the border of the views.
-
-    Args:
-        scale: Calibrated values are divided by it.
-        sample: Pixels of all views, divided already.
-    Raises:
-        CaptureError: most of the border is not of this kind.
-    """
-    pixels = _border(sensor, views, scale)
-    return _find_background(kind, pixels, _brightest(kind, sample, pixels))
-
-
-def _brightest(
-    kind: _Background, sample: Float32[np.ndarray, "N c"], border: Float32[np.ndarray, "M c"]
-) -> float:
-    everywhere = np.concatenate([_brightness(kind, sample), _brightness(kind, border)])
-    return float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHT_PERCENTILE)) if len(everywhere) else 0.0
-
-
-def _border(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
+def border_pixels(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
     """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
     raster = sensor.calibration.raster
     width = max(1, round(_BORDER_SHARE * raster.width))
@@ -249,11 +212,8 @@ def read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> Vie
 
 
 def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
-    """True materials of a view; None if it has none, or if pixels are averaged.
-
-    Raises:
-        CaptureError: the file can't be read, has another size than the cube, or is a picture in colour.
-    """
+    """True materials of a view; None if it has none, or if pixels are averaged. Raises CaptureError: the file can't be
+    read, has another size than the cube, or is a picture in colour."""
     if view.labels is None or raster.binning > 1:
         return None
     labels = _read(view.labels, np.asarray, view)
@@ -262,10 +222,9 @@ def read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] |
         or labels.dtype.kind not in "bui"
         or not 0 <= int(labels.min()) <= int(labels.max()) <= 255
     ):
-        channels = 1 if labels.ndim == 2 else labels.shape[2]
+        channels = counted(1 if labels.ndim == 2 else labels.shape[2], "channel")
         raise CaptureError(
-            f"{view.labels}: {counted(channels, 'channel')} of {labels.dtype.name}; expected labels of 0 to 255 in one "
-            "channel, grey or by palette: write them so, or leave them out"
+            f"{view.labels}: {channels} of {labels.dtype.name}; expected labels of 0 to 255 in one channel"
         )
     return _cut(labels, raster).astype(np.uint8)
 
@@ -279,11 +238,11 @@ def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
             )
         return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
     picture = _alpha_picture(view)
-    return (
-        None
-        if picture is None
-        else _read(picture, lambda image: np.asarray(image.convert("RGBA")), view)[..., 3]
-    )
+    return None if picture is None else _read(picture, _opacity_of, view)
+
+
+def _opacity_of(image: Image.Image) -> np.ndarray:
+    return np.asarray(image.convert("RGBA"))[..., 3]
 
 
 def _alpha_picture(view: CaptureView) -> Path | None:
@@ -307,18 +266,7 @@ def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
 
 def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: CaptureView) -> np.ndarray:
     """What `pixels_of` makes of a picture with the pixels of the cube."""
-    from PIL import Image
-
-    height, width, _ = view.cube.shape
     try:
-        with Image.open(path, formats=_FORMATS) as picture:
-            if picture.size != (width, height):
-                raise CaptureError(
-                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels (width x height); expected "
-                    f"{width} x {height}, as the cube of view {view.name} has"
-                )
-            return pixels_of(picture)
+        return read_picture(path, view.cube.shape[:2], pixels_of, _FORMATS)
     except UnreadableImageError as error:
-        raise CaptureError(f"{path} {error}") from error
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise CaptureError(f"{path} can't be read as a picture ({error}); mend or remove it") from error
+        raise CaptureError(f"{path} of view {view.name} {error}") from error

@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64, Int
@@ -55,13 +56,8 @@ _POSES_OFF_PX = 4.0
 """Distance left with any lens, from which poses are said to be wrong."""
 
 
-@dataclass(frozen=True)
-class MatchedView:
-    """A view and where its picture lies."""
-
-    name: str
-    camera: PosedCamera
-    picture: Path
+MatchedView: TypeAlias = tuple[PosedCamera, Path]
+"""A camera, with the lens of its picture, and where this lies."""
 
 
 @dataclass(frozen=True)
@@ -92,20 +88,15 @@ class _Star:
 def check_matches(
     views: Sequence[MatchedView], angles_deg: Float64[np.ndarray, "N N"]
 ) -> tuple[list[str], str]:
-    """What does not fit, one sentence each, and what was measured.
-
-    Args:
-        views: Of one sensor, their cameras with lenses of the pictures.
-        angles_deg: Between their optical axes.
-    """
+    """What does not fit, one sentence each, and what was measured; of views of one sensor, with the angles between
+    their optical axes."""
     chosen = _choose_stars(angles_deg)
     used = sorted({index for star in chosen for index in star})
-    features = {index: _features_of(views[index]) for index in used}
-    found = [
-        _find_star([views[index] for index in star], [features[index] for index in star]) for star in chosen
-    ]
+    features = {index: _features_of(views[index][1]) for index in used}
+    cameras = [camera for camera, _ in views]
+    found = [_find_star([cameras[i] for i in star], [features[i] for i in star]) for star in chosen]
     stars = [star for star in found if star is not None]
-    lens = views[0].camera.lens
+    lens = cameras[0].lens
     if lens is None or sum(len(star.ideal) for star in stars) < _LEAST_POINTS:
         return [], "poses and lens are not compared with matched points: too few views share features"
     return _judge(stars, lens)
@@ -143,9 +134,9 @@ def _judge(stars: Sequence[_Star], lens: Lens) -> tuple[list[str], str]:
     is_better = left < min(_BETTER * start, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
     if start > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
         finding = (
-            f"the pictures do not fit their lens: {said}, but {left / shrunk:.2f} px with a focal length "
-            f"of {np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens "
-            "of another model (a fisheye), or given for pictures of another size or crop?"
+            f"the pictures do not fit their lens: {said}, but {left / shrunk:.2f} px with a focal length of "
+            f"{np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens of another "
+            "model (a fisheye), or given for pictures of another size or crop?"
         )
         return [finding], said
     if left > _POSES_OFF_PX:
@@ -176,12 +167,12 @@ def _choose_stars(angles_deg: Float64[np.ndarray, "N N"]) -> list[list[int]]:
     return stars
 
 
-def _features_of(view: MatchedView) -> tuple[Points, np.ndarray] | None:
+def _features_of(picture: Path) -> tuple[Points, np.ndarray] | None:
     """Places in pixels of the picture, and descriptors; None where nothing stands out."""
     from PIL import Image
     from skimage.feature import SIFT
 
-    with Image.open(view.picture) as opened:
+    with Image.open(picture) as opened:
         shrunk = min(1.0, _LONGEST_SIDE_PX / max(opened.size))
         size = (max(1, round(opened.width * shrunk)), max(1, round(opened.height * shrunk)))
         whole, opacity = opened.convert("L"), opened.convert("RGBA").getchannel("A")
@@ -199,13 +190,13 @@ def _features_of(view: MatchedView) -> tuple[Points, np.ndarray] | None:
 
 
 def _find_star(
-    views: Sequence[MatchedView], features: Sequence[tuple[np.ndarray, np.ndarray] | None]
+    cameras: Sequence[PosedCamera], features: Sequence[tuple[np.ndarray, np.ndarray] | None]
 ) -> _Star | None:
     """Points of the first view that enough of the others show; None without any."""
-    first, lenses = features[0], [view.camera.lens for view in views]
+    first, lenses = features[0], [camera.lens for camera in cameras]
     if first is None or lenses[0] is None:
         return None
-    pixels = np.full((len(first[0]), len(views), 2), np.nan)
+    pixels = np.full((len(first[0]), len(cameras), 2), np.nan)
     pixels[:, 0] = first[0]
     shrunk = min(1.0, _LONGEST_SIDE_PX / max(lenses[0].width, lenses[0].height))
     for index, other in enumerate(features[1:], start=1):
@@ -223,14 +214,12 @@ def _find_star(
             ideal[seen, index] = undone
     if not len(ideal):
         return None
-    poses = np.stack([view.camera.camera_to_world for view in views])
+    poses = np.stack([camera.camera_to_world for camera in cameras])
     return _Star(ideal, poses[:, :, :3] @ FLIP, poses[:, :, 3], shrunk * float(np.mean(lenses[0].focal_px)))
 
 
 def _matches(
-    one: tuple[Points, np.ndarray],
-    other: tuple[Float64[np.ndarray, "Q 2"], np.ndarray],
-    shrunk: float,
+    one: tuple[Points, np.ndarray], other: tuple[Float64[np.ndarray, "Q 2"], np.ndarray], shrunk: float
 ) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
     """Indices of features of two views that match and that a fundamental matrix explains; none if those are few."""
     from skimage.feature import match_descriptors
@@ -241,9 +230,7 @@ def _matches(
     if min(len(one[0]), len(other[0])) < _LEAST_MATCHES:
         return none, none
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore"
-        )  # of descriptors that differ by nothing, and samples that tell nothing
+        warnings.simplefilter("ignore")  # of descriptors that differ by nothing, samples that tell nothing
         found = match_descriptors(one[1], other[1], max_ratio=_MOST_AMBIGUOUS, cross_check=True)
         if len(found) < _LEAST_MATCHES:
             return none, none

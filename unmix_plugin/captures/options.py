@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -74,3 +74,8 @@ class ProcessOptions:
     """Calibrated value that is written as 1; without it, found from the values."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Replace a scene that this command made in the output folder."""
+
+
+def plain_options(options: ProcessOptions) -> dict[str, Any]:
+    """Options as JSON-able values."""
+    return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}

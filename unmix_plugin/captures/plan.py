@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,11 @@ from jaxtyping import Float32
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.calibration import is_srgb
 from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
-from unmix_plugin.captures.masks import BackgroundRule, background_rule, choose_mask
-from unmix_plugin.captures.options import MaskKind, ProcessOptions
-from unmix_plugin.captures.poses.pose_set import name_some
+from unmix_plugin.captures.masks import BackgroundRule, background_rule, border_pixels, choose_mask
+from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe, stamps
+from unmix_plugin.errors import name_some
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.spectral.bands import Bands
 
@@ -48,11 +48,8 @@ class Plan:
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
-        asked = {
-            key: str(value) if isinstance(value, Path) else value
-            for key, value in asdict(options).items()
-            if key not in ("output_dir", "overwrite", "poses", "marker_size", "marker_family", "angles")
-        }
+        ours = ("output_dir", "overwrite", "poses", "marker_size", "marker_family", "angles")
+        asked = {key: value for key, value in plain_options(options).items() if key not in ours}
         files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
         return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps(files)}
 
@@ -80,21 +77,20 @@ def make_plan(
         sensors[name] = prepare_sensor(name, same, options, replace(references, views=all_of_it))
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = choose_mask(views, options.mask)
+    samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
     backdrops: dict[str, Backdrop | None] = {}
     if mask == "auto":
-        for name, sensor in sensors.items():
-            sample = sensor.sample / np.float32(scale)
-            backdrops[name] = _find_backdrop(sensor, by_sensor[name], scale, sample)
+        backdrops = {n: _find_backdrop(s, by_sensor[n], scale, samples[n]) for n, s in sensors.items()}
         if not all(backdrops.values()):  # frames with alpha and without don't go together
             backdrops, mask = {}, "none"
     recipes: dict[str, ViewRecipe] = {}
     evidence: dict[str, dict[str, Any]] = {}
     for name, sensor in sensors.items():
-        raster, sample = sensor.calibration.raster, sensor.sample / np.float32(scale)
-        colours = Colours.of(Bands(sensor.centers_nm), sample)
+        raster = sensor.calibration.raster
+        colours = Colours.of(Bands(sensor.centers_nm), samples[name])
         rule: BackgroundRule | Backdrop | None = backdrops.get(name)
         if mask in ("white", "black"):
-            rule = background_rule(sensor, by_sensor[name], scale, mask, sample)
+            rule = background_rule(mask, border_pixels(sensor, by_sensor[name], scale), samples[name])
         recipes[name] = ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
         evidence[name or "all views"] = {
             "unit": sensor.unit,
@@ -105,27 +101,17 @@ def make_plan(
             "background": None if rule is None else rule.evidence,
         }
     decisions = {"scale": {"calibrated": scale, "evidence": why}, "mask": mask, "sensors": evidence}
-    said = [note for sensor in sensors.values() for note in sensor.notes]
-    said += said_of_mask
-    found = [backdrop for backdrop in backdrops.values() if backdrop is not None]
-    if found:
+    said = [*(note for sensor in sensors.values() for note in sensor.notes), *said_of_mask]
+    if found := [backdrop for backdrop in backdrops.values() if backdrop is not None]:
         said.append(
             f"a backdrop was found that all views share, {', '.join(each.in_words for each in found)}, and is cut out: "
             "look at contact-sheet.png; --mask none keeps it"
         )
-    said += _notes_on_pictures([view.cube for view in views])
-    said += [note for view in views[:1] for note in view.cube.notes]
+    said += [*_notes_on_pictures([view.cube for view in views]), *views[0].cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
-    warned += _warnings_of_files(
-        [
-            (view.name, file)
-            for view in views
-            for file in (view.cube, view.dark, view.white)
-            if file is not None
-        ]
-        + [(file.path.name, file) for file in opened]
-    )
+    each = [(view.name, file) for view in views for file in (view.cube, view.dark, view.white)]
+    each += [(file.path.name, file) for file in opened]
     return Plan(
         capture,
         tuple(views),
@@ -135,7 +121,7 @@ def make_plan(
         mask,
         decisions,
         (*capture.notes, *said),
-        (*capture.warnings, *warned),
+        (*capture.warnings, *warned, *_warnings_of_files(each)),
         tuple(path for file in opened for path in file.files),
     )
 
@@ -162,11 +148,11 @@ def input_files(view: CaptureView) -> list[Path]:
     return [*view.cube.files, *more, *(path for file in references for path in file.files)]
 
 
-def _warnings_of_files(files: Sequence[tuple[str, SpectralFile]]) -> list[str]:
+def _warnings_of_files(files: Sequence[tuple[str, SpectralFile | None]]) -> list[str]:
     """What files warn of; one sentence where several warn of the same."""
     names: dict[str, list[str]] = defaultdict(list)
     for name, file in files:
-        for warning in file.warnings:
+        for warning in () if file is None else file.warnings:
             names[warning].append(name)
     return [f"{name_some(where)}: {warning}" for warning, where in names.items()]
 

@@ -21,11 +21,11 @@ from jaxtyping import Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses, name_some
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.scenes.placement import METRES_KEY, Placement
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
@@ -61,18 +61,6 @@ class PosedViews:
     notes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class _PlacedPoses:
-    """Poses in the world of a scene."""
-
-    poses: PoseSet
-    """In the scene's world; its offset is 0."""
-    placement: Placement
-    """From the source's world to the scene's."""
-    notes: tuple[str, ...]
-    """How up axis, middle and scale were found, one sentence each."""
-
-
 def given_poses(capture: Capture, where: str | None) -> PoseSet:
     """The poses of a file, or those of the layout.
 
@@ -87,8 +75,7 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
             why = "".join(f" ({note})" for note in capture.notes if "poses" in note)
             raise CaptureError(
                 f"{capture.root}: the layout '{capture.layout}' has no poses{why}; give --poses with transforms.json, "
-                f"a COLMAP model or another file, or find them from the images: '--poses {ESTIMATE}', '{MARKERS}' or "
-                f"'{TURNTABLE}'"
+                f"a COLMAP model or another file, or find them: '--poses {ESTIMATE}', '{MARKERS}' or '{TURNTABLE}'"
             )
         return capture.poses
     path = Path(where)
@@ -99,10 +86,7 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
 
 def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     """Give each view its camera, lenses of a rig that of others of their release; views without one are left out.
-
-    Raises:
-        CaptureError: fewer than two views have a camera, or a lens does not fit its view.
-    """
+    Raises CaptureError: fewer than two views have a camera, or a lens does not fit its view."""
     files = [
         (view.name, [*view.cube.files, *([] if view.picture is None else [view.picture])]) for view in views
     ]
@@ -126,13 +110,13 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
         for sensor, lens in own.items()
         if lens and lens.resampled_from
     ]
-    placed = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
-    keys = placed.placement.to_json() if poses.has_world else {}
+    placed, way, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
+    keys = way.to_json() if poses.has_world else {}
     if poses.has_world and poses.metres_per_unit is not None:
         keys[METRES_KEY] = poses.metres_per_unit
-    notes = (*poses.notes, *matched, *completed, *resampled, *placed.notes)
+    notes = (*poses.notes, *matched, *completed, *resampled, *how)
     findings = [*_unposed(views, posed, poses.source), *_other_sizes(posed, cameras)]
-    return PosedViews(posed, placed.poses, tuple(findings), keys, notes)
+    return PosedViews(posed, placed, tuple(findings), keys, notes)
 
 
 def _unposed(views: Sequence[CaptureView], posed: Sequence[CaptureView], source: str) -> list[str]:
@@ -140,11 +124,8 @@ def _unposed(views: Sequence[CaptureView], posed: Sequence[CaptureView], source:
     missing = [view.name for view in views if view not in posed]
     if len(missing) <= _MOST_UNPOSED * len(views):
         return []
-    finding = (
-        f"{len(missing)} of {len(views)} views have no pose and are left out ({name_some(missing)}): is {source} the "
-        "whole model, and are the names in it those of the files?"
-    )
-    return [finding]
+    left_out = f"{len(missing)} of {len(views)} views have no pose and are left out ({name_some(missing)})"
+    return [f"{left_out}: is {source} the whole model, and are the names in it those of the files?"]
 
 
 def _other_sizes(posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]) -> list[str]:
@@ -164,16 +145,12 @@ def _other_sizes(posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera
 
 
 def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
-    """The lens in pixels of the view's file, of which it may be given at another resolution.
-
-    Raises:
-        CaptureError: there is none, or it is that of pictures of another shape.
-    """
+    """The lens in pixels of the view's file, of which it may be given at another resolution. Raises CaptureError: there
+    is none, or it is that of pictures of another shape."""
     height, width, _ = view.cube.shape
     if lens is None:
         raise CaptureError(
-            f"view {view.name} has a pose but no lens; expected a focal length ('fl_x' or 'camera_angle_x') beside the "
-            "pose"
+            f"view {view.name} has a pose but no lens; expected a focal length, such as 'fl_x'"
         )
     if (lens.width, lens.height) == (width, height):
         return lens
@@ -204,6 +181,7 @@ def _complete_rigs(
         if view.release:
             releases[view.release].append(view)
     offsets = _measured_offsets(releases, cameras)
+    found = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
     completed, how = dict(cameras), Counter[tuple[str, str]]()
     for members in releases.values():
         posed = [view for view in members if view.name in cameras]
@@ -215,7 +193,7 @@ def _complete_rigs(
                 kind = "unknown" if posed else "unposed"
             else:
                 pose = _square(cameras[base.name].camera_to_world) @ offset
-                completed[view.name] = PosedCamera(pose[:3], view.lens)
+                completed[view.name] = PosedCamera(pose[:3], found.get(view.sensor) or view.lens)
                 kind = "poses" if (base.sensor, view.sensor) in offsets else "files"
             how[view.sensor, kind] += 1
     said = {
@@ -283,15 +261,12 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
     return np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
 
 
-def _place_poses(poses: PoseSet, is_flight: bool = False) -> _PlacedPoses:
-    """Settle up axis, middle and scale of a scene.
+def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, tuple[str, ...]]:
+    """Poses in the scene's world, the way there from the source's, and how up axis, middle and scale were found.
 
     The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
-    or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points.
-
-    Args:
-        poses: In the source's world.
-        is_flight: Whether cameras that all look one way look down.
+    or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points. In a flight,
+    cameras that all look one way look down.
     """
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
     up, how_up = _find_up(stacked, poses.up, is_flight)
@@ -300,22 +275,9 @@ def _place_poses(poses: PoseSet, is_flight: bool = False) -> _PlacedPoses:
     scale = 1.0 / reach if reach > 0 else 1.0
     rotation = _turn_to_z(up)
     inner = Placement(rotation, -rotation @ middle, scale)
-    placed = replace(
-        poses,
-        cameras={name: moved(camera, inner) for name, camera in poses.cameras.items()},
-        points=None if poses.points is None else inner.to_scene(poses.points),
-        offset=np.zeros(3),
-        up=np.array([0.0, 0.0, 1.0]),
-    )
+    placed = replace(poses.moved(inner), offset=np.zeros(3), up=np.array([0.0, 0.0, 1.0]))
     how_large = [f"1 unit of the scene is {1.0 / scale:.6g} of the source"] if poses.has_world else []
-    return _PlacedPoses(placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large))
-
-
-def moved(camera: PosedCamera, similarity: Placement) -> PosedCamera:
-    """The camera in the world that the similarity leads to."""
-    pose = camera.camera_to_world
-    position = similarity.to_scene(pose[:, 3])
-    return replace(camera, camera_to_world=np.column_stack([similarity.rotation @ pose[:, :3], position]))
+    return placed, replace(inner, offset=poses.offset), (how_up, how_middle, *how_large)
 
 
 def _find_up(
@@ -354,6 +316,5 @@ def _turn_to_z(up: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     axis, cosine = np.cross(up, (0.0, 0.0, 1.0)), float(up[2])
     if cosine < -1.0 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cross = np.cross(np.eye(3), axis)
     return np.eye(3) + cross + cross @ cross / (1.0 + cosine)

@@ -14,7 +14,6 @@ from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.posing import FROM_PICTURES, MARKERS, PosedViews, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
@@ -22,7 +21,7 @@ from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, WorkFolder, hashes, refuse_output, write_view
-from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
+from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
 
 _Say = Callable[[str], None]
 """Tells the user something, one line."""
@@ -82,6 +81,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         say("estimating poses ...")
         found = poses_of_written_views(plan, records, folder.path, folder.poses, options)
         posed = pose_views(plan.views, found)
+        _refuse_late(_resampled_lenses(plan, posed))
     for note in posed.notes:
         say(f"poses: {note}")
     findings = write_scene_files(folder.path, plan, posed, records, options)
@@ -97,6 +97,15 @@ def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, Lens]:
         if lens is not None and lens.resampled_from is not None:
             found[view.name] = plan.recipes[view.sensor].calibration.raster.lens(lens)
     return found
+
+
+def _refuse_late(lenses: dict[str, Lens]) -> None:
+    """Refuse lenses that pictures would have to be brought into, once they are written and poses were found in them."""
+    if lenses:
+        raise CaptureError(
+            f"the lens of {name_some(list(lenses))} is not found in the pictures, and its own is not one that scenes "
+            "have; give poses with --poses FILE, or leave these views out"
+        )
 
 
 def _numbers_of(lens: Lens) -> list[float]:
@@ -137,9 +146,7 @@ def _open_capture(options: ProcessOptions) -> Capture:
     output = options.output_dir.resolve()
     for view in capture.views:
         if any(path.resolve().is_relative_to(output) for path in input_files(view)):
-            raise ConfigError(
-                f"--output-dir {options.output_dir} holds files of the capture; give another folder"
-            )
+            raise ConfigError(f"--output-dir {options.output_dir} holds files of the capture")
     return capture
 
 
@@ -178,23 +185,20 @@ def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
     if cube.shape != first.shape:
         found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
         raise CaptureError(
-            f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: all views of "
-            "a camera are alike, so crop or remove this one"
+            f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: crop it, or "
+            "remove it"
         )
     wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
     if (wavelengths is None) != (expected_nm is None):
-        raise CaptureError(
-            f"only one of {cube.path} and {first.path} gives wavelengths; give them for all with --wavelengths"
-        )
+        raise CaptureError(f"only one of {cube.path} and {first.path} gives wavelengths; give --wavelengths")
     if wavelengths is not None and expected_nm is not None:
         band = int(np.argmax(np.abs(wavelengths - expected_nm)))
         if abs(wavelengths[band] - expected_nm[band]) > _LARGEST_DIFFERENCE_NM:
             raise CaptureError(
                 f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
-                f"{first.path} has: all views of a camera have the same bands"
+                f"{first.path} has"
             )
     if cube.dtype != first.dtype:
         raise CaptureError(
-            f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds: convert all "
-            "views alike"
+            f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds"
         )

@@ -205,13 +205,9 @@ class SpectralFile:
 def unreadable(path: Path, error: Exception) -> CaptureError:
     """What to say where a library fails on a file."""
     if isinstance(error, MemoryError):
-        return CaptureError(
-            f"{path}: too little memory to read it; close other programs, or cut the file in parts"
-        )
+        return CaptureError(f"{path}: too little memory to read it; cut the file in parts")
     reason = " ".join(str(error).split())[:300] or "no reason given"
-    return CaptureError(
-        f"{path}: can't be read ({type(error).__name__}: {reason}); the file may be cut short or damaged, copy it again"
-    )
+    return CaptureError(f"{path}: can't be read ({type(error).__name__}: {reason}); copy the file again")
 
 
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
@@ -278,17 +274,12 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
 
 def _stack_linears(parts: list[SpectralFile]) -> Linear | None:
     """Gains and offsets of all parts, those of parts without any being 1 and 0."""
-    stated = [part.linear for part in parts]
-    evidence = next((linear.evidence for linear in stated if linear is not None), None)
-    if evidence is None:
-        return None
-    plain = [Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts]
-    each = [own or none for own, none in zip(stated, plain, strict=True)]
-    return Linear(
-        np.concatenate([linear.gains for linear in each]),
-        np.concatenate([linear.offsets for linear in each]),
-        evidence,
-    )
+    stated = [part.linear.evidence for part in parts if part.linear is not None]
+    each = [
+        part.linear or Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts if stated
+    ]
+    gains, offsets = [linear.gains for linear in each], [linear.offsets for linear in each]
+    return Linear(np.concatenate(gains), np.concatenate(offsets), stated[0]) if stated else None
 
 
 def _stack_tables(parts: list[SpectralFile]) -> BandTable:
@@ -301,14 +292,13 @@ def _stack_tables(parts: list[SpectralFile]) -> BandTable:
     tables = [part.bands for part in parts]
     marks = [np.zeros(part.shape[2], bool) if part.bands.bad is None else part.bands.bad for part in parts]
     num_known = sum(table.wavelengths_nm is not None for table in tables)
+    has_names = all(table.names is not None for table in tables)
     return BandTable(
         join([table.wavelengths_nm for table in tables]),
         tables[0].evidence if num_known in (0, len(tables)) else _PARTLY_KNOWN,
         join([table.fwhm_nm for table in tables]),
         np.concatenate(marks) if any(table.bad is not None for table in tables) else None,
-        None
-        if any(table.names is None for table in tables)
-        else tuple(name for table in tables for name in table.names or ()),
+        tuple(name for table in tables for name in table.names or ()) if has_names else None,
     )
 
 
@@ -379,17 +369,12 @@ def loaded(load: Callable[..., np.ndarray], path: Path, *arguments: Hashable) ->
 
 
 def import_extra(package: str) -> ModuleType:
-    """A package of the extra `captures`.
-
-    Raises:
-        CaptureError: it isn't installed.
-    """
+    """A package of the extra `captures`. Raises CaptureError: it isn't installed."""
     try:
         return import_module(package)
     except ImportError as error:
         raise CaptureError(
-            f"this file needs the package {package.partition('.')[0]}, which isn't installed ({error}): "
-            "pip install 'unmix-nerf[captures]'"
+            f"the package {package.partition('.')[0]} isn't installed ({error}): pip install 'unmix-nerf[captures]'"
         ) from error
 
 

@@ -27,7 +27,7 @@ from jaxtyping import Float32, Float64
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, ViewRecord
-from unmix_plugin.errors import counted
+from unmix_plugin.errors import counted, name_some
 from unmix_plugin.scenes.reading.cubes import map_array
 
 _MOST_UNREAD, _HEADER_BYTES = 2.5, 20_000
@@ -59,14 +59,15 @@ _MOST_ODD = 5
 """Bands of which each may have a gain of its own."""
 _BLACK_SHARE, _TEXTURE = 0.1, 0.3
 """Brightness of matter over that of the background, and spread of the background, from which masks are inverted."""
+_FILLED = 0.9
+"""Share of the border that is matter, and of the middle that is none, from which they may be."""
 _OTHER_COVER = 0.3
 """Share of a view by which its mask may differ from those of near views."""
 
 
 def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[str]:
     """Files of which most was not read, and bands that are too wide for one wavelength; one sentence each."""
-    findings = []
-    left = []
+    findings, left = [], []
     for view in views:
         cube = view.cube
         size = sum(path.stat().st_size for path in cube.files if path.is_file())
@@ -74,8 +75,8 @@ def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[s
             left.append(f"{cube.path.name} ({cube.shape[2]} bands of {size / 1e6:.1f} MB)")
     if left and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
         findings.append(
-            f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts or "
-            "data sets may hold the spectra: see 'unmix-process inspect', and choose with --dataset"
+            f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
+            "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
         )
     wide: dict[float, float] = {}
     for view in views:
@@ -83,10 +84,9 @@ def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[s
         if centres is not None and widths is not None:
             wide |= {nm: width for nm, width in zip(centres, widths, strict=True) if width > _WIDE_NM}
     if wide:
-        named = ", ".join(f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in list(wide.items())[:5])
+        named = name_some([f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()], 5)
         findings.append(
-            f"{counted(len(wide), 'band')} too wide to stand for one wavelength: {named}; leave such bands out with "
-            "--drop-bands"
+            f"{counted(len(wide), 'band')} too wide to stand for one wavelength: {named}; --drop-bands leaves them out"
         )
     return findings
 
@@ -97,6 +97,8 @@ class ViewSample:
 
     record: ViewRecord
     spectra: Float32[np.ndarray, "P B"]
+    is_hollow: bool = False
+    """Whether matter fills the border of the picture and leaves out its middle."""
 
     @staticmethod
     def of(record: ViewRecord, scene: Path) -> ViewSample:
@@ -109,11 +111,14 @@ class ViewSample:
         stored = np.stack([cube[row][columns] for row in rows])
         with Image.open(scene / record.paths["file_path"]) as picture:
             kept = np.asarray(picture.convert("RGBA"))[..., 3][grid] > 127
+        border = np.concatenate([kept[0], kept[-1], kept[:, 0], kept[:, -1]])
+        third = [slice(side // 3, side - side // 3) for side in kept.shape]
+        is_hollow = bool(border.mean() > _FILLED and kept[third[0], third[1]].mean() < 1.0 - _FILLED)
         if "mask_path" in record.paths:
             with Image.open(scene / record.paths["mask_path"]) as mask:
                 kept = kept & (np.asarray(mask.convert("L"))[grid] > 0)
         kept = kept & np.all(stored < FULL_SCALE, axis=-1)
-        return ViewSample(record, stored[kept].astype(np.float32) / FULL_SCALE)
+        return ViewSample(record, stored[kept].astype(np.float32) / FULL_SCALE, is_hollow)
 
 
 def check_values(
@@ -121,18 +126,12 @@ def check_values(
     angles_deg: Float64[np.ndarray, "N N"],
     wavelengths_nm: Float64[np.ndarray, " B"],
 ) -> list[str]:
-    """What contradicts itself, one sentence each.
-
-    Args:
-        samples: Of the views of one sensor.
-        angles_deg: Between their optical axes.
-    """
-    return [
-        *_exposure_steps(samples, angles_deg),
-        *_dark_level(samples),
-        *_odd_bands(samples, wavelengths_nm),
-        *_masks(samples, angles_deg),
-    ]
+    """What contradicts itself in the views of one sensor, one sentence each, with the angles between their axes."""
+    spectra = np.concatenate([sample.spectra for sample in samples]).astype(np.float64)
+    findings = _exposure_steps(samples, angles_deg)
+    if spectra.shape[1] >= _LEAST_BANDS and len(spectra) >= _LEAST_PIXELS:
+        findings += [*_dark_level(spectra), *_odd_bands(spectra, wavelengths_nm)]
+    return [*findings, *_masks(samples, angles_deg)]
 
 
 def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[str]:
@@ -167,16 +166,13 @@ def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarra
     finding = (
         f"{counted(len(concerned), 'view')} brighter or darker than near ones by one factor in all bands, from dark "
         f"to bright pixels, as with other exposures ({'; '.join(names[:3])}): look for exposure times or gains that "
-        "the files do not tell, or scale the cubes to one exposure"
+        "the files do not tell"
     )
     return [finding]
 
 
-def _dark_level(samples: Sequence[ViewSample]) -> list[str]:
+def _dark_level(spectra: Float64[np.ndarray, "P B"]) -> list[str]:
     """Whether a level is added to all spectra."""
-    spectra = np.concatenate([sample.spectra for sample in samples]).astype(np.float64)
-    if spectra.shape[1] < _LEAST_BANDS or len(spectra) < _LEAST_PIXELS:
-        return []
     mean = spectra.mean(axis=0)
     variances, axes = np.linalg.eigh(np.cov(spectra.T))
     variances, axes = np.clip(variances[::-1], 0.0, None), axes[:, ::-1]
@@ -201,11 +197,8 @@ def _dark_level(samples: Sequence[ViewSample]) -> list[str]:
     return [finding]
 
 
-def _odd_bands(samples: Sequence[ViewSample], wavelengths_nm: Float64[np.ndarray, " B"]) -> list[str]:
+def _odd_bands(spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"]) -> list[str]:
     """Bands with a gain of their own."""
-    spectra = np.concatenate([sample.spectra for sample in samples]).astype(np.float64)
-    if spectra.shape[1] < _LEAST_BANDS or len(spectra) < _LEAST_PIXELS:
-        return []
     logs = np.log(np.maximum(spectra[spectra.mean(axis=1) > np.median(spectra.mean(axis=1))], 1e-5))
     found: dict[int, float] = {}
     for _ in range(_MOST_ODD):
@@ -249,8 +242,7 @@ def _excess(
 
 def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[str]:
     """Masks that are the wrong way round, or unlike those of near views."""
-    records = [sample.record for sample in samples]
-    findings = []
+    records, findings = [sample.record for sample in samples], []
     inverted = [
         record.name
         for record in records
@@ -259,10 +251,16 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
         and record.brightness < _BLACK_SHARE * record.background_brightness
         and record.background_spread > _TEXTURE
     ]
+    hollow = [sample.record.name for sample in samples if sample.is_hollow]
     if inverted:
         findings.append(
             f"{counted(len(inverted), 'view')} whose matter is black while the background has light and texture "
-            f"({', '.join(inverted[:5])}): are the masks the wrong way round? White is matter"
+            f"({name_some(inverted, 5)}): are the masks the wrong way round? White is matter"
+        )
+    elif 2 * len(hollow) > len(samples):
+        findings.append(
+            f"{counted(len(hollow), 'view')} whose mask takes the border of the picture for matter and its middle for "
+            f"background ({name_some(hollow, 5)}): are the masks the wrong way round? White is matter"
         )
     shares = np.array([record.matter_share for record in records])
     if len(shares) <= _NEIGHBOURS or np.ptp(shares) == 0:
@@ -275,6 +273,6 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
     if off:
         findings.append(
             f"{counted(len(off), 'view')} whose mask covers another share of the picture than those of near views: "
-            f"{', '.join(off[:5])}; look at these masks"
+            f"{name_some(off, 5)}; look at these masks"
         )
     return findings

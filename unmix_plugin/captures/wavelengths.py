@@ -200,10 +200,8 @@ def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
     """Band centres in nm from a list `620,555,503`, or from the column `wavelength` of a CSV file.
 
-    A file may also hold one bare number a line, or one line of numbers.
-
-    Raises:
-        ConfigError: no such file, no numbers, or numbers that are not wavelengths in nm.
+    A file may also hold one bare number a line, or one line of numbers. Raises ConfigError: no such file, no numbers,
+    or numbers that are not wavelengths in nm.
     """
     try:
         values = np.array([float(word) for word in text.split(",")])

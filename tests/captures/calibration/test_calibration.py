@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,6 @@ from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
-    WhiteReference,
     find_missing,
     open_reference,
     panel_reference,
@@ -109,7 +110,7 @@ def test_exposures_are_brought_to_that_of_the_white():
         file_of(np.full((1, WIDTH, BANDS), 3000, np.uint16)), "white reference", file_of(counts)
     )
     calibration = Calibration(
-        WHOLE, EVERY, white=WhiteReference(white, np.full(BANDS, 0.5)), exposure=np.full(1, 20.0)
+        WHOLE, EVERY, white=replace(white, reflectance=np.full(BANDS, 0.5)), exposure=np.full(1, 20.0)
     )
     shorter = file_of(counts, metadata={"exposure_s": 5.0, "gain": 2.0})
     np.testing.assert_allclose(
@@ -123,7 +124,7 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     light[0, 3, 2] = 40
     white = open_reference(file_of(light), "white reference", file)
     dark = open_reference(file_of(np.full((1, WIDTH, BANDS), 50, np.uint16)), "dark frame", file)
-    found = Calibration(WHOLE, EVERY, dark=dark, white=WhiteReference(white, np.ones(BANDS))).rows(
+    found = Calibration(WHOLE, EVERY, dark=dark, white=replace(white, reflectance=np.ones(BANDS))).rows(
         file, 0, HEIGHT
     )
     np.testing.assert_array_equal(found.missing, np.arange(WIDTH)[None, :] == 3 + np.zeros((HEIGHT, 1)))
@@ -154,7 +155,7 @@ def test_a_reference_has_gains_where_the_cubes_have_them():
     np.testing.assert_allclose(found.mean[0, 0], stored[0, 0] * gains + offsets)
     np.testing.assert_allclose(found.stored_mean[0, 0], stored[0, 0])
     for pair in ((cube, file_of(stored)), (file_of(stored), cube)):
-        with pytest.raises(CaptureError, match=r"no gains or scale.*its header.*write the same"):
+        with pytest.raises(CaptureError, match=r"no gains or scale.*its header"):
             open_reference(pair[0], "white reference", pair[1])
 
 

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.sensor import (
-    _BandChoice,
-    _drop_found,
-    _find_saturation,
-    _noise_shares,
-    _Sample,
-)
+from unmix_plugin.captures.calibration.sensor import _BandChoice, _drop_found, _find_saturation, _noise_shares
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -20,8 +14,8 @@ SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
 MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
 
 
-def _unsaturated(values: np.ndarray) -> _Sample:
-    return _Sample(values.astype(np.float32), np.zeros(values.shape, bool))
+def _unsaturated(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return values.astype(np.float32), np.zeros(values.shape, bool)
 
 
 def test_noise_is_found_beside_what_bands_share():
@@ -45,9 +39,7 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
-    found, _ = _drop_found(
-        _BandChoice(WAVELENGTHS_NM, {0: "named"}), _Sample(values[:, 1:], saturated[:, 1:]), 0.5
-    )
+    found, _ = _drop_found(_BandChoice(WAVELENGTHS_NM, {0: "named"}), (values[:, 1:], saturated[:, 1:]), 0.5)
     assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
         0: "named",
         2: "dead",
@@ -60,7 +52,7 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
 def test_a_white_background_that_saturates_every_band_drops_none():
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), _Sample(MIXTURES, saturated), 0.5)[0].dropped == {}
+    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), (MIXTURES, saturated), 0.5)[0].dropped == {}
 
 
 def test_bands_that_have_nothing_in_common_are_not_all_noise():

@@ -117,17 +117,27 @@ def test_what_is_evaluated_lies_in_the_middle_of_a_flight(count, evaluated):
     assert [number for number, name in enumerate(names) if splits[name] == "eval"] == evaluated
 
 
+def _beside_green(content, frames, release):
+    """Poses of all lenses of a release from the first one, in metres."""
+    poses = [
+        np.array(
+            next(
+                f["transform_matrix"]
+                for path, f in frames.items()
+                if path.endswith(f"_{release}_{lens.ending}.npy")
+            )
+        )
+        for lens in LENSES
+    ]
+    found = np.linalg.inv(poses[0]) @ np.stack(poses)
+    found[:, :3, 3] /= content.get("applied_scale", 1.0)
+    return found
+
+
 def test_all_lenses_are_posed_by_the_rig(scene):
-    content, frames = _frames(scene)
-    scale = content.get("applied_scale", 1.0)
-    poses = {path: np.array(frame["transform_matrix"]) for path, frame in frames.items()}
-    base = next(pose for path, pose in poses.items() if path.endswith("_0006_GRE.npy"))
-    for lens in LENSES:
-        pose = next(pose for path, pose in poses.items() if path.endswith(f"_0006_{lens.ending}.npy"))
-        expected = np.linalg.inv(lens_pose(6, LENSES[0])) @ lens_pose(6, lens, at_its_place=False)
-        found = np.linalg.inv(base) @ pose
-        np.testing.assert_allclose(found[:3, :3], expected[:3, :3], atol=1e-6)
-        np.testing.assert_allclose(found[:3, 3] / scale, expected[:3, 3], atol=1e-6)
+    found = _beside_green(*_frames(scene), "0006")
+    expected = [np.linalg.inv(lens_pose(6, LENSES[0])) @ lens_pose(6, x, at_its_place=False) for x in LENSES]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_offsets_follow_from_releases_in_which_all_lenses_have_poses(flight, tmp_path):
@@ -136,14 +146,8 @@ def test_offsets_follow_from_releases_in_which_all_lenses_have_poses(flight, tmp
     write_poses(tmp_path / "all.json")
     frames += json.loads((tmp_path / "all.json").read_text())["frames"][3:]
     (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
-    content, found = _frames(_process(flight, tmp_path / "scene", tmp_path / "poses.json"))
-    scale = content.get("applied_scale", 1.0)
-    poses = {path: np.array(frame["transform_matrix"]) for path, frame in found.items()}
-    base = next(pose for path, pose in poses.items() if path.endswith("_0007_GRE.npy"))
-    for lens in LENSES:
-        pose = next(pose for path, pose in poses.items() if path.endswith(f"_0007_{lens.ending}.npy"))
-        place = (np.linalg.inv(base) @ pose)[:3, 3] / scale
-        np.testing.assert_allclose(place, lens.place, atol=1e-6)
+    found = _beside_green(*_frames(_process(flight, tmp_path / "scene", tmp_path / "poses.json")), "0007")
+    np.testing.assert_allclose(found[:, :3, 3], [lens.place for lens in LENSES], atol=1e-6)
 
 
 def test_the_scene_holds_the_radiance_of_the_ground(scene):
@@ -170,64 +174,51 @@ def test_a_panel_before_the_flight_makes_reflectances(tmp_path):
         np.testing.assert_allclose(found, expected, rtol=0.01)
 
 
-def test_files_are_grouped_by_name_where_they_share_no_identifier(tmp_path):
-    for release in range(2):
-        for band in (1, 2):
-            write_band_file(
-                tmp_path / f"IMG_{release:04d}_{band}.tif",
-                np.full((4, 5), 9),
-                {
-                    "Camera:CentralWavelength": str(400 + 100 * band),
-                    "MicaSense:CaptureId": f"{release}{band}",
-                },
-            )
-    capture = find_rig(tmp_path, PLAIN)
-    assert [(view.name, view.release, view.sensor) for view in capture.views] == [
-        ("IMG_0000_1", "IMG_0000", "1"),
-        ("IMG_0000_2", "IMG_0000", "2"),
-        ("IMG_0001_1", "IMG_0001", "1"),
-        ("IMG_0001_2", "IMG_0001", "2"),
-    ]
+ID = "MicaSense:CaptureId"
+
+
+def rig_of(folder, files, size=(4, 5)):
+    """The capture of files by name, with a wavelength (nm) and further tags."""
+    for name, (centre, tags) in files.items():
+        write_band_file(folder / name, np.full(size, 9), {"Camera:CentralWavelength": str(centre)} | tags)
+    return find_rig(folder, PLAIN)
 
 
 @pytest.mark.parametrize(
-    ("names", "releases"),
+    ("files", "releases"),
     [
-        (("DJI_0011.TIF", "DJI_0012.TIF", "DJI_0021.TIF"), ["DJI_001", "DJI_001", "DJI_002"]),
-        (("IMG_0001_1.tif", "IMG_0001_10.tif"), ["IMG_0001", "IMG_0001"]),
-        (("DJI_2023_0001_MS_G.TIF", "DJI_2023_0001_MS_NIR.TIF"), ["DJI_2023_0001", "DJI_2023_0001"]),
-        (("a/IMG_0000_1.tif", "b/IMG_0000_1.tif"), ["a_IMG_0000", "b_IMG_0000"]),
+        ({f"DJI_00{number}.TIF": {} for number in (11, 12, 21)}, ["DJI_001", "DJI_001", "DJI_002"]),
+        ({"IMG_0001_1.tif": {}, "IMG_0001_10.tif": {}}, ["IMG_0001", "IMG_0001"]),
+        ({f"DJI_2023_0001_MS_{band}.TIF": {} for band in ("G", "NIR")}, ["DJI_2023_0001", "DJI_2023_0001"]),
+        ({"a/IMG_0000_1.tif": {}, "b/IMG_0000_1.tif": {}}, ["a_IMG_0000", "b_IMG_0000"]),
+        (  # by name where files share no identifier
+            {f"IMG_000{n // 2}_{n % 2}.tif": {ID: str(n)} for n in range(4)},
+            ["IMG_0000", "IMG_0000", "IMG_0001", "IMG_0001"],
+        ),
+        (  # by identifier where one name has two
+            {f"IMG_0000_{n}.tif": {ID: "AABB"[n]} for n in range(4)},
+            ["IMG_0000_A", "IMG_0000_A", "IMG_0000_B", "IMG_0000_B"],
+        ),
     ],
 )
-def test_names_of_makers_tell_releases(tmp_path, names, releases):
-    for name in names:
-        write_band_file(tmp_path / name, np.full((4, 5), 9), {"Camera:CentralWavelength": "500"})
-    assert [view.release for view in find_rig(tmp_path, PLAIN).views] == releases
+def test_names_and_identifiers_of_makers_tell_releases(tmp_path, files, releases):
+    views = rig_of(tmp_path, {name: (500, tags) for name, tags in files.items()}).views
+    assert [view.release for view in views] == releases
 
 
-def test_one_name_with_two_identifiers_is_two_releases(tmp_path):
-    for band, identifier in ((1, "A"), (2, "A"), (3, "B"), (4, "B")):
-        tags = {"Camera:CentralWavelength": str(400 + 100 * band), "MicaSense:CaptureId": identifier}
-        write_band_file(tmp_path / f"IMG_0000_{band}.tif", np.full((4, 5), 9), tags)
-    releases = [view.release for view in find_rig(tmp_path, PLAIN).views]
-    assert releases == ["IMG_0000_A", "IMG_0000_A", "IMG_0000_B", "IMG_0000_B"]
-
-
-def test_lenses_of_one_band_name_are_told_apart(tmp_path):
-    for index in (0, 5):
-        tags = {"Camera:BandName": "Red", "Camera:RigCameraIndex": str(index)}
-        tags |= {"Camera:CentralWavelength": str(650 + index), "Camera:CaptureUUID": "A"}
-        write_band_file(tmp_path / f"IMG_0000_{index}.tif", np.full((4, 5), 9), tags)
-    assert [view.sensor for view in find_rig(tmp_path, PLAIN).views] == ["red-0", "red-5"]
+def test_lenses_are_told_by_their_file_or_index(tmp_path):
+    files = {f"IMG_{n // 2:04d}_{1 + n % 2}.tif": (500 + 100 * (n % 2), {}) for n in range(4)}
+    views = rig_of(tmp_path / "number", files).views
+    assert [(view.name, view.sensor) for view in views] == [(n[:-4], n[-5]) for n in files]
+    tags = {"Camera:BandName": "Red", "Camera:CaptureUUID": "A"}
+    files = {f"IMG_0000_{n}.tif": (650 + n, tags | {"Camera:RigCameraIndex": str(n)}) for n in (0, 5)}
+    assert [view.sensor for view in rig_of(tmp_path / "index", files).views] == ["red-0", "red-5"]
 
 
 def test_thermal_bands_and_missing_bands_are_said(tmp_path):
-    for release, bands in (("0000", (1, 2, 6)), ("0001", (1,))):
-        for band in bands:
-            tags = {"Camera:BandName": "LWIR" if band == 6 else f"B{band}"}
-            tags["Camera:CentralWavelength"] = "11000" if band == 6 else str(500 + band)
-            write_band_file(tmp_path / f"IMG_{release}_{band}.tif", np.full((4, 5), 9), tags)
-    capture = find_rig(tmp_path, PLAIN)
+    named = (("0000", "1", "B1", 501), ("0000", "2", "B2", 502), ("0000", "6", "LWIR", 11000))
+    files = {f"IMG_{release}_{n}.tif": (nm, {"Camera:BandName": band}) for release, n, band, nm in named}
+    capture = rig_of(tmp_path, files | {"IMG_0001_1.tif": (501, {"Camera:BandName": "B1"})})
     assert [view.name for view in capture.views] == ["IMG_0000_1", "IMG_0000_2", "IMG_0001_1"]
     notes = " ".join(capture.notes)
     assert "1 thermal image left out" in notes
@@ -243,25 +234,19 @@ def test_given_wavelengths_are_one_a_lens(tmp_path):
         find_rig(tmp_path, ReadOptions(wavelengths_nm=np.array([500.0, 600.0, 700.0])))
 
 
-def test_a_lens_twice_in_one_release_is_refused(tmp_path):
-    for name in ("IMG_0000_1.tif", "copy/IMG_0000_1.tif"):
-        tags = {"Camera:CentralWavelength": "500", "Camera:BandName": "Blue", "MicaSense:CaptureId": "same"}
-        write_band_file(tmp_path / name, np.full((4, 5), 9), tags)
-    with pytest.raises(CaptureError, match="are both the lens blue"):
-        find_rig(tmp_path, PLAIN)
-
-
 @pytest.mark.parametrize(
-    ("size", "centre", "message"), [((4, 6), 500, "pixels"), ((4, 5), 510, "nm, .* of the same lens")]
+    ("name", "size", "centre", "message"),
+    [
+        ("copy/IMG_0000_1.tif", (4, 5), 500, "are both the lens blue"),
+        ("IMG_0001_1.tif", (4, 6), 500, "pixels"),
+        ("IMG_0001_1.tif", (4, 5), 510, "nm, .* of the same lens"),
+    ],
 )
-def test_files_of_one_lens_that_differ_are_refused(tmp_path, size, centre, message):
-    tags = {"Camera:BandName": "Blue", "Camera:CentralWavelength": "500"}
-    write_band_file(tmp_path / "IMG_0000_1.tif", np.full((4, 5), 9), tags)
-    write_band_file(
-        tmp_path / "IMG_0001_1.tif", np.full(size, 9), tags | {"Camera:CentralWavelength": str(centre)}
-    )
+def test_files_of_one_lens_that_differ_or_stand_twice_are_refused(tmp_path, name, size, centre, message):
+    tags = {"Camera:BandName": "Blue", ID: "same" if name.startswith("copy") else ""}
+    rig_of(tmp_path, {"IMG_0000_1.tif": (500, tags)})
     with pytest.raises(CaptureError, match=message):
-        find_rig(tmp_path, PLAIN)
+        rig_of(tmp_path, {name: (centre, tags)}, size)
 
 
 LENS_WIDTH, LENS_HEIGHT = 1280, 960

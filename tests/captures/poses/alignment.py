@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from tests.captures.poses.pose_factory import LENS
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
-from unmix_plugin.captures.posing import moved
 from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
@@ -150,7 +149,7 @@ def _refine(
         return Placement(turn @ first.rotation, translation, scale)
 
     def errors(step: np.ndarray) -> np.ndarray:
-        found = np.stack([moved(camera, changed(step)).pixels_of(points) for camera in mine])
+        found = np.stack([camera.moved(changed(step)).pixels_of(points) for camera in mine])
         return np.nan_to_num((found - wanted)[seen], nan=1e4)
 
     reach = _extent(theirs)
@@ -174,7 +173,7 @@ def _alignment(
     theirs: Sequence[PosedCamera],
     points: Float64[np.ndarray, "P 3"],
 ) -> Alignment:
-    aligned = [moved(camera, similarity) for camera in mine]
+    aligned = [camera.moved(similarity) for camera in mine]
     wanted = np.stack([camera.pixels_of(points) for camera in theirs])
     squared = ((np.stack([camera.pixels_of(points) for camera in aligned]) - wanted) ** 2).sum(axis=-1)
     squared[~_inside(wanted, theirs)] = np.nan
@@ -200,7 +199,7 @@ def elsewhere(poses: PoseSet) -> PoseSet:
         -SIMILARITY.scale * SIMILARITY.rotation.T @ SIMILARITY.translation,
         1 / SIMILARITY.scale,
     )
-    return replace(poses, cameras={name: moved(camera, back) for name, camera in poses.cameras.items()})
+    return replace(poses, cameras={name: camera.moved(back) for name, camera in poses.cameras.items()})
 
 
 def in_a_row() -> PoseSet:

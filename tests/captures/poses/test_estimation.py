@@ -74,9 +74,7 @@ def test_pictures_without_texture_are_refused_with_what_to_do(room, tmp_path):
 def test_views_that_match_little_are_shown_and_the_next_try_takes_what_was_found(room, tmp_path, monkeypatch):
     generator = np.random.default_rng(0)
     noise = {name: generator.integers(0, 255, (90, 120), np.uint8) for name in list(room[0])[:4]}
-    with pytest.raises(
-        CaptureError, match=r"share \d+ with the view nearest.* the fewest: view .*is kept for the next"
-    ):
+    with pytest.raises(CaptureError, match=r"share \d+ with the view nearest.* the fewest: view "):
         estimate_poses(noise, tmp_path, threads=1)
     report = (tmp_path / "report.txt").read_text()
     assert report.count("\n- ") == 4
@@ -84,12 +82,12 @@ def test_views_that_match_little_are_shown_and_the_next_try_takes_what_was_found
     with Image.open(tmp_path / "worst-matches.png") as drawn:
         assert drawn.width == 2 * next(iter(noise.values())).shape[1]
     monkeypatch.setattr(estimation.subprocess, "run", pytest.fail)
-    with pytest.raises(CaptureError, match="is kept for the next try"):
+    with pytest.raises(CaptureError, match="the fewest: view "):
         estimate_poses(noise, tmp_path, threads=1)
 
 
 def test_two_views_are_too_few(room, tmp_path):
-    with pytest.raises(CaptureError, match="2 views; expected at least 3"):
+    with pytest.raises(CaptureError, match="2 views; at least 3 are needed"):
         estimate_poses(dict(list(room[0].items())[:2]), tmp_path)
 
 

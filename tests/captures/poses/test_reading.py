@@ -221,7 +221,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": []}, "'frames' is a list of 0"),
+        ({"frames": []}, "has no camera; expected one for each view"),
         ({"frames": [1]}, r"frames\[0\] is 1"),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
         ({"fl_x": "long"}, "'fl_x' is \"long\""),

@@ -150,7 +150,7 @@ def test_a_place_of_the_camera_needs_three_views():
     pictures, turns, masks, _ = turned(knobs())
     turns["view_0_00"] = Turn(0.0, 1)
     with pytest.raises(
-        CaptureError, match="1 views were taken from place 2 of the camera; expected at least 3"
+        CaptureError, match="1 views were taken from place 2 of the camera; expected 3 or more"
     ):
         poses_from_turntable(pictures, turns, masks)
 

@@ -1,5 +1,7 @@
 """Files of named arrays (MATLAB, HDF5, NetCDF, npz, torch): against the libraries that wrote them."""
 
+import io
+import zipfile
 from typing import Any
 
 import h5py
@@ -66,40 +68,31 @@ PLAIN = CUBE.astype(np.int16)
 @pytest.mark.parametrize("bands_at", [0, 1, 2])
 def test_the_image_and_its_wavelengths_are_found(tmp_path, name, bands_at):
     stored = np.moveaxis(PLAIN, 2, bands_at)
-    arrays = {
-        "thumbnail": PLAIN[..., 0],
-        "cube": np.ascontiguousarray(stored),
-        "wavelengths": NM,
-        "fwhm": NM / 100,
-    }
+    arrays = {"thumbnail": PLAIN[..., 0], "cube": np.ascontiguousarray(stored)}
+    arrays |= {"wavelengths": NM, "fwhm": NM / 100}
     WRITERS[name](tmp_path / name, arrays)
     file = open_spectral_file(tmp_path / name)
     assert (file.shape, file.dtype.newbyteorder("=")) == ((8, 9, 5), np.dtype("i2"))
     np.testing.assert_array_equal(file.read(), PLAIN)
-    np.testing.assert_array_equal(
-        file.read(slice(2, 7, 2), np.array([4, 0, 4])), PLAIN[2:7:2][..., [4, 0, 4]]
-    )
+    some = file.read(slice(2, 7, 2), np.array([4, 0, 4]))
+    np.testing.assert_array_equal(some, PLAIN[2:7:2][..., [4, 0, 4]])
     np.testing.assert_array_equal(centres_nm(file), NM)
     np.testing.assert_allclose(widths_nm(file), NM / 100)
     assert "'wavelengths', no unit: 450 to 650 taken as nm" in file.bands.evidence
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_several_images_are_asked_about(tmp_path, name):
-    WRITERS[name](tmp_path / name, {"first": PLAIN, "second": PLAIN + 1})
+def test_several_images_are_asked_about_and_none_is_refused(tmp_path, name):
+    path = tmp_path / name
+    WRITERS[name](path, {"first": PLAIN, "second": PLAIN + 1})
     with pytest.raises(CaptureError, match=r"2 data sets could be the image; name one.*first \(8, 9, 5\)"):
-        open_spectral_file(tmp_path / name)
-    file = open_spectral_file(tmp_path / name, ReadOptions(dataset="second"))
-    np.testing.assert_array_equal(file.read(), PLAIN + 1)
+        open_spectral_file(path)
+    np.testing.assert_array_equal(open_spectral_file(path, ReadOptions(dataset="second")).read(), PLAIN + 1)
     with pytest.raises(CaptureError, match="no data sets 'third'"):
-        open_spectral_file(tmp_path / name, ReadOptions(dataset="third"))
-
-
-@pytest.mark.parametrize("name", WRITERS)
-def test_files_without_an_image_are_refused(tmp_path, name):
-    WRITERS[name](tmp_path / name, {"vector": NM, "table": PLAIN[..., 0]})
+        open_spectral_file(path, ReadOptions(dataset="third"))
+    WRITERS[name](path, {"vector": NM, "table": PLAIN[..., 0]})
     with pytest.raises(CaptureError, match="no data set has three axes; name one"):
-        open_spectral_file(tmp_path / name)
+        open_spectral_file(path)
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -115,17 +108,15 @@ def test_files_that_are_cut_short_are_refused(tmp_path, name):
 def test_lists_of_pixels_are_images_once_their_size_is_known(tmp_path):
     listed = CUBE.transpose(2, 0, 1).reshape(5, -1, order="F")  # as MATLAB's reshape does it
     scipy.io.savemat(tmp_path / "a.mat", {"Y": listed, "A": listed[:3]})
-    options = ReadOptions(dataset="Y", size=(8, 9))
-    file = open_spectral_file(tmp_path / "a.mat", options)
+    file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(8, 9)))
     np.testing.assert_array_equal(file.read(slice(2, 5), slice(1, 4)), CUBE[2:5, :, 1:4])
     with pytest.raises(CaptureError, match=r"Y \(5, 72\) is not a list of 70 pixels"):
         open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(7, 10)))
     scipy.io.savemat(tmp_path / "b.mat", {"Y": listed, "nRow": 8, "nCol": 9, "nBand": 5})
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.mat").read(), CUBE)
     scipy.io.savemat(tmp_path / "c.mat", {"Y": listed.T})
-    np.testing.assert_array_equal(
-        open_spectral_file(tmp_path / "c.mat", ReadOptions(size=(8, 9))).read(), CUBE
-    )
+    file = open_spectral_file(tmp_path / "c.mat", ReadOptions(size=(8, 9)))
+    np.testing.assert_array_equal(file.read(), CUBE)
 
 
 @pytest.mark.parametrize("do_compression", [False, True])
@@ -170,6 +161,10 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     assert file.bands.bad is not None
     assert file.bands.bad.tolist() == [False, True, False, False, False]
     assert file.metadata["dataset"] == "site/reflectance"
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs["wavelengths"] = NM
+    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "b.h5")), NM)
 
 
 def test_axes_by_the_names_of_netcdf4(tmp_path):
@@ -187,13 +182,6 @@ def test_axes_by_the_names_of_netcdf4(tmp_path):
     np.testing.assert_array_equal(file.read(), square)
     assert file.scale == pytest.approx(10000)
     assert file.notes == ()
-
-
-def test_attributes_with_wavelengths(tmp_path):
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["cube"] = CUBE
-        file["cube"].attrs["wavelengths"] = NM
-    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "a.h5")), NM)
 
 
 def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
@@ -214,12 +202,9 @@ def test_files_of_terabytes_open_at_once(tmp_path, name):
         with (tmp_path / name).open("r+b") as opened:  # as large as such a file would be
             opened.truncate(10**12)
     else:
-        header = np.lib.format.open_memmap(tmp_path / name, "w+", np.uint16, (1, 1, 1))
-        del header
-        with (tmp_path / name).open("r+b") as file:
-            np.lib.format.write_array_header_1_0(
-                file, {"descr": "<u2", "fortran_order": False, "shape": shape}
-            )
+        described = {"descr": "<u2", "fortran_order": False, "shape": shape}
+        with (tmp_path / name).open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, described)
             file.truncate(file.tell() + 10**5 * 10**4 * 500 * 2)
     file = open_spectral_file(tmp_path / name)
     assert file.shape == shape
@@ -232,9 +217,8 @@ def test_npy_arrays_are_mapped(tmp_path, order, dtype):
     np.save(tmp_path / "a.npy", np.asarray(CUBE.astype(dtype), order=order))
     file = open_spectral_file(tmp_path / "a.npy")
     assert file.dtype == np.dtype(dtype)
-    np.testing.assert_array_equal(
-        file.read(slice(1, 3), np.array([3, 1])), CUBE.astype(dtype)[1:3][..., [3, 1]]
-    )
+    some = file.read(slice(1, 3), np.array([3, 1]))
+    np.testing.assert_array_equal(some, CUBE.astype(dtype)[1:3][..., [3, 1]])
     np.save(tmp_path / "b.npy", CUBE[..., 0])
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.npy").read(), CUBE[..., :1])
 
@@ -274,13 +258,9 @@ def test_a_bare_tensor_is_an_image(tmp_path):
 
 
 def test_members_that_promise_too_much_are_refused(tmp_path):
-    import io
-    import zipfile
-
     header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<u2", "fortran_order": False, "shape": (10**6, 10**6, 9)}
-    )
+    described = {"descr": "<u2", "fortran_order": False, "shape": (10**6, 10**6, 9)}
+    np.lib.format.write_array_header_1_0(header, described)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("cube.npy", header.getvalue() + bytes(20))
     with pytest.raises(CaptureError, match=r"cube\.npy holds 148 bytes; its header promises 18000000000000$"):
@@ -323,14 +303,10 @@ def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_band
     other = open_spectral_file(path, ReadOptions(dataset="SWIR_Cube"))
     np.testing.assert_array_equal(centres_nm(other), [2400, 1800, 1200, 1000])
     assert other.linear is not None
-    np.testing.assert_allclose(
-        other.linear.apply(other.read(), slice(None)), CUBE[..., :4] / 100 - 2, atol=1e-5
-    )
-
-
-def test_of_cubes_and_their_errors_the_cubes_could_be_the_image(tmp_path):
-    with pytest.raises(CaptureError, match="2 data sets could be the image"):
-        open_spectral_file(prisma(tmp_path / "a.he5"))
+    values = other.linear.apply(other.read(), slice(None))
+    np.testing.assert_allclose(values, CUBE[..., :4] / 100 - 2, atol=1e-5)
+    with pytest.raises(CaptureError, match="2 data sets could be the image"):  # none of them their errors
+        open_spectral_file(path)
 
 
 @pytest.mark.parametrize(("bands", "is_known"), [(NM, True), (np.arange(1.0, 6), False)])
@@ -341,36 +317,39 @@ def test_a_list_called_bands_may_be_wavelengths(tmp_path, bands, is_known):
 
 
 def test_facts_of_groups_hold_for_the_images_in_them(tmp_path):
+    facts = {"integration_time": 20.0, "integration_time_units": "us", "scale_factor": 0.5}
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["run/cube"] = CUBE
-        file["run"].attrs.update(
-            {"integration_time": 20.0, "integration_time_units": "us", "scale_factor": 0.5}
-        )
+        file["run"].attrs.update(facts)
         file["exposure"] = 3.0
     found = open_spectral_file(tmp_path / "a.h5")
     assert found.metadata["exposure_s"] == pytest.approx(2e-5)
     assert found.scale == 2
 
 
-def test_a_valid_range_is_kept(tmp_path):
+LARGE = CUBE + np.uint16(50_000)
+
+
+@pytest.mark.parametrize(
+    ("stored", "attributes", "valid_range", "no_data"),
+    [
+        (CUBE, {"valid_min": 0, "valid_max": 5000, "_FillValue": -1}, (0, 5000), -1),
+        (LARGE, {"_Unsigned": "true", "_FillValue": -1}, None, 65535),
+        (LARGE, {"_Unsigned": "true", "valid_min": 0, "valid_max": -5536}, (0, 60_000), None),
+        (LARGE, {"_Unsigned": "true", "valid_range": np.array([1, -5536], "i2")}, (1, 60_000), None),
+    ],
+)
+def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
+    tmp_path, stored, attributes, valid_range, no_data
+):
     with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
         for axis, length in zip("yxb", CUBE.shape, strict=True):
             file.createDimension(axis, length)
         variable = file.createVariable("cube", "h", tuple("yxb"))
-        variable[:] = CUBE.astype(np.int16)
-        variable.valid_min, variable.valid_max, variable._FillValue = 0, 5000, -1
+        variable[:] = stored.view(np.int16)
+        for name, value in attributes.items():
+            setattr(variable, name, value)
     found = open_spectral_file(tmp_path / "a.nc")
-    assert (found.valid_range, found.no_data) == ((0, 5000), -1)
-
-
-def test_signed_numbers_that_stand_for_unsigned_ones(tmp_path):
-    large = CUBE + np.uint16(50_000)
-    with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
-        for axis, length in zip("yxb", CUBE.shape, strict=True):
-            file.createDimension(axis, length)
-        variable = file.createVariable("cube", "h", tuple("yxb"))
-        variable[:] = large.view(np.int16)
-        variable._Unsigned, variable._FillValue = "true", -1
-    found = open_spectral_file(tmp_path / "a.nc")
-    np.testing.assert_array_equal(found.read(), large)
-    assert (found.dtype.kind, found.no_data) == ("u", 65535)
+    np.testing.assert_array_equal(found.read(), stored)
+    assert found.dtype.kind == ("u" if "_Unsigned" in attributes else "i")
+    assert (found.valid_range, found.no_data) == (valid_range, no_data)

@@ -262,11 +262,8 @@ def save_labels(folder: SceneFolder, labels: np.ndarray) -> SceneFolder:
     ("labels", "message"),
     [
         (np.zeros((HEIGHT, WIDTH + 1), np.uint8), "the picture has 21 x 16 pixels"),
-        (
-            np.zeros((HEIGHT, WIDTH, 3), np.uint8),
-            "is a picture of mode RGB; expected labels in one 8-bit channel",
-        ),
-        (np.zeros((HEIGHT, WIDTH), np.uint16), "expected labels in one 8-bit channel"),
+        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), "is a picture of mode RGB; expected one 8-bit channel"),
+        (np.zeros((HEIGHT, WIDTH), np.uint16), "expected one 8-bit channel"),
         (np.full((HEIGHT, WIDTH), 2, np.uint8), "has label 2; expected 0 to 1 for the materials, or 255"),
     ],
 )
@@ -282,7 +279,7 @@ def test_a_picture_of_another_size_or_a_damaged_one_is_refused(folder):
     path.write_bytes(path.read_bytes()[:60])
     fault = fault_of(folder)
     assert "frames[1] images/view_1.png: the picture has 20 x 18 pixels" in fault
-    assert "frames[2] images/view_2.png: cannot be read as a PNG, JPEG or TIFF picture" in fault
+    assert "frames[2] images/view_2.png: cannot be read as a picture: PNG, JPEG, TIFF" in fault
 
 
 def test_a_small_file_that_decodes_to_gigabytes_is_refused_by_its_size(folder, monkeypatch):
@@ -296,7 +293,7 @@ def test_a_small_file_that_decodes_to_gigabytes_is_refused_by_its_size(folder, m
 @pytest.mark.parametrize("form", ["EPS", "GIF", "BMP", "PPM"])
 def test_a_picture_of_another_format_is_refused_whatever_its_name(folder, form):
     Image.new("RGB", (WIDTH, HEIGHT)).save(folder.root / "images/view_2.png", form)
-    assert "view_2.png: cannot be read as a PNG, JPEG or TIFF picture" in fault_of(folder)
+    assert "view_2.png: cannot be read as a picture: PNG, JPEG, TIFF" in fault_of(folder)
 
 
 def test_alpha_in_some_pictures_only_is_refused(folder):

@@ -68,5 +68,5 @@ def test_the_option_goes_before_the_scale_of_the_scene(tmp_path: Path):
 
 @pytest.mark.parametrize("scale", [0, -1, "65535", 1e40])
 def test_a_scale_that_is_none_is_refused(tmp_path: Path, scale: object):
-    with pytest.raises(SceneError, match=r"'value_scale' is .*; expected a positive number"):
+    with pytest.raises(SceneError, match=r"'value_scale' is .*; expected what stands for 1, above 0"):
         load_scene(_with_scale(tmp_path, scale))

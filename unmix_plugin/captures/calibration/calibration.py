@@ -11,7 +11,7 @@ bands of the result.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +65,8 @@ class Reference:
     """Whether each pixel has its own value, read from the file when needed."""
     how: str
     """How it is used, for people."""
+    reflectance: Float64[np.ndarray, " B"] | None = None
+    """Of a white panel at every band of the file, above 0."""
 
     @property
     def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
@@ -81,37 +83,30 @@ class Reference:
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
-
-@dataclass(frozen=True)
-class WhiteReference:
-    """A white panel and what is known of it."""
-
-    reference: Reference
-    reflectance: Float64[np.ndarray, " B"]
-    """Of the panel at every band of the file, above 0."""
+    def signal(self, dark: Reference | None) -> Float64[np.ndarray, " B"]:
+        """Mean counts above dark at each band of the file."""
+        own = self.mean.astype(np.float64).mean(axis=(0, 1))
+        return own if dark is None else own - dark.signal(None)
 
 
 def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
     """A reference for the cubes of one sensor.
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
-    camera that takes whole images), and by the mean of its lines otherwise (a line camera).
-
-    Raises:
-        CaptureError: another number of bands than the cubes, other units, or a value that is not finite.
+    camera that takes whole images), and by the mean of its lines otherwise (a line camera). Raises CaptureError:
+    another number of bands than the cubes, other units, or a value that is not finite.
     """
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(
-            f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected one "
-            "taken by the same camera with the same settings"
+            f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected as many"
         )
     if (file.linear is None) != (cube.linear is None):
         has, lacks = (file, cube) if cube.linear is None else (cube, file)
         stated = "" if has.linear is None else has.linear.evidence
         raise CaptureError(
             f"{lacks.path} has no gains or scale, {has.path} has ({stated}); expected both or neither, as numbers of "
-            "one can't be compared with those of the other: write the same into both"
+            "one can't be compared with those of the other"
         )
     mean, pattern = _column_means(file)
     if not np.isfinite(mean).all():
@@ -198,8 +193,8 @@ def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.nda
 
 def white_reference(
     reference: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
-) -> WhiteReference:
-    """A white panel that is brighter than the dark.
+) -> Reference:
+    """A white panel that is brighter than the dark, with its reflectance.
 
     Args:
         reflectance: Of the panel: a number, or a CSV file (wavelength,reflectance).
@@ -209,7 +204,7 @@ def white_reference(
         ConfigError: the reflectance is neither, or not above 0 and at most 1.5.
         SpectrumError: the CSV file is damaged or does not reach all bands.
     """
-    light = panel_signal(reference, dark)
+    light = reference.signal(dark)
     if not (light > 0).mean() > 0.5:
         dark_name = "0" if dark is None else f"the dark frame {dark.file.path}"
         raise CaptureError(
@@ -225,25 +220,17 @@ def white_reference(
             f"--white-reflectance {reflectance} is {values.min():g} to {values.max():g}; expected a reflectance above "
             "0, such as 0.99 (per cent are divided by 100 first)"
         )
-    return WhiteReference(reference, values)
+    return replace(reference, reflectance=values)
 
 
 def _read_reflectance(path: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
     if not Path(path).is_file():
-        raise ConfigError(
-            f"--white-reflectance {path}: neither a number nor a file; expected 0.99 or a CSV file"
-        )
+        raise ConfigError(f"--white-reflectance {path}: expected a number such as 0.99, or a CSV file")
     table = read_spectra_csv(Path(path))
     if len(table.names) != 1:
         raise SpectrumError(f"{path}: expected one column beside 'wavelength'; found {len(table.names)}")
     distinct, back = np.unique(wavelengths_nm, return_inverse=True)
     return table.resampled(Bands(distinct)).spectra[0][back]
-
-
-def panel_signal(reference: Reference, dark: Reference | None) -> Float64[np.ndarray, " B"]:
-    """Mean counts of the white above dark at each band of the file."""
-    signal = reference.mean.astype(np.float64).mean(axis=(0, 1))
-    return signal if dark is None else signal - dark.mean.astype(np.float64).mean(axis=(0, 1))
 
 
 @dataclass(frozen=True)
@@ -261,15 +248,8 @@ class Raster:
 
     @staticmethod
     def of(height: int, width: int, crop: tuple[int, int, int, int] | None, binning: int) -> Raster:
-        """The raster of images of this size.
-
-        Args:
-            height, width: Of the file.
-            crop: First row and column, height and width; None keeps all.
-            binning: At least 1.
-        Raises:
-            ConfigError: the rectangle leaves the image, or nothing is left.
-        """
+        """The raster of images of this size, cropped (first row and column, height and width) and binned. Raises
+        ConfigError: the rectangle leaves the image, or nothing is left."""
         top, left, rows, columns = (0, 0, height, width) if crop is None else crop
         if min(top, left) < 0 or min(rows, columns) < 1 or top + rows > height or left + columns > width:
             raise ConfigError(
@@ -277,9 +257,8 @@ class Raster:
                 f"and {width} columns"
             )
         if binning < 1 or min(rows, columns) // binning < 2:
-            raise ConfigError(
-                f"--bin-pixels {binning} leaves fewer than 2 x 2 of {rows} x {columns} pixels; give a smaller number"
-            )
+            left = f"leaves fewer than 2 x 2 of {rows} x {columns} pixels"
+            raise ConfigError(f"--bin-pixels {binning} {left}; give a smaller number")
         return Raster(top, left, rows // binning, columns // binning, binning)
 
     @property
@@ -299,20 +278,15 @@ class Raster:
 
     def averaged(self, values: np.ndarray) -> np.ndarray:
         """Means over squares, (h * n, w * n, ...) to (h, w, ...)."""
-        if self.binning == 1:
-            return values
-        n = self.binning
-        squares = values.reshape(len(values) // n, n, values.shape[1] // n, n, *values.shape[2:])
-        return squares.mean(axis=(1, 3), dtype=values.dtype)
+        return values if self.binning == 1 else self._squares(values).mean(axis=(1, 3), dtype=values.dtype)
 
     def any_in_square(self, marks: np.ndarray) -> np.ndarray:
         """Whether a mark is in each square, (h * n, w * n, ...) to (h, w, ...)."""
-        if self.binning == 1:
-            return marks
+        return marks if self.binning == 1 else np.any(self._squares(marks), axis=(1, 3))
+
+    def _squares(self, values: np.ndarray) -> np.ndarray:
         n = self.binning
-        return np.any(
-            marks.reshape(len(marks) // n, n, marks.shape[1] // n, n, *marks.shape[2:]), axis=(1, 3)
-        )
+        return values.reshape(len(values) // n, n, values.shape[1] // n, n, *values.shape[2:])
 
     def lens(self, lens: Lens) -> Lens:
         """The intrinsics of the result from those of the whole image in the file."""
@@ -338,14 +312,6 @@ class CalibratedRows:
 
 
 @dataclass(frozen=True)
-class OwnReferences:
-    """What was taken for one view alone."""
-
-    dark: Reference | None
-    white: WhiteReference | None
-
-
-@dataclass(frozen=True)
 class Calibration:
     """How the files of one sensor are calibrated."""
 
@@ -355,14 +321,14 @@ class Calibration:
     bin_bands: int = 1
     """Neighbouring kept bands that become one; what does not fill one at the end is left out."""
     dark: Reference | None = None
-    white: WhiteReference | None = None
+    white: Reference | None = None
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     exposure: Float64[np.ndarray, " b"] | None = None
     """Exposure time times gain that values are brought to, one number or one a band of the file: that of the white
     reference, otherwise of the first view; None where exposures are not compared."""
-    own: Mapping[Path, OwnReferences] = field(default_factory=dict)
-    """References of single views, by the path of their cube; they go before the common ones."""
+    own: Mapping[Path, tuple[Reference | None, Reference | None]] = field(default_factory=dict)
+    """Dark and white of single views, by the path of their cube; they go before the common ones."""
 
     @property
     def num_bands(self) -> int:
@@ -370,11 +336,8 @@ class Calibration:
         return len(self.bands) // self.bin_bands
 
     def rows(self, file: SpectralFile, first: int, last: int) -> CalibratedRows:
-        """Rows `first` to `last` (excluded) of the result from a view's file.
-
-        Raises:
-            CaptureError: the file can't be read.
-        """
+        """Rows `first` to `last` (excluded) of the result from a view's file. Raises CaptureError: the file can't be
+        read."""
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
@@ -396,14 +359,14 @@ class Calibration:
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
         values = _linear(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
-        references = self.own.get(file.path, OwnReferences(self.dark, self.white))
-        white = references.white
-        dark = None if references.dark is None else references.dark.rows(rows, columns, bands)
+        own_dark, white = self.own.get(file.path, (self.dark, self.white))
+        dark = None if own_dark is None else own_dark.rows(rows, columns, bands)
         factor = self._exposure_factor(file, white)
         if dark is not None:
             values -= dark
         if white is not None:
-            light = white.reference.rows(rows, columns, bands)
+            assert white.reflectance is not None
+            light = white.rows(rows, columns, bands)
             if dark is not None:
                 light = light - dark
             # NaN where the white is not above the dark.
@@ -412,11 +375,11 @@ class Calibration:
         values *= factor
         return values
 
-    def _exposure_factor(self, file: SpectralFile, white: WhiteReference | None) -> Float32[np.ndarray, " b"]:
+    def _exposure_factor(self, file: SpectralFile, white: Reference | None) -> Float32[np.ndarray, " b"]:
         """What brings the kept bands of a view to the common exposure, or to that of its own white reference."""
         wanted, found = self.exposure, exposure_of(file)
         if file.path in self.own and white is not None and wanted is not None:
-            wanted = exposure_of(white.reference.file)
+            wanted = exposure_of(white.file)
         if wanted is None or found is None:
             return np.ones(1, np.float32)
         factor = wanted / found

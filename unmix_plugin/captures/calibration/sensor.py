@@ -7,33 +7,30 @@ Notation: `N` sampled pixels, `B` bands of the file, `c` bands of the scene.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
-    OwnReferences,
     Raster,
     Reference,
-    WhiteReference,
     is_srgb,
     open_reference,
     panel_reference,
-    panel_signal,
     white_reference,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.exposure import Exposures, compare_exposures
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, ConfigError, counted
+from unmix_plugin.errors import CaptureError, ConfigError, counted, name_some
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -97,20 +94,14 @@ class _BandChoice:
         return self.without(repeated, "an earlier band has the same wavelength")
 
     def require(self, binning: int, where: str) -> None:
-        """Refuse to go on without bands.
-
-        Raises:
-            CaptureError: fewer bands are left than are averaged into one.
-        """
+        """Refuse to go on with fewer bands than are averaged into one. Raises CaptureError: so few are left."""
         if len(self.kept) >= binning:
             return
         reasons = "; ".join(sorted(set(self.dropped.values())))
-        advice = (
-            f"; left out: {reasons}. Check dark and white, or change --drop-bands, --max-noise or --bin-bands"
-        )
+        advice = f"left out: {reasons}. Check dark and white, --drop-bands, --max-noise and --bin-bands"
         raise CaptureError(
-            f"{where}: {len(self.kept)} of {len(self.wavelengths_nm)} bands are left, {binning} or more are needed"
-            + (advice if reasons else ": lower --bin-bands")
+            f"{where}: {len(self.kept)} of {len(self.wavelengths_nm)} bands are left, {binning} or more are needed; "
+            + (advice if reasons else "lower --bin-bands")
         )
 
 
@@ -159,8 +150,6 @@ def prepare_sensor(
     Args:
         name: Of the sensor; empty where there is one.
         views: At least one; all have the same bands and size.
-        options: What the user asks.
-        references: Of this sensor.
     Raises:
         CaptureError: references don't fit, wavelengths are unknown, no band is left, or a file can't be read.
         ConfigError: an option does not fit the files.
@@ -171,7 +160,7 @@ def prepare_sensor(
     choice, notes = _stated_bands(first, options), []
     dark, white = _references(views, choice, options, references)
     own = _own_references(views, choice, options, dark, white)
-    whites = [one for one in (white, *(pair.white for pair in own.values())) if one is not None]
+    whites = [one for one in (white, *(of_view for _, of_view in own.values())) if one is not None]
     if options.saturation is not None:
         saturation, how = options.saturation, "given with --saturation"
     elif model is not None:
@@ -181,14 +170,15 @@ def prepare_sensor(
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
     for used in whites:
-        share = 0.0 if saturation is None else float((used.reference.stored_mean >= saturation).mean())
+        share = 0.0 if saturation is None else float((used.stored_mean >= saturation).mean())
         if share > _MOST_SATURATED_WHITE:
             raise CaptureError(
-                f"{used.reference.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and "
-                "above); take it again with a shorter exposure"
+                f"{used.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and above); take "
+                "it again with a shorter exposure"
             )
-        its_dark = next((pair.dark for pair in own.values() if pair.white is used), dark)
-        signal = panel_signal(used.reference, its_dark)
+        signal = used.signal(
+            next((its_dark for its_dark, its_white in own.values() if its_white is used), dark)
+        )
         lamp = signal / used.reflectance if lamp is None else lamp
         choice = choice.without(
             signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
@@ -197,8 +187,8 @@ def prepare_sensor(
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
     if model is None:
-        darks = [one.file for one in (dark, *(pair.dark for pair in own.values())) if one is not None]
-        exposures = compare_exposures(files, [one.reference.file for one in whites], darks, is_srgb(first))
+        darks = [one.file for one in (dark, *(of_view for of_view, _ in own.values())) if one is not None]
+        exposures = compare_exposures(files, [one.file for one in whites], darks, is_srgb(first))
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
@@ -214,20 +204,16 @@ def prepare_sensor(
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
     evidence |= _evidence(views, choice, dark, white)
     if own:
-        used = next(iter(own.values()))
-        pairs = (("dark", used.dark), ("white", used.white and used.white.reference))
-        evidence |= {
-            what: {"file": "each view's own", "use": f"each view's own; {reference.how}"}
-            for what, reference in pairs
-            if reference is not None
-        }
+        for what, reference in zip(("dark", "white"), next(iter(own.values())), strict=True):
+            if reference is not None:
+                evidence[what] = {"file": "each view's own", "use": f"each view's own; {reference.how}"}
     return Sensor(
         name,
         calibration,
         choice,
         "reflectance" if whites else _unit(first),
         bool(whites) or has_one,
-        _binned(sample.values[:, still_kept], binning),
+        _binned(sample[0][:, still_kept], binning),
         evidence,
         lamp,
         tuple(notes),
@@ -240,7 +226,7 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
     if wavelengths is None:
         raise CaptureError(
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
-            "with --wavelengths, as a list in nm or a CSV file"
+            "with --wavelengths"
         )
     choice = _BandChoice(wavelengths, {})
     if file.bands.bad is not None:
@@ -256,7 +242,7 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
 
 def _references(
     views: Sequence[CaptureView], choice: _BandChoice, options: ProcessOptions, references: References
-) -> tuple[Reference | None, WhiteReference | None]:
+) -> tuple[Reference | None, Reference | None]:
     cube = views[0].cube
     dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
     if options.white_rectangle is not None:
@@ -264,8 +250,8 @@ def _references(
         shown = references.views or views
         view = next((view for view in shown if wanted in (view.name, view.release)), None)
         if view is None:
-            names = ", ".join(view.name for view in shown[:5])
-            raise ConfigError(f"--white-rectangle {wanted}: no view of this name; the first are {names}")
+            names = name_some([view.name for view in shown], 5)
+            raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
         panel = panel_reference(view.cube, (top, left, height, width), view.name)
     elif references.white is not None:
         panel = open_reference(references.white, "white reference", cube)
@@ -279,25 +265,28 @@ def _own_references(
     choice: _BandChoice,
     options: ProcessOptions,
     dark: Reference | None,
-    white: WhiteReference | None,
-) -> dict[Path, OwnReferences]:
-    """References of views that were taken with their own, by cube; what the user names goes before them.
+    white: Reference | None,
+) -> dict[Path, tuple[Reference | None, Reference | None]]:
+    """Dark and white of views that were taken with their own, by cube; what the user names goes before them.
 
-    Raises:
-        CaptureError: some views have one of their own and others have none.
+    Files that several views share are looked at once. CaptureError where some views have one and others have none.
     """
     own = {}
     darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
     whites = _each_view([view.white for view in views], views, "white reference", white is not None)
+    seen: dict[tuple[Path | None, Path | None], tuple[Reference | None, Reference | None]] = {}
     for view, own_dark, own_white in zip(views, darks, whites, strict=True):
-        its_dark, its_white = dark, white
-        if own_dark is not None:
-            its_dark = open_reference(own_dark, "dark frame", view.cube)
-        if own_white is not None:
-            panel = open_reference(own_white, "white reference", view.cube)
-            its_white = white_reference(panel, its_dark, options.white_reflectance, choice.wavelengths_nm)
-        if its_dark is not dark or its_white is not white:
-            own[view.cube.path] = OwnReferences(its_dark, its_white)
+        if own_dark is None and own_white is None:
+            continue
+        key = (own_dark and own_dark.path, own_white and own_white.path)
+        if key not in seen:
+            its_dark = dark if own_dark is None else open_reference(own_dark, "dark frame", view.cube)
+            its_white = white
+            if own_white is not None:
+                panel = open_reference(own_white, "white reference", view.cube)
+                its_white = white_reference(panel, its_dark, options.white_reflectance, choice.wavelengths_nm)
+            seen[key] = its_dark, its_white
+        own[view.cube.path] = seen[key]
     return own
 
 
@@ -312,7 +301,7 @@ def _each_view(
     if missing and len(known) > 1:
         raise CaptureError(
             f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {what} of their own, {len(known)} "
-            f"others have one; expected one for each: copy the missing ones, or give one for all (--{what.split()[0]})"
+            f"others have one; expected one for each, or one for all (--{what.split()[0]})"
         )
     only = next(iter(known.values()))
     return [only if file is None else file for file in files]
@@ -332,13 +321,12 @@ def _unit(file: SpectralFile) -> str:
 
 
 def _evidence(
-    views: Sequence[CaptureView], choice: _BandChoice, dark: Reference | None, white: WhiteReference | None
+    views: Sequence[CaptureView], choice: _BandChoice, dark: Reference | None, white: Reference | None
 ) -> dict[str, Any]:
     """References, bands, and what sunshine sensors measured, by view."""
-    used = {"dark": dark, "white": None if white is None else white.reference}
     found: dict[str, Any] = {
         what: {"file": str(reference.file.path), "use": reference.how}
-        for what, reference in used.items()
+        for what, reference in (("dark", dark), ("white", white))
         if reference is not None
     }
     found["wavelengths"] = views[0].cube.bands.evidence
@@ -357,17 +345,12 @@ def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float,
     """The scale and why.
 
     Reflectances, and values of files that say what stands for 1, are kept unless many are above 1 or all are small;
-    others are divided by a high percentile.
-
-    Raises:
-        CaptureError: nothing in the sampled pixels is above 0.
-        ConfigError: the given scale is not above 0.
+    others are divided by a high percentile. Raises CaptureError: nothing in the sampled pixels is above 0. Raises
+    ConfigError: the given scale is not above 0.
     """
     if given is not None:
         if not (np.isfinite(given) and given > 0):
-            raise ConfigError(
-                f"--scale {given:g}: expected a number above 0, the calibrated value written as 1"
-            )
+            raise ConfigError(f"--scale {given:g}: expected a number above 0, what is written as 1")
         return given, "given with --scale"
     values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
     bright = float(np.percentile(values, _BRIGHT_PERCENTILE)) if len(values) else 0.0
@@ -393,12 +376,6 @@ def sampled_rows(height: int) -> list[int]:
     return [int((index + 0.5) * height / count) for index in range(count)]
 
 
-def _places(files: Sequence[SpectralFile], rows: list[int]) -> Iterator[tuple[SpectralFile, int]]:
-    for file in files:
-        for row in rows:
-            yield file, row
-
-
 def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[float | None, str]:
     """The stored number at which a detector ends, from a plateau at the greatest one, and the evidence."""
     dtype = files[0].dtype
@@ -407,11 +384,11 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     low = int(np.iinfo(dtype).min)
     counts = np.zeros(np.iinfo(dtype).max - low + 1, dtype=np.int64)
     rows = sampled_rows(files[0].shape[0])
-    parts = [file.read(slice(row, row + 1), bands)[0] for file, row in _places(files[:_MOST_ALIKE], rows)]
+    parts = [file.read(slice(row, row + 1), bands)[0] for file, row in product(files[:_MOST_ALIKE], rows)]
     bands = bands[np.ptp(np.concatenate(parts), axis=0) > 0]
     if not len(bands):
         return None, "none: every band has one value only"
-    for file, row in _places(files, rows):
+    for file, row in product(files, rows):
         stored = file.read(slice(row, row + 1), bands).ravel()
         if file.no_data is not None:
             stored = stored[stored != file.no_data]
@@ -426,12 +403,8 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     return limit, f"no plateau below the end of {dtype.name}; the greatest sampled value is {number}"
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """Calibrated pixels of all views of a sensor, at all bands of its files."""
-
-    values: Float32[np.ndarray, "N B"]
-    saturated: Bool[np.ndarray, "N B"]
+_Sample: TypeAlias = tuple[Float32[np.ndarray, "N B"], Bool[np.ndarray, "N B"]]
+"""Calibrated pixels of all views of a sensor, and which numbers are saturated."""
 
 
 def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sample:
@@ -440,15 +413,15 @@ def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sa
     rows = sampled_rows(raster.height)
     step = max(1, len(files) * len(rows) * raster.width // _MOST_PIXELS)
     values, saturated = [], []
-    for file, row in _places(files, rows):
+    for file, row in product(files, rows):
         part = calibration.rows(file, row, row + 1)
         keep = np.zeros(raster.width, bool)
         keep[row % step :: step] = True
         keep &= ~part.missing[0]
         values.append(part.values[0][keep])
         saturated.append(part.saturated[0][keep])
-    sample = _Sample(np.concatenate(values), np.concatenate(saturated))
-    if not len(sample.values):
+    sample = np.concatenate(values), np.concatenate(saturated)
+    if not len(sample[0]):
         raise CaptureError(
             f"{files[0].path}: no sampled pixel of it and of the other views has a measurement in all bands (NaN, "
             "no-data, or no light on the white panel); check these, or leave bands out with --drop-bands"
@@ -460,13 +433,13 @@ def _drop_found(
     choice: _BandChoice, sample: _Sample, max_noise: float
 ) -> tuple[_BandChoice, tuple[str, ...]]:
     """Leave out bands that are dead, saturated or noisy in the sample, which has all that were kept; and notes."""
-    kept, notes = choice.kept, ()
-    shares = sample.saturated.mean(axis=0)
+    kept, notes, (values, saturated) = choice.kept, (), sample
+    shares = saturated.mean(axis=0)
     is_saturated = shares > _MOST_SATURATED + np.median(shares)
-    is_dead = np.ptp(sample.values, axis=0) == 0
+    is_dead = np.ptp(values, axis=0) == 0
     noise = np.zeros(len(kept))
-    usable = ~sample.saturated[:, ~is_dead].any(axis=1)
-    noise[~is_dead] = _noise_shares(sample.values[usable][:, ~is_dead])
+    usable = ~saturated[:, ~is_dead].any(axis=1)
+    noise[~is_dead] = _noise_shares(values[usable][:, ~is_dead])
     is_noisy = noise > max_noise  # false for NaN
     if is_noisy.mean() > _MOST_NOISY:  # bands have little in common then, or the whole capture is noisy
         notes = (

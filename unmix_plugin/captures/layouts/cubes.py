@@ -22,11 +22,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unmix_plugin.captures.layouts.registry import view_names
-from unmix_plugin.captures.poses.pose_set import name_some
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, name_some
 
 _CUBE_SUFFIXES = frozenset(
     {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4", ".pt"}
@@ -49,12 +48,8 @@ _DEEPEST = 5
 
 
 def find_cubes(root: Path, options: ReadOptions) -> Capture:
-    """The views of a folder.
-
-    Raises:
-        CaptureError: no file in it can be a view, one can't be opened, two views share a name, or the number of
-            wavelengths given is not the number of bands.
-    """
+    """The views of a folder. Raises CaptureError: no file in it can be a view, one can't be opened, two views share a
+    name, or the number of wavelengths given is not the number of bands."""
     excluded = {path.resolve() for path in options.exclude}
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
     pictures = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
@@ -89,11 +84,10 @@ def _capture_of_plain(
 
 @dataclass
 class _Group:
-    """What belongs to one view."""
+    """What belongs to one view; `result` is the reflectance that the camera wrote."""
 
     cube: Path | None = None
     result: Path | None = None
-    """Reflectance that the camera wrote."""
     dark: Path | None = None
     white: Path | None = None
 
@@ -148,12 +142,8 @@ def _notes(
     if take_results:
         notes.append("views are the reflectances that the camera wrote, as not all have a white reference")
     if left_out:
-        several = len(left_out) > 1
-        notes.append(
-            f"{name_some([path.name for path in left_out])} {'were' if several else 'was'} left out, as "
-            f"{'their names are those of references' if several else 'its name is that of a reference'}; use "
-            f"{'one' if several else 'it'} with --white or --dark"
-        )
+        named = name_some([path.name for path in left_out])
+        notes.append(f"left out, as named like references: {named}; use one with --white or --dark")
     return tuple(notes)
 
 
@@ -172,7 +162,7 @@ def _sort_into(
         if is_result:
             group.result = path
             continue
-        if group.cube is not None and path.parent == group.cube.parent:
+        if group.cube is not None:
             raise CaptureError(_same_name(group.cube, path))
         group.cube = path
         own.append(path.stem)
@@ -236,10 +226,7 @@ def _refuse_same_names(found: Sequence[Path]) -> None:
 
 
 def _same_name(first: Path, second: Path) -> str:
-    return (
-        f"{first} and {second} would both be the view '{_name(first)}'; expected one file a view: rename or move one "
-        "of them"
-    )
+    return f"{first} and {second} would both be the view '{_name(first)}'; rename or move one of them"
 
 
 def _open(path: Path, options: ReadOptions) -> SpectralFile:

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
-from unmix_plugin.captures.layouts.transforms import make_capture, read_frames, with_wavelengths
+from unmix_plugin.captures.layouts.transforms import make_capture, read_frames
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
@@ -42,11 +42,8 @@ _POSES = "poses_bounds.npy"
 
 
 def find_nespof(root: Path, options: ReadOptions) -> Capture:
-    """The views of a rendered scene.
-
-    Raises:
-        CaptureError: no wavelength folders, no frames, files are missing, or a path leaves the folder.
-    """
+    """The views of a rendered scene. Raises CaptureError: no wavelength folders, no frames, files are missing, or a
+    path leaves the folder."""
     folders = _wavelength_entries(root, is_file=False)
     listed = read_frames(root, "file_path")
     names = view_names([frame.name for frame in listed.frames], str(root))
@@ -58,9 +55,8 @@ def find_nespof(root: Path, options: ReadOptions) -> Capture:
         there = [file for file in files if file is not None]
         if len(there) < len(files):
             continue
-        labels = [
-            root / "seg" / f"{stem}.png" for stem in (text, Path(text).name)
-        ]  # the folder may be left out
+        # The folder may be left out.
+        labels = [root / "seg" / f"{stem}.png" for stem in (text, Path(text).name)]
         views.append(
             CaptureView(
                 name,
@@ -70,24 +66,17 @@ def find_nespof(root: Path, options: ReadOptions) -> Capture:
                 split=frame.split,
             )
         )
-    found.refuse_missing(
-        "expected one OpenEXR file for every view and wavelength: copy them, or drop the frames"
-    )
+    found.refuse_missing("there is one OpenEXR file for every view and wavelength: drop the frames")
     return make_capture("nespof", root, listed, views)
 
 
 def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
-    """The views of a real capture.
-
-    Raises:
-        CaptureError: no views, a file that can't be read, views of different bands, or more or fewer poses than views.
-    """
+    """The views of a real capture. Raises CaptureError: no views, a file that can't be read, views of different bands,
+    or more or fewer poses than views."""
     parent, path = root / "exr", root / _POSES
     folders = sorted(entry for entry in parent.iterdir() if entry.is_dir()) if parent.is_dir() else []
     if not folders:
-        raise CaptureError(
-            f"{root} holds no folder exr with one folder a view; expected exr/<view>/450.exr and so on"
-        )
+        raise CaptureError(f"{root} holds no folder exr with one folder a view, as exr/<view>/450.exr")
     views: list[CaptureView] = []
     first: dict[float, Path] = {}
     for folder, name in zip(folders, view_names([entry.name for entry in folders], str(parent)), strict=True):
@@ -95,25 +84,22 @@ def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
         first = first or files
         if list(files) != list(first):
             differing = ", ".join(f"{wavelength:g}" for wavelength in sorted(set(first) ^ set(files)))
+            both = f"{folder} and {folders[0].name} differ"
             raise CaptureError(
-                f"{folder} and {folders[0].name} differ: {differing} nm in one of them alone; expected one file a "
-                "wavelength in every view"
+                f"{both}: {differing} nm in one of them alone; expected the same in every view"
             )
         views.append(CaptureView(name, _stack_intensities(files, options)))
     if not path.is_file():
-        return Capture(
-            "nespof-real", root, tuple(views), notes=(f"{_POSES} is not there: the layout has no poses",)
-        )
+        missing = f"{_POSES} is not there: the layout has no poses"
+        return Capture("nespof-real", root, tuple(views), notes=(missing,))
     poses = read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in views})
     if len(poses.cameras) != len(views):
         raise CaptureError(
             f"{path} holds {len(poses.cameras)} poses, {parent} {len(views)} views; expected as many: views are "
             "matched to poses in the order of their names"
         )
-    cameras = zip(
-        (view.name for view in views), poses.cameras.values(), strict=True
-    )  # in the order of the file
-    return Capture("nespof-real", root, tuple(views), replace(poses, cameras=dict(cameras)))
+    in_order = dict(zip((view.name for view in views), poses.cameras.values(), strict=True))
+    return Capture("nespof-real", root, tuple(views), replace(poses, cameras=in_order))
 
 
 def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
@@ -129,25 +115,27 @@ def _wavelength_entries(folder: Path, *, is_file: bool) -> dict[float, Path]:
             raise CaptureError(f"{other} and {path.name} are both {matched[1]} nm; remove one of them")
     if not entries:
         kind = "files such as 450.exr" if is_file else "folders such as 450, 460, ..."
-        raise CaptureError(
-            f"{folder} holds no {kind}, named by a wavelength in nm; is this the right folder and layout?"
-        )
+        raise CaptureError(f"{folder} holds no {kind}, named by a wavelength; is this the right layout?")
     return dict(sorted(entries.items()))
 
 
 def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> SpectralFile:
     """Files of one view by their wavelength, as one cube."""
     parts = [_open_intensity(file) for file in files.values()]
-    bands = BandTable(np.array(list(files), dtype=np.float64), "names of the folders or files, nm")
-    return with_wavelengths(replace(stack_bands(parts, parts[0].path), bands=bands), options)
+    stack, given = stack_bands(parts, parts[0].path), options.wavelengths_nm
+    if given is None:
+        bands = BandTable(np.array(list(files), dtype=np.float64), "names of the folders or files, nm")
+    elif len(given) == len(files):
+        bands = BandTable(given, "given with --wavelengths")
+    else:
+        numbers = f"--wavelengths gives {len(given)} numbers"
+        raise CaptureError(f"{stack.path} has {len(files)} bands, {numbers}; expected one a band")
+    return replace(stack, bands=bands)
 
 
 def _open_intensity(path: Path) -> SpectralFile:
-    """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels.
-
-    Raises:
-        CaptureError: the file can't be read, or which channel is s0 can't be told.
-    """
+    """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels. Raises CaptureError: the
+    file can't be read, or which channel is s0 can't be told."""
     names = _channels(path)
     named = [name for name in names if "s0" in name.lower().split(".")]
     if not named and len(names) == 16:

@@ -32,7 +32,7 @@ from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
 from unmix_plugin.captures.poses.lens_models import Points
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.errors import CaptureError, counted, name_some
 
 _TIFF_SUFFIXES = (".tif", ".tiff")
 _COLOUR_SUFFIXES = (".jpg", ".jpeg")
@@ -55,12 +55,8 @@ _LONGEST_MM = 50.0
 
 
 def find_rig(root: Path, options: ReadOptions) -> Capture:
-    """The views of a multispectral camera; see the module.
-
-    Raises:
-        CaptureError: no band files, one can't be read, two of one release are of the same lens, or files of one lens
-            differ in size or band.
-    """
+    """The views of a multispectral camera; see the module. Raises CaptureError: no band files, one can't be read, two
+    of one release are of the same lens, or files of one lens differ in size or band."""
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
@@ -71,8 +67,8 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     ]
     if not bands:
         raise CaptureError(
-            f"{root} holds no TIFF files of single bands; expected IMG_0000_1.tif, IMG_..._GRE.TIF or "
-            "DJI_..._MS_G.TIF: give the folder of the flight, or use the layout 'cubes' for other files"
+            f"{root} holds no TIFF files of single bands, such as IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: "
+            "give the folder of the flight, or use the layout 'cubes'"
         )
     sensors = _sensor_names(bands)
     releases = _release_names(bands, str(root))
@@ -106,18 +102,16 @@ def _check_lenses(views: Sequence[CaptureView]) -> None:
     for view in views:
         other = taken.setdefault((view.release, view.sensor), view)
         if other is not view:
-            raise CaptureError(
-                f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor} of the release "
-                f"{view.release}; expected one file: remove the copy"
-            )
+            both = f"{other.cube.path} and {view.cube.path} are both the lens {view.sensor}"
+            raise CaptureError(f"{both} of the release {view.release}; remove the copy")
         same = first.setdefault(view.sensor, view)
         tables = (same.cube.bands.wavelengths_nm, view.cube.bands.wavelengths_nm)
         centres = [None if table is None else float(table[0]) for table in tables]
         for what, expected, found in (("pixels", same.cube.shape[:2], view.cube.shape[:2]), ("nm", *centres)):
             if expected != found:
                 raise CaptureError(
-                    f"{view.cube.path} has {found} {what}, {same.cube.path} of the same lens {view.sensor} {expected}; "
-                    "expected files of one camera with one setting: process different flights apart"
+                    f"{view.cube.path} has {found} {what}, {same.cube.path} of the same lens {view.sensor} {expected}: "
+                    "process different flights apart"
                 )
 
 
@@ -128,14 +122,10 @@ def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[Ca
         return views
     sensors = sorted({view.sensor for view in views})
     if len(given) != len(sensors):
-        raise CaptureError(
-            f"--wavelengths gives {len(given)} numbers for {len(sensors)} lenses ({', '.join(sensors)}); expected one "
-            "a lens, in this order"
-        )
-    tables = {
-        sensor: BandTable(np.array([wavelength]), "given with --wavelengths")
-        for sensor, wavelength in zip(sensors, given, strict=True)
-    }
+        lenses = f"{len(sensors)} lenses ({', '.join(sensors)})"
+        raise CaptureError(f"--wavelengths gives {len(given)} numbers for {lenses}; expected one a lens")
+    evidence = "given with --wavelengths"
+    tables = {sensor: BandTable(np.array([nm]), evidence) for sensor, nm in zip(sensors, given, strict=True)}
     return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
 
 
@@ -156,20 +146,16 @@ def _notes(
     broad = [item for item in opened if item.file.shape[2] == 1 and item.file.bands.is_broad.any()]
     if broad and len(bands) < len(opened) - thermal - colour:
         names = sorted({tag_text(item.tags, "BandName") or item.ending for item in broad})
-        notes.append(
-            f"{counted(len(broad), 'image')} of bands too broad for one wavelength left out: {', '.join(names)}"
-        )
+        too_broad = f"{counted(len(broad), 'image')} of bands too broad for one wavelength left out"
+        notes.append(f"{too_broad}: {', '.join(names)}")
     if colour:
-        notes.append(
-            f"{counted(colour, 'colour picture')} left out: nothing says what their channels measure"
-        )
+        pictures = f"{counted(colour, 'colour picture')} left out"
+        notes.append(f"{pictures}: nothing says what their channels measure")
     if turned:
-        notes.append(
-            f"EXIF's orientation of {counted(turned, 'file')} is ignored: poses and lenses refer to the stored raster"
-        )
+        ignored = f"EXIF's orientation of {counted(turned, 'file')} is ignored"
+        notes.append(f"{ignored}: poses and lenses refer to the stored raster")
     if incomplete:
-        shown = ", ".join(incomplete[:3])
-        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {shown}")
+        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
     return notes
 
 
@@ -242,11 +228,8 @@ def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
 
 
 def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
-    """The lens of a file, and what there is to say of it; no lens where its tags don't tell one.
-
-    Raises:
-        CaptureError: its model differs from every OPENCV lens by too much, or folds the image over.
-    """
+    """The lens of a file, and what there is to say of it; no lens where its tags don't tell one. Raises CaptureError:
+    its model differs from every OPENCV lens by too much, or folds the image over."""
     tags = file.metadata.get("xmp") or {}
     try:
         if tag_numbers(tags, "DewarpData") is not None:
@@ -283,9 +266,8 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
             lens, note = _fit_fisheye((width, height), tuple(fisheye), tuple(matrix), centre)
         except CaptureError as error:
             raise CaptureError(f"{file.path}, {error}") from error
-        return lens, () if lens.resampled_from else (
-            note,
-        )  # said where it is used: poses may bring a better one
+        # A resampling is said where it is used, as poses may bring another lens.
+        return lens, (() if lens.resampled_from else (note,))
     focal = tag_numbers(tags, "PerspectiveFocalLength")
     if focal is None or focal[0] <= 0.0:
         raise _NoLensError("PerspectiveFocalLength is absent")

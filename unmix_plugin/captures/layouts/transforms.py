@@ -25,7 +25,7 @@ import numpy as np
 
 from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
 from unmix_plugin.captures.poses.pose_set import load_json, path_text
-from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.poses.reading import frames_of, read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
     BandTable,
@@ -36,7 +36,7 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
 )
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.faults import describe, read_number
+from unmix_plugin.scenes.reading.faults import read_number
 
 Split: TypeAlias = Literal["train", "eval"]
 _SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}
@@ -97,19 +97,15 @@ def read_frames(root: Path, key: str) -> _FrameList:
         files = {path: split for path, split in files.items() if path.is_file()}
     if not files:
         raise CaptureError(
-            f"{root} holds no transforms.json and no transforms_train.json; expected one of them with 'frames': "
-            "give the folder that holds it with --data, or name another layout"
+            f"{root} holds no transforms.json and no transforms_train.json; give another folder with --data, or name "
+            "another layout"
         )
     top: dict[str, Any] = {}
     frames: dict[str, _Frame] = {}
     repeated: dict[str, int] = defaultdict(int)
     for path, split in files.items():
-        content = load_json(path)
-        top = {**(content if isinstance(content, dict) else {}), **top}
-        listed = content.get("frames") if isinstance(content, dict) else content
-        if not isinstance(listed, list) or not all(isinstance(values, dict) for values in listed):
-            found = "absent" if listed is None else describe(listed)
-            raise CaptureError(f"{path}: 'frames' is {found}; expected a list with one object a view")
+        own, listed = frames_of(path, load_json(path))
+        top = {**own, **top}
         for index, values in enumerate(listed):
             frame = _Frame(f"{path.name}: frames[{index}]", values, split)
             if frames.setdefault(frame.name or frame.where, frame) is not frame:
@@ -117,7 +113,7 @@ def read_frames(root: Path, key: str) -> _FrameList:
     for frame in frames.values():
         if not frame.text(key):
             raise CaptureError(
-                f"{frame.where} has no '{key}'; expected the path of its file: add it or drop the frame"
+                f"{frame.where} has no '{key}', the path of its file: add it or drop the frame"
             )
     notes = [
         f"{counted(count, 'frame')} of {name} listed before: left out" for name, count in repeated.items()
@@ -148,12 +144,9 @@ def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_F
 def make_capture(
     layout: str, root: Path, listed: _FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()
 ) -> Capture:
-    """Views with the poses of their frames, in the order of their names.
+    """Views, one a frame, with the poses of these, in the order of their names.
 
     Poses that can't be used are noted, as the user may give others.
-
-    Args:
-        views: One a frame, in the order of the frames.
     """
     posed = dict(zip((frame.name for frame in listed.frames), views, strict=True))
     sizes = {name: (view.cube.shape[1], view.cube.shape[0]) for name, view in posed.items()}
@@ -167,28 +160,9 @@ def make_capture(
     return Capture(layout, root, tuple(sorted(views, key=lambda view: view.name)), poses, tuple(said))
 
 
-def with_wavelengths(file: SpectralFile, options: ReadOptions) -> SpectralFile:
-    """The file with the wavelengths that a user gives; unchanged where there are none.
-
-    Raises:
-        CaptureError: another number of them than of bands.
-    """
-    given = options.wavelengths_nm
-    if given is None:
-        return file
-    if len(given) != file.shape[2]:
-        raise CaptureError(
-            f"{file.path} has {file.shape[2]} bands, --wavelengths gives {len(given)} numbers; expected one a band"
-        )
-    return replace(file, bands=BandTable(given, "given with --wavelengths"))
-
-
 def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
-    """The views of a scene of pictures. EXIF's orientation is ignored: poses refer to the stored raster.
-
-    Raises:
-        CaptureError: no frames, pictures are missing or can't be read, or a path leaves the folder.
-    """
+    """The views of a scene of pictures. EXIF's orientation is ignored: poses refer to the stored raster. Raises
+    CaptureError: no frames, pictures are missing or can't be read, or a path leaves the folder."""
     listed = read_frames(root, "file_path")
     names = view_names([frame.name for frame in listed.frames], str(root))
     found, folder = FoundFiles(root), listed.top.get("datadir")
@@ -225,11 +199,10 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         cubes += [] if path is None else [path]
         moved += path is not None and "val" in PurePosixPath(text).parts and not (root / text).is_file()
     found.refuse_missing(
-        "copy them into the folder; if there are RGB pictures alone, the layout 'nerfstudio' takes those"
+        "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"
     )
-    by_folder: list[Split | None] = [
-        _SPLIT_OF_FILE.get(PurePosixPath(frame.name).parent.name) for frame in listed.frames
-    ]
+    folders = [PurePosixPath(frame.name).parent.name for frame in listed.frames]
+    by_folder: list[Split | None] = [_SPLIT_OF_FILE.get(folder) for folder in folders]
     if None in by_folder or len(set(by_folder)) != 2:
         by_folder = [None] * len(by_folder)
     values = listed.top.get("wavelengths")

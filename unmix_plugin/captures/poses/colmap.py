@@ -11,6 +11,7 @@ import os
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -29,7 +30,14 @@ from unmix_plugin.captures.poses.lens_models import (
     project_fisheye,
     project_opencv,
 )
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
+from unmix_plugin.captures.poses.pose_set import (
+    FLIP,
+    PosedCamera,
+    PoseSet,
+    SparsePoints,
+    make_pose_set,
+    reading,
+)
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
@@ -114,12 +122,8 @@ def is_model(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> PoseSet:
-    """Poses, lenses and sparse points of the model in a folder.
-
-    Raises:
-        CaptureError: a file is missing or damaged, an image names a camera that is not there, or a lens can't be
-            represented.
-    """
+    """Poses, lenses and sparse points of the model in a folder. Raises CaptureError: a file is missing or damaged, an
+    image names a camera that is not there, or a lens can't be represented."""
     suffix = _suffix(folder)
     if suffix is None:
         raise CaptureError(
@@ -159,23 +163,15 @@ def _suffix(folder: Path) -> str | None:
 
 def _matrix(image: _Image, where: str) -> Float64[np.ndarray, "3 4"]:
     """Camera to world, OpenGL axes."""
+    from scipy.spatial.transform import Rotation
+
     length = float(np.linalg.norm(image.quaternion))
     if not 1e-6 < length < 1e6:
-        raise CaptureError(
-            f"{where}: {image.name} has the quaternion {image.quaternion}; expected length 1: the file is damaged"
-        )
-    w, x, y, z = np.array(image.quaternion) / length
-    to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    with np.errstate(
-        invalid="ignore"
-    ):  # places that are not finite are refused where all poses are looked at
-        return np.column_stack([to_camera.T @ FLIP, -to_camera.T @ np.array(image.translation)])
+        raise CaptureError(f"{where}: {image.name} has the quaternion {image.quaternion}; expected length 1")
+    w, x, y, z = image.quaternion
+    to_world = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    with np.errstate(invalid="ignore"):  # what is not finite is refused where all poses are looked at
+        return np.column_stack([to_world @ FLIP, -to_world @ np.array(image.translation)])
 
 
 def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
@@ -183,22 +179,19 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
     model, width, height, parameters = camera.model, camera.width, camera.height, camera.parameters
     if not np.isfinite(parameters).all() or not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(
-            f"{where} is {width} x {height} with {parameters}; expected a size and finite numbers: the file is damaged"
+            f"{where} is {width} x {height} with {parameters}; expected finite numbers above 0"
         )
     if model == "EQUIRECTANGULAR":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
         return fit_lens(lambda ideal: project_equirectangular(ideal, *parameters), start, model, where)
     fx, fy, cx, cy, *terms = (parameters[0], *parameters) if model in _ONE_FOCAL else parameters
     if min(fx, fy) <= 0:
-        raise CaptureError(
-            f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0: run COLMAP again"
-        )
+        raise CaptureError(f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0")
     focal, center = (fx, fy), (cx, cy)
     start = Lens(width, height, focal, center)
     if model in _FISHEYES:
-        return fit_lens(
-            lambda ideal: project_fisheye(ideal, focal, center, tuple(terms)), start, model, where
-        )
+        fisheye = partial(project_fisheye, focal_px=focal, center_px=center, terms=tuple(terms))
+        return fit_lens(fisheye, start, model, where)
     if model in _BENT:
         bend = _BENT[model]
         return fit_lens(lambda ideal: bend(ideal, terms) * focal + center, start, model, where)
@@ -224,10 +217,8 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
     for _ in range(reader.count(_CAMERA.size, "cameras")):
         number, model, width, height = reader.take(_CAMERA)
         if model not in _MODELS:
-            raise CaptureError(
-                f"{path}: a camera has the model number {model}; COLMAP's are {min(_MODELS)} to {max(_MODELS)}: "
-                "the file is damaged, or no file of COLMAP"
-            )
+            known = f"{min(_MODELS)} to {max(_MODELS)}"
+            raise CaptureError(f"{path}: a camera has the model number {model}; COLMAP's are {known}")
         name, length = _MODELS[model]
         cameras[number] = _Camera(name, width, height, reader.take(struct.Struct(f"<{length}d")))
     return cameras
@@ -270,9 +261,7 @@ class _Reader:
     def skip(self, count: int) -> None:
         left = len(self._data) - self._at
         if count > left:
-            raise CaptureError(
-                f"{self._path} ends early: {left} bytes are left where {count} are expected; copy it again"
-            )
+            raise CaptureError(f"{self._path} ends early: {left} of {count} bytes are left; copy it again")
         self._at += count
 
     def count(self, least_bytes: int, what: str) -> int:
@@ -281,8 +270,7 @@ class _Reader:
         left = len(self._data) - self._at
         if count * least_bytes > left:
             raise CaptureError(
-                f"{self._path} promises {count} {what}, but only {left} bytes follow; it is damaged or no file of "
-                "COLMAP: copy it again"
+                f"{self._path} promises {count} {what}, but only {left} bytes follow; copy it again"
             )
         return count
 
@@ -290,7 +278,7 @@ class _Reader:
         """Characters up to a zero."""
         end = self._data.find(b"\0", self._at, self._at + _LONGEST_NAME)
         if end < 0:
-            raise CaptureError(f"{self._path}: the name of an image has no end; it is damaged: copy it again")
+            raise CaptureError(f"{self._path}: the name of an image has no end; copy it again")
         text = self._data[self._at : end].decode("utf-8", "replace")
         self._at = end + 1
         return text
@@ -359,14 +347,11 @@ def _parsed(path: Path, parse: Callable[[str], _Record], expected: str) -> list[
         try:
             records.append(parse(line))
         except (ValueError, IndexError, KeyError, OverflowError) as error:
-            raise CaptureError(
-                f"{path}, line {number}: found {line.strip()[:80]!r}; expected {expected}: was the file cut short?"
-            ) from error
+            found = line.strip()[:80]
+            raise CaptureError(f"{path}, line {number}: found {found!r}; expected {expected}") from error
     return records
 
 
 def _bytes_of(path: Path) -> bytes:
-    try:
+    with reading(path):
         return read_bounded(path, MOST_TABLE_BYTES)
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error

@@ -16,7 +16,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
 from unmix_plugin.captures.poses.colmap import read_colmap
-from unmix_plugin.captures.poses.pose_set import PoseSet, name_some
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.errors import CaptureError, name_some
 
 _LEAST_VIEWS = 3
 _LEAST_SHARE = 0.5
@@ -93,13 +93,10 @@ def estimate_poses(
 
     if importlib.util.find_spec("pycolmap") is None:
         raise CaptureError(
-            "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give poses of "
-            "another program"
+            "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give other poses"
         )
     if len(pictures) < _LEAST_VIEWS:
-        raise CaptureError(
-            f"{len(pictures)} views; expected at least {_LEAST_VIEWS} to estimate poses from: {_WHAT_TO_DO}"
-        )
+        raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_WHAT_TO_DO}")
     files = {name: f"{index:06d}.png" for index, name in enumerate(sorted(pictures))}
     _write_pictures(folder, {files[name]: picture for name, picture in pictures.items()}, "images")
     if masks is not None:
@@ -111,14 +108,14 @@ def estimate_poses(
     sensors: dict[str, list[str]] = {}
     for name in sorted(pictures):
         sensors.setdefault((sensor_of or {}).get(name, ""), []).append(files[name])
-    settings = _Settings(
-        folder=str(folder.resolve()),
-        sensors=tuple(map(tuple, sensors.values())),
-        has_masks=masks is not None,
-        sequential=len(pictures) > _MOST_EXHAUSTIVE,
-        threads=threads or min(os.cpu_count() or 1, 8),
-        pictures=_digest(folder),
-    )
+    settings = {
+        "folder": str(folder.resolve()),
+        "sensors": list(sensors.values()),
+        "has_masks": masks is not None,
+        "sequential": len(pictures) > _MOST_EXHAUSTIVE,
+        "threads": threads or min(os.cpu_count() or 1, 8),
+        "pictures": _digest(folder),
+    }
     found = _run(settings, folder)
     return _best(found["models"], found["views"], files, folder)
 
@@ -140,26 +137,22 @@ def _digest(folder: Path) -> str:
     return found.hexdigest()
 
 
-def _run(settings: _Settings, folder: Path) -> dict[str, Any]:
+def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Start the process that reconstructs, with its output in the log file; or take what an earlier try found."""
-    result, asked = folder / _RESULT, folder.resolve() / "settings.json"
-    told = json.dumps(asdict(settings))
+    result, asked, told = folder / _RESULT, folder.resolve() / "settings.json", json.dumps(settings)
     if result.is_file() and asked.is_file() and asked.read_text(encoding="utf-8") == told:
         with contextlib.suppress(ValueError):  # cut short by a kill: found anew
             return json.loads(result.read_text(encoding="utf-8"))
     result.unlink(missing_ok=True)
-    asked.write_text(json.dumps(asdict(settings)), encoding="utf-8")
+    asked.write_text(told, encoding="utf-8")
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
     with (folder / _LOG).open("wb") as log:
-        status = subprocess.run(
-            command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False
-        ).returncode
+        ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
+    status = ran.returncode
     if status != 0 or not result.is_file():
         lines = (folder / _LOG).read_text("utf-8", "replace").strip().splitlines()
-        raise CaptureError(
-            f"COLMAP stopped with status {status} ({lines[-1].strip() if lines else 'without a word'}); see "
-            f"{folder / _LOG}"
-        )
+        last = lines[-1].strip() if lines else "without a word"
+        raise CaptureError(f"COLMAP stopped with status {status} ({last}); see {folder / _LOG}")
     return json.loads(result.read_text(encoding="utf-8"))
 
 
@@ -173,8 +166,7 @@ def _best(
         evidence, advice = _explain(views, files, folder)
         raise CaptureError(
             f"poses of only {registered} of {len(files)} views could be estimated; expected at least half. {evidence}. "
-            f"Try: {advice}. {folder / _REPORT} and {folder / _DRAWN} show the matches of the worst views; what was "
-            "found is kept for the next try"
+            f"Try: {advice}. {folder / _REPORT} and {folder / _DRAWN} show the worst views"
         )
     poses = read_colmap(Path(best["folder"]))
     cameras = {name: poses.cameras[file] for name, file in files.items() if file in poses.cameras}
@@ -183,9 +175,7 @@ def _best(
     notes = [f"COLMAP registered {registered} of {len(files)} views with {error}"]
     if missing:
         matches = ", ".join(f"{name} ({_most_matches(views[files[name]])})" for name in missing[:_MOST_WORST])
-        notes.append(
-            f"views without pose: {name_some(missing)}; matches with the view nearest to each: {matches}"
-        )
+        notes.append(f"views without pose: {name_some(missing)}; matches with the nearest view: {matches}")
     notes += poses.notes
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
 
@@ -281,39 +271,26 @@ def contrast_picture(
     return np.where(counts, np.round(255.0 * local), 0.0).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _Settings:
-    """What the process reconstructs."""
-
-    folder: str
-    """Holds `images` and gets `database.db` and `models`."""
-    sensors: tuple[tuple[str, ...], ...]
-    """Names of image files with one lens each."""
-    has_masks: bool
-    """Whether `masks` holds IMAGE.png for images, black where no features are wanted."""
-    sequential: bool
-    """Match neighbours in the order of names instead of all pairs."""
-    threads: int
-    pictures: str
-    """Digest of all of them."""
-
-
 def _reconstruct(path: Path) -> None:
     """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model; and
-    features and matches of each image. Those of an earlier try of the same pictures are gone on with."""
+    features and matches of each image. Those of an earlier try of the same pictures are gone on with.
+
+    The settings: `folder`, which holds `images` (and `masks`: IMAGE.png, black where no features are wanted, where
+    `has_masks`); `sensors`, names of image files with one lens each; whether to match neighbours in the order of names
+    alone (`sequential`); `threads`; and the digest of all pictures.
+    """
     import pycolmap
 
-    values = json.loads(path.read_text(encoding="utf-8"))
-    settings = _Settings(**{**values, "sensors": tuple(map(tuple, values["sensors"]))})
+    settings = json.loads(path.read_text(encoding="utf-8"))
     pycolmap.set_random_seed(_SEED)
-    folder = Path(settings.folder)
+    folder = Path(settings["folder"])
     database, matched = folder / "database.db", folder / "matched.txt"
-    if not (database.is_file() and matched.is_file() and matched.read_text() == settings.pictures):
+    if not (database.is_file() and matched.is_file() and matched.read_text() == settings["pictures"]):
         database.unlink(missing_ok=True)
         _extract(pycolmap, settings, database)
         _match(pycolmap, settings, database)
-        matched.write_text(settings.pictures)
-    count = sum(map(len, settings.sensors))
+        matched.write_text(settings["pictures"])
+    count = sum(map(len, settings["sensors"]))
     found: list[dict[str, Any]] = []
     for factor in _FOCAL_FACTORS:
         _set_focal(pycolmap, database, factor)
@@ -346,19 +323,19 @@ def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
     return views
 
 
-def _extract(pycolmap: Any, settings: _Settings, database: Path) -> None:
+def _extract(pycolmap: Any, settings: dict[str, Any], database: Path) -> None:
     options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu = settings.threads, False
+    options.num_threads, options.use_gpu = settings["threads"], False
     options.sift.max_num_features, options.sift.peak_threshold = _MOST_FEATURES, _PEAK_THRESHOLD
-    reader = pycolmap.ImageReaderOptions()
+    reader, folder = pycolmap.ImageReaderOptions(), Path(settings["folder"])
     reader.camera_model = "SIMPLE_RADIAL"  # a lens with one number of distortion
-    if settings.has_masks:
-        reader.mask_path = Path(settings.folder) / "masks"
-    for names in settings.sensors:
+    if settings["has_masks"]:
+        reader.mask_path = folder / "masks"
+    for names in settings["sensors"]:
         pycolmap.extract_features(
             database,
-            Path(settings.folder) / "images",
-            image_names=list(names),
+            folder / "images",
+            image_names=names,
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=options,
@@ -366,12 +343,12 @@ def _extract(pycolmap: Any, settings: _Settings, database: Path) -> None:
         )
 
 
-def _match(pycolmap: Any, settings: _Settings, database: Path) -> None:
+def _match(pycolmap: Any, settings: dict[str, Any], database: Path) -> None:
     options = pycolmap.FeatureMatchingOptions()
-    options.num_threads, options.use_gpu = settings.threads, False
+    options.num_threads, options.use_gpu = settings["threads"], False
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
-    match = pycolmap.match_sequential if settings.sequential else pycolmap.match_exhaustive
+    match = pycolmap.match_sequential if settings["sequential"] else pycolmap.match_exhaustive
     match(database, matching_options=options, verification_options=verification, device=pycolmap.Device.cpu)
 
 
@@ -386,11 +363,11 @@ def _set_focal(pycolmap: Any, database: Path, factor: float) -> None:
             opened.update_camera(camera)
 
 
-def _map(pycolmap: Any, settings: _Settings, database: Path, output: Path) -> list[dict[str, Any]]:
+def _map(pycolmap: Any, settings: dict[str, Any], database: Path, output: Path) -> list[dict[str, Any]]:
     """Models from one first focal length, without distortion, which a few views of a far lens would let run away."""
     output.mkdir(parents=True, exist_ok=True)
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = settings.threads, _SEED
+    options.num_threads, options.random_seed = settings["threads"], _SEED
     options.min_model_size = _LEAST_VIEWS
     options.max_num_models = 5
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = False
@@ -399,7 +376,7 @@ def _map(pycolmap: Any, settings: _Settings, database: Path, output: Path) -> li
     options.mapper.random_seed = options.triangulation.random_seed = _SEED
     options.mapper.init_min_tri_angle, options.mapper.init_min_num_inliers = 8.0, 50
     options.mapper.abs_pose_min_num_inliers, options.mapper.abs_pose_min_inlier_ratio = 15, 0.15
-    models = pycolmap.incremental_mapping(database, Path(settings.folder) / "images", output, options)
+    models = pycolmap.incremental_mapping(database, Path(settings["folder"]) / "images", output, options)
     found = []
     for number, model in models.items():
         place = output / str(number)

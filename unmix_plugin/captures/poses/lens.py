@@ -29,6 +29,18 @@ class FileLens:
 
 
 @dataclass(frozen=True)
+class _Cut:
+    """A model seen in a part of its picture, scaled; equal for equal parts, so that what follows is remembered."""
+
+    project: Project
+    corner: tuple[float, float]
+    scale: tuple[float, float]
+
+    def __call__(self, ideal: Points) -> Points:
+        return (self.project(ideal) - self.corner) * self.scale
+
+
+@dataclass(frozen=True)
 class Lens:
     """Intrinsics of a camera. Pixels, with the centre of the first pixel at (0.5, 0.5)."""
 
@@ -85,8 +97,7 @@ class Lens:
         """
         from_file = self.resampled_from
         if from_file is not None:
-            project = from_file.project
-            from_file = replace(from_file, project=lambda ideal: (project(ideal) - corner) * scale)
+            from_file = replace(from_file, project=_Cut(from_file.project, corner, scale))
         return replace(
             self,
             width=width,
@@ -112,6 +123,7 @@ _MOST_OUTSIDE = 0.95
 """Share of the file's picture that a pinhole may leave out; one of all directions loses 86 %."""
 _GRID = 21
 _STEP = 1e-6
+_CALIBRATE = "calibrate the camera again, or undistort the images and give poses with a pinhole lens"
 
 
 def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
@@ -133,21 +145,16 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
     if ideal is not None and np.linalg.norm(ideal, axis=1).max() < np.tan(np.radians(_WIDEST_DEG)):
         lens, worst = _nearest_opencv(pixels, ideal, start)
         if worst <= _LARGEST_ERROR_PX:
-            return (
-                lens,
-                f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px",
-            )
+            note = f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
+            return lens, note
         if not _folds(lens):
-            note = (
-                f"lens model {model}: no OPENCV lens comes nearer than {worst:.2g} px, so pixels are interpolated into "
-                "that one"
-            )
+            nearest = f"no OPENCV lens comes nearer than {worst:.2g} px"
+            note = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
             return replace(lens, resampled_from=FileLens(model, project, note)), note
     found = _widest_pinhole(project, start)
     if found is None:
         raise CaptureError(
-            f"{where}: the lens model {model} can't be followed even in the middle of the image; calibrate the camera "
-            "again, or undistort the images and export the poses with a pinhole lens"
+            f"{where}: the lens model {model} can't be followed even in the middle of the image; {_CALIBRATE}"
         )
     pinhole, outside = found
     corner = np.hypot(pinhole.width, pinhole.height) / 2 / pinhole.focal_px[0]
@@ -200,15 +207,10 @@ def _widest_pinhole(project: Project, start: Lens) -> tuple[Lens, float] | None:
 
 
 def require_unfolded(lens: Lens, where: str) -> None:
-    """Refuse a lens that maps two directions to one pixel of its image.
-
-    Raises:
-        CaptureError: it does.
-    """
+    """Refuse a lens that maps two directions to one pixel of its image. Raises CaptureError: it does."""
     if _folds(lens):
         raise CaptureError(
-            f"{where}: the distortion {[*lens.radial, *lens.tangential]} folds the corners of the image over; "
-            "calibrate the camera again, or undistort the images and export the poses with a pinhole lens"
+            f"{where}: the distortion {[*lens.radial, *lens.tangential]} folds the image's corners over; {_CALIBRATE}"
         )
 
 

@@ -65,17 +65,12 @@ def parse_family(name: str | None) -> str | None:
 
 
 def require_opencv() -> Any:
-    """OpenCV.
-
-    Raises:
-        CaptureError: it is not installed.
-    """
+    """OpenCV. Raises CaptureError: it is not installed."""
     try:
         import cv2
     except ImportError as error:
         raise CaptureError(
-            "markers can't be found: OpenCV is not installed; pip install 'unmix-nerf[sfm]', or give poses of another "
-            "program"
+            "OpenCV, which finds markers, is not installed; pip install 'unmix-nerf[sfm]', or give other poses"
         ) from error
     return cv2
 
@@ -89,16 +84,13 @@ def count_markers(
     """
     cv2 = require_opencv()
     families = _TRIED if family is None else (family,)
-    dictionaries = [_dictionary(cv2, name) for name in families]
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(0), _parameters(cv2))
-    detector.setDictionaries(dictionaries)
+    detector.setDictionaries([_dictionary(cv2, name) for name in families])
     seen: Counter[tuple[int, int]] = Counter()
     for picture in pictures:
         _, numbers, _, which = detector.detectMarkersMultiDict(_stretched(cv2, picture)[0])
-        pairs = (
-            [] if numbers is None else zip(np.ravel(which).tolist(), np.ravel(numbers).tolist(), strict=True)
-        )
-        seen.update(set(pairs))
+        if numbers is not None:
+            seen.update(set(zip(np.ravel(which).tolist(), np.ravel(numbers).tolist(), strict=True)))
     counts = dict.fromkeys(families, 0)
     for (index, _), count in seen.items():
         counts[families[index]] += count if count > 1 or len(pictures) == 1 else 0
@@ -135,9 +127,7 @@ def find_markers(
     if not doubled:
         return found, []
     numbers = ", ".join(map(str, sorted(doubled)))
-    return found, [
-        f"markers of one number twice in a picture, left out there: {numbers}; print each number once"
-    ]
+    return found, [f"markers of one number twice in a picture, left out there: {numbers}"]
 
 
 def _dictionary(cv2: Any, family: str) -> Any:

@@ -6,9 +6,8 @@ takes coordinates of b to those of a; camera axes are OpenCV's here, +x right, +
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
@@ -36,6 +35,7 @@ class Seen:
     """Index of the lens of each view."""
 
     def part(self, keep: Bool[np.ndarray, " S"]) -> Seen:
+        """Some of the sightings."""
         return replace(self, view=self.view[keep], marker=self.marker[keep], corners=self.corners[keep])
 
 
@@ -50,10 +50,14 @@ class MarkerMap:
     lenses: tuple[Lens, ...]
 
     def errors(self, seen: Seen) -> Float64[np.ndarray, "S 4 2"]:
-        """Pixels by which corners are missed."""
+        """Pixels by which corners are missed; points behind a camera are taken far off its picture."""
         corners = transformed(self.world_from_marker, self.sizes[:, None, None] * SQUARE)
         local = transformed(self.camera_from_world[seen.view], corners[seen.marker])
-        return _pixels(local, seen, self.lenses) - seen.corners
+        ideal, pixels = local[..., :2] / np.maximum(local[..., 2:], 1e-3), np.empty(local[..., :2].shape)
+        for index, lens in enumerate(self.lenses):
+            own = seen.sensor[seen.view] == index
+            pixels[own] = lens.pixels_of(ideal[own].reshape(-1, 2)).reshape(-1, 4, 2)
+        return pixels - seen.corners
 
 
 def solve(
@@ -93,37 +97,23 @@ def solve(
         for transforms, by in ((cameras, step[0]), (placed, step[1])):
             transforms[:, :3, :3] = Rotation.from_rotvec(by[:, :3]).as_matrix() @ transforms[:, :3, :3]
             transforms[:, :3, 3] += by[:, 3:6]
-        lenses = tuple(
-            replace(
-                lens,
-                focal_px=(lens.focal_px[0] * float(np.exp(by[0])), lens.focal_px[1] * float(np.exp(by[0]))),
-                distortion=(
-                    lens.distortion[0] + float(by[1]),
-                    lens.distortion[1] + float(by[2]),
-                    *lens.distortion[2:],
-                ),
-            )
-            if is_free
-            else lens
-            for lens, by, is_free in zip(found.lenses, step[2], free, strict=True)
-        )
-        return MarkerMap(cameras, placed, found.sizes * np.exp(step[1][:, 6]), lenses)
+        lenses = list(found.lenses)
+        for index in np.flatnonzero(free):
+            lens, (zoom, k1, k2) = lenses[index], step[2][index].tolist()
+            x, y = (focal * float(np.exp(zoom)) for focal in lens.focal_px)
+            bend = (lens.distortion[0] + k1, lens.distortion[1] + k2, *lens.distortion[2:])
+            lenses[index] = replace(lens, focal_px=(x, y), distortion=bend)
+        return MarkerMap(cameras, placed, found.sizes * np.exp(step[1][:, 6]), tuple(lenses))
 
     where = [columns[0][seen.view], columns[1][seen.marker], columns[2][seen.sensor[seen.view]]]
     column = np.concatenate(where, axis=1)[:, None].repeat(8, axis=1)
     row = np.arange(8 * len(seen.view)).reshape(-1, 8, 1).repeat(16, axis=2)
-    is_free = column >= 0
-
-    def slopes(values: np.ndarray) -> Any:
-        parts = _slopes(state(values), seen, values, columns)
-        return csr_matrix(
-            (parts[is_free], (row[is_free], column[is_free])), shape=(8 * len(seen.view), total)
-        )
-
+    acts = column >= 0  # a sighting's corners move with its view, marker and lens alone
+    pattern = csr_matrix((np.ones(acts.sum()), (row[acts], column[acts])), shape=(8 * len(seen.view), total))
     result = least_squares(
         lambda values: state(values).errors(seen).ravel(),
         np.zeros(total),
-        jac=slopes,  # type: ignore[arg-type]
+        jac_sparsity=pattern,
         loss=loss,
         x_scale="jac",
         tr_solver="lsmr",
@@ -132,87 +122,10 @@ def solve(
     return state(result.x)
 
 
-def _slopes(
-    found: MarkerMap, seen: Seen, values: np.ndarray, columns: Sequence[np.ndarray]
-) -> Float64[np.ndarray, "S 8 16"]:
-    """Derivatives of the pixels of each sighting's corners by the columns of its view, marker and lens."""
-    padded = np.append(values, 0.0)
-    square = found.sizes[seen.marker, None, None] * SQUARE
-    placed, camera = found.world_from_marker[seen.marker], found.camera_from_world[seen.view]
-    turned = transformed(placed, square) - placed[:, None, :3, 3]
-    world = turned + placed[:, None, :3, 3]
-    swung = world @ camera[:, :3, :3].transpose(0, 2, 1)
-    local = swung + camera[:, None, :3, 3]
-    view_turn = np.where(columns[0] < 0, 0.0, padded[columns[0]])[seen.view, :3]
-    marker_turn = np.where(columns[1] < 0, 0.0, padded[columns[1]])[seen.marker, :3]
-    by_local, by_lens = _lens_slopes(local, seen, found.lenses)
-    into_camera = camera[:, None, :3, :3]
-    by_view = np.concatenate(
-        [-_cross(swung) @ _left(view_turn)[:, None], np.eye(3) + 0 * _cross(swung)], axis=-1
-    )
-    by_marker = np.concatenate(
-        [-_cross(turned) @ _left(marker_turn)[:, None], np.eye(3) + 0 * _cross(turned), turned[..., None]],
-        axis=-1,
-    )
-    parts = [by_local @ by_view, by_local @ (into_camera @ by_marker), by_lens]
-    return np.concatenate(parts, axis=-1).reshape(len(seen.view), 8, 16)
-
-
-def _cross(vectors: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """Matrices that take the cross product with vectors from the left."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _left(turns: Float64[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3 3"]:
-    """How rotation vectors turn further with a small step of theirs (the left Jacobian of SO(3))."""
-    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
-    cross = _cross(turns)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    return np.eye(3) + first * cross + second * cross @ cross
-
-
-def _lens_slopes(
-    local: Float64[np.ndarray, "S 4 3"], seen: Seen, lenses: Sequence[Lens]
-) -> tuple[Float64[np.ndarray, "S 4 2 3"], Float64[np.ndarray, "S 4 2 3"]]:
-    """Derivatives of pixels by the point before the camera, and by log f, k1, k2; tangential terms left out."""
-    sensor = seen.sensor[seen.view]
-    focal = np.array([lens.focal_px for lens in lenses])[sensor][:, None]
-    radial = np.array([lens.radial for lens in lenses])[sensor]
-    depth = local[..., 2:]
-    ideal = local[..., :2] / depth
-    squared = (ideal**2).sum(axis=-1)
-    powers = squared[..., None] ** np.arange(1, 5)
-    grown = 1.0 + (powers * radial[:, None]).sum(axis=-1)
-    growth = (np.arange(1, 5) * squared[..., None] ** np.arange(4) * radial[:, None]).sum(axis=-1)
-    by_ideal = grown[..., None, None] * np.eye(2) + 2 * growth[..., None, None] * (
-        ideal[..., :, None] * ideal[..., None, :]
-    )
-    by_point = np.concatenate([np.eye(2) + 0 * by_ideal, -ideal[..., None]], axis=-1) / depth[..., None]
-    by_lens = np.stack([ideal * grown[..., None], ideal * powers[..., :1], ideal * powers[..., 1:2]], axis=-1)
-    return focal[..., None] * (by_ideal @ by_point), focal[..., None] * by_lens
-
-
-def _pixels(
-    local: Float64[np.ndarray, "S 4 3"], seen: Seen, lenses: Sequence[Lens]
-) -> Float64[np.ndarray, "S 4 2"]:
-    """Where lenses see points; points behind the camera are taken far off the picture."""
-    ideal = local[..., :2] / np.maximum(local[..., 2:], 1e-3)
-    pixels = np.empty_like(ideal)
-    sensor = seen.sensor[seen.view]
-    for index, lens in enumerate(lenses):
-        pixels[sensor == index] = lens.pixels_of(ideal[sensor == index].reshape(-1, 2)).reshape(-1, 4, 2)
-    return pixels
-
-
 def transformed(
     transforms: Transforms, points: Float64[np.ndarray, "#*n P 3"]
 ) -> Float64[np.ndarray, "*n P 3"]:
+    """Points in the coordinates that transforms lead to."""
     return points @ np.swapaxes(transforms[..., :3, :3], -1, -2) + transforms[..., None, :3, 3]
 
 

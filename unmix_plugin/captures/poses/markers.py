@@ -31,8 +31,8 @@ from unmix_plugin.captures.poses.marker_map import (
     solve,
     transformed,
 )
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, name_some
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
+from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.scenes.placement import Placement
 
 LEAST_VIEWS = 3
@@ -76,18 +76,15 @@ def poses_from_markers(
             have several sizes, or they moved against each other.
     """
     require_opencv()
-    sensors = sorted({(sensor_of or {}).get(name, "") for name in sightings})
-    seen = _gather(sightings, {name: sensors.index((sensor_of or {}).get(name, "")) for name in sightings})
+    sensor_of, lenses = sensor_of or {}, lenses or {}
+    sensors = sorted({sensor_of.get(name, "") for name in sightings})
+    seen = _gather(sightings, {name: sensors.index(sensor_of.get(name, "")) for name in sightings})
     first = []
     for sensor in sensors:
-        width, height = next(
-            size for name, size in sizes_px.items() if (sensor_of or {}).get(name, "") == sensor
-        )
-        known = (lenses or {}).get(sensor)
-        first.append(known or Lens(width, height, (0.0, 0.0), (width / 2, height / 2)))
-    free = np.array([sensor not in (lenses or {}) for sensor in sensors])
-    begun = _begin(seen, first, free)
-    found, kept = _adjust(begun, seen, free)
+        width, height = next(size for name, size in sizes_px.items() if sensor_of.get(name, "") == sensor)
+        first.append(lenses.get(sensor) or Lens(width, height, (0.0, 0.0), (width / 2, height / 2)))
+    free = np.array([sensor not in lenses for sensor in sensors])
+    found, kept = _adjust(_begin(seen, first, free), seen, free)
     _refuse_several_sizes(found, seen, kept)
     found = replace(found, sizes=np.ones(len(found.sizes)))
     found, kept = _adjust(found, seen, free, same_size=True)
@@ -97,11 +94,7 @@ def poses_from_markers(
 
 
 def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
-    """Sightings of markers that at least two views have.
-
-    Raises:
-        CaptureError: there are none in at least three views.
-    """
+    """Sightings of markers that at least two views have, at least three views of them."""
     views_of = Counter(number for markers in sightings.values() for number in markers)
     shared = {number for number, count in views_of.items() if count > 1}
     views = [name for name, markers in sightings.items() if shared & set(markers)]
@@ -109,8 +102,7 @@ def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
         alone = sum(bool(markers) for markers in sightings.values())
         raise CaptureError(
             f"markers are seen in {alone} of {len(sightings)} views, the same ones in {len(views)}; expected at least "
-            f"{LEAST_VIEWS} views of the same markers: take the board into every picture, larger or sharper, or let "
-            "another way find the poses (--poses estimate)"
+            f"{LEAST_VIEWS}: take the board into every picture, larger or sharper, or give --poses estimate"
         )
     numbers = sorted(shared)
     rows = [
@@ -143,8 +135,7 @@ def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> 
             begun.append((float(usable.mean()), float(misses.mean()), start))
     if not begun:
         raise CaptureError(
-            "the markers of the views do not belong together; expected pictures that show several markers at once, or "
-            "always the same: take the whole board into every picture"
+            "the markers of the views do not belong together; take several of them, the whole board, into every picture"
         )
     most = max(share for share, _, _ in begun)
     ranked = sorted((miss, index) for index, (share, miss, _) in enumerate(begun) if share > 0.95 * most)
@@ -170,9 +161,15 @@ class _Chain:
     def __init__(self, seen: Seen, lenses: tuple[Lens, ...]) -> None:
         self._seen, self._lenses = seen, lenses
         self._focal = np.array([lens.focal_px[0] for lens in lenses])[seen.sensor][seen.view]
-        self._ideal = np.stack(
-            [_ideal(lenses[seen.sensor[v]], c) for v, c in zip(seen.view, seen.corners, strict=True)]
-        )
+        self._ideal = np.empty_like(seen.corners)
+        for index, lens in enumerate(lenses):
+            own = seen.sensor[seen.view] == index
+            ideal = lens.ideal_of(seen.corners[own].reshape(-1, 2))
+            if ideal is None:
+                raise CaptureError(
+                    "a lens folds its picture over, so markers can't be placed: calibrate it again"
+                )
+            self._ideal[own] = ideal.reshape(-1, 4, 2)
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""
         self._placed = np.full((len(seen.numbers), 4, 4), np.nan)
@@ -272,23 +269,11 @@ def _resected(
     return pose
 
 
-def _ideal(lens: Lens, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, "P 2"]:
-    """Ideal points that a lens sees at pixels, by fixed-point iteration."""
-    ideal = (pixels - np.array(lens.center_px)) / np.array(lens.focal_px)
-    for _ in range(20 if any(lens.radial) or any(lens.tangential) else 0):
-        ideal = ideal + (pixels - lens.pixels_of(ideal)) / np.array(lens.focal_px)
-    return ideal
-
-
 # Bundle adjustment, sightings that don't fit, and distortion.
 
 
 def _adjust(
-    found: MarkerMap,
-    seen: Seen,
-    free: Bool[np.ndarray, " L"],
-    same_size: bool = False,
-    steps: int = 60,
+    found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"], same_size: bool = False, steps: int = 60
 ) -> tuple[MarkerMap, Bool[np.ndarray, " S"]]:
     """The map that explains most sightings, and which these are."""
     usable = _usable(found, seen)
@@ -318,8 +303,8 @@ def _refuse_several_sizes(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, "
     if odd.any():
         each = [f"{seen.numbers[markers[i]]} ({relative[i]:.2f})" for i in np.flatnonzero(odd)]
         raise CaptureError(
-            f"markers have several sizes: over the usual one, {name_some(each)}; expected all to have the side that "
-            "--marker-size gives: cover the others, or print them in another --marker-family"
+            f"markers have several sizes: over the usual one, {name_some(each)}; expected the side that --marker-size "
+            "gives: cover the others, or print them in another --marker-family"
         )
 
 
@@ -341,9 +326,8 @@ def _refuse_moved(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) ->
             f"them of the markers {name_some(numbers)}"
         )
     raise CaptureError(
-        f"markers did not keep their places: {found_is}; expected boards that are fixed to each other and to the "
-        "object: cover those of one board, or print them in another --marker-family; if none moved, the lens bends "
-        "more than k1 and k2 can say"
+        f"markers did not keep their places: {found_is}; expected boards that are fixed to the object: cover those "
+        "that are not. If none moved, the lens bends more than k1 and k2 can say"
     )
 
 
@@ -363,25 +347,21 @@ def _pose_set(
     cameras = {}
     for view in views:
         pose = np.linalg.inv(found.camera_from_world[view])
-        position = to_board.to_scene(pose[:3, 3])
-        matrix = np.column_stack([to_board.rotation @ pose[:3, :3] @ FLIP, position])
-        cameras[seen.views[view]] = PosedCamera(matrix, found.lenses[seen.sensor[view]])
+        camera = PosedCamera(
+            np.column_stack([pose[:3, :3] @ FLIP, pose[:3, 3]]), found.lenses[seen.sensor[view]]
+        )
+        cameras[seen.views[view]] = camera.moved(to_board)
     error = float(np.sqrt(np.mean(rms(found.errors(seen.part(kept))) ** 2)))
-    notes = []
-    notes.append(
-        f"markers gave poses of {len(cameras)} of {len(sightings)} views: {counted(len(markers), 'marker')} in "
-        f"{len(seen.view[kept])} sightings, corners off by {error:.2f} px (root mean square)"
-    )
+    found_in = f"{counted(len(markers), 'marker')} in {len(seen.view[kept])} sightings"
+    gave = f"markers gave poses of {len(cameras)} of {len(sightings)} views: {found_in}"
+    notes = [f"{gave}, corners off by {error:.2f} px (root mean square)"]
     if missing := [name for name in sightings if name not in cameras]:
         notes.append(f"views without enough markers: {name_some(missing)}")
     if left := int((~kept).sum()):
         notes.append(f"{counted(left, 'sighting')} of markers left out as not fitting the others")
-    focal = ", ".join(
-        f"{lens.focal_px[0]:.1f}" for lens, is_free in zip(found.lenses, free, strict=True) if is_free
-    )
-    notes += [f"focal length estimated from the markers: {focal} px"] if focal else []
-    notes.append(how_up)
-    notes.append(_how_large(marker_size))
+    focal = [f"{lens.focal_px[0]:.1f}" for lens, own in zip(found.lenses, free, strict=True) if own]
+    notes += [f"focal length estimated from the markers: {', '.join(focal)} px"] if focal else []
+    notes += [how_up, _how_large(marker_size)]
     return PoseSet(
         dict(sorted(cameras.items())),
         "markers in the pictures",
@@ -424,19 +404,13 @@ def stand_on_markers(
     way = Placement(rotation, -rotation @ points.mean(axis=0), marker_size / float(np.median(sides)))
     if group.sum() < 2 <= len(corners):
         return way, None, "no two markers lie in one plane, so they do not tell up"
-    return (
-        way,
-        np.array([0.0, 0.0, 1.0]),
-        f"up is square to the plane of {counted(int(group.sum()), 'marker')}",
-    )
+    how_up = f"up is square to the plane of {counted(int(group.sum()), 'marker')}"
+    return way, np.array([0.0, 0.0, 1.0]), how_up
 
 
 def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> PoseSet:
-    """Poses that were found without markers, in the world that stands on the markers in view.
-
-    Raises:
-        CaptureError: no marker is seen by two cameras that agree on where it is.
-    """
+    """Poses that were found without markers, in the world that stands on the markers in view. Raises CaptureError: no
+    marker is seen by two cameras that agree on where it is."""
     views_of: dict[int, list[tuple[PosedCamera, np.ndarray]]] = {}
     for name, markers in sightings.items():
         camera = poses.cameras.get(name)
@@ -448,24 +422,11 @@ def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> Po
     if not corners:
         raise CaptureError(
             f"--marker-size: {counted(len(views_of), 'marker')} in the views, none of them seen by two cameras that "
-            "agree; expected the same marker, sharp, in two views or more: leave --marker-size out, or take it into "
-            "more pictures"
+            "agree; take the same one, sharp, into more pictures, or leave --marker-size out"
         )
     way, up, how_up = stand_on_markers(np.stack(corners), marker_size)
-    cameras = {}
-    for name, camera in poses.cameras.items():
-        pose = camera.camera_to_world
-        moved = np.column_stack([way.rotation @ pose[:, :3], way.to_scene(pose[:, 3])])
-        cameras[name] = replace(camera, camera_to_world=moved)
-    return replace(
-        poses,
-        cameras=cameras,
-        points=None if poses.points is None else way.to_scene(poses.points),
-        up=up,
-        has_world=True,
-        metres_per_unit=1.0,
-        notes=(*poses.notes, how_up, _how_large(marker_size)),
-    )
+    notes = (*poses.notes, how_up, _how_large(marker_size))
+    return replace(poses.moved(way), up=up, has_world=True, metres_per_unit=1.0, notes=notes)
 
 
 def _located(
@@ -477,13 +438,13 @@ def _located(
         table, wanted = np.zeros((4, 3, 3)), np.zeros((4, 3))
         for camera, pixels in left:
             assert camera.lens is not None
-            pose = camera.camera_to_world
-            ideal = _ideal(camera.lens, pixels)
+            pose, ideal = camera.camera_to_world, camera.lens.ideal_of(pixels)
+            if ideal is None:
+                return None
             rays = np.column_stack([ideal, np.ones(4)]) @ FLIP @ pose[:, :3].T
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             across = np.eye(3) - rays[:, :, None] * rays[:, None]
-            table = table + across
-            wanted = wanted + across @ pose[:, 3]
+            table, wanted = table + across, wanted + across @ pose[:, 3]
         points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
         misses = [rms((camera.pixels_of(points) - pixels)[None])[0] for camera, pixels in left]
         if max(misses) < 2.0 * _OUTLIER_PX:

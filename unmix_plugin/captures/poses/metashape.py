@@ -10,6 +10,7 @@ which are OpenCV's p2, p1.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -28,11 +29,10 @@ from unmix_plugin.captures.poses.pose_set import (
     PosedCamera,
     PoseSet,
     make_pose_set,
-    name_some,
     number_of,
     numbers_of,
 )
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.errors import CaptureError, counted, name_some
 
 _EARTH_RADII = (6.2e6, 6.6e6)
 """Metres from the middle of the Earth between which a position is geocentric."""
@@ -40,17 +40,13 @@ _RADIAL = ("k1", "k2", "k3", "k4")
 
 
 def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
-    """Poses of all enabled cameras with a transform, in or out of groups.
-
-    Raises:
-        CaptureError: no chunk, no aligned camera, several components without a common world, or a lens that can't be
-            represented.
-    """
+    """Poses of all enabled cameras with a transform, in or out of groups. Raises CaptureError: no chunk, no aligned
+    camera, several components without a common world, or a lens that can't be represented."""
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled", "true") != "false"]
     chunks = [chunk for chunk in chunks if chunk.find("cameras") is not None]
     if not chunks:
         raise CaptureError(
-            f"{path} has no chunk with cameras; expected Metashape's File > Export > Export Cameras"
+            f"{path} has no chunk with cameras; use Metashape's File > Export > Export Cameras"
         )
     chunk = max(chunks, key=lambda one: len(list(one.iter("camera"))))
     notes = [f"{len(chunks)} chunks; the one with the most cameras was read"] if len(chunks) > 1 else []
@@ -72,9 +68,7 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
         world = worlds.get(camera.get("component_id"), worlds[None])
         values = numbers_of(camera.find("transform"), 16, f"{path}: camera {camera.get('label')}")
         if values is None:
-            raise CaptureError(
-                f"{path}: camera {camera.get('label')}: <transform> is empty; expected 16 numbers"
-            )
+            raise CaptureError(f"{path}: camera {camera.get('label')}: <transform> is empty")
         scale = np.cbrt(np.abs(np.linalg.det(world[:3, :3]))) or 1.0
         matrix = world @ values.reshape(4, 4)
         pose = np.column_stack([matrix[:3, :3] / scale @ FLIP, matrix[:3, 3]])
@@ -98,7 +92,7 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
     missing = [camera.get("label", "?") for camera in enabled if camera.find("transform") is None]
     if not aligned:
         raise CaptureError(
-            f"{path}: none of {len(cameras)} cameras is enabled and has a transform; align photos in Metashape first"
+            f"{path}: none of {len(cameras)} cameras is enabled and has a transform; align photos first"
         )
     if missing:
         why = ""
@@ -150,15 +144,12 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
         return _from_physical(sensor, size), [f"sensor {name} is not calibrated: nominal focal length"]
     kind = calibration.get("type") or sensor.get("type", "frame")
     if kind not in ("frame", "fisheye", "spherical"):
-        raise CaptureError(
-            f"{where} is of the type {kind}; expected frame, fisheye or spherical: export undistorted photos"
-        )
+        raise CaptureError(f"{where} is of the type {kind}; expected frame, fisheye or spherical")
     width, height = size
     if kind == "spherical":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        around, said = fit_lens(
-            lambda ideal: project_equirectangular(ideal, width, height), start, "Metashape spherical", where
-        )
+        project = partial(project_equirectangular, width=width, height=height)
+        around, said = fit_lens(project, start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
     values = {
         tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
@@ -175,7 +166,7 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
         bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])
         return Lens(width, height, focal, center, *bends), []
 
-    def project(ideal: Points) -> Points:
+    def bent_and_skewed(ideal: Points) -> Points:
         if kind == "fisheye":
             bent = bend_brown_fisheye(ideal, radial, tangential)
         else:
@@ -183,7 +174,7 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
         return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center
 
     model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"
-    fitted, note = fit_lens(project, Lens(width, height, focal, center), model, where)
+    fitted, note = fit_lens(bent_and_skewed, Lens(width, height, focal, center), model, where)
     return fitted, [f"sensor {name}: {note}"]
 
 

@@ -44,11 +44,8 @@ def find_orientations(folder: Path) -> list[Path]:
 
 
 def read_micmac(paths: list[Path]) -> PoseSet:
-    """Poses of orientation files.
-
-    Raises:
-        CaptureError: a file is damaged, of another convention, or its calibration is missing or can't be represented.
-    """
+    """Poses of orientation files. Raises CaptureError: a file is damaged, of another convention, or its calibration is
+    missing or can't be represented."""
     lenses: dict[str, Lens] = {}
     notes: list[str] = []
     raw = []
@@ -56,7 +53,7 @@ def read_micmac(paths: list[Path]) -> PoseSet:
         root = load_xml(path)
         orientation = root if root.tag == "OrientationConique" else root.find("OrientationConique")
         if orientation is None:
-            raise CaptureError(f"{path} holds no <OrientationConique>; expected an orientation of MicMac")
+            raise CaptureError(f"{path} holds no <OrientationConique> of MicMac")
         lens = _lens_micmac(orientation, path, lenses, notes)
         name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
         raw.append((name, PosedCamera(_matrix(orientation, str(path)), lens)))
@@ -76,9 +73,7 @@ def _matrix(orientation: ElementTree.Element, where: str) -> Float64[np.ndarray,
     code = orientation.find("Externe/ParamRotation/CodageMatr")
     rows = [None if code is None else numbers_of(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
     if center is None or any(row is None for row in rows):
-        raise CaptureError(
-            f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing; export it again"
-        )
+        raise CaptureError(f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing")
     return np.column_stack([np.array(rows) @ FLIP, center])
 
 
@@ -93,15 +88,11 @@ def _lens_micmac(
         if inner is None:
             file = path.parent / Path(name.replace("\\", "/")).name  # whatever folder it was written in
             if not name or not file.is_file():
-                raise CaptureError(
-                    f"{path} names the calibration {name!r}, which is not beside it; copy it into {path.parent}"
-                )
+                raise CaptureError(f"{path} names the calibration {name!r}; copy it into {path.parent}")
             where, root = str(file), load_xml(file)
             inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
         if inner is None:
-            raise CaptureError(
-                f"{where} holds no <CalibrationInternConique>; expected a calibration of MicMac"
-            )
+            raise CaptureError(f"{where} holds no <CalibrationInternConique> of MicMac")
         lenses[key], said = _calibration_micmac(inner, where)
         notes += said
     return lenses[key]
@@ -120,8 +111,7 @@ def _calibration_micmac(inner: ElementTree.Element, where: str) -> tuple[Lens, l
     unknown = [model.tag for model in bends if model.tag not in ("ModRad", "ModPhgrStd")]
     if unknown:
         raise CaptureError(
-            f"{where}: the distortion {unknown[0]} is not supported; expected ModRad or ModPhgrStd: "
-            "calibrate with RadialStd or Fraser, or undistort with Drunk"
+            f"{where}: the distortion {unknown[0]} is not supported; calibrate with RadialStd or Fraser, or use Drunk"
         )
     if not bends:
         return start, []

@@ -20,15 +20,8 @@ from unmix_plugin.captures.poses.lens_models import (
     project_equirectangular,
     project_fisheye,
 )
-from unmix_plugin.captures.poses.pose_set import (
-    FLIP,
-    PosedCamera,
-    PoseSet,
-    SparsePoints,
-    make_pose_set,
-    name_some,
-)
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
+from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
@@ -45,11 +38,8 @@ def is_reconstruction(content: Any) -> bool:
 
 
 def read_opensfm(path: Path, content: Any) -> PoseSet:
-    """Poses, lenses and points of the reconstruction with the most shots.
-
-    Raises:
-        CaptureError: a shot without a sound pose or camera, or a lens that can't be represented.
-    """
+    """Poses, lenses and points of the reconstruction with the most shots. Raises CaptureError: a shot without a sound
+    pose or camera, or a lens that can't be represented."""
     parts = [part for part in (content if isinstance(content, list) else [content]) if isinstance(part, dict)]
     parts = [part for part in parts if isinstance(part.get("shots"), dict)]
     best = max(parts, key=lambda part: len(part["shots"]), default={})
@@ -85,9 +75,7 @@ def _world_to_camera(
 ) -> Float64[np.ndarray, "3 4"] | None:
     """The shot's own pose, otherwise that of its rig: first into the rig, then into its camera. None without either."""
     if not isinstance(shot, dict):
-        raise CaptureError(
-            f"{where} is {describe(shot)}; expected an object with 'rotation' and 'translation'"
-        )
+        raise CaptureError(f"{where} is {describe(shot)}; expected an object")
     if "rotation" in shot:
         return _pose(shot, where)
     for instance in _object(content, "rig_instances").values():
@@ -97,7 +85,7 @@ def _world_to_camera(
         lens = _object(content, "rig_cameras").get(members[name])
         if not isinstance(lens, dict):
             raise CaptureError(
-                f"{where} names the rig camera {describe(members[name])}; expected one of 'rig_cameras'"
+                f"{where} names the rig camera {describe(members[name])}, not in 'rig_cameras'"
             )
         outer, inner = _pose(instance, where), _pose(lens, where)
         return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
@@ -129,9 +117,7 @@ def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
     if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
         raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
     if kind not in _KNOWN:
-        raise CaptureError(
-            f"{where} is {describe(kind)}; expected one of {', '.join(_KNOWN)}: undistort with OpenSfM"
-        )
+        raise CaptureError(f"{where} is {describe(kind)}; expected one of {', '.join(_KNOWN)}")
     side = max(width, height)
     focal = (side * focal[0], side * focal[1])
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))

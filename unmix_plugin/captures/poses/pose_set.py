@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
@@ -19,8 +20,9 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.limits import read_bounded
+from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
+from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.faults import UnreadableJsonError, read_json_file
 
 FLIP = np.diag([1.0, -1.0, -1.0])
@@ -35,7 +37,6 @@ _FAR = 100.0
 """Cameras further from the origin than this many times their spread are geo-referenced."""
 _FAR_ALONE = 1e4
 """The same for one camera, in units of the source."""
-_MAX_NAMED = 3
 
 SparsePoints: TypeAlias = tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]
 """Positions and sRGB of structure from motion's points."""
@@ -58,6 +59,12 @@ class PosedCamera:
         x, y, z = ((points - self.camera_to_world[:, 3]) @ self.camera_to_world[:, :3] @ FLIP).T
         depth = np.where(z > 1e-9, z, np.nan)
         return self.lens.pixels_of(np.column_stack([x / depth, y / depth]))
+
+    def moved(self, way: Placement) -> PosedCamera:
+        """The camera in the world that a similarity leads to."""
+        pose = self.camera_to_world
+        place = way.to_scene(pose[:, 3])
+        return replace(self, camera_to_world=np.column_stack([way.rotation @ pose[:, :3], place]))
 
 
 @dataclass(frozen=True)
@@ -84,6 +91,13 @@ class PoseSet:
     """What was changed or is odd: rotations made rigid, frames without files, ..."""
     warnings: tuple[str, ...] = ()
     """What may make the geometry wrong, one sentence each: reports begin with it."""
+
+    def moved(self, way: Placement) -> PoseSet:
+        """Cameras and points in the world that a similarity leads to."""
+        cameras = {name: camera.moved(way) for name, camera in self.cameras.items()}
+        return replace(
+            self, cameras=cameras, points=None if self.points is None else way.to_scene(self.points)
+        )
 
 
 def path_text(text: str) -> str:
@@ -119,9 +133,8 @@ def make_pose_set(
     moved = np.column_stack([np.zeros((3, 3)), offset])
     said = [*notes, *made_rigid]
     if repeated:
-        said.append(
-            f"{counted(len(repeated), 'camera')} listed twice with the same pose: {name_some(repeated)}"
-        )
+        listed = counted(len(repeated), "camera")
+        said.append(f"{listed} listed twice with the same pose: {name_some(repeated)}")
     if offset.any():
         said.append(f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}")
     positions, colours = points if points is not None and len(points[0]) else (None, None)
@@ -151,12 +164,6 @@ def find_offset(positions: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "3
     return np.round(middle) if is_far else np.zeros(3)
 
 
-def name_some(names: Sequence[str]) -> str:
-    """A few names for a message, and how many more there are."""
-    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-    return ", ".join(names[:_MAX_NAMED]) + more
-
-
 def _unique(
     cameras: Iterable[tuple[str, PosedCamera]], where: str
 ) -> tuple[dict[str, PosedCamera], list[str]]:
@@ -167,10 +174,7 @@ def _unique(
         if first is camera:
             continue
         if not np.array_equal(first.camera_to_world, camera.camera_to_world) or first.lens != camera.lens:
-            raise CaptureError(
-                f"{where} has two cameras of the name {name} with different poses; expected one for each image: rename "
-                "or remove one"
-            )
+            raise CaptureError(f"{where} has two cameras of the name {name} with different poses; rename one")
         repeated.append(name)
     return unique, repeated
 
@@ -189,8 +193,7 @@ def _make_rigid(
         listed = "; ".join(f"{name_some(names)}: {fault}" for fault, names in faulty.items())
         raise CaptureError(
             f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are not poses: "
-            f"{listed}; expected camera to world, a rotation (or a scaled one) and a position: remove these frames or "
-            "export again"
+            f"{listed}; expected camera to world, a rotation (or a scaled one) and a position"
         )
     rigid, scaled = {}, []
     for name, matrix in matrices.items():
@@ -200,9 +203,7 @@ def _make_rigid(
         scaled += [scale] if abs(scale - 1.0) > _SCALE_TOLERANCE else []
     first = next(iter(rigid.values()))
     if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
-        raise CaptureError(
-            f"{where}: all {len(rigid)} cameras have the same pose; expected different ones, estimate them again"
-        )
+        raise CaptureError(f"{where}: all {len(rigid)} cameras have the same pose; estimate them again")
     if not scaled:
         return rigid, []
     low, high = min(scaled), max(scaled)
@@ -233,46 +234,38 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
 # JSON and XML of unknown origin, and numbers in XML.
 
 
-def load_json(path: Path) -> Any:
-    """What the file holds.
-
-    Raises:
-        CaptureError: it can't be read, or is no JSON.
-    """
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Context in which an error of the system becomes one of reading a file."""
     try:
-        return read_json_file(path)
-    except UnreadableJsonError as error:
-        raise CaptureError(f"{path} {error}") from error
+        yield
     except OSError as error:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
+
+
+def load_json(path: Path) -> Any:
+    """What a file holds; CaptureError where it can't be read, or is no JSON."""
+    try:
+        with reading(path):
+            return read_json_file(path)
+    except UnreadableJsonError as error:
+        raise CaptureError(f"{path} {error}") from error
 
 
 def load_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file.
-
-    Raises:
-        CaptureError: it can't be read, is no XML, or declares entities, which could grow without end.
-    """
+    """The root of an XML file; CaptureError where it can't be read, is no XML, or declares entities."""
     try:
-        data = read_bounded(path)
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise CaptureError(f"{path} declares a DOCTYPE or entities; expected plain XML: export it again")
-    try:
-        return ElementTree.fromstring(data)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
+        with reading(path):
+            return parse_xml(read_bounded(path, MOST_TABLE_BYTES))
+    except ValueError as error:
         raise CaptureError(f"{path} is not valid XML ({error}); was it cut short?") from error
 
 
 def numbers_of(
     element: ElementTree.Element | None, count: int, where: str
 ) -> Float64[np.ndarray, " count"] | None:
-    """Numbers in the text of an element; None without an element or text.
-
-    Raises:
-        CaptureError: they are not as many finite numbers.
-    """
+    """Numbers in the text of an element; None without an element or text, CaptureError for other than `count` finite
+    ones."""
     if element is None or not (element.text or "").strip():
         return None
     texts = (element.text or "").split()
@@ -281,9 +274,8 @@ def numbers_of(
     except ValueError:
         values = np.full(count, np.nan)
     if len(texts) != count or not np.isfinite(values).all():
-        raise CaptureError(
-            f"{where}: <{element.tag}> holds {' '.join(texts)[:60]!r}; expected {count} finite numbers: is it damaged?"
-        )
+        found = " ".join(texts)[:60]
+        raise CaptureError(f"{where}: <{element.tag}> holds {found!r}; expected {count} finite numbers")
     return values
 
 
@@ -327,8 +319,7 @@ def match_poses(
     if not found:
         raise CaptureError(
             f"no view has a pose: views are called {name_some(list(wanted)) or '(none)'}, the cameras of "
-            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes: "
-            "rename one of them"
+            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes"
         )
     unposed = [name for name in wanted if name not in found]
     unused = [name for name in owners if name not in set(found.values())]
@@ -347,9 +338,7 @@ def match_poses(
     if unused:
         notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
     if shared:
-        notes.append(
-            f"several views or cameras share the name of {name_some(shared)}; give them names of their own"
-        )
+        notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
     return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes
 
 
@@ -359,8 +348,7 @@ def _by_order(owners: list[str], wanted: list[str]) -> dict[str, str] | None:
         return None
     if len(owners) != len(wanted):
         raise CaptureError(
-            f"there are {len(owners)} poses without names and {len(wanted)} views; expected as many: add or "
-            "remove views"
+            f"there are {len(owners)} poses without names and {len(wanted)} views; expected as many"
         )
     return dict(zip(sorted(wanted), sorted(owners), strict=True))
 

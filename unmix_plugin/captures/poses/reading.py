@@ -33,10 +33,10 @@ from unmix_plugin.captures.poses.pose_set import (
     load_json,
     load_xml,
     make_pose_set,
-    name_some,
     path_text,
+    reading,
 )
-from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
@@ -70,7 +70,7 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
         raise CaptureError(f"{path} is not there; give a file or folder with poses: {_KNOWN}")
     read = _read_folder if path.is_dir() else _read_file
     poses = read(path, picture_sizes or {})
-    for lens in {camera.lens for camera in poses.cameras.values()} - {None}:
+    for lens in {camera.lens for camera in poses.cameras.values()}:
         if lens is not None and any(lens.higher_radial):
             require_unfolded(lens, str(path))
     return poses
@@ -142,28 +142,20 @@ def _read_folder(folder: Path, given: Mapping[str, _Size]) -> PoseSet:
 
 def _greatest_model(models: list[Path]) -> PoseSet:
     """The model with the most images, the first of several."""
-    found = [read_colmap(model) for model in models]
-    poses = max(found, key=lambda model: len(model.cameras))
-    if len(models) == 1:
-        return poses
-    others = [
-        f"{path} ({counted(len(other.cameras), 'image')})"
-        for path, other in zip(models, found, strict=True)
-        if other is not poses
-    ]
+    found = sorted((read_colmap(model) for model in models), key=lambda model: -len(model.cameras))
+    if len(found) == 1:
+        return found[0]
+    others = [f"{other.source} ({counted(len(other.cameras), 'image')})" for other in found[1:]]
     note = (
-        f"{len(models)} COLMAP models are there; {poses.source} has the most images "
-        f"({len(poses.cameras)}) and was read, not {name_some(others)}"
+        f"{len(models)} COLMAP models are there; {found[0].source} has the most images "
+        f"({len(found[0].cameras)}) and was read, not {name_some(others)}"
     )
-    return replace(poses, notes=(*poses.notes, note))
+    return replace(found[0], notes=(*found[0].notes, note))
 
 
 def _first_bytes(path: Path) -> bytes:
-    try:
-        with open_regular(path) as file:
-            return file.read(512)
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
+    with reading(path), open_regular(path) as file:
+        return file.read(512)
 
 
 def _read_llff(path: Path) -> PoseSet:
@@ -172,13 +164,12 @@ def _read_llff(path: Path) -> PoseSet:
     Cameras have the names of the pictures beside it, where there are as many.
     """
     try:
-        shape = read_array_header(path).shape
-        is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
-        table = np.array(map_array(path), dtype=np.float64) if is_table else None
+        with reading(path):
+            shape = read_array_header(path).shape
+            is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
+            table = np.array(map_array(path), dtype=np.float64) if is_table else None
     except UnreadableArrayError as error:
         raise CaptureError(f"{path} {error}") from error
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
     if table is None:
         raise CaptureError(f"{path} has the shape {shape}; expected (views, 17) numbers, as LLFF writes them")
     names = [f"{BY_ORDER}{index:04d}" for index in range(len(table))]
@@ -192,9 +183,9 @@ def _read_llff(path: Path) -> PoseSet:
     for name, row in zip(names, table[:, :15].reshape(-1, 3, 5), strict=True):
         down, right, back, position, (height, width, focal) = row.T
         if not (1 <= width <= 1e6 and 1 <= height <= 1e6 and 0 < focal < 1e9):
+            numbers = f"{height:g}, {width:g}, {focal:g}"
             raise CaptureError(
-                f"{path}: the camera of {name} has height, width, focal length {height:g}, {width:g}, {focal:g}; "
-                "expected pixels above 0"
+                f"{path}: the camera of {name} has height, width, focal length {numbers}; expected pixels above 0"
             )
         center = (float(width) / 2, float(height) / 2)
         lens = Lens(round(width), round(height), (float(focal), float(focal)), center)
@@ -220,6 +211,20 @@ def _has_frames(content: Any) -> bool:
     )
 
 
+def frames_of(path: Path, content: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """What holds for all frames of a transforms.json, or a bare list of frames, and the frames. Raises CaptureError:
+    there is no list of them, or one is no object."""
+    top = content if isinstance(content, dict) else {}
+    frames = top.get("frames") if isinstance(content, dict) else content
+    if not isinstance(frames, list):
+        found = "absent" if frames is None else describe(frames)
+        raise CaptureError(f"{path}: 'frames' is {found}; expected a list with one object a view")
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise CaptureError(f"{path}: frames[{index}] is {describe(frame)}; expected an object")
+    return top, frames
+
+
 def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
     """Poses of one transforms.json, or of one for each split."""
     cameras: list[tuple[str, PosedCamera]] = []
@@ -229,16 +234,14 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
     up = np.array([0.0, 0.0, 1.0])
     metres: set[float | None] = set()
     for path, content in contents.items():
-        top = content if isinstance(content, dict) else {}
-        listed = top.get("frames") if top else content
-        frames = [frame for frame in listed if isinstance(frame, dict)] if isinstance(listed, list) else []
+        top, frames = frames_of(path, content)
         warned, said = keys_to_say(top, frames)
         warnings += [f"{path.name}: {text}" for text in warned]
         notes += [f"{path.name}: {text}" for text in said]
         faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
         metres.add(read_metres_per_unit(top, faults, path.name))
-        found = _read_frames(path, content, sizes, faults, notes)
+        found = _read_frames(path, top, frames, sizes, faults, notes)
         try:
             faults.raise_if_any()
         except SceneError as error:
@@ -258,20 +261,18 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
 
 
 def _read_frames(
-    path: Path, content: Any, sizes: Mapping[str, _Size], faults: Faults, notes: list[str]
+    path: Path,
+    top: dict[str, Any],
+    frames: list[dict[str, Any]],
+    sizes: Mapping[str, _Size],
+    faults: Faults,
+    notes: list[str],
 ) -> list[tuple[list[str], Float64[np.ndarray, "3 4"], Lens | None]]:
     """Names, matrix and lens of each frame, in the file's own world."""
-    top = content if isinstance(content, dict) else {}
-    frames = content.get("frames") if isinstance(content, dict) else content
-    if not isinstance(frames, list) or not frames:
-        found = "nothing" if frames is None else describe(frames)
-        raise CaptureError(f"{path}: 'frames' is {found}; expected a list with one object a view")
     lenses: dict[str, tuple[Lens | None, str | None]] = {}
     read, missing = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frames[{index}]"
-        if not isinstance(frame, dict):
-            raise CaptureError(f"{where} is {describe(frame)}; expected an object with 'transform_matrix'")
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
         names = [path_text(text) for text in texts] or [f"#{index:04d}"]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
@@ -335,9 +336,7 @@ def _other_model(
         listed = [values.get(f"ftheta_p{power}", 0.0) for power in range(6)]
         terms = _terms(listed, "'ftheta_p0' to 'ftheta_p5'", where)
         if not terms[1] > 0:
-            raise CaptureError(
-                f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian, greater than 0"
-            )
+            raise CaptureError(f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian above 0")
         return "ftheta", terms, (top, frame)
     if str(values.get("camera_model")).upper() != "FISHEYE624":
         return None, (), (top, frame)
@@ -347,9 +346,7 @@ def _other_model(
         raise CaptureError(
             f"{where}: 'distortion_params' has {len(terms)} numbers; FISHEYE624 has {_NUM_TERMS_624}"
         )
-    top, frame = (
-        {key: values[key] for key in values if key != "distortion_params"} for values in (top, frame)
-    )
+    top, frame = ({key: own[key] for key in own if key != "distortion_params"} for own in (top, frame))
     return "FISHEYE624", terms, (top, frame)
 
 

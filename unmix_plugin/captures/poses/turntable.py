@@ -90,9 +90,9 @@ def poses_from_turntable(
 def _refuse_few(turns: Mapping[str, Turn]) -> None:
     counts = np.bincount([turn.camera for turn in turns.values()])
     if counts.min() < _LEAST_VIEWS:
+        place = int(counts.argmin()) + 1
         raise CaptureError(
-            f"{counts.min()} views were taken from place {int(counts.argmin()) + 1} of the camera; expected at least "
-            f"{_LEAST_VIEWS} of each: leave it out, or give its views the place that they were taken from"
+            f"{counts.min()} views were taken from place {place} of the camera; expected {_LEAST_VIEWS} or more of each"
         )
 
 
@@ -121,9 +121,7 @@ class _Numbers:
         from scipy.spatial.transform import Rotation
 
         yaw, pitch, roll, distance, azimuth, height = self.cameras[evidence.camera].T
-        inward = np.array(
-            [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
-        )  # at azimuth 0, towards the axis
+        inward = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # azimuth 0, to the axis
         turned = Rotation.from_euler("yxz", np.column_stack([yaw, -pitch, roll])).as_matrix()
         about = azimuth - self.sense * (evidence.angle + self.slack)
         swing = Rotation.from_euler("z", about[:, None]).as_matrix()
@@ -194,16 +192,11 @@ def _tangential(
     essential = _essential((first[0][i], first[1][i]), (second[0][j], second[1][j]))
     ideal = numbers.ideal(evidence.hulls, evidence.size)
     middles = ((ideal.min(axis=1) + ideal.max(axis=1)) / 2)[:, None]
-    inside = np.asarray(
-        ((evidence.hulls > 1.0) & (evidence.hulls < np.array(evidence.size) - 1.0)).all(axis=-1)
-    )
-    ends_i, good_i = _touching(ideal, middles, i, first[0][i], second[1][j] - first[1][i])
-    ends_j, good_j = _touching(ideal, middles, j, second[0][j], first[1][i] - second[1][j])
+    inside = np.all((evidence.hulls > 1.0) & (evidence.hulls < np.array(evidence.size) - 1.0), axis=-1)
+    ends_i, out_i = _touching(ideal, middles, i, first[0][i], second[1][j] - first[1][i])
+    ends_j, out_j = _touching(ideal, middles, j, second[0][j], first[1][i] - second[1][j])
     touch_i, touch_j = ideal[i[:, None], ends_i], ideal[j[:, None], ends_j]
-    good_i, good_j = (
-        good_i[:, None] & inside[i[:, None], ends_i],
-        good_j[:, None] & inside[j[:, None], ends_j],
-    )
+    good_i, good_j = out_i[:, None] & inside[i[:, None], ends_i], out_j[:, None] & inside[j[:, None], ends_j]
     lines_j, lines_i = touch_i @ essential.transpose(0, 2, 1), touch_j @ essential
 
     def beyond(lines: np.ndarray, points: np.ndarray, middle: np.ndarray) -> np.ndarray:
@@ -213,14 +206,10 @@ def _tangential(
 
     # Which tangent belongs to which depends on the sides that the epipoles lie on.
     either = [
-        (
-            beyond(lines_i[:, ::order], touch_i, middles[i]),
-            beyond(lines_j, touch_j[:, ::order], middles[j]),
-            order,
-        )
+        (beyond(lines_i[:, ::order], touch_i, middles[i]), beyond(lines_j, touch_j[:, ::order], middles[j]))
         for order in (1, -1)
     ]
-    size = [(np.abs(of_i) + np.abs(of_j)).sum(axis=1) for of_i, of_j, _ in either]
+    size = [(np.abs(of_i) + np.abs(of_j)).sum(axis=1) for of_i, of_j in either]
     straight = (size[0] <= size[1])[:, None]
     of_i, of_j = (np.where(straight, either[0][part], either[1][part]) for part in (0, 1))
     good = good_i & np.where(straight, good_j, good_j[:, ::-1])
@@ -308,13 +297,8 @@ def _solve(
         cameras[free] += values[int(zoom) + int(bent) : few]
         angles[: len(values) - few] += values[few:]
         focal = start.focal_px * float(np.exp(values[0])) if zoom else start.focal_px
-        return replace(
-            start,
-            focal_px=focal,
-            cameras=cameras,
-            slack=angles,
-            k1=start.k1 + (float(values[int(zoom)]) if bent else 0.0),
-        )
+        k1 = start.k1 + (float(values[int(zoom)]) if bent else 0.0)
+        return replace(start, focal_px=focal, cameras=cameras, slack=angles, k1=k1)
 
     def flat(numbers: _Numbers, **changes: Any) -> np.ndarray:
         return np.concatenate([part.ravel() for part in numbers.errors(evidence, **changes)])
@@ -327,16 +311,13 @@ def _solve(
         now = flat(numbers_of(values))
         result = np.zeros((len(now) + views, few + views))
         for column, length in enumerate(1e-4 * size):
-            result[: len(now), column] = (
-                flat(numbers_of(values + length * (np.arange(len(values)) == column))) - now
-            ) / length
+            ahead = flat(numbers_of(values + length * (np.arange(len(values)) == column)))
+            result[: len(now), column] = (ahead - now) / length
         if slack:
             numbers = numbers_of(values)  # rims, which all pairs share, are taken to stay
             by_turn = (flat(numbers, ahead=1e-5, rims=False) - flat(numbers, rims=False)) / 1e-5
-            rows = np.arange(len(now))
-            ends = np.concatenate(
-                [np.column_stack([evidence.first, evidence.second]), np.repeat(evidence.touched, 4, axis=0)]
-            )
+            rows, four = np.arange(len(now)), np.repeat(evidence.touched, 4, axis=0)
+            ends = np.concatenate([np.column_stack([evidence.first, evidence.second]), four])
             result[rows, few + ends[:, 0]] = by_turn
             result[rows, few + ends[:, 1]] = -by_turn
             result[len(now) + np.arange(views), few + np.arange(views)] = 1.0 / np.radians(_SLACK_DEG)
@@ -367,11 +348,9 @@ def _fit(evidence: Evidence) -> _Numbers:
         ends.append(min(tried, key=lambda found: found.cost(rough)))
     # From far away, turning the other way and looking up from below gives the same outlines.
     costs = [end.cost(rough) for end in ends]
-    looks_down = [float(end.cameras[:, 1].mean()) for end in ends]
-    if abs(costs[0] - costs[1]) < _GAIN * max(costs):
-        best = ends[int(np.argmax(looks_down))]
-    else:
-        best = ends[int(np.argmin(costs))]
+    looks_down = [-float(end.cameras[:, 1].mean()) for end in ends]
+    is_unclear = abs(costs[0] - costs[1]) < _GAIN * max(costs)
+    best = ends[int(np.argmin(looks_down if is_unclear else costs))]
     best = _solve(best, fine, everyone, steps=40)
     fits = np.abs(best.errors(fine)[0]) < _FITS_PX
     if len(fits) and fits.mean() < _ENOUGH_FIT and len(fine.touched) and evidence.likeness <= _MOST_ALIKE:
@@ -422,13 +401,11 @@ def _refuse_alike(evidence: Evidence, fits: int) -> None:
     """Refuse views whose silhouettes tell nothing, where too few matches fit to tell it instead."""
     if evidence.likeness <= _MOST_ALIKE or fits >= max(_LEAST_MATCHES, _LEAST_FIT * len(evidence.first)):
         return
-    told = (
-        f"silhouettes overlap by {evidence.likeness:.1%}" if len(evidence.touched) else "there are no masks"
-    )
+    has_masks = len(evidence.touched) > 0
+    told = f"silhouettes overlap by {evidence.likeness:.1%}" if has_masks else "there are no masks"
     raise CaptureError(
         f"the axis can't be told, as all views are alike: {told}, and {fits} of {len(evidence.first)} points that were "
-        "matched and moved fit one; put something uneven or patterned on the turntable, cut out the background, or "
-        "give poses of another program"
+        "matched and moved fit one; put something patterned on the turntable, or cut out the background"
     )
 
 
@@ -441,15 +418,13 @@ def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
     limit = _MOST_OFF * float(np.hypot(*evidence.size))
     if off <= limit or fits >= max(_ENOUGH_MATCHES, _ENOUGH_FIT * len(matched)):
         return
-    outline = ""
-    if np.isfinite(off):
-        outline = (
-            f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
-        )
+    limits = (
+        f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
+    )
     raise CaptureError(
-        f"the angles do not explain the pictures: {outline}{fits} of {len(matched)} matched points fit; expected the "
-        "object alone to turn, by the angles given, before a camera and a background that stand still: check --angles, "
-        "and that --mask cuts out the object"
+        f"the angles do not explain the pictures: {limits if np.isfinite(off) else ''}{fits} of {len(matched)} matched "
+        "points fit; expected the object alone to turn before a camera and a background that stand still: check "
+        "--angles, and that --mask cuts out the object"
     )
 
 
@@ -464,14 +439,14 @@ def _pose_set(fitted: _Numbers, evidence: Evidence, names: Sequence[str]) -> Pos
     }
     matched, outlines = (np.abs(part) for part in fitted.errors(evidence))
     compared = outlines[outlines != _NOT_COMPARED_PX]
+    off = f", outlines are off by {np.median(compared):.2f} px in the median" if len(compared) else ""
+    fits = f"{int((matched < _FITS_PX).sum())} of {len(matched)} matched points fit"
+    down = ", ".join(f"{np.degrees(pitch):.1f}" for pitch in fitted.cameras[:, _PITCH])
+    sense = "against" if fitted.sense > 0 else "with"
     notes = [
-        f"the turntable gave poses of {len(names)} of {len(names)} views: {int((matched < _FITS_PX).sum())} of "
-        f"{len(matched)} matched points fit"
-        + (f", outlines are off by {np.median(compared):.2f} px in the median" if len(compared) else ""),
-        f"focal length estimated from the turning: {fitted.focal_px:.1f} px; the camera looks down by "
-        + ", ".join(f"{np.degrees(pitch):.1f}" for pitch in fitted.cameras[:, _PITCH])
-        + " degrees",
-        f"the object turned {'against' if fitted.sense > 0 else 'with'} the clock, seen from above",
+        f"the turntable gave poses of {len(names)} of {len(names)} views: {fits}{off}",
+        f"focal length estimated from the turning: {fitted.focal_px:.1f} px; the camera looks down by {down} degrees",
+        f"the object turned {sense} the clock, seen from above",
     ]
     if fitted.slack.any():
         notes.append(f"angles were corrected by up to {np.degrees(np.abs(fitted.slack).max()):.2f} degrees")

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64, Int, UInt8
 
-from unmix_plugin.captures.poses.pose_set import name_some
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, name_some
 
 _MOST_MATCHED_DEG, _MOST_TOUCHED_DEG = 30.0, 130.0
 """Between views whose points, and whose outlines, are compared."""
@@ -68,15 +67,14 @@ def parse_angles(text: str, names: Sequence[str]) -> dict[str, Turn]:
             count = int(np.ceil((stop - start) / step - 1e-9))
         except (ValueError, ZeroDivisionError, OverflowError) as error:
             raise ConfigError(
-                f"--angles {text}: expected START:STOP:STEP in degrees, such as 0:360:10, or a CSV file with the "
-                "columns view and angle"
+                f"--angles {text}: expected START:STOP:STEP in degrees, or a CSV file with the columns view and angle"
             ) from error
         total += max(count, 0)
         turns += [Turn(start + index * step, camera) for index in range(min(count, len(names)))]
     if total != len(names):
         raise ConfigError(
             f"--angles {text} gives {total} angles (the end of a range is none of them) for {len(names)} views; "
-            "expected one a view: give other steps, or a CSV file with the columns view and angle"
+            "expected one a view: give other steps, or a CSV file"
         )
     return dict(zip(names, turns, strict=True))
 
@@ -96,14 +94,11 @@ def _read_angles(path: Path, names: Sequence[str]) -> dict[str, Turn]:
                 raise ValueError
         except (KeyError, TypeError, ValueError) as error:
             raise ConfigError(
-                f"--angles {path}, line {line}: expected the columns view and angle (degrees), and camera if it stood "
-                "in several places"
+                f"--angles {path}, line {line}: expected the columns view and angle (degrees), and perhaps camera"
             ) from error
         key = name if name in names else Path(name).stem
         if key in found:
-            raise ConfigError(
-                f"--angles {path}, line {line}: the view {key} has an angle already; expected one a view"
-            )
+            raise ConfigError(f"--angles {path}, line {line}: the view {key} has an angle already")
         found[key] = Turn(angle, places.setdefault((row.get("camera") or "").strip(), len(places)))
     missing, unknown = [n for n in names if n not in found], [n for n in found if n not in names]
     if missing or unknown:
@@ -175,10 +170,8 @@ def gather(
     height, width = pictures[0].shape
     angle = np.radians([turn.angle_deg for turn in turns])
     camera = np.array([turn.camera for turn in turns])
-    features = [
-        _features(cv2, picture, None if masks is None else masks[index])
-        for index, picture in enumerate(pictures)
-    ]
+    shown = [None] * len(pictures) if masks is None else masks
+    features = [_features(cv2, picture, mask) for picture, mask in zip(pictures, shown, strict=True)]
     matcher = cv2.BFMatcher(cv2.NORM_L2)
     first, second, touched = [], [], []
     points = [np.zeros((0, 2, 2))]

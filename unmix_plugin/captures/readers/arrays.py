@@ -137,8 +137,12 @@ def image_of_arrays(
     exposure, exposure_warnings = _exposure(arrays, image)
 
     dtype, no_data = _dtype_meant(image), _first_number(image.all_attributes, _NO_DATA)
-    if dtype != image.dtype and no_data is not None and no_data < 0:
-        no_data += 256.0**dtype.itemsize
+    valid = _valid_range(image.all_attributes)
+    if dtype != image.dtype:  # attributes are written in the signed type
+        more = 256.0**dtype.itemsize
+        no_data = no_data + more if no_data is not None and no_data < 0 else no_data
+        low, high = valid or (0.0, 0.0)
+        valid = valid and (low + more * (low < 0), high + more * (high < 0))
 
     def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
         if take is not None:
@@ -154,7 +158,7 @@ def image_of_arrays(
         bands=bands,
         linear=linear,
         no_data=no_data,
-        valid_range=_valid_range(image.all_attributes),
+        valid_range=valid,
         warnings=axis_warnings + band_warnings + exposure_warnings,
         metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )
@@ -162,10 +166,17 @@ def image_of_arrays(
 
 def _dtype_meant(image: FoundArray) -> np.dtype:
     """The type of the numbers; unsigned where NetCDF says that a signed type holds such (`_Unsigned`)."""
-    said = image.attributes.get("_Unsigned")
-    text = said.decode("utf-8", "replace") if isinstance(said, bytes) else str(said)
-    is_unsigned = image.dtype.kind == "i" and text.lower() == "true"
+    is_unsigned = image.dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true"
     return np.dtype(image.dtype.str.replace("i", "u")) if is_unsigned else image.dtype
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _unit_of(attributes: Mapping[str, Any]) -> str | None:
+    key = _first_key(attributes, ("units", "unit"))
+    return None if key is None else _text(attributes[key])
 
 
 def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
@@ -179,9 +190,8 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
         named = [array for array in numeric if array.name.strip("/") == wanted]
         named = named or [array for array in numeric if array.name.rpartition("/")[2] == wanted]
         if len(named) != 1:
-            raise CaptureError(
-                f"{path}: {len(named) or 'no'} data sets '{options.dataset}'; the file holds {listed}"
-            )
+            found = f"{len(named) or 'no'} data sets '{options.dataset}'"
+            raise CaptureError(f"{path}: {found}; the file holds {listed}")
         return named[0]
     images = [array for array in numeric if len(array.shape) == 3]
     if not images:
@@ -196,9 +206,8 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
             f"pixels. The file holds {listed}"
         )
     if len(images) > 1:
-        raise CaptureError(
-            f"{path}: {len(images)} data sets could be the image; name one (--dataset). The file holds {listed}"
-        )
+        several = f"{len(images)} data sets could be the image"
+        raise CaptureError(f"{path}: {several}; name one (--dataset). The file holds {listed}")
     return images[0]
 
 
@@ -260,15 +269,12 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
     else:
         name, listed = of_image[0]
         where, attributes = f"attribute '{name}'", {}
-    unit = next((value for key, value in attributes.items() if key.lower() in ("unit", "units")), None)
+    unit = _unit_of(attributes)
     if unit is None:
         suffix = name.lower()[-2:]
         unit = suffix if suffix in ("nm", "um") else None
-    else:
-        unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
-    return StatedBands(
-        where, listed, unit, numbers(widths) or of_image[1][1], numbers(good) or of_image[2][1]
-    )
+    fwhm, marks = numbers(widths) or of_image[1][1], numbers(good) or of_image[2][1]
+    return StatedBands(where, listed, unit, fwhm, marks)
 
 
 def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, list[object] | None]:
@@ -355,13 +361,8 @@ def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str
     entries: dict[str, Any] = dict(image.all_attributes)
     for array in arrays:
         if array.is_vector and prod(array.shape) in (1, *image.shape) and is_exposure(array.own_name):
-            unit = next(
-                (value for key, value in array.attributes.items() if key.lower() in ("unit", "units")), ""
-            )
-            text = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else str(unit)
-            entries[array.own_name] = ",".join(
-                f"{number} {text}" for number in array.whole().reshape(-1).tolist()
-            )
+            unit, numbers = _unit_of(array.attributes) or "", array.whole().reshape(-1).tolist()
+            entries[array.own_name] = ",".join(f"{number} {unit}" for number in numbers)
     return exposure_facts(entries, "data set or attribute")
 
 
@@ -372,24 +373,17 @@ def _first_key(attributes: Mapping[str, Any], names: Sequence[str]) -> str | Non
 
 
 def _first_number(attributes: Mapping[str, Any], names: Sequence[str]) -> float | None:
-    for key, value in attributes.items():
-        if key.lower() in names:
-            try:
-                return float(np.asarray(value).reshape(-1)[0])
-            except (ValueError, TypeError, IndexError):
-                continue
-    return None
+    key = _first_key(attributes, names)
+    numbers = [] if key is None else _numbers(attributes[key])
+    return numbers[0] if numbers else None
 
 
 # NumPy: .npy is mapped, of .npz the member that is an image is loaded. No pickle is ever read.
 
 
 def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open an array of three axes, or of two for one band, by its header.
-
-    Raises:
-        CaptureError: it is cut short, holds objects or no numbers, or has another number of axes.
-    """
+    """Open an array of three axes, or of two for one band, by its header. Raises CaptureError: it is cut short, holds
+    objects or no numbers, or has another number of axes."""
     try:
         header = read_array_header(path)
     except UnreadableArrayError as error:
@@ -399,11 +393,8 @@ def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
 
 
 def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the image among the arrays of an archive; a list of wavelengths beside it is found by its name.
-
-    Raises:
-        CaptureError: a member is damaged or holds objects, or none can be the image.
-    """
+    """Open the image among the arrays of an archive; a list of wavelengths beside it is found by its name. Raises
+    CaptureError: a member is damaged or holds objects, or none can be the image."""
     with open_zip(path, CaptureError) as archive:
         arrays = [_npz_member(path, archive, info) for info in archive.infolist()]
     return image_of_arrays(path, "npy", arrays, options)
@@ -415,14 +406,13 @@ def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
         version = np.lib.format.read_magic(file)
         if version not in READ_HEADER:
             raise CaptureError(
-                f"{path}: {info.filename} is a .npy file of version {version}; write it with numpy.savez"
+                f"{path}: {info.filename} is a .npy file of version {version}; use numpy.savez"
             )
         shape, _, dtype = parse_header(file, version)
     needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
     if not dtype.hasobject and info.file_size < needed:
-        raise CaptureError(
-            f"{path}: {info.filename} holds {info.file_size} bytes; its header promises {needed}"
-        )
+        held = f"holds {info.file_size} bytes"
+        raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
     allow_decoded(path, info.file_size, CaptureError, info.compress_size)
     name = info.filename.removesuffix(".npy")
     return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
@@ -437,11 +427,8 @@ def _load_npz_member(path: Path, name: str) -> np.ndarray:
 
 
 def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open a tensor, or the image among the tensors of a dictionary.
-
-    Raises:
-        CaptureError: the file is damaged, holds other objects than tensors, or none can be the image.
-    """
+    """Open a tensor, or the image among the tensors of a dictionary. Raises CaptureError: the file is damaged, holds
+    other objects than tensors, or none can be the image."""
     import torch
 
     _check_pickle(path)
@@ -454,8 +441,7 @@ def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
         except pickle.UnpicklingError as error:
             raise CaptureError(
-                f"{path}: holds other objects than tensors, which are never loaded because they can run code; "
-                "save a plain tensor with torch.save"
+                f"{path}: holds other objects than tensors, which are never loaded because they can run code"
             ) from error
         named = content if isinstance(content, dict) else {"": content}
         return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
@@ -513,11 +499,8 @@ def _check_pickle(path: Path) -> None:
 
 
 def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the variable that is the image.
-
-    Raises:
-        CaptureError: the file is damaged, or no variable, or more than one, can be the image.
-    """
+    """Open the variable that is the image. Raises CaptureError: the file is damaged, or no variable, or more than one,
+    can be the image."""
     from scipy.io import netcdf_file
 
     def found(name: str, variable: Any) -> FoundArray:

@@ -81,10 +81,8 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
 def described_by_header(file: SpectralFile) -> SpectralFile:
     """An image of another format with what an ENVI header beside it says; unchanged where there is none.
 
-    Programs write such headers beside TIFF files to keep wavelengths and gains, often with `file type = TIFF`.
-
-    Raises:
-        CaptureError: it is a header of this image and is damaged.
+    Programs write such headers beside TIFF files to keep wavelengths and gains, often with `file type = TIFF`. Raises
+    CaptureError: it is a header of this image and is damaged.
     """
     header_path = header_beside(file.path)
     if header_path is None or described_image(header_path) != file.path:
@@ -110,9 +108,10 @@ def described_image(header_path: Path) -> Path | None:
     if not others or not is_envi_header(header_path):
         return None
     with suppress(ValueError, OSError):
-        if "tif" not in read_header(header_path).get("file type", "").lower():
-            _ = data_beside(header_path, 0)
-            return None
+        header = read_header(header_path)
+        if "tif" not in header.get("file type", "").lower():
+            numbers = data_beside(header_path, read_layout(header).num_bytes)
+            return None if numbers not in others else others[0]
     return others[0]
 
 
@@ -153,14 +152,10 @@ def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear 
     for kind in ("data reflectance", "data"):
         keys = [f"{kind} gain values", f"{kind} offset values"]
         gains, offsets = ([_float(path, key, item) for item in header_items(header, key)] for key in keys)
-        stated = " and ".join(
-            f"'{key}'" for key, column in zip(keys, (gains, offsets), strict=True) if column
-        )
-        found += [
-            one
-            for one in [linear_values(path, num_bands, gains, offsets, f"header field {stated}")]
-            if one is not None
-        ]
+        named = zip(keys, (gains, offsets), strict=True)
+        stated = " and ".join(f"'{key}'" for key, column in named if column)
+        if one := linear_values(path, num_bands, gains, offsets, f"header field {stated}"):
+            found.append(one)
     key, warnings = "reflectance scale factor", ()
     scale = _number(header, key)
     if key in header and (scale is None or not math.isfinite(scale) or scale <= 0):
@@ -168,12 +163,10 @@ def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear 
     elif scale is not None and scale != 1:
         if found:
             raise CaptureError(
-                f"{path}: has '{key}' {scale:g} and other gains ({found[0].evidence}); expected one of them, as it is "
-                "unclear which the numbers need: take the other out of the header"
+                f"{path}: has '{key}' {scale:g} and other gains ({found[0].evidence}); take one of them out of the "
+                "header, as it is unclear which the numbers need"
             )
-        found = [
-            one for one in [linear_values(path, num_bands, [1 / scale], [], f"header field '{key}'")] if one
-        ]
+        return linear_values(path, num_bands, [1 / scale], [], f"header field '{key}'"), ()
     if len(found) > 1:
         warnings = (f"{found[0].evidence} is applied, not {found[1].evidence}",)
     return (found[0] if found else None), warnings
@@ -210,8 +203,7 @@ def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple
     height, width, num_bands = layout.shape
     raise CaptureError(
         f"{data_path}: cut short: {found} bytes; {header_path.name} promises {needed} ({height} lines x {width} "
-        f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes). Copy the file again or "
-        "correct the header"
+        f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes)"
     )
 
 

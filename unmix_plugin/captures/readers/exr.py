@@ -18,18 +18,15 @@ import struct
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
 
 from unmix_plugin.captures.exposure import exposure_facts
-from unmix_plugin.captures.spectral_file import (
-    BandTable,
-    ReadOptions,
-    SpectralFile,
-    loaded,
-)
+from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 
@@ -77,10 +74,8 @@ class _SpectralChannel:
 def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     """Open an image by its header; the numbers are read as a whole, when the first of them is asked for.
 
-    `options.dataset` names a layer (`S0`, `T`), a part, or one channel.
-
-    Raises:
-        CaptureError: the file is damaged, or has no such layer, part or channel.
+    `options.dataset` names a layer (`S0`, `T`), a part, or one channel. Raises CaptureError: the file is damaged, or
+    has no such layer, part or channel.
     """
     with path.open("rb") as file:
         begin = file.read(_HEADER_BYTES)
@@ -95,31 +90,27 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     considered = [one for one in channels if wanted is None or titles[one.part] == wanted]
     table, chosen, warnings = _choose(path, considered or channels, None if considered else wanted)
     if not all(channel.is_whole for channel in chosen):
-        raise CaptureError(
-            f"{path}: channels leave out pixels (sampling above 1, or a deep image); expected one number a pixel"
-        )
+        raise CaptureError(f"{path}: channels leave out pixels (sampling above 1, or a deep image)")
     header = parts[chosen[0].part].header
     frame = _window(header, "displayWindow")
     others = [channel.name for channel in channels if channel not in chosen]
-    unused = [
-        title or f"number {index}"
-        for index, title in enumerate(titles)
-        if not any(channel.part == index for channel in chosen)
-    ]
+    unused = set(range(len(parts))) - {channel.part for channel in chosen}
     if unused and table.wavelengths_nm is None:
-        warnings += (f"only the first part is taken; the file also has the parts {', '.join(unused)}",)
-    windows = [_window(parts[index].header, "dataWindow") for index in sorted({one.part for one in chosen})]
-    if any(window.isdisjoint(frame) for window in windows):
-        raise CaptureError(
-            f"{path}: its data window {windows[0]} lies outside of the picture {frame} (left, top, right, bottom); "
-            "expected a part of it: render it again"
-        )
-    # The library decodes all channels of a part; what is taken is put on the picture.
-    for index in {channel.part for channel in chosen}:
-        own = _window(parts[index].header, "dataWindow")
+        names = ", ".join(titles[index] or f"number {index}" for index in sorted(unused))
+        warnings += (f"only the first part is taken; the file also has the parts {names}",)
+    windows = {one.part: _window(parts[one.part].header, "dataWindow") for one in chosen}
+    is_partial = False
+    for index, own in windows.items():
+        low, high = np.maximum(own[0], frame[0]), np.minimum(own[1], frame[1])
+        if (high <= low).any():
+            raise CaptureError(
+                f"{path}: its data window {own.tolist()} lies outside of the picture {frame.tolist()} (left and top, "
+                "right and bottom); expected a part of it: render it again"
+            )
+        is_partial |= bool((low > frame[0]).any() or (high < frame[1]).any())
+        # The library decodes all channels of a part; what is taken is put on the picture.
         a_pixel = sum(channel.dtype.itemsize for channel in channels if channel.part == index)
-        allow_decoded(path, max(own.size, frame.size) * a_pixel, CaptureError)
-    is_partial = any(not window.covers(frame) for window in windows)
+        allow_decoded(path, max(_area(own), _area(frame)) * a_pixel, CaptureError)
     dtype = np.result_type(*(channel.dtype for channel in chosen))
     attributes = {
         name: value
@@ -142,13 +133,11 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     return SpectralFile(
         path=path,
         reader="exr",
-        shape=(frame.bottom - frame.top + 1, frame.right - frame.left + 1, len(chosen)),
+        shape=(*(frame[1] - frame[0])[::-1].tolist(), len(chosen)),
         dtype=np.result_type(dtype, np.float16) if is_partial else dtype,
         read_part=lambda rows, wanted: np.moveaxis(loaded(_load_exr, path, keys)[wanted][:, rows], 0, -1),
         bands=table,
-        notes=("the data window is a part of the picture: pixels outside of it are missing",)
-        if is_partial
-        else (),
+        notes=("the data window is a part of the picture: pixels outside are missing",) if is_partial else (),
         warnings=(*warnings, *exposure_warnings),
         metadata=attributes
         | exposure
@@ -157,37 +146,14 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     )
 
 
-@dataclass(frozen=True)
-class _Window:
-    """A rectangle of pixels; its last column and row belong to it."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-
-    @property
-    def size(self) -> int:
-        """Number of pixels."""
-        return max(0, self.right - self.left + 1) * max(0, self.bottom - self.top + 1)
-
-    def covers(self, other: _Window) -> bool:
-        """Whether all of the other lies in it."""
-        is_wide = self.left <= other.left and other.right <= self.right
-        return is_wide and self.top <= other.top and other.bottom <= self.bottom
-
-    def isdisjoint(self, other: _Window) -> bool:
-        """Whether they share no pixel."""
-        is_beside = self.right < other.left or other.right < self.left
-        return is_beside or self.bottom < other.top or other.bottom < self.top
-
-    def __str__(self) -> str:
-        return f"({self.left}, {self.top}, {self.right}, {self.bottom})"
+def _window(header: dict[str, Any], key: str) -> Int[np.ndarray, "2 2"]:
+    """Column and row of a rectangle's first pixel, and those behind its last."""
+    first, last = (np.asarray(corner, np.int64) for corner in header[key])
+    return np.stack([first, last + 1])
 
 
-def _window(header: dict[str, Any], key: str) -> _Window:
-    (left, top), (right, bottom) = header[key]
-    return _Window(int(left), int(top), int(right), int(bottom))
+def _area(window: Int[np.ndarray, "2 2"]) -> int:
+    return prod(max(0, side) for side in (window[1] - window[0]).tolist())
 
 
 def _list_channels(header: bytes, is_deep: Sequence[bool]) -> list[_Channel]:
@@ -229,9 +195,8 @@ def _choose(
     spectral = _spectral_channels(list(by_name))
     layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*LAYERS, layer).index(layer))
     if wanted is not None and wanted not in layers:
-        raise CaptureError(
-            f"{path}: no layer, part or channel '{wanted}'; it has {', '.join(layers + names)[:300]}"
-        )
+        known = ", ".join(layers + names)[:300]
+        raise CaptureError(f"{path}: no layer, part or channel '{wanted}'; it has {known}")
     if not spectral:
         own = [channel.name for channel in channels if channel.part == channels[0].part]
         bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
@@ -251,9 +216,8 @@ def _choose(
         warnings.append(f"layer '{layer}' is taken; the file also has {', '.join(others)} (--dataset)")
     alike = {channel.part for channel in channels if channel.name in (table.names or ())}
     if repeated := alike - {channel.part for channel in chosen}:
-        warnings.append(
-            f"wavelengths of the first part are taken; {len(repeated)} other parts have the same ones (--dataset)"
-        )
+        same = f"{len(repeated)} other parts have the same ones"
+        warnings.append(f"wavelengths of the first part are taken; {same} (--dataset)")
     return table, chosen, tuple(warnings)
 
 
@@ -303,26 +267,21 @@ def _load_exr(path: Path, keys: tuple[tuple[int, str], ...]) -> np.ndarray:
     channels = []
     for index, name in keys:
         pixels, window = parts[index].channels[name].pixels, _window(parts[index].header, "dataWindow")
-        if window != frame:
+        if (window != frame).any():
             pixels = _on_frame(pixels, window, frame)
         channels.append(pixels)
     return np.stack(channels)
 
 
-def _on_frame(pixels: np.ndarray, window: _Window, frame: _Window) -> np.ndarray:
-    """Pixels of a window where they lie in the frame."""
-    shape = (frame.bottom - frame.top + 1, frame.right - frame.left + 1)
-    placed = np.full(shape, np.nan, np.result_type(pixels.dtype, np.float16))
-    spans = [
-        (max(low, start), min(high, end) + 1, start, low)
-        for low, high, start, end in (
-            (window.top, window.bottom, frame.top, frame.bottom),
-            (window.left, window.right, frame.left, frame.right),
-        )
-    ]
-    target = tuple(slice(first - start, last - start) for first, last, start, _ in spans)
-    source = tuple(slice(first - low, last - low) for first, last, _, low in spans)
-    placed[target] = pixels[source]
+def _on_frame(
+    pixels: np.ndarray, window: Int[np.ndarray, "2 2"], frame: Int[np.ndarray, "2 2"]
+) -> np.ndarray:
+    """Pixels of a window where they lie in the frame; NaN elsewhere."""
+    placed = np.full((frame[1] - frame[0])[::-1], np.nan, np.result_type(pixels.dtype, np.float16))
+    low, high = np.maximum(window[0], frame[0]), np.minimum(window[1], frame[1])
+    (x, y), (right, bottom) = low - frame[0], high - frame[0]
+    (left, top), (width, height) = low - window[0], high - low
+    placed[y:bottom, x:right] = pixels[top : top + height, left : left + width]
     return placed
 
 
@@ -335,6 +294,6 @@ def _opened(path: Path, **options: bool) -> Any:
         file = OpenEXR.File(str(path), separate_channels=True, **options)
     if printed.getvalue():
         raise CaptureError(
-            f"{path}: damaged: {printed.getvalue().rpartition(' - ')[2].strip()}; copy the file again"
+            f"{path}: damaged: {printed.getvalue().rpartition(' - ')[2].strip()}; copy it again"
         )
     return file

@@ -14,23 +14,14 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.readers.arrays import FoundArray, image_of_arrays
-from unmix_plugin.captures.spectral_file import (
-    Axes,
-    BandIndex,
-    ReadOptions,
-    SpectralFile,
-    import_extra,
-)
+from unmix_plugin.captures.spectral_file import Axes, BandIndex, ReadOptions, SpectralFile, import_extra
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_depth, allow_parts
 
 
 def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone.
-
-    Raises:
-        CaptureError: the file is damaged, or no data set, or more than one, can be the image.
-    """
+    """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone. Raises
+    CaptureError: the file is damaged, or no data set, or more than one, can be the image."""
     h5py = import_extra("h5py")
     with path.open("rb") as begin:
         is_matlab = begin.read(10) == b"MATLAB 7.3"
@@ -99,23 +90,13 @@ def _found(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray
             part = file[name][tuple(selection[axis] for axis in stored_axes)]
         return part.transpose([stored_axes.index(axis) for axis in "yxb"])[..., order]
 
-    # Names of the axes, by NetCDF's dimension scales or by labels.
-    names = []
+    names = []  # of the axes, by NetCDF's dimension scales or by labels
     for dimension in item.dims:
         scales = [scale.name for scale in dimension.values()] if len(dimension) else []
         names.append((scales[0] or "") if scales else dimension.label)
-    dimensions = tuple(names) if any(names) else None
-    return [
-        FoundArray(
-            name,
-            shape,
-            item.dtype,
-            whole,
-            take if is_cube else None,
-            _attributes(path, item),
-            dimensions=dimensions,
-        )
-    ]
+    dimensions, faster = tuple(names) if any(names) else None, take if is_cube else None
+    attributes = _attributes(path, item)
+    return [FoundArray(name, shape, item.dtype, whole, faster, attributes, dimensions=dimensions)]
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:

@@ -18,14 +18,7 @@ from typing import BinaryIO
 import numpy as np
 
 from unmix_plugin.captures.readers.arrays import FoundArray, image_of_arrays
-from unmix_plugin.captures.spectral_file import (
-    Axes,
-    BandIndex,
-    ReadOptions,
-    SpectralFile,
-    loaded,
-    take_part,
-)
+from unmix_plugin.captures.spectral_file import Axes, BandIndex, ReadOptions, SpectralFile, loaded, take_part
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 
@@ -54,11 +47,8 @@ class _MatlabArray:
 
 
 def open_matlab(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the variable that is the image; cells, structures, texts and complex numbers are passed over.
-
-    Raises:
-        CaptureError: the file is damaged, or no variable, or more than one, can be the image.
-    """
+    """Open the variable that is the image; cells, structures, texts and complex numbers are passed over. Raises
+    CaptureError: the file is damaged, or no variable, or more than one, can be the image."""
 
     def found(array: _MatlabArray) -> FoundArray:
         if array.packed is not None:

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -35,7 +34,7 @@ from unmix_plugin.captures.spectral_file import (
     unreadable,
 )
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import open_regular, open_zip, read_bounded
+from unmix_plugin.limits import open_regular, open_zip, parse_xml, read_bounded
 
 _BEGINNINGS = {
     b"II*\0": "tiff",
@@ -103,12 +102,9 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         if given is None:
             return opened
         if len(given) != num_bands:
-            raise CaptureError(
-                f"{opened.path}: {len(given)} wavelengths were given for {size}; expected one a band"
-            )
-        return replace(
-            opened, bands=replace(opened.bands, wavelengths_nm=given, evidence="given by the user")
-        )
+            raise CaptureError(f"{opened.path}: {len(given)} wavelengths were given for {size}")
+        bands = replace(opened.bands, wavelengths_nm=given, evidence="given by the user")
+        return replace(opened, bands=bands)
     except CaptureError:
         raise
     except Exception as error:
@@ -131,10 +127,7 @@ def _with_xml_beside(file: SpectralFile) -> SpectralFile:
     """The file with what an XML beside it says of its bands, where it says nothing itself.
 
     GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; EnMAP's NAME-SPECTRAL_IMAGE.TIF has wavelengths,
-    widths, gains and offsets in NAME-METADATA.XML.
-
-    Raises:
-        CaptureError: gains are impossible.
+    widths, gains and offsets in NAME-METADATA.XML. Raises CaptureError: gains are impossible.
     """
     beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
     beside += [
@@ -143,19 +136,15 @@ def _with_xml_beside(file: SpectralFile) -> SpectralFile:
         if path.stem.endswith(_ENMAP_IMAGE)
         for ending in ("METADATA.XML", "METADATA.xml")
     ]
-    found = next((path for path in beside if path.is_file()), None)
-    if found is None:
-        return file
-    data = read_bounded(found)
+    for path in filter(Path.is_file, beside):
+        file = _with_xml(file, path)
+    return file
+
+
+def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
     try:
-        root = (
-            None
-            if any(word in data for word in (b"<!DOCTYPE", b"<!ENTITY"))
-            else ElementTree.fromstring(data)
-        )
-    except ElementTree.ParseError:
-        root = None
-    if root is None:
+        root = parse_xml(read_bounded(found))
+    except ValueError:
         return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: what it says is not used"))
     columns = {name: np.full(file.shape[2], usual) for name, usual in _OF_BANDS.items()}
     for element in [*root.iter("PAMRasterBand"), *root.iterfind(".//bandCharacterisation/bandID")]:
@@ -171,11 +160,11 @@ def _with_xml_beside(file: SpectralFile) -> SpectralFile:
         bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
         widths = columns["FWHMOfBand"]
         bands = replace(bands, fwhm_nm=widths if np.isfinite(widths).all() else bands.fwhm_nm)
+    linear = linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name)
     return replace(
         file,
         bands=bands,
-        linear=file.linear
-        or linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name),
+        linear=file.linear or linear,
         no_data=float(no_data) if file.no_data is None and not np.isnan(no_data) else file.no_data,
         sources=(*file.sources, found),
     )
@@ -195,9 +184,7 @@ def _file_kind(path: Path) -> str:
         raise CaptureError(f"{path}: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'")
     kind = _by_content(path, begin)
     if kind is None:
-        raise CaptureError(
-            f"{path}: of no known kind: begins with {begin[:8]!r}, has no ENVI header beside it; expected {_KNOWN}"
-        )
+        raise CaptureError(f"{path}: of no known kind: begins with {begin[:8]!r}; expected {_KNOWN}")
     return kind
 
 
@@ -227,10 +214,8 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
     """Facts about a file or folder, as JSON-able values: an image, poses, or both.
 
     The same facts of every file, None where it has no such thing; indices of bands count from 0. The last row of an
-    image is read, so that a file that is cut short is found out.
-
-    Raises:
-        CaptureError: the file is neither, or is damaged.
+    image is read, so that a file that is cut short is found out. Raises CaptureError: the file is neither, or is
+    damaged.
     """
     opened = refused = None
     try:

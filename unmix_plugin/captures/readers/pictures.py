@@ -38,11 +38,8 @@ _EXIF_DIRECTORY, _EXPOSURE_TIME, _ISO_SPEED = 0x8769, 0x829A, 0x8827
 
 
 def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
-    """Open a picture by its header; it is decoded when its first numbers are asked for.
-
-    Raises:
-        CaptureError: it is damaged, or of a kind that has neither one band nor three.
-    """
+    """Open a picture by its header; it is decoded when its first numbers are asked for. Raises CaptureError: it is
+    damaged, or of a kind that has neither one band nor three."""
     from PIL import Image
 
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
@@ -116,10 +113,8 @@ _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".j
 def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) -> SpectralFile:
     """Open the files of a folder as the bands of one image, by rising wavelength or in the order of their names.
 
-    Wavelengths are in the files, or in their names.
-
-    Raises:
-        CaptureError: there are no such files, or they hold several bands each or differ in size.
+    Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, or they hold several
+    bands each or differ in size.
     """
     found = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     kinds = Counter(_KINDS[path.suffix.lower()] for path in found if path.suffix.lower() in _KINDS)
@@ -131,9 +126,7 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     bands = [open_band(path) for path in files]
     for band in bands:
         if band.shape[2] != 1:
-            raise CaptureError(
-                f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}, or one file with all"
-            )
+            raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
     if any(band.bands.wavelengths_nm is None for band in bands):
         bands = _with_wavelengths_of_names(bands)
     centres = [band.bands.wavelengths_nm[0] for band in bands if band.bands.wavelengths_nm is not None]

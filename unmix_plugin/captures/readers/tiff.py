@@ -19,7 +19,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -40,7 +39,7 @@ from unmix_plugin.captures.spectral_file import (
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import allow_decoded, allow_parts, refuse
+from unmix_plugin.limits import allow_decoded, allow_parts, parse_xml, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
 if TYPE_CHECKING:
@@ -91,18 +90,13 @@ class _GdalItem:
 
 
 def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open an image whose bands are pages, planes or samples.
-
-    Raises:
-        CaptureError: pages contradict each other, or the file is cut short.
-    """
+    """Open an image whose bands are pages, planes or samples. Raises CaptureError: pages contradict each other, or the
+    file is cut short."""
     _check_directories(path)
     with _logged() as messages, import_extra("tifffile").TiffFile(path) as file:
         stack = _find_stack(path, file)
         if any("page offset" in message for message in messages):
-            raise CaptureError(
-                f"{path}: cut short: only {len(file.pages)} pages are there; copy the file again"
-            )
+            raise CaptureError(f"{path}: cut short: only {len(file.pages)} pages are there; copy it again")
         first = stack.pages[0]
         tags = camera_tags(first.tags)
         # What holds for the whole file stands in its first page, which may be a preview.
@@ -112,15 +106,12 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     stated = stated or _from_pages(stack.pages)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
-    axes, axis_warnings = (
-        choose_axes(stack.shape, options.axes, None if given is None else len(given), "byx")
-        if is_stack
-        else ("yxb", ())
-    )
+    axes, axis_warnings = "yxb", ()
+    interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     if is_stack:
+        num_known = None if given is None else len(given)
+        axes, axis_warnings = choose_axes(stack.shape, options.axes, num_known, "byx")
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
-    else:
-        interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     shape = image_shape(stack.shape, axes)
     bands, band_warnings = check_bands(stated, shape[2])
     exposure, exposure_warnings = _exposure(tags, items)
@@ -223,7 +214,7 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
     if planes * samples > 1:
         raise CaptureError(
             f"{path}: {len(like)} pages of {planes * samples} numbers a pixel; expected one page with all bands, or "
-            "one band a page. Split the file into one image each"
+            "one band a page"
         )
     return _Stack(like, (len(like), height, width), dtype, None, warnings)
 
@@ -260,9 +251,7 @@ def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
     if _is_mappable(page):
         end = max(end, page.dataoffsets[0] + page.nbytes)
     if end > file_size:
-        raise CaptureError(
-            f"{where}: cut short: its numbers reach to byte {end} of {file_size}; copy the file again"
-        )
+        raise CaptureError(f"{where}: cut short: its numbers reach to byte {end} of {file_size}")
 
 
 def _is_mappable(page: TiffPage) -> bool:
@@ -327,11 +316,9 @@ def _decode_into(block: np.ndarray, first_row: int, file: Any, page: TiffPage, i
 def _gdal_items(page: TiffPage) -> list[_GdalItem]:
     """Entries of GDAL's metadata; none if there is no such tag or it is damaged."""
     text = str(page.tags.valueof(_GDAL_METADATA) or "").strip("\0 \n")
-    if not text or "<!" in text:  # entities can grow without bound, and GDAL writes none
-        return []
     try:
-        items = list(ElementTree.fromstring(text).iter("Item"))
-    except ElementTree.ParseError:
+        items = list(parse_xml(text).iter("Item"))
+    except ValueError:
         return []
     return [
         _GdalItem(
@@ -349,29 +336,26 @@ def _linear(path: Path, items: list[_GdalItem], num_bands: int) -> Linear | None
     columns = []
     for role, names in _GAIN_ITEMS.items():
         by_role = [item for item in items if item.role == role]
-        chosen = by_role or [
-            item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names
-        ]
+        by_name = [item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names]
+        chosen = by_role or by_name
         own = {item.sample: item.value for item in chosen if item.sample is not None}
         whole = next((item.value for item in chosen if item.sample is None), None)
         usual = "1" if role == "scale" else "0"
+        texts = re.findall(r"[^\s,{}]+", whole or "")
         if own:
             texts = [own.get(sample, whole or usual) for sample in range(num_bands)]
-        else:
-            texts = re.findall(r"[^\s,{}]+", whole or "")
         numbers = [_number(text) for text in texts]
         if None in numbers:
-            raise CaptureError(
-                f"{path}: GDAL's {role} is {texts[numbers.index(None)]!r}; expected a number a band: correct it"
-            )
+            found = texts[numbers.index(None)]
+            raise CaptureError(f"{path}: GDAL's {role} is {found!r}; expected a number a band")
         columns.append([number for number in numbers if number is not None])
     named = [_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
     factor = named[0] if named and named[0] else 1.0
     linear = linear_values(path, num_bands, columns[0], columns[1], "GDAL's scales and offsets")
     if factor != 1 and linear is not None:
         raise CaptureError(
-            f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; expected one of them, as "
-            "it is unclear which the numbers need: take the other out"
+            f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; take one of them out, as "
+            "it is unclear which the numbers need"
         )
     return linear or linear_values(path, num_bands, [1.0 / factor], [], "GDAL's reflectance_scale_factor")
 
@@ -398,14 +382,8 @@ def _from_gdal(items: list[_GdalItem]) -> StatedBands | None:
         centres = re.findall(r"[^\s,{}]+", whole[0]) if whole else []
     if not centres and not names:
         return None
-    return StatedBands(
-        "GDAL metadata",
-        centres or None,
-        units[0] if units else None,
-        fwhm or None,
-        of_samples("bbl") or None,
-        names or None,
-    )
+    good, unit = of_samples("bbl") or None, units[0] if units else None
+    return StatedBands("GDAL metadata", centres or None, unit, fwhm or None, good, names or None)
 
 
 def _from_description(page: TiffPage) -> StatedBands | None:
@@ -425,13 +403,8 @@ def _from_description(page: TiffPage) -> StatedBands | None:
         centres = entries.get("wavelength", entries.get("wavelengths_nm", entries.get("wavelength_nm")))
         unit = entries.get("wavelength_unit", "nm" if "wavelengths_nm" in map(str.lower, content) else None)
         if isinstance(centres, list):
-            fwhm = entries.get("fwhm")
-            return StatedBands(
-                "image description",
-                centres,
-                unit if isinstance(unit, str) else None,
-                fwhm if isinstance(fwhm, list) else None,
-            )
+            unit, fwhm = unit if isinstance(unit, str) else None, entries.get("fwhm")
+            return StatedBands("image description", centres, unit, fwhm if isinstance(fwhm, list) else None)
     match = _LIST.search(text)
     centres = re.findall(r"\d+(?:\.\d+)?", match["list"]) if match else []
     if match is None or not centres:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import json
 import textwrap
 from collections import Counter, defaultdict
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks import SeenView, angles_between, check_views, report_text
 from unmix_plugin.captures.masks import BackgroundRule
-from unmix_plugin.captures.match_checks import MatchedView, check_matches
-from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.match_checks import check_matches
+from unmix_plugin.captures.options import ProcessOptions, plain_options
 from unmix_plugin.captures.plan import Plan
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
@@ -30,7 +30,7 @@ from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, RECORD_NAME, ViewRecord, hashes
 from unmix_plugin.engine.runs.atomic_files import write_file
-from unmix_plugin.errors import counted
+from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
 from unmix_plugin.figures.plotting import FIGURE_DPI, figure_bytes, plain_axes
 from unmix_plugin.formats.meshes import write_ply
@@ -64,44 +64,32 @@ def write_scene_files(
     # Views of sensors with other bands can't be compared with those of the one that took the most.
     ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
-    checked = check_views([view for view in seen if view.record.sensor in alike], posed.poses.points)
-    warned = dict.fromkeys((*plan.warnings, *posed.poses.warnings))
-    checked = replace(checked, findings=(*warned, *checked.findings))
-    checked = checked.with_more(*_contradictions(folder, plan, posed, seen, greatest, options))
+    findings, measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points)
+    more, said = _contradictions(folder, plan, posed, seen, greatest, options)
+    findings = [*dict.fromkeys((*plan.warnings, *posed.poses.warnings)), *findings, *more]
+    measured = [*measured, said]
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
-    write_file(folder / _REPORT_NAME, report_text(title, checked, done).encode())
-    spectra = [
-        _Spectra(
-            name,
-            sensor.centers_nm,
-            np.array([view.record.mean_spectrum for view in seen if view.record.sensor == name]),
-            sensor.bands.wavelengths_nm[sorted(sensor.bands.dropped)],
-        )
-        for name, sensor in plan.sensors.items()
-    ]
-    sheet = _contact_sheet(seen, spectra, posed.poses.points, posed.poses.colours, title)
-    write_file(folder / _SHEET_NAME, sheet)
+    write_file(folder / _REPORT_NAME, report_text(title, (findings, measured), done).encode())
+    write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
     record = {
         "made_by": f"unmix-process {__version__}",
-        "options": {
-            key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()
-        },
+        "options": plain_options(options),
         "decisions": plan.decisions,
         "stored": {"type": "uint16", "value_scale": FULL_SCALE, "calibrated_value_of_1": plan.scale},
         "poses": {"source": posed.poses.source, "notes": list(posed.notes), **posed.keys},
         "notes": list(plan.notes),
-        "what_looks_wrong": list(checked.findings),
-        "measured": list(checked.measured),
+        "what_looks_wrong": findings,
+        "measured": measured,
         "totals": {key: sum(view[key] for view in views) for key in totals},
         "references": hashes(plan.reference_files),
         "views": views,
     }
     _write_json(folder / RECORD_NAME, record)
     _write_json(folder / _SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
-    return list(checked.findings)
+    return findings
 
 
 def _contradictions(
@@ -111,7 +99,7 @@ def _contradictions(
     seen: Sequence[SeenView],
     greatest: str,
     options: ProcessOptions,
-) -> tuple[list[str], list[str]]:
+) -> tuple[list[str], str]:
     """What contradicts itself in files, poses, values and pictures; and what was measured."""
     findings = [*posed.findings, *check_files(posed.views, options)]
     for name, sensor in plan.sensors.items():
@@ -119,9 +107,8 @@ def _contradictions(
         samples = [ViewSample.of(view.record, folder) for view in same]
         findings += check_values(samples, angles_between(same), sensor.centers_nm)
     same = [view for view in seen if view.record.sensor == greatest]
-    matched = [MatchedView(view.name, view.camera, view.picture) for view in same]
-    found, said = check_matches(matched, angles_between(same))
-    return [*findings, *found], [said]
+    found, said = check_matches([(view.camera, view.picture) for view in same], angles_between(same))
+    return [*findings, *found], said
 
 
 def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
@@ -249,18 +236,18 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
     )
 
-    def total(what: str) -> int:
-        return sum(getattr(view, what) for view in views)
+    def total(what: str, noun: str = "pixel") -> str:
+        return counted(sum(getattr(view, what) for view in views), noun)
 
     lines.append(
-        f"{counted(total('saturated_pixels'), 'pixel')} with saturated bands, which are written as 1; "
-        f"{counted(total('clipped_values'), 'value')} above 1, written as 1 too; "
-        f"{total('negative_values')} below 0, written as 0; "
-        f"{counted(total('missing_pixels'), 'pixel')} masked, as nothing was measured there"
+        f"{total('saturated_pixels')} with saturated bands, which are written as 1; "
+        f"{total('clipped_values', 'value')} above 1, written as 1 too; "
+        f"{total('negative_values', 'value')} below 0, written as 0; "
+        f"{total('missing_pixels')} masked, as nothing was measured there"
     )
     share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are matter"
     found = [recipe.background for recipe in plan.recipes.values() if isinstance(recipe.background, Backdrop)]
-    changed = f"{total('specks')} specks removed, {total('holes')} holes filled"
+    changed = f"{total('specks', 'speck')} removed, {total('holes', 'hole')} filled"
     if found:
         whole = sum(view.matter_share == 1.0 for view in views)
         lines.append(
@@ -284,11 +271,7 @@ def _left_out(sensor: Sensor) -> dict[str, str]:
     for band, reason in sorted(sensor.bands.dropped.items()):
         wavelength = f"{sensor.bands.wavelengths_nm[band]:g} nm"
         found["noisy" if reason.startswith("noise") else reason].append(wavelength)
-    return {
-        reason: ", ".join(names[:_MOST_BANDS])
-        + (f" and {len(names) - _MOST_BANDS} more" if len(names) > _MOST_BANDS else "")
-        for reason, names in found.items()
-    }
+    return {reason: name_some(names, _MOST_BANDS) for reason, names in found.items()}
 
 
 # The contact sheet.
@@ -305,23 +288,8 @@ _LETTERS_AN_INCH = 10
 _MOST_POINTS = 6000
 
 
-@dataclass(frozen=True)
-class _Spectra:
-    """Mean spectra of the views of one sensor."""
-
-    label: str
-    wavelengths_nm: Float64[np.ndarray, " B"]
-    views: Float64[np.ndarray, "N B"]
-    dropped_nm: Float64[np.ndarray, " d"]
-    """Wavelengths of bands that were left out."""
-
-
 def _contact_sheet(
-    views: Sequence[SeenView],
-    spectra: Sequence[_Spectra],
-    points: Float64[np.ndarray, "P 3"] | None,
-    colours: UInt8[np.ndarray, "P 3"] | None,
-    heading: str,
+    views: Sequence[SeenView], sensors: Mapping[str, Sensor], poses: PoseSet, heading: str
 ) -> bytes:
     """The sheet as a PNG, with one group of spectra a sensor and the points in their sRGB."""
     from matplotlib.figure import Figure
@@ -340,9 +308,9 @@ def _contact_sheet(
     third = (page_width - 0.4) / 3
     boxes = [(0.7 + index * third, 0.5, third - 0.75, _CHARTS_INCHES - 0.7) for index in range(3)]
     panels = [figure.add_axes((x / page[0], y / page[1], w / page[0], h / page[1])) for x, y, w, h in boxes]
-    _draw_cameras(panels[0], views, points, colours, (0, 1), "cameras and points from above")
-    _draw_cameras(panels[1], views, points, colours, (0, 2), "from the side")
-    _draw_spectra(panels[2], spectra)
+    _draw_cameras(panels[0], views, poses, (0, 1), "cameras and points from above")
+    _draw_cameras(panels[1], views, poses, (0, 2), "from the side")
+    _draw_spectra(panels[2], views, sensors)
     return figure_bytes(figure)
 
 
@@ -386,15 +354,10 @@ def _small_picture(view: SeenView, side_px: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _draw_cameras(
-    axes: Any,
-    views: Sequence[SeenView],
-    points: Float64[np.ndarray, "P 3"] | None,
-    colours: UInt8[np.ndarray, "P 3"] | None,
-    plane: tuple[int, int],
-    title: str,
+    axes: Any, views: Sequence[SeenView], poses: PoseSet, plane: tuple[int, int], title: str
 ) -> None:
     """Cameras as arrows along their axes, on two axes of the world."""
-    across, up = plane
+    (across, up), points, colours = plane, poses.points, poses.colours
     places, looks = (np.stack([getattr(view, name) for view in views]) for name in ("position", "axis"))
     if points is not None and len(points):
         kept = _evenly(len(points), _MOST_POINTS)
@@ -414,19 +377,20 @@ def _draw_cameras(
     plain_axes(axes)
 
 
-def _draw_spectra(axes: Any, spectra: Sequence[_Spectra]) -> None:
+def _draw_spectra(axes: Any, views: Sequence[SeenView], sensors: Mapping[str, Sensor]) -> None:
     """Mean spectra of views as thin lines, their mean as a thick one, bands that were left out as ticks above."""
     from matplotlib import colormaps
 
-    for index, sensor in enumerate(spectra):
-        colour = colormaps["tab10"](index % 10)
-        marker = "." if len(sensor.wavelengths_nm) < 12 else None
-        nm, style = sensor.wavelengths_nm, {"color": colour, "marker": marker}
-        axes.plot(nm, sensor.views.T, alpha=0.15, linewidth=0.6, **style)
-        label = f"{sensor.label}: mean" if sensor.label else "mean over views"
-        axes.plot(nm, sensor.views.mean(axis=0), linewidth=1.8, label=label, **style)
-    dropped = np.concatenate([sensor.dropped_nm for sensor in spectra])
-    if len(dropped):
+    dropped = []
+    for index, (name, sensor) in enumerate(sensors.items()):
+        nm, colour = sensor.centers_nm, colormaps["tab10"](index % 10)
+        means = np.array([view.record.mean_spectrum for view in views if view.record.sensor == name])
+        style = {"color": colour, "marker": "." if len(nm) < 12 else None}
+        axes.plot(nm, means.T, alpha=0.15, linewidth=0.6, **style)
+        label = f"{name}: mean" if name else "mean over views"
+        axes.plot(nm, means.mean(axis=0), linewidth=1.8, label=label, **style)
+        dropped += sensor.bands.wavelengths_nm[sorted(sensor.bands.dropped)].tolist()
+    if dropped:
         style = {"color": "#d04040", "linewidth": 0.8, "alpha": 0.6, "label": "bands left out"}
         axes.vlines(dropped, 0.0, 1.0, transform=axes.get_xaxis_transform(), **style)
     axes.set_ylim(bottom=0.0)

@@ -12,7 +12,6 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -31,6 +30,7 @@ from unmix_plugin.captures.masks import (
     read_labels,
     read_view_masks,
 )
+from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.engine.runs.atomic_files import (
@@ -41,7 +41,7 @@ from unmix_plugin.engine.runs.atomic_files import (
     write_file,
 )
 from unmix_plugin.engine.runs.run_folder import RunLock
-from unmix_plugin.errors import CaptureError, ConfigError
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
@@ -136,14 +136,8 @@ class ViewRecipe:
 def write_view(
     view: CaptureView, recipe: ViewRecipe, folder: Path, resampling: Resampling | None = None
 ) -> ViewRecord:
-    """Write cube, picture and mask of a view.
-
-    Args:
-        resampling: Where its pixels are brought into another lens.
-    Raises:
-        CaptureError: a file of the view can't be read.
-        RunError: the folder can't be written.
-    """
+    """Write cube, picture and mask of a view, its pixels brought into another lens where there is a resampling. Raises
+    CaptureError: a file of the view can't be read. Raises RunError: the folder can't be written."""
     raster = recipe.calibration.raster
     masks, labels = read_view_masks(view, raster, recipe.use_opacity), read_labels(view, raster)
     if resampling is not None:
@@ -159,9 +153,7 @@ def write_view(
             np.lib.format.write_array_header_1_0(file, described)
             start = file.tell()
             read = partial(recipe.calibration.rows, view.cube)
-            values_a_pixel = len(recipe.calibration.bands)
-            if resampling is not None:
-                values_a_pixel = max(values_a_pixel, _WEIGHTS_A_PIXEL)
+            values_a_pixel = max(len(recipe.calibration.bands), _WEIGHTS_A_PIXEL if resampling else 0)
             for first, last in raster.blocks(values_a_pixel, _BLOCK_VALUES):
                 part = read(first, last) if resampling is None else resampling.rows(first, last, read)
                 file.write(_stored(tally.add(first, part, recipe), part).data)
@@ -357,8 +349,8 @@ class WorkFolder:
     def begin(self, plan: dict[str, Any]) -> bool:
         """Make the folder, or go on in the one that an interrupted start left.
 
-        Args:
-            plan: Options, decisions and inputs; views that were made with other ones are thrown away.
+        Views that were made with another plan (options, decisions and inputs) are thrown away.
+
         Returns:
             Whether an earlier start is gone on with.
         Raises:
@@ -370,10 +362,7 @@ class WorkFolder:
             self._hold()
         if self.path.exists():
             if not plan_file.is_file() and any(self.path.iterdir()):
-                raise ConfigError(
-                    f"{self.path} is in the way and was not made by unmix-process; rename it or choose another "
-                    "--output-dir"
-                )
+                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
             if plan_file.is_file() and plan_file.read_bytes() == text:
                 for folder in ("cubes", "images", "masks", _VIEWS):
                     remove_stale_temporaries(self.path / folder)
@@ -386,11 +375,7 @@ class WorkFolder:
         return False
 
     def _hold(self) -> None:
-        """Let no other process write the same scene, until this one ends.
-
-        Raises:
-            RunError: another one does.
-        """
+        """Let no other process write the same scene, until this one ends; RunError where another one does."""
         if self._lock is not None:
             self._lock.release()
         self._lock = RunLock(self.path / _LOCK, "unmix-process")
@@ -407,11 +392,7 @@ class WorkFolder:
         write_file(self._record(record.name), _json(asdict(record)))
 
     def finish(self, overwrite: bool) -> None:
-        """Give the scene its name; the record of how it was made stays in it.
-
-        Raises:
-            RunError: it can't be moved.
-        """
+        """Give the scene its name; the record of how it was made stays in it. RunError where it can't be moved."""
         with write_errors_as(self.output):
             if self._lock is not None:
                 self._lock.release()
@@ -433,11 +414,8 @@ class WorkFolder:
 
 
 def refuse_output(output: Path, overwrite: bool) -> None:
-    """Look before anything is computed whether the scene can get its name.
-
-    Raises:
-        ConfigError: the folder holds something; with `overwrite`, something that this command did not make.
-    """
+    """Look before anything is computed whether the scene can get its name. Raises ConfigError: the folder holds
+    something; with `overwrite`, something that this command did not make."""
     if not output.resolve().name:
         raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
     if output.is_file():
@@ -447,9 +425,7 @@ def refuse_output(output: Path, overwrite: bool) -> None:
     if not (output / RECORD_NAME).is_file():
         raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
     if not overwrite:
-        raise ConfigError(
-            f"{output} holds a scene already; choose another folder, or replace it with --overwrite"
-        )
+        raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
 
 
 def _json(value: Any) -> bytes:
@@ -457,28 +433,21 @@ def _json(value: Any) -> bytes:
 
 
 def stamps(paths: Iterable[Path]) -> list[list[Any]]:
-    """Path, size and time of change of each file: what tells quickly whether it is still the same.
-
-    Raises:
-        CaptureError: a file is gone.
-    """
+    """Path, size and time of change of each file: what tells quickly whether it is still the same. CaptureError where
+    one is gone."""
     found = []
     for file in _files_of(paths):
-        with _reading(file):
+        with reading(file):
             facts = file.stat()
         found.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
     return found
 
 
 def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Path, size and SHA-256 of each file.
-
-    Raises:
-        CaptureError: a file can't be read.
-    """
+    """Path, size and SHA-256 of each file. CaptureError where one can't be read."""
     found = []
     for file in _files_of(paths):
-        with _reading(file):
+        with reading(file):
             found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
     return found
 
@@ -487,12 +456,3 @@ def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
     """Files, and those of a folder that a reader takes as one."""
     for path in paths:
         yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
-
-
-@contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Context in which an error of the system becomes one of reading `path`."""
-    try:
-        yield
-    except OSError as error:
-        raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error

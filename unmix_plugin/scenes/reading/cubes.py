@@ -23,10 +23,7 @@ from jaxtyping import Bool, Float32
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size
 
-READ_HEADER = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
+READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _ONE_PARSER = Lock()
 """NumPy parses headers as Python literals, which fails in CPython 3.11 if several threads do so at the same moment."""
 _BLOCK_VALUES = 1 << 20
@@ -65,12 +62,9 @@ class _ArrayHeader:
 
 
 def read_array_header(path: Path) -> _ArrayHeader:
-    """Read and check the header of a .npy file; no value and no pickle is read.
-
-    Raises:
-        UnreadableArrayError: not a .npy file, a pickled one, cut short, or of a type that is not float or integer.
-        OSError: the file cannot be opened.
-    """
+    """Read and check the header of a .npy file; no value and no pickle is read. Raises UnreadableArrayError: not a .npy
+    file, a pickled one, cut short, or of a type that is not float or integer. Raises OSError: the file cannot be
+    opened."""
     with path.open("rb") as file:
         try:
             version = np.lib.format.read_magic(file)
@@ -86,26 +80,19 @@ def read_array_header(path: Path) -> _ArrayHeader:
     if not all(type(length) is int and length >= 0 for length in shape):
         raise UnreadableArrayError(f"has the shape {shape} in its .npy header; write it again")
     if dtype.hasobject:
-        raise UnreadableArrayError(
-            "holds pickled Python objects, which are never loaded because they can run code; "
-            "save a plain numeric array with numpy.save(..., allow_pickle=False)"
-        )
+        raise UnreadableArrayError("holds pickled Python objects, which are never loaded: they can run code")
     if dtype.kind not in "fiu":
         raise UnreadableArrayError(f"holds {dtype} values; expected a float or an integer type")
     expected_bytes = prod(shape) * dtype.itemsize
     if found_bytes < expected_bytes:
-        raise UnreadableArrayError(
-            f"is cut short: {found_bytes} bytes of values found, {expected_bytes} expected for shape {shape}"
-        )
+        expected = f"{expected_bytes} expected for shape {shape}"
+        raise UnreadableArrayError(f"is cut short: {found_bytes} bytes of values found, {expected}")
     return _ArrayHeader(shape, dtype)
 
 
 def parse_header(file: Any, version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, whether the first axis runs fastest, and type, of an open binary file behind its magic string.
-
-    Raises:
-        Exception: of NumPy, of many kinds, for a damaged header.
-    """
+    """Shape, whether the first axis runs fastest, and type, of an open binary file behind its magic string. Raises
+    Exception: of NumPy, of many kinds, for a damaged header."""
     with _ONE_PARSER:
         return READ_HEADER[version](file)
 
@@ -394,9 +381,8 @@ def check_abundances(
         expected = f"{size[1]} x {size[0]} as the cubes have"
         faults.add(where, f"has {found[1]} x {found[0]} pixels (width x height); expected {expected}")
     if num_materials is not None and header.shape[2] != num_materials:
-        faults.add(
-            where, f"has {header.shape[2]} abundances a pixel; expected {num_materials}, one a material"
-        )
+        abundances = f"has {header.shape[2]} abundances a pixel"
+        faults.add(where, f"{abundances}; expected {num_materials}, one a material")
     values = map_array(path)
     if not (values.min() >= -0.01 and values.max() <= 1.01):  # false with any NaN
         faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
@@ -411,10 +397,8 @@ def _note_invalid(
         if values.num_invalid_pixels == values.num_pixels and invalid_pixels != "refuse":
             faults.add(where, "every pixel of the cube has a NaN, infinite or negative value; drop the frame")
         elif invalid_pixels == "clip" and not values.is_noise:
-            faults.add(
-                where,
-                f"the cube has {values.num_far_negative} values far below 0, which is not noise; check its dark frame",
-            )
+            found = f"the cube has {values.num_far_negative} values far below 0"
+            faults.add(where, f"{found}, which is not noise; check its dark frame")
         elif values.num_invalid_pixels:
             usable.append((where, values))
     if invalid_pixels != "refuse" or not usable:
@@ -442,11 +426,10 @@ def _note_scales(measured: list[tuple[str, _CubeValues]], scale: float | None, f
     if integers and scale is None:
         greatest = max(values.greatest for _, values in integers)
         proposal = _propose_scale(greatest, is_integer=True)
-        message = (
-            f"the cube holds integers (up to {greatest:g} in this scene); give --value-scale {proposal:g}"
-        )
+        holds = f"the cube holds integers (up to {greatest:g} in this scene)"
+        meant = f"the number that stands for 1{_describe_scale(proposal)}"
         for where, _ in integers:
-            faults.add(where, f"{message}, the number that stands for 1{_describe_scale(proposal)}")
+            faults.add(where, f"{holds}; give --value-scale {proposal:g}, {meant}")
     is_judged = [(w, v) for w, v in measured if not (v.is_integer and scale is None)]
     far = [(where, values) for where, values in is_judged if _is_far_out_of_range(values, scale)]
     if not far:
@@ -457,8 +440,6 @@ def _note_scales(measured: list[tuple[str, _CubeValues]], scale: float | None, f
     advice = f"give --value-scale {proposal:g}"
     if scale is None:
         advice += ", or to 1 to clip highlights at 1"
+    found = f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene)"
     for where, _ in far:
-        faults.add(
-            where,
-            f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene); {advice}",
-        )
+        faults.add(where, f"{found}; {advice}")

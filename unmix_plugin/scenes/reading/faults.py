@@ -15,14 +15,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
-from unmix_plugin.errors import SceneError
+from unmix_plugin.errors import SceneError, name_some
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
-_MAX_PLACES = 3
-"""Places written out for a fault that many frames share."""
-_HASH_BLOCK_BYTES = 1 << 20
 
 
 class Faults:
@@ -31,7 +28,8 @@ class Faults:
     def __init__(self, root: Path) -> None:
         self._root = root
         self._places: dict[str, list[str]] = {}
-        self._noted = 0
+        self.noted = 0
+        """How often a fault was noted so far, repetitions included."""
 
     def add(self, where: str, message: str) -> None:
         """Note a fault.
@@ -40,26 +38,17 @@ class Faults:
             where: File, frame or key that has it.
             message: What was found against what was expected, and what to do.
         """
-        self._noted += 1
+        self.noted += 1
         places = self._places.setdefault(message, [])
         if where not in places:
             places.append(where)
 
-    @property
-    def noted(self) -> int:
-        """How often a fault was noted so far, repetitions included."""
-        return self._noted
-
     def raise_if_any(self) -> None:
-        """End here if anything is wrong.
-
-        Raises:
-            SceneError: one or more faults were noted; its message lists them.
-        """
+        """End here if anything is wrong. Raises SceneError: one or more faults were noted; its message lists them."""
         if not self._places:
             return
         lines = [
-            message if places == [str(self._root)] else f"{_name_places(places)}: {message}"
+            message if places == [str(self._root)] else f"{name_some(places)}: {message}"
             for message, places in self._places.items()
         ]
         if len(lines) == 1:
@@ -70,39 +59,24 @@ class Faults:
         raise SceneError("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
 
 
-def _name_places(places: list[str]) -> str:
-    shown = ", ".join(places[:_MAX_PLACES])
-    hidden = len(places) - _MAX_PLACES
-    return f"{shown} and {hidden} more" if hidden > 0 else shown
-
-
 class UnreadableJsonError(ValueError):
     """A file holds no JSON; the text says why."""
 
 
 def read_json_file(path: Path) -> Any:
-    """The value in a JSON file.
-
-    Raises:
-        UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply, or has text that is not Unicode.
-        OSError: it cannot be opened.
-    """
+    """The value in a JSON file. Raises UnreadableJsonError: it is not in UTF-8 or UTF-16, not JSON, nested too deeply,
+    or has text that is not Unicode. Raises OSError: it cannot be opened."""
     data = read_bounded(path, MOST_TABLE_BYTES)
     if not data.strip(b"\xef\xbb\xbf\t\r\n "):
         raise UnreadableJsonError("is empty; expected JSON")
     try:
         is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
         content = json.loads(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
-        json.dumps(
-            content, ensure_ascii=False
-        ).encode()  # fails on lone surrogates, which no file name can hold
+        json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
     except json.JSONDecodeError as error:
         at = f"line {error.lineno}, column {error.colno}"
         raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # not UTF-8, surrogates, numbers of thousands of digits, nesting
+    except (ValueError, RecursionError) as error:  # no UTF-8, surrogates, numbers of thousands of digits
         raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
     return content
 
@@ -162,11 +136,8 @@ def _in_any_case(root: Path, parts: list[str]) -> Path | None:
     for part in parts:
         if not (path / part).exists() and part != "..":
             wanted = _plain(part)
-            alike = (
-                [entry.name for entry in path.iterdir() if _plain(entry.name) == wanted]
-                if path.is_dir()
-                else []
-            )
+            entries = path.iterdir() if path.is_dir() else ()
+            alike = [entry.name for entry in entries if _plain(entry.name) == wanted]
             if len(alike) != 1:
                 return None
             part = alike[0]
@@ -194,20 +165,14 @@ def resolve_path(
         inside = path.resolve().is_relative_to(root.resolve()) and not Path(text).is_absolute()
         is_file = path.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # a name too long, a loop of links, a zero byte
-        faults.add(
-            where,
-            f"{text!r} cannot be followed ({type(error).__name__}); expected a file in the scene folder",
-        )
+        faults.add(where, f"{text!r} cannot be followed ({type(error).__name__})")
         return None
     if not (is_file and (inside or allow_outside)) and (found := find_named(root, text, least_parts)):
         return found
     if not inside and not allow_outside:
-        or_allow = (
-            ""
-            if allow_outside is None
-            else ", or allow it with --allow-outside-paths if you trust this scene"
-        )
-        faults.add(where, f"{text!r} leaves the scene folder; copy the file into it{or_allow}")
+        or_allow = ", or allow it with --allow-outside-paths if you trust this scene"
+        advice = f"copy the file into it{'' if allow_outside is None else or_allow}"
+        faults.add(where, f"{text!r} leaves the scene folder; {advice}")
         return None
     if not is_file:
         state = "is not a plain file" if path.exists() else "is missing"
@@ -220,6 +185,6 @@ def sha256_of(path: Path) -> str:
     """SHA-256 of a file of any size, read in small blocks."""
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(_HASH_BLOCK_BYTES):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()

@@ -41,76 +41,20 @@ _SAID = {
     "black_transparent": "black pixels that instant-ngp takes for background: --mask black leaves them out",
     "fix_premult": "colours that instant-ngp divides by their opacity: they are taken as they are",
 }
-_KNOWN = {
-    *(
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "w",
-        "h",
-        "k1",
-        "k2",
-        "k3",
-        "k4",
-        "p1",
-        "p2",
-        "distortion_params",
-        "camera_model",
-    ),
-    *(
-        "camera_angle_x",
-        "camera_angle_y",
-        "x_fov",
-        "y_fov",
-        "is_fisheye",
-        "intrinsic_matrix",
-        "frames",
-        "datadir",
-    ),
-    *("applied_transform", "applied_scale", "offset", "ply_file_path", "wavelengths", "fwhm", "value_scale"),
-    "metres_per_unit",
-    *(
-        "train_filenames",
-        "val_filenames",
-        "test_filenames",
-        "materials",
-        "illuminant_path",
-        "endmembers_path",
-    ),
-    *(
-        "file_path",
-        "name",
-        "transform_matrix",
-        "row_poses",
-        "key_poses",
-        "sensor",
-        "bands",
-        "capture",
-        "responses_path",
-    ),
-    *("hyperspectral_file_path", "seg_file_path", "mask_path", "abundance_file_path", "dino_file_path"),
-    # Hints for rendering and training, which move no pose.
-    *(
-        "aabb",
-        "aabb_scale",
-        "scale",
-        "from_na",
-        "render_aabb",
-        "up",
-        "n_extra_learnable_dims",
-        "importance_sampling",
-    ),
-    *(
-        "integer_depth_scale",
-        "enable_depth_loading",
-        "enable_ray_loading",
-        "sharpen",
-        "sharpness_discard_threshold",
-    ),
-    *("sharpness", "depth_path", "depth_file_path", "depth_unit_scale_factor", "driver_parameters", "envmap"),
-    *("orientation_override", "colmap_im_id", "rotation", "time", "transform_matrix_start"),
-}
+_KNOWN = frozenset(
+    """
+    fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model camera_angle_x camera_angle_y x_fov y_fov
+    is_fisheye intrinsic_matrix frames datadir applied_transform applied_scale offset ply_file_path wavelengths fwhm
+    value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path file_path
+    name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
+    seg_file_path mask_path abundance_file_path dino_file_path
+    aabb aabb_scale scale from_na render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
+    enable_depth_loading enable_ray_loading sharpen sharpness_discard_threshold sharpness depth_path depth_file_path
+    depth_unit_scale_factor driver_parameters envmap orientation_override colmap_im_id rotation time
+    transform_matrix_start
+    """.split()  # noqa: SIM905
+)
+"""What readers follow; and hints for rendering and training, from `aabb` on, which move no pose."""
 
 
 def refused_keys(content: Mapping[str, Any], frame: Mapping[str, Any], is_scene: bool = False) -> list[str]:

@@ -33,11 +33,8 @@ class UnreadableImageError(ValueError):
 
 
 def read_colour(path: Path, size: Size) -> UInt8[np.ndarray, "H W C"]:
-    """Read sRGB (C = 3) or sRGB with alpha (C = 4), 8 bits.
-
-    Raises:
-        UnreadableImageError: not a readable picture of this size with 8 bits a channel.
-    """
+    """Read sRGB (C = 3) or sRGB with alpha (C = 4), 8 bits. Raises UnreadableImageError: not a readable picture of this
+    size with 8 bits a channel."""
 
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode == "P":
@@ -46,43 +43,33 @@ def read_colour(path: Path, size: Size) -> UInt8[np.ndarray, "H W C"]:
             raise UnreadableImageError(f"is a picture of mode {image.mode}; expected 8-bit RGB or RGBA")
         return np.asarray(image.convert(_COLOUR_MODES[image.mode]))
 
-    return _read(path, size, convert)
+    return read_picture(path, size, convert)
 
 
 def read_labels(path: Path, size: Size) -> UInt8[np.ndarray, "H W"]:
-    """Read class indices from an 8-bit picture of one channel (grey or palette; 255 = unlabelled).
-
-    Raises:
-        UnreadableImageError: not a readable picture of this size with one 8-bit channel.
-    """
+    """Read class indices from an 8-bit picture of one channel (grey or palette; 255 = unlabelled). Raises
+    UnreadableImageError: not a readable picture of this size with one 8-bit channel."""
 
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode not in ("L", "P"):
-            raise UnreadableImageError(
-                f"is a picture of mode {image.mode}; expected labels in one 8-bit channel"
-            )
+            raise UnreadableImageError(f"is a picture of mode {image.mode}; expected one 8-bit channel")
         return np.asarray(image)
 
-    return _read(path, size, convert)
+    return read_picture(path, size, convert)
 
 
 def read_mask(path: Path, size: Size) -> Bool[np.ndarray, "H W"]:
-    """Read a mask: True where a pixel counts, False where it is black (nerfstudio's convention).
-
-    Raises:
-        UnreadableImageError: not a readable picture of this size, or neither black and white nor two numbers.
-    """
-    return _read(path, size, white_of)
+    """Read a mask: True where a pixel counts, False where it is black (nerfstudio's convention). Raises
+    UnreadableImageError: not a readable picture of this size, or neither black and white nor two numbers."""
+    return read_picture(path, size, white_of)
 
 
 def white_of(image: Image.Image) -> Bool[np.ndarray, "H W"]:
     """Where a mask is white. The one rule for masks: white is what is brighter than half of the range.
 
     A mask whose numbers are all dark holds 0 and one other number, such as 1, which is its white. Opacity counts as
-    brightness over black.
-
-    Raises:
-        UnreadableImageError: all is dark and there are several greys, so that white can't be told.
+    brightness over black. Raises UnreadableImageError: all is dark and there are several greys, so that white can't be
+    told.
     """
     grey, top = _grey_of(image)
     brightest = grey.max(initial=0)
@@ -109,23 +96,25 @@ def _grey_of(image: Image.Image) -> tuple[np.ndarray, int]:
     return np.asarray(image.convert("L")).astype(np.int64), 255
 
 
-def _read(path: Path, size: Size, convert: Callable[[Image.Image], np.ndarray]) -> np.ndarray:
+def read_picture(
+    path: Path, size: Size, convert: Callable[[Image.Image], np.ndarray], formats: tuple[str, ...] = FORMATS
+) -> np.ndarray:
+    """What `convert` makes of a picture of this size. Raises UnreadableImageError: not a readable picture of this size
+    and of these formats."""
     from PIL import Image
 
     try:
-        with Image.open(path, formats=FORMATS) as image:
+        with Image.open(path, formats=formats) as image:
             if (image.height, image.width) != size:
-                raise UnreadableImageError(
-                    f"the picture has {image.width} x {image.height} pixels (width x height); "
-                    f"expected {size[1]} x {size[0]} as the cubes have"
-                )
+                found = f"the picture has {image.width} x {image.height} pixels (width x height)"
+                raise UnreadableImageError(f"{found}; expected {size[1]} x {size[0]} as the cubes have")
             return convert(image)
     except UnreadableImageError:
         raise
     # pillow reports damage as OSError, SyntaxError, ValueError, EOFError or a bomb error, by format
     except Exception as error:
         raise UnreadableImageError(
-            f"cannot be read as a PNG, JPEG or TIFF picture ({type(error).__name__}: {error})"
+            f"cannot be read as a picture: {', '.join(formats)} ({type(error).__name__}: {error})"
         ) from error
 
 
@@ -168,10 +157,7 @@ def check_masks(
     for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
         masks.append(_checked(frame, paths, "mask_path", read_mask, size, faults))
         if masks[-1] is not None and not masks[-1].any():
-            faults.add(
-                frame.name_of("mask_path"),
-                "the mask is black everywhere, so no pixel of the frame counts; drop the frame",
-            )
+            faults.add(frame.name_of("mask_path"), "the mask is black everywhere; drop the frame")
     return masks
 
 
@@ -187,10 +173,8 @@ def check_labels(
         labels = _checked(frame, paths, "seg_file_path", read_labels, size, faults)
         greatest = 0 if labels is None else int(labels.max(where=labels != UNLABELLED, initial=0))
         if num_materials is not None and greatest >= num_materials:
-            faults.add(
-                frame.name_of("seg_file_path"),
-                f"has label {greatest}; expected 0 to {num_materials - 1} for the materials, or {UNLABELLED}",
-            )
+            expected = f"expected 0 to {num_materials - 1} for the materials, or {UNLABELLED}"
+            faults.add(frame.name_of("seg_file_path"), f"has label {greatest}; {expected}")
 
 
 def _checked(

@@ -68,13 +68,9 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     """
     options = SceneOptions() if options is None else options
     faults = Faults(root)
-    if (
-        options.value_scale is not None and not 1e-30 <= options.value_scale <= 1e30
-    ):  # float32 divides by these
-        found = f"is {options.value_scale:g}"
-        faults.add(
-            "--value-scale", f"{found}; expected a positive number, the stored value that stands for 1"
-        )
+    scale = options.value_scale
+    if scale is not None and not 1e-30 <= scale <= 1e30:  # float32 divides by these
+        faults.add("--value-scale", f"is {scale:g}; expected a positive number, what stands for 1")
         faults.raise_if_any()
     entry = read_transforms(root, faults)
     if options.value_scale is None:
@@ -352,15 +348,10 @@ def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisat
     lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
     assert len(lenses) == len(entry.frames)
     centers = [
-        [
-            0.5 * side if value is None else value
-            for value, side in zip(lens.center_px, size[::-1], strict=True)
-        ]
+        [0.5 * side if at is None else at for at, side in zip(lens.center_px, size[::-1], strict=True)]
         for lens, size in zip(lenses, sizes, strict=True)
     ]
-    count = max(
-        len(lens.coefficients) for lens in lenses
-    )  # six where any has higher radial terms, otherwise four
+    count = max(len(lens.coefficients) for lens in lenses)  # 6 where any has higher radial terms, or 4
     distortion = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
     focal_px = [lens.focal_at(width, height) for lens, (height, width) in zip(lenses, sizes, strict=True)]
     return Cameras.of_sizes(
@@ -426,10 +417,7 @@ def _find_model_space(
     stand before a backdrop, if views without alpha share one, and why the world is taken to end, where that was found.
 
     The similarity starts from the space of transforms.json. The box is found in a space centred on the training
-    cameras, where coordinates are of order 1.
-
-    Raises:
-        SceneError: alpha and poses contradict.
+    cameras, where coordinates are of order 1. Raises SceneError: alpha and poses contradict.
     """
     cubes = list(checked.cube_hashes)
     positions = _world_poses(entry)[list(train), :, 3]

@@ -69,9 +69,8 @@ def group_by_sensor(
         index, first_matrix, first_size = known[key]
         if first_size != size:
             found, expected = (f"{wide} x {high}" for high, wide in (size, first_size))
-            faults.add(
-                where, f"has {found} pixels, others of sensor {entry.name!r} {expected}; name it otherwise"
-            )
+            others = f"others of sensor {entry.name!r} {expected}"
+            faults.add(where, f"has {found} pixels, {others}; name it otherwise")
         elif first_matrix != matrix.tobytes():
             faults.add(where, f"has other bands than others of sensor {entry.name!r}; name it otherwise")
         indices.append(index)
@@ -94,13 +93,10 @@ def check_coverage(
 def lonely_sensors(sensors: tuple[SceneSensor, ...], train_sensors: set[int]) -> list[str]:
     """Names of sensors of the training frames whose bands no other sensor of them sees."""
     used = sorted(train_sensors)
+    counts = np.sum([sensors[index].seen_bands for index in used], axis=0)
+    alone = [not (sensors[index].seen_bands & (counts > 1)).any() for index in used]
     return [
-        sensors[index].name
-        for index in used
-        if len(used) > 1
-        and not any(
-            (sensors[index].seen_bands & sensors[other].seen_bands).any() for other in used if other != index
-        )
+        sensors[index].name for index, is_alone in zip(used, alone, strict=True) if is_alone and len(used) > 1
     ]
 
 

@@ -29,17 +29,12 @@ class Split:
 
 
 def split_frames(
-    entry: SceneEntry,
-    method: Literal["auto", "lists", "filename", "interval"],
-    interval: int,
-    faults: Faults,
+    entry: SceneEntry, method: Literal["auto", "lists", "filename", "interval"], interval: int, faults: Faults
 ) -> Split:
     """Split the frames; notes a fault where training or evaluation is left without a frame."""
     if method == "lists" and not entry.split_lists:
-        faults.add(
-            FILE_NAME,
-            "has no train_filenames, val_filenames or test_filenames; --eval-split lists needs them",
-        )
+        missing = "has no train_filenames, val_filenames or test_filenames"
+        faults.add(FILE_NAME, f"{missing}; --eval-split lists needs them")
         return Split((), ())
     if method == "lists" or (method == "auto" and entry.split_lists):
         split = _by_lists(entry, faults)
@@ -48,9 +43,8 @@ def split_frames(
     else:
         split = _by_interval(len(entry.frames), interval, faults)
     if entry.frames and not split.train:
-        faults.add(
-            FILE_NAME, f"no frame is left to train on ({_how(method)}); name some in 'train_filenames'"
-        )
+        advice = "name some in 'train_filenames'"
+        faults.add(FILE_NAME, f"no frame is left to train on ({_how(method)}); {advice}")
     if entry.frames and not split.evaluation:
         advice = "name some in 'test_filenames' or use --eval-split interval"
         faults.add(FILE_NAME, f"no frame is left to evaluate ({_how(method)}); {advice}")
@@ -127,8 +121,6 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
 
 def _by_interval(count: int, interval: int, faults: Faults) -> Split:
     if interval < 2:
-        faults.add(
-            "--eval-interval", f"is {interval}; expected 2 or more, so that frames are left to train on"
-        )
+        faults.add("--eval-interval", f"is {interval}; expected 2 or more: frames are to be left to train on")
         return Split((), ())
     return Split(tuple(i for i in range(count) if i % interval != 0), tuple(range(0, count, interval)))

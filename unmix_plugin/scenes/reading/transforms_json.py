@@ -31,14 +31,8 @@ from unmix_plugin.spectral.bands import require_nanometres
 FILE_NAME = "transforms.json"
 Size = tuple[int, int]
 """Height and width in pixels."""
-_FILE_KEYS = (
-    "file_path",
-    "hyperspectral_file_path",
-    "seg_file_path",
-    "mask_path",
-    "abundance_file_path",
-    "responses_path",
-)
+_FILE_KEYS = tuple(f"{key}_path" for key in ("file", "hyperspectral_file", "seg_file", "mask"))
+_FILE_KEYS += ("abundance_file_path", "responses_path")
 _SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
@@ -115,9 +109,8 @@ def read_lens(
     noted_before = faults.noted
     for message in refused_keys(content, frame, is_scene):
         faults.add(where, message)
-    matrix = _read_intrinsic_matrix(
-        frame.get("intrinsic_matrix", content.get("intrinsic_matrix")), where, faults
-    )
+    given = frame.get("intrinsic_matrix", content.get("intrinsic_matrix"))
+    matrix = _read_intrinsic_matrix(given, where, faults)
 
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
         source = frame if frame.get(key) is not None else content
@@ -149,9 +142,8 @@ def read_lens(
     listed = frame.get("distortion_params", content.get("distortion_params"))
     if listed is not None:
         bending = [read_number(value) for value in listed] if isinstance(listed, list) else []
-        if len(bending) != len(_BENDING_KEYS) or any(
-            number is None or abs(number) > _GREATEST_PX for number in bending
-        ):
+        are_sound = all(number is not None and abs(number) <= _GREATEST_PX for number in bending)
+        if len(bending) != len(_BENDING_KEYS) or not are_sound:
             names = ", ".join(_BENDING_KEYS)
             faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")
     if faults.noted > noted_before:
@@ -172,9 +164,7 @@ def _read_model(content: dict[str, Any], frame: dict[str, Any], where: str, faul
     model = model.upper() if isinstance(model, str) else model
     if frame.get("is_fisheye", content.get("is_fisheye")):
         if model not in (None, "OPENCV_FISHEYE"):
-            faults.add(
-                where, f"'is_fisheye' is true and camera_model {describe(model)}; expected one of them"
-            )
+            faults.add(where, f"'is_fisheye' is true and camera_model {describe(model)}; drop one of them")
         return "OPENCV_FISHEYE"
     return "OPENCV" if model is None else model
 
@@ -211,9 +201,7 @@ def read_intrinsics(
         )
     focal_keys = ("fl_x", "camera_angle_x", "x_fov", "intrinsic_matrix")
     if all(source.get(key) is None for source in (frame, content) for key in focal_keys):
-        faults.add(
-            where, "'fl_x' is absent; expected the focal length in pixels, for a frame or the whole scene"
-        )
+        faults.add(where, "'fl_x' is absent; expected the focal length in pixels, of a frame or the scene")
     if lens is not None and model in ("PINHOLE", "SIMPLE_PINHOLE") and any(lens.coefficients):
         (k1, k2, p1, p2), (k3, k4) = lens.distortion, lens.higher_radial
         bending = dict(zip(_BENDING_KEYS, (k1, k2, k3, k4, p1, p2), strict=True))
@@ -250,10 +238,7 @@ def read_pose(
         faults.add(where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis")
         return None
     if np.abs(position).max() > _MAX_DISTANCE:
-        faults.add(
-            where,
-            f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away",
-        )
+        faults.add(where, f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away")
         return None
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, position[:, None]], axis=1)
@@ -331,12 +316,8 @@ def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LineP
         here, name, matrix, row = f"{where} '{given[0]}'[{index}]", "the pose", entry, float(index)
         if given[0] == _KEY_POSES:
             keys = entry if isinstance(entry, dict) else {}
-            name, matrix, number = (
-                "'transform_matrix'",
-                keys.get("transform_matrix"),
-                read_number(keys.get("row")),
-            )
-            if number is None:
+            name, matrix = "'transform_matrix'", keys.get("transform_matrix")
+            if (number := read_number(keys.get("row"))) is None:
                 found = f"has the row {describe(keys.get('row'))}" if keys else f"is {describe(entry)}"
                 faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
                 return None
@@ -354,11 +335,9 @@ def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LineP
     turns = np.rad2deg(np.arccos(np.clip((products - 1) / 2, -1, 1)))
     largest = int(turns.argmax())
     if turns[largest] > _GREATEST_TURN_DEG:
-        faults.add(
-            where,
-            f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row "
-            f"{rows[largest + 1]:g}; expected at most {_GREATEST_TURN_DEG:g}, give more key poses",
-        )
+        turn = f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row"
+        most = f"expected at most {_GREATEST_TURN_DEG:g}, give more key poses"
+        faults.add(where, f"{turn} {rows[largest + 1]:g}; {most}")
         return None
     return _LinePoses(np.array(rows), stacked, given[0] == _ROW_POSES)
 
@@ -468,9 +447,7 @@ def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
         found = "is a file, not a scene folder" if path.parent.is_file() else "the scene folder is not there"
         faults.add(str(path.parent), f"{found}; give the folder that holds transforms.json with --data")
     elif not path.is_file():
-        faults.add(
-            FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README, 'own data')"
-        )
+        faults.add(FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README)")
     faults.raise_if_any()
     content: Any = None
     try:
@@ -481,9 +458,7 @@ def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
         faults.add(FILE_NAME, str(error))
     faults.raise_if_any()
     if not isinstance(content, dict):
-        faults.add(
-            FILE_NAME, f"holds {describe(content)}; expected an object with 'frames' and 'wavelengths'"
-        )
+        faults.add(FILE_NAME, f"holds {describe(content)}; expected an object with 'frames'")
         faults.raise_if_any()
     return content
 
@@ -504,14 +479,9 @@ def _read_frame(
     lines = read_line_poses(frame, where, faults)
     is_frame_camera = lines is None and faults.noted == noted
     pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
-    return FrameEntry(
-        where=where,
-        paths={key: path for key, path in paths.items() if path is not None},
-        pose=pose if lines is None else lines.middle,
-        intrinsics=read_intrinsics(content, frame, where, faults),
-        sensor=_read_sensor_entry(frame, where, faults),
-        line_poses=lines,
-    )
+    lens, sensor = read_intrinsics(content, frame, where, faults), _read_sensor_entry(frame, where, faults)
+    named = {key: path for key, path in paths.items() if path is not None}
+    return FrameEntry(where, named, pose if lines is None else lines.middle, lens, sensor, lines)
 
 
 def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) -> str | None:
@@ -539,10 +509,8 @@ def _read_wavelengths(
     numbers = [read_number(value) for value in values]
     for band, number in enumerate(numbers):
         if number is None or number <= 0.0:
-            found = describe(values[band])
-            faults.add(
-                FILE_NAME, f"'wavelengths' has {found} at band {band}; expected a positive number in nm"
-            )
+            found = f"'wavelengths' has {describe(values[band])} at band {band}"
+            faults.add(FILE_NAME, f"{found}; expected a positive number in nm")
             return None
     wavelengths = np.array(numbers, dtype=np.float64)
     drops = np.flatnonzero(np.diff(wavelengths) <= 0.0)
@@ -563,9 +531,7 @@ def _read_value_scale(content: dict[str, Any], faults: Faults) -> float | None:
     value = content.get("value_scale")
     scale = read_number(value)
     if value is not None and (scale is None or not 1e-30 <= scale <= 1e30):
-        faults.add(
-            FILE_NAME, f"'value_scale' is {describe(value)}; expected a positive number, what stands for 1"
-        )
+        faults.add(FILE_NAME, f"'value_scale' is {describe(value)}; expected what stands for 1, above 0")
         return None
     return scale
 
@@ -574,12 +540,9 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
     values = content.get("materials")
     if values is None:
         return None
-    is_list = (
-        isinstance(values, list)
-        and values
-        and all(isinstance(v, str) and v.strip() and v.isprintable() for v in values)
-    )
-    if not is_list or len(set(values)) != len(values):
+    names = values if isinstance(values, list) else [None]
+    are_names = names and all(isinstance(v, str) and v.strip() and v.isprintable() for v in names)
+    if not are_names or len(set(values)) != len(values):
         faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
         return None
     return tuple(values)
