@@ -134,7 +134,11 @@ SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
     (_no_wavelengths, {}, "the wavelengths of its 9 bands are unknown .* --wavelengths"),
     (_zero_poses, {}, "4 of 4 camera matrices that are not poses: .* the rotation is all zeros"),
     (_poses_of("cow", "horse"), {}, "no view has a pose"),
-    (_poses_of("view_00", "view_01", size=(100, 40)), {}, "has 32 x 24 pixels .*, its lens is given for 100 x 40"),
+    (
+        _poses_of("view_00", "view_01", size=(100, 40)),
+        {},
+        "has 32 x 24 pixels .*, its lens is given for 100 x 40",
+    ),
 ]
 
 

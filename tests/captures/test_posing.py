@@ -1,6 +1,7 @@
 """Where cameras stand in the world of a scene, and how the lenses of a rig share poses."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,19 +13,21 @@ from tests.captures.poses.alignment import SIMILARITY, elsewhere, in_a_row
 from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
-from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.lens import FileLens, Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _complete_rigs, _place_poses
+from unmix_plugin.captures.process import _refuse_late
 from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.writing.scene_files import _write_points
+from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
 
 FAR = np.array([500_123.0, 5_400_321.0, 300.0])
 
 
 def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
-    placed, placement, notes = _place_poses(elsewhere(ring_set(12)))
+    placed, _placement, _notes = _place_poses(elsewhere(ring_set(12)))
     stacked = np.stack([camera.camera_to_world for camera in placed.cameras.values()])
     np.testing.assert_allclose(np.linalg.norm(stacked[:, :, 3], axis=1), 1, atol=1e-9)
     np.testing.assert_allclose(stacked[:, 2, 0], 0, atol=1e-9)  # horizontal axes lie flat
@@ -35,7 +38,7 @@ def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
 
 def test_what_was_placed_returns_to_the_source():
     poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
-    placed, placement, notes = _place_poses(poses)
+    placed, placement, _notes = _place_poses(poses)
     for name, camera in placed.cameras.items():
         back = placement.to_source(camera.camera_to_world[:, 3])
         np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
@@ -47,10 +50,10 @@ def test_what_was_placed_returns_to_the_source():
 def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
     row = in_a_row()
-    placed, placement, notes = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
+    _, placement, notes = _place_poses(ring_set(up=np.array([0.0, 0.0, 1.0])))
     np.testing.assert_array_equal(placement.rotation, np.eye(3))
     assert "up is the source's" in notes
-    placed, placement, notes = _place_poses(type(row)(row.cameras, row.source, points))
+    _placed, placement, notes = _place_poses(type(row)(row.cameras, row.source, points))
     np.testing.assert_allclose(placement.to_source(np.zeros(3)), [2, 2, -3])
     assert "up is the mean of the cameras' up vectors" in notes
 
@@ -90,7 +93,7 @@ def test_sparse_points_are_written_with_their_colours(tmp_path):
 
 def test_written_placements_are_read_back_to_the_source(tmp_path):
     poses = elsewhere(ring_set(offset=FAR))
-    placed, placement, notes = _place_poses(poses)
+    placed, placement, _notes = _place_poses(poses)
     stacked = {name: camera.camera_to_world for name, camera in placed.cameras.items()}
     found = read_poses(write_json(tmp_path / "transforms.json", transforms(stacked, **placement.to_json())))
     for name, camera in poses.cameras.items():
@@ -193,3 +196,20 @@ def test_views_without_release_are_left_alone():
     completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
     assert set(completed) == {"one"}
     assert notes == ()
+
+
+def test_a_lens_that_was_found_goes_before_that_of_the_file():
+    found = replace(SMALL_LENS, focal_px=(6.0, 6.0))
+    views = [rig_view(release, sensor, ANGLES[sensor]) for release in ("r1", "r2") for sensor in "ab"]
+    posed = {
+        name: replace(turned_camera(seed), lens=found) for seed, name in enumerate(("r1a", "r1b", "r2a"), 1)
+    }
+    completed, _ = _complete_rigs(views, posed)
+    assert completed["r2b"].lens == found
+
+
+def test_a_lens_that_pixels_would_be_brought_into_is_refused_once_they_are_written():
+    bent = replace(SMALL_LENS, resampled_from=FileLens("fisheye", SMALL_LENS.pixels_of, ""))
+    _refuse_late({})
+    with pytest.raises(CaptureError, match="the lens of a is not found in the pictures"):
+        _refuse_late({"a": bent})

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.options import ProcessOptions
@@ -83,6 +84,25 @@ def test_masks_the_wrong_way_round_are_named():
     assert "the wrong way round" in finding
     white = [replace(sample, record=replace(sample.record, background_spread=0.05)) for sample in samples]
     assert findings(white) == []  # dark matter before a white backdrop
+
+
+def test_masks_that_leave_out_the_middle_are_named_unless_few_do():
+    samples = scene()
+    hollow = [replace(sample, is_hollow=index < 7) for index, sample in enumerate(samples)]
+    (finding,) = findings(hollow)
+    assert "7 views whose mask takes the border of the picture for matter and its middle" in finding
+    assert findings([replace(sample, is_hollow=index < 5) for index, sample in enumerate(samples)]) == []
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_mask_is_hollow_where_it_covers_the_border_alone(tmp_path, inverted):
+    mask = np.zeros((30, 40), np.uint8)
+    mask[5:25, 8:32] = 255
+    rgba = np.dstack([np.full((30, 40, 3), 99, np.uint8), 255 - mask if inverted else mask])
+    Image.fromarray(rgba).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", np.full((30, 40, 12), 9000, np.uint16))
+    record = replace(RECORD, paths={"file_path": "a.png", "hyperspectral_file_path": "a.npy"})
+    assert ViewSample.of(record, tmp_path).is_hollow == inverted
 
 
 def test_a_mask_unlike_those_of_near_views_is_named():

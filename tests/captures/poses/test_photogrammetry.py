@@ -194,6 +194,12 @@ def test_other_models_and_conventions_are_refused(tmp_path, options, message):
         read_poses(write_micmac(tmp_path, **options))
 
 
+def test_a_large_export_of_cameras_is_read(tmp_path):
+    document = metashape_document(dict(ring().items()), extra=f"<!--{' ' * (17 << 20)}-->")
+    (tmp_path / "cameras.xml").write_text(document)
+    assert len(read_poses(tmp_path / "cameras.xml").cameras) == 6
+
+
 def test_a_missing_calibration_is_asked_for(tmp_path):
     folder = write_micmac(tmp_path)
     (folder / "AutoCal.xml").unlink()

@@ -13,6 +13,7 @@ import spectral.io.envi as spy
 import tifffile
 
 from tests.captures.file_factory import centres_nm, header_text, widths_nm, write_envi
+from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.captures.spectral_file import (
     BandTable,
@@ -605,3 +606,30 @@ def test_the_metadata_of_enmap_describe_its_image(tmp_path):
     np.testing.assert_array_equal(widths_nm(file), 7)
     assert file.linear is not None
     np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE * GAINS + OFFSETS)
+
+
+def test_every_xml_beside_an_image_is_read(tmp_path):
+    tifffile.imwrite(tmp_path / "a-SPECTRAL_IMAGE.TIF", CUBE, planarconfig="contig", photometric="minisblack")
+    bands = "".join(
+        f'<bandID number="{i + 1}"><wavelengthCenterOfBand>{nm}</wavelengthCenterOfBand></bandID>'
+        for i, nm in enumerate((450, 550, 650))
+    )
+    (tmp_path / "a-METADATA.XML").write_text(
+        f"<x><y><bandCharacterisation>{bands}</bandCharacterisation></y></x>"
+    )
+    no_data = '<PAMRasterBand band="1"><NoDataValue>7</NoDataValue></PAMRasterBand>'
+    (tmp_path / "a-SPECTRAL_IMAGE.TIF.aux.xml").write_text(f"<PAMDataset>{no_data}</PAMDataset>")
+    file = open_spectral_file(tmp_path / "a-SPECTRAL_IMAGE.TIF")
+    assert file.no_data == 7
+    np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
+
+
+@pytest.mark.parametrize("other", [".mat", ".tif", ".npy"])
+def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, other):
+    header = write_envi(tmp_path / "s.hdr", CUBE, "bil", BANDS)
+    (tmp_path / "s").rename(tmp_path / "s.spe")
+    np.save(tmp_path / "s.npy", CUBE[:2])
+    (tmp_path / "s.npy").rename(tmp_path / f"s{other}")
+    np.testing.assert_array_equal(open_spectral_file(header).read(), CUBE)
+    with pytest.raises(CaptureError, match="would both be the view 's'"):
+        find_cubes(tmp_path, ReadOptions())

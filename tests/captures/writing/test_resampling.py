@@ -173,3 +173,10 @@ def test_a_scene_of_an_ftheta_lens_shows_its_views_in_a_lens_that_trains(tmp_pat
     found, kept = looked_up(200 * cube[..., :2], outside, lens.pixels_of(ideal))
     assert kept.mean() > 0.9
     assert np.linalg.norm(found - ftheta(ideal)[kept], axis=1).max() < 0.1
+
+
+def test_views_of_one_lens_share_their_resampling():
+    lens, _ = fitted("fisheye of 120 degrees")
+    first, second = (lens.seen_as(64, 48, (0.0, 0.0), (0.5, 0.5)) for _ in range(2))
+    assert Resampling.into(first) is Resampling.into(second)
+    assert Resampling.into(first) is not Resampling.into(lens.seen_as(64, 48, (4.0, 0.0), (0.5, 0.5)))

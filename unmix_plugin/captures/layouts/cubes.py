@@ -159,13 +159,11 @@ def _sort_into(
         match = _RESULT.fullmatch(path.stem)
         is_result = match is not None and (path.parent.name.lower() == _RESULTS or match["of"] in stems)
         group = groups[place, match["of"] if is_result and match is not None else path.stem]
-        if is_result:
-            group.result = path
-            continue
-        if group.cube is not None:
-            raise CaptureError(_same_name(group.cube, path))
-        group.cube = path
-        own.append(path.stem)
+        kind = "result" if is_result else "cube"
+        if (other := getattr(group, kind)) is not None:
+            raise CaptureError(_same_name(other, path))
+        setattr(group, kind, path)
+        own += [] if is_result else [path.stem]
     left_out = []
     for path in references:
         match = _REFERENCE.fullmatch(path.stem)

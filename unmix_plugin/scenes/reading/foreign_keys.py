@@ -45,8 +45,8 @@ _KNOWN = frozenset(
     """
     fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model camera_angle_x camera_angle_y x_fov y_fov
     is_fisheye intrinsic_matrix frames datadir applied_transform applied_scale offset ply_file_path wavelengths fwhm
-    value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path file_path
-    name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
+    value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path
+    file_path name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
     seg_file_path mask_path abundance_file_path dino_file_path
     aabb aabb_scale scale from_na render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
     enable_depth_loading enable_ray_loading sharpen sharpness_discard_threshold sharpness depth_path depth_file_path
