@@ -58,9 +58,7 @@ def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
         raise ConfigError(f"--marker-size {options.marker_size:g}: expected metres, {low} to {high:g}")
     parse_family(options.marker_family)
     if (options.angles is None) == (options.poses == TURNTABLE):
-        raise ConfigError(
-            f"--poses {TURNTABLE} and --angles go together; give both, such as --angles 0:360:10"
-        )
+        raise ConfigError(f"--poses {TURNTABLE} and --angles go together, such as --angles 0:360:10")
     if options.angles is not None:
         parse_angles(options.angles, [view.name for view in capture.views])
     if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:

@@ -149,9 +149,7 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
     is none, or it is that of pictures of another shape."""
     height, width, _ = view.cube.shape
     if lens is None:
-        raise CaptureError(
-            f"view {view.name} has a pose but no lens; expected a focal length, such as 'fl_x'"
-        )
+        raise CaptureError(f"view {view.name} has a pose but no lens; expected a focal length ('fl_x')")
     if (lens.width, lens.height) == (width, height):
         return lens
     across, down = width / lens.width, height / lens.height

@@ -85,9 +85,7 @@ def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
         if list(files) != list(first):
             differing = ", ".join(f"{wavelength:g}" for wavelength in sorted(set(first) ^ set(files)))
             both = f"{folder} and {folders[0].name} differ"
-            raise CaptureError(
-                f"{both}: {differing} nm in one of them alone; expected the same in every view"
-            )
+            raise CaptureError(f"{both}: {differing} nm in one of them alone; expected in every view")
         views.append(CaptureView(name, _stack_intensities(files, options)))
     if not path.is_file():
         missing = f"{_POSES} is not there: the layout has no poses"
@@ -95,8 +93,7 @@ def find_nespof_real(root: Path, options: ReadOptions) -> Capture:
     poses = read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in views})
     if len(poses.cameras) != len(views):
         raise CaptureError(
-            f"{path} holds {len(poses.cameras)} poses, {parent} {len(views)} views; expected as many: views are "
-            "matched to poses in the order of their names"
+            f"{path} holds {len(poses.cameras)} poses, {parent} {len(views)} views; expected as many"
         )
     in_order = dict(zip((view.name for view in views), poses.cameras.values(), strict=True))
     return Capture("nespof-real", root, tuple(views), replace(poses, cameras=in_order))

@@ -112,9 +112,7 @@ def read_frames(root: Path, key: str) -> _FrameList:
                 repeated[path.name] += 1
     for frame in frames.values():
         if not frame.text(key):
-            raise CaptureError(
-                f"{frame.where} has no '{key}', the path of its file: add it or drop the frame"
-            )
+            raise CaptureError(f"{frame.where} has no '{key}', the path of its file: add it")
     notes = [
         f"{counted(count, 'frame')} of {name} listed before: left out" for name, count in repeated.items()
     ]

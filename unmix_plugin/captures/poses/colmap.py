@@ -178,9 +178,7 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
     """Exactly the camera's lens where it is of our kind, otherwise the nearest one and a note."""
     model, width, height, parameters = camera.model, camera.width, camera.height, camera.parameters
     if not np.isfinite(parameters).all() or not (0 < width < 1e6 and 0 < height < 1e6):
-        raise CaptureError(
-            f"{where} is {width} x {height} with {parameters}; expected finite numbers above 0"
-        )
+        raise CaptureError(f"{where} is {width} x {height} with {parameters}; expected numbers above 0")
     if model == "EQUIRECTANGULAR":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
         return fit_lens(lambda ideal: project_equirectangular(ideal, *parameters), start, model, where)
@@ -269,9 +267,7 @@ class _Reader:
         (count,) = self.take(struct.Struct("<Q"))
         left = len(self._data) - self._at
         if count * least_bytes > left:
-            raise CaptureError(
-                f"{self._path} promises {count} {what}, but only {left} bytes follow; copy it again"
-            )
+            raise CaptureError(f"{self._path} promises {count} {what}, {left} bytes follow; copy it again")
         return count
 
     def text(self) -> str:

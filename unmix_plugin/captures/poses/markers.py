@@ -166,9 +166,7 @@ class _Chain:
             own = seen.sensor[seen.view] == index
             ideal = lens.ideal_of(seen.corners[own].reshape(-1, 2))
             if ideal is None:
-                raise CaptureError(
-                    "a lens folds its picture over, so markers can't be placed: calibrate it again"
-                )
+                raise CaptureError("a lens folds its picture over: calibrate it again")
             self._ideal[own] = ideal.reshape(-1, 4, 2)
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""

@@ -45,9 +45,7 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled", "true") != "false"]
     chunks = [chunk for chunk in chunks if chunk.find("cameras") is not None]
     if not chunks:
-        raise CaptureError(
-            f"{path} has no chunk with cameras; use Metashape's File > Export > Export Cameras"
-        )
+        raise CaptureError(f"{path} has no chunk with cameras; use File > Export > Export Cameras")
     chunk = max(chunks, key=lambda one: len(list(one.iter("camera"))))
     notes = [f"{len(chunks)} chunks; the one with the most cameras was read"] if len(chunks) > 1 else []
     # Similarities to the world by component; None is the chunk's own, the identity without one.

@@ -84,9 +84,7 @@ def _world_to_camera(
             continue
         lens = _object(content, "rig_cameras").get(members[name])
         if not isinstance(lens, dict):
-            raise CaptureError(
-                f"{where} names the rig camera {describe(members[name])}, not in 'rig_cameras'"
-            )
+            raise CaptureError(f"{where} names {describe(members[name])}, not in 'rig_cameras'")
         outer, inner = _pose(instance, where), _pose(lens, where)
         return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
     return None

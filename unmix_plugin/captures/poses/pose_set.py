@@ -347,9 +347,7 @@ def _by_order(owners: list[str], wanted: list[str]) -> dict[str, str] | None:
     if not all(name.startswith(BY_ORDER) for name in owners):
         return None
     if len(owners) != len(wanted):
-        raise CaptureError(
-            f"there are {len(owners)} poses without names and {len(wanted)} views; expected as many"
-        )
+        raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
     return dict(zip(sorted(wanted), sorted(owners), strict=True))
 
 

@@ -405,9 +405,7 @@ def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> 
     with archive.open(info) as file:
         version = np.lib.format.read_magic(file)
         if version not in READ_HEADER:
-            raise CaptureError(
-                f"{path}: {info.filename} is a .npy file of version {version}; use numpy.savez"
-            )
+            raise CaptureError(f"{path}: {info.filename} is .npy of version {version}; use numpy.savez")
         shape, _, dtype = parse_header(file, version)
     needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
     if not dtype.hasobject and info.file_size < needed:
