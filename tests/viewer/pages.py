@@ -34,7 +34,7 @@ def opened(viewer, rows=24, **settings):
     with page_of(viewer, **settings) as page:
         page.look_from(0.3)
         page.wait_until(lambda: bool(page.pictures) and has_control(page, "render a video"))
-        page.set("finest picture (rows)", rows)
+        page.set("picture height (px)", rows)
         page.wait_until(lambda: len(decoded(page.last_picture)) == rows)
         yield page
 

@@ -54,7 +54,7 @@ def test_pages_get_a_picture_of_their_shape_that_becomes_finer_at_rest(viewer):
 def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compressed(viewer):
     with opened(viewer) as page:
         assert page.last_picture.startswith(b"\x89PNG")
-        page.set("finest picture (rows)", 128)
+        page.set("picture height (px)", 128)
         page.wait_until(lambda: len(decoded(page.last_picture)) == 128)
         assert page.last_picture.startswith(b"\xff\xd8")
         labels = show_layer(page, "segmentation").reshape(-1, 3).astype(int)

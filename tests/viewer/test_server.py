@@ -110,7 +110,7 @@ def test_waiting_ends_when_no_page_is_left(source, monkeypatch):
 def test_the_page_has_the_title_of_the_viewer(viewer):
     with urllib.request.urlopen(f"http://127.0.0.1:{viewer.port}/") as answer:
         page = answer.read().decode()
-    assert "<title>unmix-nerf</title>" in page
+    assert " - unmix-nerf</title>" in page
     assert "<title>Viser" not in page
     assert "prefers-color-scheme: dark" in page
 
@@ -138,7 +138,7 @@ def test_a_camera_that_is_none_harms_nobody(viewer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("label", ["layer", "formula", "low", "finest picture (rows)", "width", "brightness"])
+@pytest.mark.parametrize("label", ["layer", "formula", "low", "picture height (px)", "width", "brightness"])
 def test_values_that_no_control_would_send_harm_nobody(viewer, label):
     with opened(viewer) as page:
         page.set("own range", True)
@@ -230,7 +230,7 @@ def test_a_page_must_give_the_token_before_it_sees_anything(guarded):
     status, headers, _ = read(guarded, coded("sesame"))
     assert status == 200
     cookie = {"Cookie": headers["Set-Cookie"].partition(";")[0]}
-    assert "<title>unmix-nerf</title>" in read(guarded, cookie)[2]
+    assert " - unmix-nerf</title>" in read(guarded, cookie)[2]
     with opened(guarded, headers=cookie, origin=f"http://127.0.0.1:{guarded.port}"):
         pass
 

@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.viewer.view_factory import ring, some_pose
+from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.view_cameras import (
     _checked_pose,
     _quaternion,
     _rotation_matrix,
+    beside,
     camera_of,
     path_poses,
     pose_of,
@@ -127,3 +129,15 @@ def test_a_path_is_smooth():
 def test_a_path_needs_two_key_frames(count):
     with pytest.raises(ConfigError, match="at least two key frames"):
         path_poses([some_pose()] * count, 10)
+
+
+def test_a_page_starts_beside_a_camera_and_further_back_but_stays_in_a_room():
+    camera, box = ring(8)[0], SceneBox(torch.tensor([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]]))
+    start = beside(camera, box, (0.0, 0.0, 1.0))
+    before, after = (one.camera_to_world[0].double().numpy() for one in (camera, start))
+    assert np.linalg.norm(after[:, 3]) == pytest.approx(1.25 * np.linalg.norm(before[:, 3]), rel=0.05)
+    cosine = after[:2, 3] @ before[:2, 3] / np.linalg.norm(after[:2, 3]) / np.linalg.norm(before[:2, 3])
+    assert 5 < math.degrees(math.acos(cosine)) < 15
+    np.testing.assert_allclose(after[:, :3].T @ after[:, :3], np.eye(3), atol=1e-6)
+    room = SceneBox(torch.tensor([[-9.0] * 3, [9.0] * 3]))
+    assert beside(camera, room, (0.0, 0.0, 1.0)) is camera

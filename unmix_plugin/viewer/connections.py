@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from html import escape
 from http import HTTPStatus
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,14 +35,27 @@ from unmix_plugin.viewer.gate import Gate
 
 LABEL = "unmix-nerf"
 
-_HEAD = f"""<title>{LABEL}</title>
+_HEAD = """<title>TITLE</title>
+<style>
+  .uplot:not(:hover) .u-legend .u-value, .uplot:not(:hover) .u-legend .u-label::after { visibility: hidden }
+  /* viser's sheet of controls on phones: as wide as the screen, and its head, which folds it, says so. */
+  @media (max-width: 36em) {
+    [style*="min-height: 3.5em"], [style*="min-height: 3.5em"] [style*="width: 20em"] { width: 100% !important }
+    [style*="cursor: pointer"][style*="height: 3.5em"]::after { content: "\\2630  controls"; padding-left: 1em }
+  }
+</style>
 <script>
   const asked = new URLSearchParams(location.search);
-  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {{
+  if (matchMedia("(prefers-color-scheme: dark)").matches && !asked.has("darkMode")) {
     asked.set("darkMode", "");
     history.replaceState(null, "", "?" + asked);
-  }}
+  }
+  if (matchMedia("(max-width: 36em)").matches) new MutationObserver((_, watch) => {
+    const head = document.querySelector('[style*="cursor: pointer"][style*="height: 3.5em"]');
+    if (head) { watch.disconnect(); head.click(); }
+  }).observe(document, {childList: true, subtree: true});
 </script>"""
+"""The title, and what viser's page lacks: charts without dashes for values, and a picture first on phones."""
 
 _LARGEST_MESSAGE = 1 << 16
 """Bytes. The longest that a page says is the text of a box."""
@@ -178,11 +192,16 @@ class _Connection(ServerConnection):
 class _PageServer(infra.WebsockServer):
     """Sends viser's page under our title, dark where the browser's user prefers that."""
 
+    title = LABEL
+
     def __init__(self, *, http_server_root: Path, **options: Any) -> None:
         folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         page = (http_server_root / "index.html").read_text(encoding="utf-8")
-        (folder / "index.html").write_text(page.replace("<title>Viser</title>", _HEAD, 1), encoding="utf-8")
+        (folder / "index.html").write_text(
+            page.replace("<title>Viser</title>", _HEAD.replace("TITLE", escape(self.title)), 1),
+            encoding="utf-8",
+        )
         super().__init__(http_server_root=folder, **options)
 
 
@@ -196,14 +215,17 @@ class _LocalServer(viser.ViserServer):
 _NAME = "websockets"
 
 
-def open_server(host: str, port: int, gate: Gate, say: Callable[[str], None]) -> viser.ViserServer:
+def open_server(
+    host: str, port: int, gate: Gate, say: Callable[[str], None], title: str = LABEL
+) -> viser.ViserServer:
     """A server that listens, and lets in what the gate does.
 
     Args:
+        title: Of its pages.
         say: Told of what pages caused that should not have happened, in a short line each.
     """
     before = infra.WebsockServer, getattr(_infra, _NAME)
-    infra.WebsockServer = _PageServer
+    infra.WebsockServer = type("_TitledServer", (_PageServer,), {"title": title})
     # viser asks websockets for its server in this module's name of it, once, while it starts.
     gated = SimpleNamespace(
         asyncio=SimpleNamespace(server=SimpleNamespace(serve=_serve_through(gate, say))),

@@ -141,7 +141,7 @@ class Debounced:
             self._work()
 
 
-BLOCK_STYLE = "padding:0.2em 0.8em;font-size:0.85em;line-height:1.35"
+BLOCK_STYLE = "padding:0.2em 0.8em 0.4em;font-size:0.85em;line-height:1.35"
 _ROW = '<div style="display:flex;align-items:center;gap:0.5em">'
 
 
@@ -154,7 +154,7 @@ def paragraph(text: str, is_warning: bool = False) -> str:
 def bars(entries: Sequence[tuple[str, float, Sequence[float]]]) -> str:
     """Names, values in [0, 1] and sRGB colours as horizontal bars."""
     rows = (
-        f'{_ROW}<span style="flex:0 0 8.5em;overflow:hidden;text-overflow:ellipsis">{escape(name)}</span>'
+        f'{_ROW}<span style="flex:0 0 8.5em;overflow-wrap:anywhere">{escape(name)}</span>'
         '<span style="flex:1;background:#8883;height:0.8em"><span style="display:block;height:100%;'
         f'width:{100 * min(max(value, 0.0), 1.0):.1f}%;background:{css_colour(colour)}"></span></span>'
         f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
@@ -196,8 +196,10 @@ class Line:
 class Chart:
     """Lines over wavelength or over anything else; hidden while it has none."""
 
-    def __init__(self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)") -> None:
-        self._gui, self._x_label = gui, x_label
+    def __init__(
+        self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)", y_label: str = "radiance"
+    ) -> None:
+        self._gui, self._x_label, self._y_label = gui, x_label, y_label
         self._handle: viser.GuiUplotHandle | None = None
         self._place = gui.add_folder(title, visible=False)
 
@@ -224,5 +226,8 @@ class Chart:
             self._handle = None
         if lines:
             scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
+            axes: Any = ({"label": self._x_label}, {"label": self._y_label})
             with self._place:
-                self._handle = self._gui.add_uplot(data=data, series=series, scales=scales, aspect=1.5)
+                self._handle = self._gui.add_uplot(
+                    data=data, series=series, scales=scales, axes=axes, aspect=1.3
+                )

@@ -8,6 +8,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import viser
 
@@ -20,7 +21,7 @@ from unmix_plugin.viewer.page import failures_said, paragraph
 from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
-from unmix_plugin.viewer.view_cameras import point_ahead, pose_of
+from unmix_plugin.viewer.view_cameras import beside, point_ahead, pose_of
 
 _TICK_S = 0.5
 _UNWATCHED_S = 5
@@ -71,15 +72,17 @@ class Viewer:
         # A page that is closed while it is being sent something is not a reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         port = free_port(self._options.host, self._options.port)
-        server = open_server(self._options.host, port, self._gate, self._say)
+        scene = self.services.source.record
+        name = Path(str(scene.summary.get("root") or LABEL)).name
+        server = open_server(self._options.host, port, self._gate, self._say, f"{name} - {LABEL}")
         self._server, self.port = server, server.get_port()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
-        server.gui.set_panel_label(LABEL)
-        scene = self.services.source.record
+        server.gui.set_panel_label(name)
         up = up_direction(scene.train_cameras)
         server.scene.set_up_direction(up)
         server.scene.world_axes.visible = False
         camera = (scene.eval_cameras if len(scene.eval_cameras) else scene.train_cameras)[0]
+        camera = beside(camera, scene.scene_box, up)
         pose, first = pose_of(camera), server.initial_camera
         first.position, first.look_at = pose.position, point_ahead(camera, scene.scene_box)
         first.up, first.fov = up, pose.fov

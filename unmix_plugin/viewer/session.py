@@ -7,6 +7,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from unmix_plugin.editing import Light, Recipe
 from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.training.progress import TrainingStatus
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
@@ -307,6 +308,7 @@ class Session:
         kept = view.pose
         self.client.camera.on_update(self._moved)
         if kept is None:
+            self._fit_width()
             self._moved(self.client.camera)
         else:
             self.services.loop.change(view, pose=kept)
@@ -368,9 +370,11 @@ class Session:
                 self._note.remove()
             self._note = self.say("edited", "; ".join(new))
 
-    def add_button(self, label: str, work: Callable[[], None]) -> viser.GuiButtonHandle:
-        """Add a button to the folder that is open, and do something when it is clicked."""
-        button = self.client.gui.add_button(label)
+    def add_button(
+        self, label: str, work: Callable[[], None], *, is_minor: bool = False
+    ) -> viser.GuiButtonHandle:
+        """Add a button to the folder that is open, grey if it is a minor one, and do something when it is clicked."""
+        button = self.client.gui.add_button(label, color="gray" if is_minor else None)
         button.on_click(self.guarded(work))
         return button
 
@@ -419,6 +423,20 @@ class Session:
             self.client.camera.look_at = point_ahead(camera, self.services.source.record.scene_box)
             self.client.camera.fov = pose.fov
 
+    def _fit_width(self) -> None:
+        """On a screen higher than wide, as a phone's, see as much across as otherwise from top to bottom."""
+        camera = self.client.camera
+        with suppress(ConfigError):
+            pose = pose_from(camera)
+            if pose.aspect < 1:
+                camera.fov = 2 * math.atan(math.tan(pose.fov / 2) / pose.aspect)
+
+    def say_busy(self, what: str) -> None:
+        """Show what is being drawn, in place of what the last picture's colours mean, until it is there."""
+        if self._status is not None and self._legend is not None:
+            self._status.content = paragraph(f"drawing {what} ...")
+            self._legend_shown = self._legend.content = ""
+
     def _moved(self, camera: viser.CameraHandle) -> None:
         """The client's camera moved; what it sends may be anything."""
         if self.is_closed:
@@ -441,9 +459,8 @@ class Session:
         if self._legend is not None and (content := legend_html(legend)) != self._legend_shown:
             self._legend_shown = self._legend.content = content
         if self._status is not None and not self.view.has_reported:
-            speed = self.services.maker.speed.rays_per_second
-            more = ", refining" if shown.is_moving else ""
-            self._status.content = paragraph(f"{width} x {height}, {speed / 1000:.0f} k rays/s{more}")
+            more = ", getting finer" if shown.is_moving else ""
+            self._status.content = paragraph(f"{width} x {height} pixels{more}")
 
     def _report(self, text: str) -> None:
         """Show in the panel what is wrong with the picture, until it is right again."""

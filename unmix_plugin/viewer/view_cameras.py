@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -118,6 +118,25 @@ def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
     reach = max(float((box.aabb.mean(dim=0) - place) @ forward), 0.1)
     x, y, z = (place + reach * forward).tolist()
     return x, y, z
+
+
+_START_TURN_RAD, _START_DISTANCE = math.radians(12.0), 1.25
+"""Beside a camera of the scene, about the middle, and how much further from it."""
+
+
+def beside(camera: Cameras, box: SceneBox, up: tuple[float, float, float]) -> Cameras:
+    """Where a page looks from at first: near one of the scene's cameras, but beside it and further back, so that all
+    is seen and the camera's own picture does not fill the page. A camera within the scene box stays."""
+    from scipy.spatial.transform import Rotation
+
+    place, (low, high) = camera.camera_to_world[0, :, 3], box.aabb.to(camera.camera_to_world)
+    if bool(((place > low) & (place < high)).all()):
+        return camera
+    turn = torch.from_numpy(Rotation.from_rotvec(_START_TURN_RAD * np.array(up)).as_matrix()).to(place)
+    middle, pose = torch.tensor(point_ahead(camera, box)).to(place), camera.camera_to_world.clone()
+    pose[0, :, :3] = turn @ pose[0, :, :3]
+    pose[0, :, 3] = middle + _START_DISTANCE * turn @ (place - middle)
+    return replace(camera, camera_to_world=pose)
 
 
 def _rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:

@@ -272,7 +272,7 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
         assert [name for name, _ in legend.entries] == list(frame.materials.names)
 
 
-@pytest.mark.parametrize("layer", [name for name in PAINTED if name not in ("accumulation", "specular")])
+@pytest.mark.parametrize("layer", [name for name in PAINTED if name != "accumulation"])
 def test_where_nothing_is_the_background_shows(frame, aids, layer):
     nothing = frame.map(torch.zeros_like)
     for background, value in BACKGROUNDS.items():
@@ -390,6 +390,7 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
         picture, legend = painted(frame, aids, "index", index=formula)
         assert picture.isfinite().all()
         assert (legend.low, legend.high) == (0.0, 1.0)
+        assert ("; undefined wherever something is" in legend.label) == (formula[:3] == "log")
     _, legend = painted(frame, aids, "index", index="+".join(["r650"] * 90))
     assert len(legend.label) < 160
     assert "..." in legend.label

@@ -160,7 +160,7 @@ class ProbePanel:
         self._chart = Chart(gui, "spectrum")
         self._comparison = Chart(gui, "all probes")
         session.add_button("save as CSV", self._save)
-        session.add_button("forget all", self._forget)
+        session.add_button("forget all", self._forget, is_minor=True)
         _on_click(session, self._take)
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:

@@ -58,7 +58,7 @@ class LayerPanel:
         self._connect(self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma), "gamma", "tone")
         transforms = {title: name for name, title in VIEW_TRANSFORMS.items()}
         shown = VIEW_TRANSFORMS[settings.view_transform]
-        transform = self._gui.add_dropdown("tones", tuple(transforms), initial_value=shown)
+        transform = self._gui.add_dropdown("highlights", tuple(transforms), initial_value=shown)
         self._connect(transform, "view_transform", "tone", lambda: transforms.get(transform.value))
         backgrounds = tuple(BACKGROUNDS)
         background = self._gui.add_dropdown("background", backgrounds, initial_value=settings.background)
@@ -117,7 +117,9 @@ class LayerPanel:
         self._session.on_tick.append(typed.tick)
 
     def _add_scale(self) -> None:
-        colour_map = self._gui.add_dropdown("colours", COLOUR_MAPS, initial_value=self._settings.colour_map)
+        colour_map = self._gui.add_dropdown(
+            "colour map", COLOUR_MAPS, initial_value=self._settings.colour_map
+        )
         self._connect(colour_map, "colour_map", "scale")
         own_range = self._settings.value_range
         is_own = self._gui.add_checkbox(
@@ -154,6 +156,8 @@ class LayerPanel:
         self._settings = self._settings.changed(setting, read())
         if setting in ("layer", "value_range"):
             self._show_controls()
+        if setting == "layer":
+            self._session.say_busy(layer_named(self._settings.layer, self._layers).title)
         self._session.services.loop.change(self._session.view, settings=self._settings)
 
     def _show_controls(self) -> None:
@@ -222,14 +226,18 @@ class ScenePanel:
             session.add_button("look from there", self._look_from_view)
         with gui.add_folder("quality"):
             self._height = gui.add_slider(
-                "finest picture (rows)", *HEIGHT_BOUNDS, _HEIGHT_STEP, session.view.largest_height
+                "picture height (px)",
+                *HEIGHT_BOUNDS,
+                _HEIGHT_STEP,
+                session.view.largest_height,
+                hint="Of the finest picture, which comes when the camera rests; more takes longer.",
             )
             self._subpixels = gui.add_slider(
-                "rays along a pixel's edge",
+                "smooth edges",
                 *SUBPIXEL_BOUNDS,
                 1,
                 session.view.subpixels,
-                hint="More smooth edges, for as much more time.",
+                hint="Rays along the edge of a pixel, 1 to 4: 2 takes four times as long as 1.",
             )
         for control in (self._height, self._subpixels):
             control.on_update(session.guarded(self._change_quality))

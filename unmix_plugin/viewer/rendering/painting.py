@@ -48,8 +48,8 @@ from unmix_plugin.viewer.page import BLOCK_STYLE, choice, number, paragraph, swa
 
 _ViewTransform = Literal["srgb", "agx"]
 VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
-    "srgb": "sRGB (exact up to white)",
-    "agx": "AgX (keeps highlights)",
+    "srgb": "cut at white (sRGB, exact)",
+    "agx": "kept (AgX, as film does)",
 }
 """Names and what users read."""
 
@@ -445,6 +445,10 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
         scale = _percentile_range(seen[seen.isfinite()])
     what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
     label = what if materials.light is not None else f"{what}; of radiance: light unknown"
+    if bool((frame.opacity > OCCUPIED_ACCUMULATION).any()) and not bool(values.isfinite().any()):
+        label += (
+            "; undefined wherever something is: the light has no power at its wavelengths, or it divides by 0"
+        )
     return _paint_scaled(values, frame.opacity * values.isfinite(), settings, scale, label)
 
 
@@ -454,9 +458,7 @@ def _paint_colour(diffuse: bool, specular: bool) -> _Painter:
         light = frame.materials.through(
             frame.coefficients, rgb_matrix(bands), diffuse=diffuse, specular=specular
         )
-        # The view-dependent part is light added to what is there: it has no opacity of its own.
-        part = frame.coverage if diffuse else torch.ones_like(light[..., 0])
-        return _tone_mapped(light, part, settings), _TextLegend(describe_colour(bands))
+        return _tone_mapped(light, frame.coverage, settings), _TextLegend(describe_colour(bands))
 
     return paint
 
