@@ -14,8 +14,9 @@ import { Mesh } from "three";
 import { acceleratedRaycast } from "three-mesh-bvh";
 Mesh.prototype.raycast = acceleratedRaycast;
 export {
-  BufferAttribute, BufferGeometry, Color, DoubleSide, Group, Line, LineBasicMaterial, Mesh, MeshBasicMaterial,
-  PerspectiveCamera, Raycaster, Scene, ShaderMaterial, SphereGeometry, Triangle, Vector2, Vector3, WebGLRenderer,
+  BufferAttribute, BufferGeometry, Color, Data3DTexture, DoubleSide, Group, HalfFloatType, Line, LineBasicMaterial,
+  LinearFilter, Mesh, MeshBasicMaterial, PerspectiveCamera, Raycaster, RepeatWrapping, Scene, ShaderMaterial,
+  SphereGeometry, Triangle, UnsignedByteType, Vector2, Vector3, WebGLRenderer,
 } from "three";
 export { OrbitControls } from "three/addons/controls/OrbitControls.js";
 export { MeshBVH } from "three-mesh-bvh";

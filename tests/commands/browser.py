@@ -1,5 +1,6 @@
 """The browser that tests drive, where there is one."""
 
+import importlib.util
 import shutil
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -7,3 +8,5 @@ FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+HAS_BROWSER = CHROMIUM is not None and importlib.util.find_spec("playwright") is not None

@@ -417,6 +417,12 @@ def test_a_report_quotes_the_figures_that_eval_found(solid_copy):
     )
     assert run(export, *words("report", "--run", solid_copy)).status == 0
     page = (solid_copy / "exports" / "report" / "report.html").read_text()
+    assert "in 3-D" not in page
+    (solid_copy / "exports" / "page").mkdir()
+    (solid_copy / "exports" / "page" / "page.html").touch()
+    assert run(export, *words("report", "--run", solid_copy, "--overwrite")).status == 0
+    page = (solid_copy / "exports" / "report" / "report.html").read_text()
+    assert '<a href="../page/page.html">in 3-D</a>' in page
     assert "eval/metrics.json" in page
     assert "12.34" in page
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import base64
-import importlib.util
 import io
+import itertools
 
 import numpy as np
 import pytest
@@ -12,14 +12,13 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from tests.commands.browser import CHROMIUM, FLAGS
+from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
 from tests.commands.running import run
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.trained.open_run import open_run
 
-HAS_BROWSER = CHROMIUM is not None and importlib.util.find_spec("playwright") is not None
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(not HAS_BROWSER, reason="needs the package playwright and the program chromium"),
@@ -49,8 +48,7 @@ def browser():
 
     with sync_playwright() as session:
         flags = [flag for flag in FLAGS if flag not in ("--headless", "--disable-gpu")]
-        software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        found = session.chromium.launch(executable_path=CHROMIUM, args=[*flags, *software])
+        found = session.chromium.launch(executable_path=CHROMIUM, args=[*flags, *SOFTWARE_GL])
         yield found
         found.close()
 
@@ -153,16 +151,34 @@ def test_names_are_text_and_points_are_saved(opened):
 
 
 @pytest.mark.parametrize("opened", [(1440, 900), (390, 844)], indirect=True)
-def test_the_object_is_not_under_the_panel(opened):
+@pytest.mark.parametrize("folded", [True, False])
+def test_the_object_is_not_under_the_panel(opened, folded):
+    opened.evaluate(f"document.querySelector('#panel.folded') ? {int(folded)} || unmixPage.fold() : 0")
+    opened.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    opened.evaluate("unmixPage.wholeObject()")
     opened.wait_for_timeout(300)
-    box = opened.locator("#panel").bounding_box()
-    size = opened.viewport_size
-    free = (0, box["x"]) if size["width"] > 700 else (0, size["width"])
-    url = opened.evaluate("(unmixPage.draw(), document.querySelector('canvas').toDataURL())")
-    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")).astype(
-        int
-    )
-    columns = np.abs(pixels - pixels[2, 2]).max(axis=(0, 2)) > 12
-    taken = np.flatnonzero(columns)
-    assert free[0] < taken[0] < taken[-1] < free[1]
+    box, size = opened.locator("#panel").bounding_box(), opened.viewport_size
+    columns, rows = np.nonzero(drawn(opened).T)
+    is_phone = size["width"] <= 700
+    assert 0 < columns.min() < columns.max() < (size["width"] if is_phone else box["x"])
+    assert 0 < rows.min() < rows.max() < (box["y"] if is_phone else size["height"])
     assert opened.evaluate("document.documentElement.scrollWidth") <= size["width"]
+
+
+def drawn(opened):
+    """Pixels of the window that differ from its ground."""
+    url = opened.evaluate("(unmixPage.draw(), document.querySelector('canvas').toDataURL())")
+    picture = Image.open(io.BytesIO(base64.b64decode(url.split(",")[1]))).convert("RGB")
+    pixels = np.asarray(picture).astype(int)
+    return np.abs(pixels - pixels[2, 2]).max(axis=2) > 12
+
+
+def test_nothing_is_cut_off_however_far_one_goes_away(opened):
+    counts = []
+    for _ in range(9):
+        counts.append(drawn(opened).sum())
+        for _ in range(3):
+            opened.mouse.wheel(0, 400)
+        opened.wait_for_timeout(60)
+    assert all(after < before for before, after in itertools.pairwise(counts[:5]))
+    assert counts[-1] > 8

@@ -6,9 +6,10 @@ import struct
 import numpy as np
 import pytest
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 from tests.products.mesh_reading import loaded_mesh
-from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
+from unmix_plugin.formats.meshes import least_turns, obj_paths, write_glb, write_obj, write_ply
 
 GENERATOR = np.random.default_rng(0)
 POSITIONS, NORMALS = (GENERATOR.normal(size=(5, 3)).astype(np.float32) for _ in range(2))
@@ -143,3 +144,15 @@ def test_the_container_is_as_the_specification_has_it(tmp_path):
     for view in content["bufferViews"]:
         assert view["byteOffset"] % 4 == 0
         assert view["byteOffset"] + view["byteLength"] <= content["buffers"][0]["byteLength"]
+
+
+def test_least_turns_take_one_direction_to_another_about_what_is_square_to_both():
+    starts = NORMALS / np.linalg.norm(NORMALS, axis=1, keepdims=True)
+    ends = np.concatenate([[starts[0], -starts[1]], np.roll(starts, 1, axis=0)[2:]])
+    turns = Rotation.from_quat(least_turns(starts, ends))
+    np.testing.assert_allclose(turns.apply(starts), ends, atol=1e-6)
+    angles = np.arccos(np.clip((starts * ends).sum(axis=1), -1, 1))
+    np.testing.assert_allclose(turns.magnitude(), angles, atol=1e-3)
+    np.testing.assert_allclose(
+        Rotation.from_quat(least_turns(np.eye(3)[2:], ends)).apply([0, 0, 1]), ends, atol=1e-6
+    )

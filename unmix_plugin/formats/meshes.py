@@ -34,6 +34,7 @@ _FLOAT, _UNSIGNED_INT = 5126, 5125
 _VERTEX_BUFFER, _INDEX_BUFFER = 34962, 34963
 _JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 _POINTS = 0
+_Y = np.array([0.0, 1.0, 0.0])
 _LINEAR, _LINEAR_MIPMAPS, _CLAMP = 9729, 9987, 33071
 _READ_TYPES = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
 _READ_TYPES |= {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"}
@@ -191,7 +192,7 @@ def write_glb(
     faces: Int[np.ndarray, "F 3"],
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
-    up: Sequence[float] | Float64[np.ndarray, "3"] = (0.0, 1.0, 0.0),
+    up: Float64[np.ndarray, "3"] = _Y,
 ) -> Path:
     """Write a mesh in colours of its vertices.
 
@@ -203,7 +204,7 @@ def write_glb(
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
-        up: The direction that is up; its node turns it to +y, as glTF prescribes.
+        up: The unit vector that is up; its node turns it to +y, as glTF prescribes.
     """
     material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
     attributes = {"POSITION": positions, "NORMAL": normals, "COLOR_0": linear_rgb, **numbers}
@@ -239,7 +240,7 @@ def write_splats_glb(
     splats: Splats,
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
-    up: Sequence[float] | Float64[np.ndarray, "3"],
+    up: Float64[np.ndarray, "3"],
 ) -> Path:
     """Write Gaussians as points of a GLB, with their colours for programs that know points only.
 
@@ -248,7 +249,7 @@ def write_splats_glb(
         splats: What to write.
         numbers: More of each Gaussian, (P,) float32, by a name that starts with `_`.
         extras: What else the file says, as JSON has it.
-        up: The direction that is up; the node turns it to +y.
+        up: The unit vector that is up; the node turns it to +y.
     Source:
         Khronos Group, KHR_gaussian_splatting.
     """
@@ -317,7 +318,7 @@ def _write_glb(
     material: Mapping[str, Any] | None,
     pictures: Mapping[str, bytes],
     extras: Mapping[str, Any],
-    up: Sequence[float] | Float64[np.ndarray, "3"] = (0.0, 1.0, 0.0),
+    up: Float64[np.ndarray, "3"] = _Y,
     extensions: Mapping[str, Any] | None = None,
 ) -> Path:
     """A file of one mesh in one material, or of points: attributes, faces and pictures in one buffer."""
@@ -366,7 +367,7 @@ def _write_glb(
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface", "rotation": _turn_to_y(up)}],
+        "nodes": [{"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist()}],
         "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
         **({} if material is None else {"materials": [material]}),
         **({"extensionsUsed": list(extensions)} if extensions else {}),
@@ -382,10 +383,14 @@ def _write_glb(
     return write_file(path, b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
 
 
-def _turn_to_y(up: Sequence[float] | Float64[np.ndarray, "3"]) -> list[float]:
-    """Unit quaternion x, y, z, w of the least turn that takes a direction to +y."""
-    x, y, z = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    if y < -1 + 1e-9:
-        return [1.0, 0.0, 0.0, 0.0]
-    quaternion = np.array([-z, 0.0, x, 1 + y])  # up cross y, and 1 + their cosine
-    return (quaternion / np.linalg.norm(quaternion)).tolist()
+def least_turns(
+    start: Float[np.ndarray, "*#turns 3"], end: Float[np.ndarray, "*#turns 3"]
+) -> Float64[np.ndarray, "*turns 4"]:
+    """Unit quaternions x, y, z, w of the least turns that take unit vectors to others."""
+    start, end = np.broadcast_arrays(start, end)
+    axes, whole = np.cross(start, end), 1 + np.sum(start * end, axis=-1, keepdims=True)
+    beside = np.cross(start, np.eye(3)[np.abs(start).argmin(axis=-1)])  # half a turn may go either way
+    quaternions = np.where(
+        whole < 1e-9, np.append(beside, 0 * whole, axis=-1), np.append(axes, whole, axis=-1)
+    )
+    return quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)

@@ -308,7 +308,7 @@ def _write_mesh(
     looks = SurfaceAppearance(scene.materials, *seen, scale=scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
-    glb = partial(_write_glb, up=world_up(scene.views, frame) if up == "y" else (0.0, 1.0, 0.0))
+    glb = partial(_write_glb, up=world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0]))
     writers = {"ply": _write_ply, "obj": _write_obj, "glb": glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
 
@@ -351,7 +351,7 @@ def _write_glb(
     mesh: TriangleMesh,
     normals: Float32[np.ndarray, "V 3"],
     looks: SurfaceAppearance,
-    up: Sequence[float] | Float64[np.ndarray, "3"],
+    up: Float64[np.ndarray, "3"],
 ) -> list[Path]:
     positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
     return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras, up)]

@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float64
 
-from unmix_plugin.formats.meshes import Splats, write_splats_glb, write_splats_ply
+from unmix_plugin.formats.meshes import Splats, least_turns, write_splats_glb, write_splats_ply
 from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import Coefficients
@@ -56,7 +56,7 @@ def export_splats(
     widths = _WIDTH * np.sqrt(_vertex_areas(world))
     splats = Splats(
         positions,
-        _turns_to(directions_to_world(frame, normals)),
+        least_turns(np.eye(3)[2:], directions_to_world(frame, normals)).astype(np.float32),
         np.stack([widths, widths, _THICKNESS * widths], axis=1).astype(np.float32),
         looks.srgb.astype(np.float32),
         _OPACITY,
@@ -92,19 +92,11 @@ def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
     return np.maximum(areas, 0.01 * np.mean(areas))
 
 
-def _turns_to(normals: Float[np.ndarray, "V 3"]) -> Float32[np.ndarray, "V 4"]:
-    """Unit quaternions x, y, z, w of the least turns that take +z to each of these unit vectors."""
-    x, y, z = normals.T
-    quaternions = np.stack([-y, x, np.zeros_like(x), 1 + z], axis=1)
-    quaternions[1 + z < 1e-9] = [1.0, 0.0, 0.0, 0.0]
-    return (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float32)
-
-
 def _turned(splats: Splats, up: Float[np.ndarray, "3"]) -> Splats:
     """The same with `up` turned to -y."""
     from scipy.spatial.transform import Rotation
 
-    turn = Rotation.align_vectors([[0.0, -1.0, 0.0]], [up])[0]
+    turn = Rotation.from_quat(least_turns(up, np.array([0.0, -1.0, 0.0])))
     return Splats(
         turn.apply(splats.positions).astype(np.float32),
         (turn * Rotation.from_quat(splats.rotations)).as_quat().astype(np.float32),

@@ -91,7 +91,7 @@ def write_material(
     seen = family
     if isinstance(family, SpectralFamily) and bands is not None:
         family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
-        seen = _InColours(family, bands)
+        seen = InColours(family, bands)
     fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(seed))
     textures = _textures_of(seen, baked.parameters, fit.parameters)
     written, pictures = [], {}
@@ -206,7 +206,7 @@ def _report_bytes(
     return json.dumps(content, indent=1).encode()
 
 
-class _InColours:
+class InColours:
     """A spectral family as an eye sees it in light of a flat spectrum: the same materials in three colours."""
 
     num_colours = 3

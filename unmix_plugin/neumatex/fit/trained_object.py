@@ -42,6 +42,7 @@ from unmix_plugin.trained.trained_scene import one_pixel
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.model import NeumatexModel
+    from unmix_plugin.products.page.page import PageContent
 
 OWN_LIGHT = "of the pictures"
 """Name of the light that the pictures were taken under."""
@@ -216,6 +217,13 @@ class TrainedObject:
         position = hits.points.positions[0].double().cpu().numpy() if len(hits) else None
         world = None if position is None else self.frame.to_world(position[None])[0]
         return Probe(values, float(view.opacity.reshape(-1)[0]), position, world)
+
+    @torch.no_grad()
+    def page_content(self, resolution: int) -> PageContent:
+        """What `unmix-export page` shows of it, with about so many vertices along the longest edge."""
+        from unmix_plugin.neumatex.export.page import page_content
+
+        return page_content(self, resolution)
 
     @torch.no_grad()
     def _rendered(self, camera: Cameras, subpixels: int, samples: int, number: int) -> ModelView:

@@ -31,7 +31,7 @@
     const how = facts.arrays[name];
     if (!how) return null;
     const stored = new types[how.type](buffer, how.start, how.count);
-    if (name === "faces") return stored;
+    if (!how.scale && !how.scales) return stored;
     return Float32Array.from(stored, (value, index) => {
       const scale = how.scales ? how.scales[index % how.width] : how.scale;
       return how.is_root ? scale * value * value : scale * value;
@@ -39,11 +39,16 @@
   };
   const [positions, materials, confidence] = ["positions", "materials", "confidence"].map(read);
   const [scaled, abundances, gloss, tints] = ["scaled", "abundances", "gloss", "tints"].map(read);
+  // Of objects whose light can be exchanged: `relit` says how the rest is meant.
+  const relit = facts.relit;
+  const [base, polish, normals, transfer, mirrored, tones] = ["base", "polish", "normals", "transfer", "mirrored", "tones"].map(read);
+  const lit = read("lit") ?? base; // the base colour of what is lit in place of the material
   const faces = Uint32Array.from(read("faces"));
   for (let i = 1; i < faces.length; i++) faces[i] += faces[i - 1];
   const offset = facts.arrays.positions.offset;
-  const [V, K, J, B] = [materials.length, facts.names.length, facts.specular.length, facts.wavelengths_nm.length];
+  const [V, K, J, B] = [positions.length / 3, facts.names.length, facts.specular.length, facts.wavelengths_nm.length];
   const names = [...facts.names];
+  const isWhite = relit || (facts.light && Math.max(...facts.light) - Math.min(...facts.light) < 1e-6);
   const colours = facts.colours.map((colour) => [...colour]);
   const tinted = new Set();
   const hidden = new Set();
@@ -57,8 +62,6 @@
     "#" + colour.map((part) => Math.round(255 * Math.min(Math.max(part, 0), 1)).toString(16).padStart(2, "0")).join("");
   const mapColour = (part) => facts.colour_map[Math.round(255 * Math.min(Math.max(part, 0), 1))].map((v) => v / 255);
   const luminance = (rgb) => 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2];
-  const nearestBand = (nm) =>
-    facts.wavelengths_nm.reduce((best, centre, b) => (Math.abs(centre - nm) < Math.abs(facts.wavelengths_nm[best] - nm) ? b : best), 0);
   const throughMatrix = (spectra, matrix) =>
     spectra.map((spectrum) => [0, 1, 2].map((c) => spectrum.reduce((sum, value, b) => sum + value * matrix[b][c], 0)));
   const bandsAsColour = (bands) => facts.wavelengths_nm.map((_, b) => bands.map((band) => (band === b ? 1 : 0)));
@@ -147,6 +150,22 @@
   // ---- scene --------------------------------------------------------------------------------------------------------
   const renderer = new Kit.WebGLRenderer({ canvas, context, antialias: true, preserveDrawingBuffer: true });
   const scene = new Kit.Scene();
+  // Gloss of a smooth or rough surface in light from far away, which `mirrored` has for each direction and roughness
+  // (split sum; the share that a lobe reflects after Karis 2014), and the numbers that a display gets for light.
+  const reflecting = relit && `
+      precision highp sampler3D; uniform sampler3D mirrored, tones; varying vec3 across, eye, head_on, finish;
+      vec3 reflected() {
+        vec3 n = normalize(across), v = normalize(eye), r = reflect(-v, n);
+        float facing = max(dot(n, v), 0.), layers = ${relit.map[2]}.;
+        vec3 place = vec3(0.5 - (atan(r.y, r.x) - turn) / 6.2831853, acos(clamp(r.z, -1., 1.)) / 3.1415927, (finish.x * (layers - 1.) + 0.5) / layers);
+        vec4 k = finish.x * vec4(-1., -0.0275, -0.572, 0.022) + vec4(1., 0.0425, 1.04, -0.04);
+        float low = min(k.x * k.x, exp2(-9.28 * facing)) * k.x + k.y;
+        return finish.z * texture(mirrored, place).rgb * (head_on * (k.z - 1.04 * low) + k.w + 1.04 * low);
+      }
+      vec3 toned(vec3 light) {
+        vec3 steps = (log2(max(light, 1e-9)) - ${relit.stops[0].toFixed(1)}) / ${(relit.stops[1] - relit.stops[0]).toFixed(1)};
+        return texture(tones, (clamp(steps, 0., 1.) * ${relit.tones - 1}. + 0.5) / ${relit.tones}.).rgb;
+      }`;
   const camera = new Kit.PerspectiveCamera(40, 1, 0.01, 1000);
   camera.up.fromArray(facts.up);
   const geometry = new Kit.BufferGeometry();
@@ -156,13 +175,26 @@
   geometry.setIndex(new Kit.BufferAttribute(faces, 1));
   const [lightOf, tintOf, shownOf] = [attribute("light", 3), attribute("tint", 3), attribute("shown", 1)];
   if (gloss) [0, 3, 6].forEach((first) => attribute(`gloss${first}`, 3, Float32Array.from({ length: 3 * V }, (_, i) => gloss[9 * Math.floor(i / 3) + first + (i % 3)])));
+  if (relit) [["normal", normals, 3], ["base", lit, 3], ["polish", polish, 3]].forEach(([name, values, width]) => attribute(name, width, values));
+  const volume = (values, sizes, type) => {
+    const texture = Object.assign(new Kit.Data3DTexture(values, ...sizes), { type, minFilter: Kit.LinearFilter, magFilter: Kit.LinearFilter, needsUpdate: true });
+    if (type === Kit.HalfFloatType) texture.wrapS = Kit.RepeatWrapping; // directions go round
+    return texture;
+  };
+  const mapSize = relit && 4 * relit.map[0] * relit.map[1] * relit.map[2];
+  const reflections = relit && facts.lights.map((_, i) => volume(mirrored.slice(i * mapSize, (i + 1) * mapSize), relit.map, Kit.HalfFloatType));
   const surface = new Kit.ShaderMaterial({
     side: Kit.DoubleSide,
-    uniforms: { gain: { value: 1 }, glossy: { value: 0 }, flat_: { value: 0 } },
+    uniforms: {
+      gain: { value: 1 }, glossy: { value: 0 }, flat_: { value: 0 }, turn: { value: 0 }, mirrored: { value: relit && reflections[0] },
+      tones: { value: relit && volume(tones, [relit.tones, relit.tones, relit.tones], Kit.UnsignedByteType) },
+    },
     vertexShader: `
       attribute vec3 light, tint${gloss ? ", gloss0, gloss3, gloss6" : ""}; attribute float shown;
       uniform float glossy; varying vec3 sent; varying float there;
+      ${relit ? "attribute vec3 base, polish; varying vec3 across, eye, head_on, finish;" : ""}
       void main() {
+        ${relit ? "across = normal; eye = cameraPosition - position; finish = polish; head_on = mix(vec3(0.04), base, polish.y);" : ""}
         vec3 d = normalize(cameraPosition - position);
         float strength = ${gloss ? `dot(gloss0, vec3(1., d.x, d.y)) + dot(gloss3, vec3(d.z, d.x * d.y, d.y * d.z))
           + dot(gloss6, vec3(d.x * d.z, d.x * d.x - d.y * d.y, 3. * d.z * d.z - 1.))` : "0."};
@@ -170,9 +202,11 @@
         gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.);
       }`,
     fragmentShader: `
-      uniform float gain, flat_; varying vec3 sent; varying float there;
+      uniform float gain, flat_, glossy, turn; varying vec3 sent; varying float there;
+      ${relit ? reflecting : ""}
       void main() {
         if (there < 0.5) discard;
+        ${relit ? "if (glossy > 0.) { gl_FragColor = vec4(toned((sent + reflected()) * gain), 1.); return; }" : ""}
         vec3 linear = clamp(sent * gain, 0., 1.);
         vec3 curved = mix(12.92 * linear, 1.055 * pow(max(linear, 1e-6), vec3(1. / 2.4)) - 0.055, step(0.0031308, linear));
         gl_FragColor = vec4(mix(curved, sent, flat_), 1.);
@@ -184,6 +218,7 @@
   const sphere = geometry.boundingSphere;
   const controls = new Kit.OrbitControls(camera, canvas);
   controls.listenToKeyEvents(canvas);
+  controls.maxDistance = 40 * sphere.radius;
   const marks = new Kit.Group();
   scene.add(marks);
 
@@ -206,27 +241,30 @@
       camera.updateProjectionMatrix();
     }
     // The object stands in the middle of what the panel leaves free.
-    const taken = width > 700 && !$("panel").classList.contains("folded") ? $("panel").offsetWidth : 0;
-    camera.setViewOffset(width, height, taken / 2, 0, width, height);
+    const [panel, isPhone] = [$("panel"), width <= 700];
+    const isOpen = !panel.hidden && !panel.classList.contains("folded");
+    const [right, below] = [isOpen && !isPhone ? panel.offsetWidth : 0, isOpen && isPhone ? panel.offsetHeight : 0];
+    camera.zoom = Math.min(width - right, height - below) / Math.min(width, height);
+    const distance = camera.position.distanceTo(sphere.center);
+    [camera.near, camera.far] = [Math.max(distance - 2 * sphere.radius, distance / 1000), distance + 2 * sphere.radius];
+    camera.setViewOffset(width, height, right / 2, below / 2, width, height);
     renderer.setClearColor(new Kit.Color(getComputedStyle(document.body).backgroundColor));
     renderer.render(scene, camera);
     drawScaleBar(height);
   };
   addEventListener("resize", redraw);
+  new ResizeObserver(redraw).observe($("panel"));
 
   const lookFrom = (position, target) => {
     camera.position.copy(position);
     controls.target.copy(target);
-    const away = position.distanceTo(sphere.center) + 2 * sphere.radius;
-    [camera.near, camera.far] = [away / 2000, away * 4];
-    camera.updateProjectionMatrix();
     controls.update();
     redraw();
   };
   const wholeObject = () => {
     const first = facts.cameras[0] ? new Kit.Vector3(...facts.cameras[0].position).sub(new Kit.Vector3(...offset)) : new Kit.Vector3(1, 1, 1);
     camera.fov = 40;
-    const narrow = Math.min(1, (innerWidth > 700 ? innerWidth - 350 : innerWidth) / innerHeight);
+    const narrow = Math.min(1, innerWidth / innerHeight);
     const distance = sphere.radius / Math.sin((camera.fov * Math.PI) / 360) / narrow;
     lookFrom(first.sub(sphere.center).setLength(distance).add(sphere.center), sphere.center);
   };
@@ -242,14 +280,16 @@
   // ---- layers -------------------------------------------------------------------------------------------------------
   const state = { layer: "colour", band: Math.floor(B / 2), false: [5, 3, 1].map((part) => Math.floor((part * B) / 6)), material: 0, index: 0, formula: "" };
   const layers = [
-    ["colour", "true colour"], ["band", "one band"], ["false", "false colour"], ["abundance", "abundance of a material"],
-    ["materials", "materials"], ["confidence", "confidence in the material"], ["index", "spectral index"],
+    ["colour", relit ? "colour in a light" : "true colour"], ...(relit ? [["base", "base colour"], ["roughness", "roughness"], ["metallicity", "metallicity"]] : []),
+    ...(B ? [["band", "one band"], ["false", "false colour"], ["abundance", "abundance of a material"], ["materials", "materials"]] : []),
+    ...(confidence ? [["confidence", "confidence in the material"]] : []), ...(B ? [["index", "spectral index"]] : []),
   ];
+  const litLayers = relit ? ["colour"] : ["colour", "band", "false"];
   layers.forEach(([value, text]) => $("layer").append(make("option", { value, text })));
   facts.lights.forEach((light, value) => $("light").append(make("option", { value, text: light.name })));
 
   const paintLight = (matrix) => {
-    const factors = facts.lights[$("light").value].factors;
+    const factors = facts.lights[relit ? 0 : $("light").value].factors;
     const lit = (spectra) => spectra.map((spectrum) => spectrum.map((value, b) => value * factors[b]));
     const sent = throughMatrix(lit(facts.endmembers), matrix);
     tinted.forEach((k) => {
@@ -270,8 +310,35 @@
       }
     lightOf.needsUpdate = tintOf.needsUpdate = true;
     surface.uniforms.flat_.value = 0;
-    surface.uniforms.gain.value = 2 ** Number($("exposure").value);
+    surface.uniforms.gain.value = relit ? 1 : 2 ** Number($("exposure").value);
     surface.uniforms.glossy.value = gloss && $("gloss").checked ? 1 : 0;
+  };
+  // Light from far away as 16 spherical harmonics, turned about the vertical; `transfer` is what of them arrives.
+  const paintRelit = () => {
+    const [light, angle] = [facts.lights[$("light").value], (Number($("turn").value) * Math.PI) / 180];
+    const turned = light.harmonics.map((value, i) => {
+      const l = Math.floor(Math.sqrt(i)), m = i - l * l - l;
+      const [cos, sin, other] = [Math.cos(m * angle), Math.sin(m * angle), light.harmonics[i - 2 * m]];
+      return value.map((part, c) => part * cos - other[c] * sin);
+    });
+    for (let v = 0; v < V; v++)
+      for (let c = 0; c < 3; c++) {
+        let sum = 0;
+        for (let i = 0; i < 16; i++) sum += transfer[16 * v + i] * turned[i][c];
+        lightOf.array[3 * v + c] = 0.95 * Math.max(sum, 0) * lit[3 * v + c] * (1 - polish[3 * v + 1]); // 5 % stay in the gloss
+      }
+    lightOf.needsUpdate = true;
+    const uniforms = surface.uniforms;
+    [uniforms.gain.value, uniforms.glossy.value, uniforms.turn.value] = [2 ** Number($("exposure").value), 1, angle];
+    uniforms.mirrored.value = reflections[$("light").value];
+    return facts.colour;
+  };
+  const paintBase = () => {
+    if (B) paintLight(facts.rgb);
+    else lightOf.array.set(base);
+    lightOf.needsUpdate = true;
+    [surface.uniforms.flat_.value, surface.uniforms.gain.value, surface.uniforms.glossy.value] = [0, 1, 0];
+    return "what the surface reflects of white light, without gloss";
   };
   const paintValues = (valueOf, low, high) => {
     for (let v = 0; v < V; v++) {
@@ -297,10 +364,13 @@
   };
 
   const painters = {
-    colour: () => { paintLight(facts.rgb); return facts.colour; },
+    colour: () => { if (relit) return paintRelit(); paintLight(facts.rgb); return facts.colour; },
+    base: paintBase,
+    roughness: () => { paintValues((v) => polish[3 * v], 0, 1); return "roughness of the gloss, 0 (a mirror) to 1"; },
+    metallicity: () => { paintValues((v) => polish[3 * v + 1], 0, 1); return "0 (no metal) to 1 (bare metal)"; },
     band: () => {
       paintLight(bandsAsColour([state.band, state.band, state.band]));
-      return `radiance at ${facts.wavelengths_nm[state.band]} nm, 1 = full scale, shown as grey`;
+      return `${isWhite ? "reflectance" : "radiance"} at ${facts.wavelengths_nm[state.band]} nm${isWhite ? "" : ", 1 = full scale"}, shown as grey`;
     },
     false: () => {
       paintLight(bandsAsColour(state.false));
@@ -340,7 +410,7 @@
       $("about").textContent = error.message;
     }
     const notes = facts.lights[$("light").value].notes;
-    if (["colour", "band", "false"].includes(state.layer) && notes.length) $("about").textContent += ". " + notes.join(". ");
+    if (litLayers.includes(state.layer) && notes.length) $("about").textContent += ". " + notes.join(". ");
     for (let v = 0; v < V; v++) {
       let share = 1;
       hidden.forEach((k) => (share -= abundances[v * K + k]));
@@ -375,12 +445,13 @@
       ],
     };
     $("arguments").replaceChildren(...(choices[state.layer]?.() ?? []));
-    $("lit").hidden = !["colour", "band", "false"].includes(state.layer);
+    $("lit").hidden = !litLayers.includes(state.layer);
+    $("turning").hidden = !relit;
     $("gloss").parentElement.hidden = !gloss;
   };
   const choose = (layer) => { state.layer = $("layer").value = layer; showArguments(); paint(); };
   $("layer").onchange = () => choose($("layer").value);
-  $("light").onchange = $("gloss").onchange = paint;
+  $("light").onchange = $("gloss").onchange = $("turn").oninput = paint;
   $("exposure").oninput = () => { $("stops").textContent = $("exposure").value; paint(); };
 
   // ---- materials ----------------------------------------------------------------------------------------------------
@@ -416,6 +487,7 @@
       return {
         place: hit.point.clone(), spectrum: spectrumOf(corners, weights, from),
         mixture: names.map((_, k) => mean(abundances, K, k)),
+        finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
       };
     }
     return null;
@@ -445,12 +517,15 @@
       dot.style.background = point.colour;
       const mixture = point.mixture.map((share, k) => [share, k]).filter(([share]) => share >= 0.02).sort((a, b) => b[0] - a[0]);
       const shares = mixture.slice(0, 4).map(([share, k]) => `${names[k]} ${Math.round(100 * share)} %`).join(", ");
+      const at = `At ${world(point.place).map(shownNumber).join(", ")}.`;
+      const finish = relit ? `base colour ${hex(point.finish.slice(0, 3).map(toDisplay))}, roughness ${point.finish[3].toFixed(2)}, metallicity ${point.finish[4].toFixed(2)}. ` : "";
+      if (!B) return make("div", { className: "key" }, dot, make("span", { textContent: `${index + 1}: ${finish}${at}` }));
       const nearest = facts.endmembers.map((spectrum, k) => [angle(spectrum, point.spectrum), k]).sort((a, b) => a[0] - b[0])[0];
       const like = facts.known[nearest[1]][0];
-      const text = `${index + 1}: ${shares || "nothing"}. Nearest: ${names[nearest[1]]}, ${nearest[0].toFixed(3)} rad${like ? `, like ${like}` : ""}. At ${world(point.place).map(shownNumber).join(", ")}.`;
+      const text = `${index + 1}: ${shares || "nothing"}. Nearest: ${names[nearest[1]]}, ${nearest[0].toFixed(3)} rad${like ? `, like ${like}` : ""}. ${finish}${at}`;
       return make("div", { className: "key" }, dot, make("span", { textContent: text }));
     });
-    $("points").replaceChildren(...(points.length ? [chart()] : []), ...rows);
+    $("points").replaceChildren(...(points.length && B ? [chart()] : []), ...rows);
   };
   const chart = () => {
     const shown = points.map((point) => reflectanceOf(point.spectrum));
@@ -491,6 +566,7 @@
     const rows = [["quantity", ...head]];
     ["x", "y", "z"].forEach((axis, i) => rows.push([axis, ...points.map((point) => world(point.place)[i])]));
     names.forEach((name, k) => rows.push([quoted(`abundance of ${name}`), ...points.map((point) => point.mixture[k])]));
+    if (relit) ["base colour red", "base colour green", "base colour blue", "roughness", "metallicity"].forEach((what, i) => rows.push([what, ...points.map((point) => point.finish[i])]));
     const what = facts.light ? "reflectance" : "radiance";
     facts.wavelengths_nm.forEach((nm, b) => rows.push([`${what} at ${nm} nm`, ...points.map((point) => reflectanceOf(point.spectrum)[b])]));
     return rows.map((row) => row.join(",")).join("\r\n") + "\r\n";
@@ -522,9 +598,9 @@
   };
   const drawScaleBar = (height) => {
     const distance = camera.position.distanceTo(controls.target);
-    const perPixel = (2 * distance * Math.tan((camera.fov * Math.PI) / 360)) / height;
+    const perPixel = (2 * distance * Math.tan((camera.fov * Math.PI) / 360)) / height / camera.zoom;
     const unit = metresPerUnit ?? 1;
-    const widest = 140 * perPixel * unit;
+    const widest = 220 * perPixel * unit;
     const power = 10 ** Math.floor(Math.log10(widest));
     const length = power * ([5, 2, 1].find((step) => step * power <= widest) ?? 1);
     $("scale").hidden = false;
@@ -584,9 +660,11 @@
   // ---- begin --------------------------------------------------------------------------------------------------------
   const about = [
     facts.subtitle, `${V.toLocaleString("en")} vertices, ${(faces.length / 3).toLocaleString("en")} triangles`,
-    `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
-    facts.light ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
-    facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
+    ...(B ? [
+      `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
+      facts.light ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
+    ] : []),
+    ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
   ];
   $("facts").replaceChildren(...about.map((text) => make("p", { className: "note", textContent: text })));
   document.querySelector("#head h1").textContent = facts.title;
@@ -595,6 +673,8 @@
   if (innerWidth <= 700) fold();
   document.body.classList.add("ready");
   listMaterials();
+  $("materials").parentElement.hidden = !K;
+  if (!B) $("how").textContent = "Click the object: its material appears here.";
   choose("colour");
   wholeObject();
   frame();

@@ -17,7 +17,7 @@ import json
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -60,6 +60,27 @@ _RIDGE = 0.05
 _CHUNK = 1 << 17
 
 
+@dataclass(frozen=True)
+class PageContent:
+    """What a page shows of an object; page.js reads facts and arrays by their names."""
+
+    arrays: dict[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]]
+    """`positions` (V, 3) in the world and `faces` (F, 3); of each vertex or of anything else, numbers by name."""
+    facts: dict[str, Any]
+    """As `spectral_facts` gives them, and more; `notes` are sentences to be said."""
+    pictures: dict[str, UInt8[np.ndarray, "H W 3"]]
+    """By caption, for browsers that can't draw in 3-D."""
+
+
+@runtime_checkable
+class ShownAsPage(Protocol):
+    """A trained scene without mixed materials that says itself what a page shows of it."""
+
+    def page_content(self, resolution: int) -> PageContent:
+        """Its surface with about so many cells along the longest edge."""
+        ...
+
+
 def export_page(job: Job, title: str, resolution: int) -> list[Path]:
     """Find the surface, look at every vertex, and write `page.html`.
 
@@ -68,28 +89,32 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
         title: Of the page; empty: the scene's name.
         resolution: Cells along the longest edge of the scene box; fewer where the page would exceed `MOST_BYTES`.
     """
-    path = job.folder / "page.html"
+    path, scene = job.folder / "page.html", job.loaded.scene
     job.claim([path])
-    pictures = _pictures(job)
     while True:
-        mesh = find_surface(job, resolution)[0]
-        page = _page(job, mesh, title, pictures)
+        if isinstance(scene, ShownAsPage):
+            with job.working("looking at the surface"):
+                content = scene.page_content(resolution)
+        else:
+            content = _mixture_content(job, resolution)
+        page = _page(job, content, title)
         coarser = int(resolution * _COARSER)
         if len(page) <= MOST_BYTES or coarser < _COARSEST:
             break
         job.say(
-            f"a page of {len(mesh.faces)} triangles would have {len(page) / 1e6:.1f} MB, more than the "
+            f"a page of {len(content.arrays['faces'])} triangles would have {len(page) / 1e6:.1f} MB, more than the "
             f"{MOST_BYTES / 1e6:g} MB that a mail takes: made again with {coarser} cells along the longest edge"
         )
         resolution = coarser
-    job.say(f"{len(mesh.faces)} triangles, {len(page) / 1e6:.1f} MB")
+    for note in content.facts["notes"]:
+        job.say(note)
+    job.say(f"{len(content.arrays['faces'])} triangles, {len(page) / 1e6:.1f} MB")
     return [write_file(path, page)]
 
 
-def _page(job: Job, mesh: TriangleMesh, title: str, pictures: list[dict[str, str]]) -> bytes:
+def _page(job: Job, content: PageContent, title: str) -> bytes:
     """The whole page."""
-    with job.working("looking at the surface's points"):
-        arrays, layout = _packed(_vertex_arrays(job.scene, mesh, job.frame))
+    arrays, layout = _packed(content.arrays)
     root = job.loaded.record.summary.get("root")
     name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
     facts = {
@@ -97,15 +122,30 @@ def _page(job: Job, mesh: TriangleMesh, title: str, pictures: list[dict[str, str
         "subtitle": f"{job.loaded.config.method_name}, run {job.loaded.folder.path.name}",
         "made": f"unmix-nerf {__version__}, {datetime.now(timezone.utc):%Y-%m-%d}",
         "arrays": layout,
-        **_spectral_facts(job.materials),
-        "up": _rounded(world_up(job.scene.views, job.frame)),
+        **content.facts,
+        "up": rounded(world_up(job.loaded.scene.views, job.frame)),
         "cameras": _camera_facts(job.views("all"), job.frame),
     }
-    return _fill(facts, arrays, pictures)
+    return _fill(facts, arrays, _jpegs(content.pictures))
 
 
-def _spectral_facts(materials: Materials) -> dict[str, Any]:
-    """Spectra, lights and names."""
+def _mixture_content(job: Job, resolution: int) -> PageContent:
+    """Of a scene of mixed materials."""
+    from unmix_plugin.products.segmentation import paint_ids
+
+    mesh = find_surface(job, resolution)[0]
+    with job.working("looking at the surface's points"):
+        arrays = _vertex_arrays(job.scene, mesh, job.frame)
+    view = [*job.views("eval"), *job.views("all")][0]
+    seen = job.scene.look(view.camera)
+    ids = paint_ids(seen["segmentation"].cpu().numpy(), dict(enumerate(endmember_colours(job.materials))))
+    shown = {f"{view.name} in colour": seen["rgb"].cpu().numpy(), f"{view.name}, materials": ids}
+    pictures = {caption: np.round(255 * values).astype(np.uint8) for caption, values in shown.items()}
+    return PageContent(arrays, {**spectral_facts(job.materials), "notes": []}, pictures)
+
+
+def spectral_facts(materials: Materials) -> dict[str, Any]:
+    """Spectra, lights and names, as page.js reads them."""
     bands, power = materials.bands, None
     endmembers = materials.endmembers.detach().cpu().double().numpy()
     if materials.light is not None:
@@ -116,17 +156,17 @@ def _spectral_facts(materials: Materials) -> dict[str, Any]:
             factors, notes = relighting_factors(bands, power, Light(light))
         except SpectrumError:
             continue  # it does not reach these bands: not offered
-        lights.append({"name": light, "factors": _rounded(factors), "notes": notes})
+        lights.append({"name": light, "factors": rounded(factors), "notes": notes})
     known = shown_matches(endmembers, bands, power, measured_library())
     return {
-        "wavelengths_nm": _rounded(bands.centers_nm),
-        "edges_nm": _rounded(bands.edges_nm),
+        "wavelengths_nm": rounded(bands.centers_nm),
+        "edges_nm": rounded(bands.edges_nm),
         "names": list(materials.names),
-        "colours": _rounded(endmember_colours(materials)),
-        "endmembers": _rounded(endmembers),
-        "specular": _rounded(materials.specular_spectra.detach().cpu().double().numpy()),
-        "light": None if power is None else _rounded(power),
-        "rgb": _rounded(rgb_matrix(bands, torch.float64).numpy()),
+        "colours": rounded(endmember_colours(materials)),
+        "endmembers": rounded(endmembers),
+        "specular": rounded(materials.specular_spectra.detach().cpu().double().numpy()),
+        "light": None if power is None else rounded(power),
+        "rgb": rounded(rgb_matrix(bands, torch.float64).numpy()),
         "colour": describe_colour(bands),
         "lights": lights,
         "known": [
@@ -137,7 +177,7 @@ def _spectral_facts(materials: Materials) -> dict[str, Any]:
             | {"range": NAMED_INDICES[name].usual_range}
             for name in available_indices(bands)
         ],
-        "colour_map": _viridis(),
+        "colour_map": colour_map(),
     }
 
 
@@ -189,7 +229,7 @@ def _vertex_arrays(
         "faces": mesh.faces,
         "scaled": found.scaled_abundances.numpy(),
         "abundances": found.abundances.numpy(),
-        "materials": scene.materials.to("cpu").ids(found),
+        "materials": scene.materials.to("cpu").ids(found).numpy(),
         "confidence": scene.materials.to("cpu").confidence(found).numpy(),
     }
     if len(scene.materials.specular_spectra):
@@ -230,9 +270,11 @@ def _harmonics(directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V 9"]:
 def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
     """All arrays as one text (base64 of gzip), and for each where it lies and how its numbers are got back.
 
-    Positions have 16 bits over their box; shares and brightness 8 bits of their square root, as an eye sees them; each
-    corner of a triangle is stored as its difference from the one before.
+    Positions have 16 bits over their box; shares and brightness 8 bits of their square root, as an eye sees them; what
+    may be negative 16 bits of its column's largest; whole numbers stay. Each corner of a triangle is stored as its
+    difference from the one before.
     """
+    arrays = dict(arrays)
     positions, faces = arrays.pop("positions"), arrays.pop("faces")
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent = float((high - low).max())
@@ -242,19 +284,18 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
             {"scale": extent / 65535, "offset": low.tolist()},
         ),
         "faces": (np.diff(faces.reshape(-1), prepend=0).astype("<i4"), {}),
-        "materials": (np.asarray(arrays.pop("materials")).astype("u1"), {"scale": 1}),
     }
-    if "gloss" in arrays:
-        gloss = arrays.pop("gloss")
-        largest = np.maximum(np.abs(gloss).max(axis=0), 1e-9)
-        # A few vertices have far more gloss than all others: 16 bits serve both.
-        parts["gloss"] = (
-            np.round(gloss / largest * 32767).astype("<i2"),
-            {"scales": (largest / 32767).tolist()},
-        )
     for name, values in arrays.items():
-        largest = max(float(values.max()), 1e-9)
-        parts[name] = (_roots(values / largest), {"scale": largest / 255**2, "is_root": True})
+        if values.dtype.kind in "iu":
+            parts[name] = (values, {})
+        elif values.min(initial=0) < 0:
+            largest = np.maximum(np.abs(values).max(axis=0), 1e-9)
+            # A few vertices may have far more gloss than all others: 16 bits serve both.
+            steps = np.round(values / largest * 32767).astype("<i2")
+            parts[name] = (steps, {"scales": (largest / 32767).tolist()})
+        else:
+            largest = max(float(values.max()), 1e-9)
+            parts[name] = (_roots(values / largest), {"scale": largest / 255**2, "is_root": True})
     layout, content = {}, io.BytesIO()
     for name, (values, how) in parts.items():
         width = values.shape[1] if values.ndim > 1 and name != "faces" else 1
@@ -273,33 +314,24 @@ def _roots(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
     return np.round(255 * np.sqrt(np.clip(values, 0, 1))).astype(np.uint8)
 
 
-def _rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
+def rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
+    """Numbers as JSON has them, with six digits."""
     return json.loads(
         json.dumps(np.asarray(values).tolist()), parse_float=lambda text: float(f"{float(text):.6g}")
     )
 
 
-def _viridis() -> list[list[int]]:
+def colour_map() -> list[list[int]]:
+    """Of values from 0 to 1, in 256 steps of 8 bits: viridis."""
     from matplotlib import colormaps
 
     return np.round(255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(int).tolist()
 
 
-def _pictures(job: Job) -> list[dict[str, str]]:
-    """Two pictures for browsers that can't draw in 3-D."""
+def _jpegs(shown: dict[str, UInt8[np.ndarray, "H W 3"]]) -> list[dict[str, str]]:
+    """Pictures by caption as the template takes them."""
     from PIL import Image
 
-    from unmix_plugin.products.segmentation import paint_ids
-
-    view = job.views("eval")[0] if job.views("eval") else job.views("all")[0]
-    seen = job.scene.look(view.camera)
-    ids = seen["segmentation"].cpu().numpy()
-    shown = {
-        f"{view.name} in colour": np.round(255 * seen["rgb"].cpu().numpy()).astype(np.uint8),
-        f"{view.name}, materials": np.round(
-            255 * paint_ids(ids, dict(enumerate(endmember_colours(job.materials))))
-        ).astype(np.uint8),
-    }
     pictures = []
     for caption, pixels in shown.items():
         content = io.BytesIO()

@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -132,6 +133,7 @@ def _write_report(
         {
             "title": f"{_scene_name(loaded)}: spectral unmixing report",
             "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
+            "page": _page_link(folder, loaded),
             "notes": notes,
             "facts": _scene_facts(loaded, materials, figures),
             "cards": material_cards(materials, views.proportions, light, library, truth),
@@ -167,6 +169,12 @@ def _view_values(views: ReportViews) -> dict[str, Any]:
         "segmentation": pictures.segmentation_pictures(views),
         "error_chart": pictures.error_chart(views),
     }
+
+
+def _page_link(folder: Path, loaded: LoadedRun) -> str | None:
+    """The exported 3-D page from the report's folder, where there is one."""
+    page = loaded.folder.exports / "page" / "page.html"
+    return Path(os.path.relpath(page, folder)).as_posix() if page.is_file() else None
 
 
 def _true_materials(loaded: LoadedRun, light: np.ndarray | None) -> TrueMaterials | None:

@@ -1,0 +1,249 @@
+"""What the exported page shows of an object: its material at each vertex, and lights that it can be seen in.
+
+The page has no path tracer. Of light from far away it knows, at each vertex, the share of each spherical harmonic that
+arrives there past the object itself, once reflected on it included (precomputed radiance transfer, Sloan et al. 2002),
+and for gloss each environment blurred to several roughnesses (split sum, Karis 2013). Materials are those of glTF.
+
+Notation: `V` vertices, `F` faces, `N` rays a vertex, `S` sizes of a table.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from unmix_plugin.neumatex.export.material import InColours
+from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
+from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
+from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.products.page.page import PageContent, colour_map, rounded, spectral_facts
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.model_scene import LightChoice
+from unmix_plugin.trained.run_views import directions_to_world
+
+if TYPE_CHECKING:
+    from unmix_plugin.neumatex.fit.trained_object import TrainedObject
+
+_MOST_TRIANGLES = 400_000
+_RAYS = 128
+_CHUNK = 1 << 13
+_MAP = (48, 96)
+"""Rows and columns of a blurred environment."""
+_FINER = 4
+"""Times finer the environment is looked up, so that a small sun is not missed."""
+_LEVELS = 6
+"""Roughnesses from 0 to 1 that environments are blurred to."""
+_TONES, _STOPS = 40, (-12.0, 5.0)
+"""Of the table from light to what a display is given: sizes, and powers of 2 of its first and last light."""
+
+
+def page_content(scene: TrainedObject, resolution: int) -> PageContent:
+    """What a page shows of an object; its mesh has vertices about as dense as cells of the resolution."""
+    mesh = _resampled(scene.mesh, 2.0 / resolution)
+    family, notes, facts = scene.surface.family, [], _no_bands()
+    parameters = scene.surface.parameters(mesh.vertices).cpu()
+    arrays: dict[str, np.ndarray] = {}
+    if isinstance(family, SpectralFamily) and scene.bands is not None:
+        family = SpectralFamily(family.endmembers.detach().cpu())
+        shares = family.abundances(parameters)
+        flat = torch.ones(len(scene.bands))
+        none = torch.zeros(0, len(scene.bands))
+        facts = spectral_facts(Materials(scene.bands, family.endmembers, none, light=flat))
+        arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
+        arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
+        family = InColours(family, scene.bands)
+    fit = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
+    if not isinstance(family, PbrFamily):
+        notes.append(
+            "The page lights the nearest metallic-roughness material, which differs from the trained one by "
+            f"{100 * fit.mean_error:.1f} % of the reflected light."
+        )
+    if len(mesh.faces) < len(scene.mesh.faces):
+        notes.append(f"The mesh of {len(scene.mesh.faces):,} triangles is reduced to {len(mesh.faces):,}.")
+    lit, roughness, metallicity = fit.parameters.clamp(0, 1).split([3, 1, 1], dim=1)
+    transfer = _transfer(mesh, lit.mean(dim=1) * (1 - metallicity[:, 0]))
+    openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
+    lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
+    pictures = [_picture(light, scene.bands) for light in lights]
+    arrays |= {
+        "positions": scene.frame.to_world(mesh.vertices.double().numpy()),
+        "faces": mesh.faces.long().numpy(),
+        "normals": directions_to_world(scene.frame, mesh.normals.numpy()),
+        "base": family.base_colour(parameters).clamp(0, 1).numpy(),
+        "lit": lit.numpy(),
+        "polish": torch.cat([roughness, metallicity, openness], dim=1).numpy(),
+        "transfer": transfer.numpy(),
+        "mirrored": _blurred(torch.stack(pictures)).numpy().view("<u2"),
+        "tones": _tone_table(scene),
+    }
+    facts["lights"] = [
+        {"name": name, "factors": [1.0] * len(facts["wavelengths_nm"]), "notes": []}
+        | {"harmonics": rounded(_projected(picture).numpy())}
+        for name, picture in zip(scene.lights, pictures, strict=True)
+    ]
+    facts |= {"notes": notes, "colour": "with the tones of the pictures; shadows are soft"}
+    facts["relit"] = {"map": [_MAP[1], _MAP[0], _LEVELS], "tones": _TONES, "stops": _STOPS}
+    view = next((view for view in scene.views if view.split == "eval"), scene.views[0])
+    seen = scene.look(view.camera)
+    shown = {"in colour": seen["rgb"], "base colour": linear_to_srgb(seen["base_colour"].clamp(0, 1))}
+    bytes_of = {
+        f"{view.name}, {name}": (255 * values.clamp(0, 1)).round().byte().cpu().numpy()
+        for name, values in shown.items()
+    }
+    return PageContent(arrays, facts, bytes_of)
+
+
+def _no_bands() -> dict[str, Any]:
+    """Facts of an object in three colours."""
+    names = (
+        "wavelengths_nm",
+        "edges_nm",
+        "names",
+        "colours",
+        "endmembers",
+        "specular",
+        "rgb",
+        "known",
+        "indices",
+    )
+    return {**{name: [] for name in names}, "light": None, "colour_map": colour_map()}
+
+
+def _resampled(mesh: Mesh, cell: float) -> Mesh:
+    """The mesh with triangles about as large as a cell: split where they are larger, vertices of a cell merged where
+    there are far too many."""
+    vertices, faces = mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().long().numpy()
+    normals = mesh.normals.cpu().double().numpy()
+    if len(faces) > _MOST_TRIANGLES:
+        _, first, of = np.unique(np.round(vertices / cell), axis=0, return_index=True, return_inverse=True)
+        faces = of.reshape(-1)[faces]
+        count = np.bincount(of.reshape(-1))[:, None]
+        vertices, normals = (_summed(values, of.reshape(-1), len(first)) for values in (vertices, normals))
+        vertices = vertices / count
+        apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        faces = np.unique(faces[apart], axis=0)
+    from trimesh.remesh import subdivide
+
+    while 4 * len(faces) <= _MOST_TRIANGLES and _usual_edge(vertices, faces) > 1.5 * cell:
+        vertices, faces, more = subdivide(vertices, faces, vertex_attributes={"normals": normals})
+        normals = more["normals"]
+    return mesh_of(torch.from_numpy(vertices), torch.from_numpy(faces), torch.from_numpy(normals))
+
+
+def _summed(values: Float[np.ndarray, "V 3"], of: Int[np.ndarray, " V"], count: int) -> np.ndarray:
+    return np.stack([np.bincount(of, weights=column, minlength=count) for column in values.T], axis=1)
+
+
+def _usual_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
+    return float(np.quantile(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, 1)], axis=2), 0.9))
+
+
+def _transfer(mesh: Mesh, reflected: Float[Tensor, " V"]) -> Float[Tensor, "V 16"]:
+    """What a white matt surface at each vertex sends back of each harmonic of light, less what the object hides, and
+    with what comes by one reflection on it.
+
+    Args:
+        mesh: Model space.
+        reflected: Share of light that each vertex sends back.
+    """
+    traced, steps = RayMesh(mesh), torch.arange(_RAYS, dtype=torch.float32)
+    height = ((steps + 0.5) / _RAYS).sqrt()  # density: the cosine
+    angle, flat = math.pi * (3 - math.sqrt(5)) * steps, (1 - height * height).sqrt()
+    local = torch.stack([flat * angle.cos(), flat * angle.sin(), height], dim=1)
+    direct, hits = [], []
+    for part in torch.arange(len(mesh.vertices)).split(_CHUNK):
+        normals = mesh.normals[part]
+        turned = frames(normals).repeat_interleave(_RAYS, dim=0)
+        directions = to_world(turned, local.repeat(len(part), 1))
+        origins = (mesh.vertices[part] + 1e-3 * normals).repeat_interleave(_RAYS, dim=0)
+        found = traced.closest(origins, directions)
+        arriving = _harmonics(directions) * ~found.found[:, None]
+        direct.append(arriving.unflatten(0, (-1, _RAYS)).mean(dim=1))
+        hits.append(found.triangles.int())
+    sent = torch.cat(direct) * reflected[:, None]
+    of_faces = torch.cat([sent[mesh.faces.long()].mean(dim=1), sent.new_zeros(1, 16)])  # -1: nothing is met
+    once = [of_faces[part.long()].unflatten(0, (-1, _RAYS)).mean(dim=1) for part in hits]
+    return torch.cat(direct) + torch.cat(once)
+
+
+def _harmonics(directions: Float[Tensor, "*d 3"]) -> Float[Tensor, "*d 16"]:
+    """Real spherical harmonics of degrees 0 to 3, orthonormal; number l^2 + l + m has degree l and order m."""
+    x, y, z = directions.unbind(-1)
+    one = torch.ones_like(x)
+    return torch.stack(
+        [
+            0.282095 * one,
+            *(0.488603 * each for each in (y, z, x)),
+            *(1.092548 * x * y, 1.092548 * y * z, 0.315392 * (3 * z * z - 1), 1.092548 * x * z),
+            0.546274 * (x * x - y * y),
+            *(0.590044 * y * (3 * x * x - y * y), 2.890611 * x * y * z, 0.457046 * y * (5 * z * z - 1)),
+            0.373176 * z * (5 * z * z - 3),
+            *(0.457046 * x * (5 * z * z - 1), 1.445306 * z * (x * x - y * y)),
+            0.590044 * x * (x * x - 3 * y * y),
+        ],
+        dim=-1,
+    )
+
+
+def _picture(light: Environment, bands: Bands | None) -> Float[Tensor, "rows columns 3"]:
+    """Radiance in three colours, each pixel the mean of its part of the sphere."""
+    (rows, columns), n = _MAP, _FINER
+    radiance = light.radiance(directions_of_pixels(n * rows, n * columns).flatten(0, 1).to(light.image)).cpu()
+    if bands is not None:
+        radiance = (radiance @ rgb_matrix(bands)).clamp(min=0)
+    weights = _solid_angles(n * rows, n * columns).reshape(rows, n, columns, n, 1)
+    summed = (radiance.reshape(rows, n, columns, n, 3) * weights).sum(dim=(1, 3))
+    return summed / weights.sum(dim=(1, 3))
+
+
+def _solid_angles(rows: int, columns: int) -> Float[Tensor, "rows columns"]:
+    edges = (torch.arange(rows + 1, dtype=torch.float64) * math.pi / rows).cos()
+    return ((edges[:-1] - edges[1:]) * 2 * math.pi / columns).float()[:, None].expand(rows, columns)
+
+
+def _projected(picture: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "16 3"]:
+    """A light's spherical harmonics."""
+    basis = _harmonics(directions_of_pixels(*_MAP)) * _solid_angles(*_MAP)[..., None]
+    return torch.einsum("rci,rck->ik", basis, picture)
+
+
+def _blurred(pictures: Float[Tensor, "lights rows columns 3"]) -> Any:
+    """Environments as lobes of each roughness see them around a direction, as half floats of four channels, the last
+    of which is 1: (lights, levels, rows, columns, 4), flat."""
+    directions = directions_of_pixels(*_MAP).flatten(0, 1)
+    light = pictures.flatten(1, 2).permute(1, 0, 2).flatten(1)
+    solid = _solid_angles(*_MAP).flatten()
+    levels = [light]
+    for roughness in torch.linspace(0, 1, _LEVELS)[1:]:
+        a2 = float(alpha_of(roughness)) ** 2
+        rows = []
+        for part in directions.split(512):
+            cosine = part @ directions.T
+            # Density of the microfacets that reflect the one direction into the other, seen from the first.
+            lobe = (
+                a2 / ((1 + cosine) / 2 * (a2 - 1) + 1).clamp(min=1e-9).square() * cosine.clamp(min=0) * solid
+            )
+            rows.append(lobe @ light / lobe.sum(dim=1, keepdim=True))
+        levels.append(torch.cat(rows))
+    colours = torch.stack(levels).unflatten(-1, (-1, 3)).permute(2, 0, 1, 3)
+    whole = torch.cat([colours, torch.ones_like(colours[..., :1])], dim=-1)
+    return whole.clamp(max=65504).half().flatten()
+
+
+def _tone_table(scene: TrainedObject) -> Any:
+    """What a display is given for light, as the texture of a cube: red runs fastest; (S * S * S * 4) bytes."""
+    steps = 2 ** torch.linspace(*_STOPS, _TONES)
+    light = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij")[::-1], dim=-1)
+    shown = agx(light) if scene.bands is not None else scene.curve(light.to(scene.device)).cpu()
+    whole = torch.cat([shown.clamp(0, 1), torch.ones_like(shown[..., :1])], dim=-1)
+    return np.round(255 * whole.detach().numpy()).astype(np.uint8).reshape(-1)
