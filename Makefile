@@ -13,7 +13,7 @@ MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/s
 .PHONY: demo test test-all test-minimum wheel platforms audit lint format bench site clean help
 
 help:
-	@echo "make demo    train on the built-in scene, evaluate, export abundance maps"
+	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
 	@echo "make test    run the tests, less the slow ones"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"

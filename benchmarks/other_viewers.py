@@ -35,10 +35,12 @@ PAGE = """<!DOCTYPE html><body style="margin:0"><canvas id="c" width="WIDTH" hei
 <script type="module">
 import * as pc from '/playcanvas.mjs';
 const canvas = document.getElementById('c');
-const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ['webgl2'], antialias: false, preserveDrawingBuffer: true });
+const drawing = { deviceTypes: ['webgl2'], antialias: false, preserveDrawingBuffer: true };
+const device = await pc.createGraphicsDevice(canvas, drawing);
 const options = new pc.AppOptions();
 options.graphicsDevice = device;
-options.componentSystems = [pc.RenderComponentSystem, pc.CameraComponentSystem, pc.LightComponentSystem, pc.GSplatComponentSystem];
+options.componentSystems = [pc.RenderComponentSystem, pc.CameraComponentSystem, pc.LightComponentSystem];
+options.componentSystems.push(pc.GSplatComponentSystem);
 options.resourceHandlers = [pc.TextureHandler, pc.ContainerHandler, pc.GSplatHandler];
 const app = new pc.AppBase(canvas);
 app.init(options);
@@ -50,7 +52,8 @@ camera.setPosition(pose.getTranslation());
 camera.setRotation(new pc.Quat().setFromMat4(pose));
 app.root.addChild(camera);
 const kind = new URLSearchParams(location.search).get('kind');
-const asset = new pc.Asset('splats', kind === 'ply' ? 'gsplat' : 'container', { url: `/splats.${kind}`, filename: `splats.${kind}` });
+const file = { url: `/splats.${kind}`, filename: `splats.${kind}` };
+const asset = new pc.Asset('splats', kind === 'ply' ? 'gsplat' : 'container', file);
 app.assets.add(asset);
 asset.on('error', (error) => { window.failed = String(error); });
 asset.ready(() => {
@@ -102,7 +105,9 @@ def main(options: Options) -> None:
         measured = {
             "pictures": pictures(run, folder / "z", packages, chromium),
             "table": table(folder, packages),
-            "validator": {name: validated(folder / name / f"{name}.glb", packages) for name in ("mesh", "splats")},
+            "validator": {
+                name: validated(folder / name / f"{name}.glb", packages) for name in ("mesh", "splats")
+            },
         }
     setting = {"packages": PACKAGES, "splats": measured["table"]["splats"]}
     question = "Exported splats and meshes in other programs"
@@ -250,7 +255,8 @@ def judge(measured: dict[str, Any]) -> list[_common.Figure]:
         _common.required(
             "splats that PlayCanvas and SuperSplat's reader find",
             "all",
-            len({*(one["splats"] for one in measured["pictures"].values()), measured["table"]["splats"]}) == 1,
+            len({*(one["splats"] for one in measured["pictures"].values()), measured["table"]["splats"]})
+            == 1,
             str(measured["table"]["splats"]),
         ),
         _common.required("numbers in SuperSplat's reader", "within 1e-4", off < 1e-4, f"within {off:.1g}"),
@@ -259,7 +265,7 @@ def judge(measured: dict[str, Any]) -> list[_common.Figure]:
                 f"Khronos validator, {name}.glb",
                 "0 errors, 0 warnings",
                 found["errors"] == found["warnings"] == 0,
-                f"{found['errors']} errors, {found['warnings']} warnings; {', '.join(found['codes']) or 'nothing said'}",
+                f"{found['errors']} errors, {found['warnings']} warnings; {', '.join(found['codes']) or 'no note'}",
             )
             for name, found in (("mesh", mesh), ("splats", splats))
         ),

@@ -1,7 +1,10 @@
+import json
+
 import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 from plyfile import PlyData
 
 from tests.products.ball_model import (
@@ -25,6 +28,7 @@ from unmix_plugin.products.mesh import (
     _not_empty,
     _require_sound,
     _surface_density,
+    _textures,
     _trim_unseen,
     _without_stray_pieces,
     _write_mesh,
@@ -211,6 +215,62 @@ def test_up_is_y_in_glb_unless_asked_otherwise(files, outside, tmp_path):
     np.testing.assert_allclose(
         np.linalg.norm(turned.vertices, axis=1), np.linalg.norm(as_is.vertices, axis=1), atol=1e-5
     )
+
+
+@pytest.fixture(scope="module")
+def textured(outside, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("textured")
+    written = _write_mesh(folder, ("obj", "glb"), outside, SCENE, FRAME, "z", _textures(SCENE, outside, 256))
+    assert sorted(written) == sorted(_mesh_paths(folder, ("obj", "glb"), SCENE.materials.names))
+    return folder
+
+
+def sampled(picture, uv):
+    """Texels of a picture where uv, v upwards, points."""
+    pixels = np.asarray(picture)
+    rows, columns = ((1 - uv[:, 1]) * len(pixels)).astype(int), (uv[:, 0] * pixels.shape[1]).astype(int)
+    return pixels[rows.clip(0, len(pixels) - 1), columns.clip(0, pixels.shape[1] - 1)]
+
+
+@pytest.mark.parametrize("kind", ["obj", "glb"])
+def test_textures_show_the_material_of_the_place_that_they_lie_on(textured, files, kind):
+    mesh = loaded_mesh(textured / f"mesh.{kind}")
+    height = FRAME.to_model(np.asarray(mesh.vertices))[:, 2]
+    uv, away = np.asarray(mesh.visual.uv), np.abs(height) > 0.05
+    ids = sampled(Image.open(textured / "mesh_segmentation.png"), uv)
+    np.testing.assert_array_equal(ids[away], (height < 0)[away])
+    shares = sampled(Image.open(textured / "mesh_abundance_endmember_0.png"), uv)
+    np.testing.assert_array_equal(shares[away], 255 * (height > 0)[away])
+    vertices = PlyData.read(files[".ply"])["vertex"]
+    colours = np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1).astype(int)
+    expected = [colours[vertices[f"abundance_endmember_{index}"].argmax()] for index in (0, 1)]
+    found = sampled(Image.open(textured / "mesh_colour.png").convert("RGB"), uv)[away].astype(int)
+    assert np.abs(found - np.where((height > 0)[away, None], *expected)).max() <= 1
+    outwards = mesh.vertices - FRAME.to_world(np.zeros(3))
+    assert (mesh.vertex_normals * outwards).sum(axis=1).min() > 0
+
+
+def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured):
+    data = (textured / "mesh.glb").read_bytes()
+    content = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    names = ["colour", "segmentation", *(f"abundance_endmember_{index}" for index in range(3))]
+    variants = content["extensions"]["KHR_materials_variants"]["variants"]
+    assert [one["name"] for one in variants] == [one["name"] for one in content["materials"]] == names
+    assert content["extensionsUsed"] == ["KHR_materials_variants", "KHR_materials_unlit"]
+    primitive = content["meshes"][0]["primitives"][0]
+    assert "COLOR_0" not in primitive["attributes"]
+    assert primitive["extensions"]["KHR_materials_variants"]["mappings"][3] == {
+        "material": 3,
+        "variants": [3],
+    }
+    assert "map_Kd mesh_colour.png" in (textured / "mesh.mtl").read_text()
+
+
+def test_textures_that_are_too_small_or_of_no_size_are_refused(outside):
+    with pytest.raises(ConfigError, match="--texture-size is 9; choose 16 to 8192"):
+        _textures(SCENE, outside, 9)
+    with pytest.raises(ConfigError, match="choose a larger --texture-size"):
+        _textures(SCENE, outside, 16)
 
 
 def test_a_density_that_nothing_reaches_is_refused(densities):

@@ -1,4 +1,4 @@
-"""`unmix-demo`: does it work here, and what comes out? Train on the built-in scene, evaluate, export abundance maps."""
+"""`unmix-demo`: does it work here, and what comes out? Train on the built-in scene, evaluate, export abundance maps and a page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unmix_plugin.engine.configs import DeviceName
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Train on the built-in scene, evaluate the run, export its abundance maps, and say where the pictures are."""
+    """Train on the built-in scene, evaluate the run, export its abundance maps and its page in 3-D, and say where they are."""
 
     seconds: float = 45.0
     """Time to train."""
@@ -23,7 +23,7 @@ class DemoOptions:
 
 
 def demo(arguments: list[str]) -> None:
-    """Parse the arguments, do what the three commands do, say what to look at."""
+    """Parse the arguments, do what the commands do, say what to look at."""
     options = tyro.cli(DemoOptions, prog="unmix-demo", args=arguments)
 
     from unmix_plugin.commands.eval import evaluate
@@ -38,5 +38,7 @@ def demo(arguments: list[str]) -> None:
     run = newest_run(options.output_dir)
     evaluate(["--run", str(run.path), "--device", options.device])
     export(["abundances", "--run", str(run.path), "--device", options.device])
+    export(["page", "--run", str(run.path), "--device", options.device, "--resolution", "160"])
     print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
+    print(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
     print(f"look around in it: unmix-view --run {run.path}")

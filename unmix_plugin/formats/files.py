@@ -33,6 +33,7 @@ __all__ = [
     "RowSink",
     "array_bytes",
     "csv_bytes",
+    "grey_png_bytes",
     "indexed_png_bytes",
     "make_folder",
     "npy_rows",
@@ -136,6 +137,13 @@ def rgba_png_bytes(rgba: UInt8[np.ndarray, "H W C"], description: str = "") -> b
     from PIL import Image
 
     return _encoded(Image.fromarray(rgba), description)
+
+
+def grey_png_bytes(values: UInt8[np.ndarray, "H W"], description: str = "") -> bytes:
+    """Numbers as shades of grey; `description` as `rgba_png_bytes` takes it."""
+    from PIL import Image
+
+    return _encoded(Image.fromarray(values), description)
 
 
 def indexed_png_bytes(

@@ -135,6 +135,7 @@ def write_obj(
     names: Sequence[str],
     palette: Float[np.ndarray, "M 3"],
     comments: Sequence[str] = (),
+    textured: tuple[Float[np.ndarray, "U 2"], Int[np.ndarray, "F 3"], str] | None = None,
 ) -> list[Path]:
     """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32.
 
@@ -147,6 +148,8 @@ def write_obj(
         faces, materials: Indices of vertices, and the material of each face.
         names, palette: Of the materials; in names what is not a letter or digit becomes `_`; sRGB.
         comments: First lines.
+        textured: Texture coordinates (u to the right, v downwards), those of each corner, and the file of the picture
+            that all materials then show.
     """
     obj_path, library_path = obj_paths(path_without_suffix)
     plain = [f"material_{index}_{re.sub(r'[^0-9A-Za-z]+', '_', name)}" for index, name in enumerate(names)]
@@ -156,12 +159,18 @@ def write_obj(
     digits = " ".join(3 * ["%.17g" if positions.dtype == np.float64 else "%.9g"])
     np.savetxt(text, np.hstack([positions, srgb]), fmt=f"v {digits} %.9g %.9g %.9g")
     np.savetxt(text, normals, fmt="vn %.9g %.9g %.9g")
+    shown, corner, numbers = "", "%d//%d", [faces, faces]
+    if textured is not None:
+        uv, uv_faces, picture = textured
+        np.savetxt(text, np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1), fmt="vt %.9g %.9g")
+        shown, corner, numbers = f"map_Kd {picture}\n", "%d/%d/%d", [faces, uv_faces, faces]
+        palette = np.ones_like(palette)
+    corners = np.stack(numbers, axis=2).reshape(len(faces), -1) + 1
     for index in np.unique(materials):
         text.write(f"usemtl {plain[index]}\n")
-        corners = faces[materials == index] + 1
-        np.savetxt(text, corners.repeat(2, axis=1), fmt="f %d//%d %d//%d %d//%d")
+        np.savetxt(text, corners[materials == index], fmt="f " + " ".join(3 * [corner]))
     library = "".join(
-        f"newmtl {name}\nKd {colour[0]:.6g} {colour[1]:.6g} {colour[2]:.6g}\nillum 1\n\n"
+        f"newmtl {name}\nKd {colour[0]:.6g} {colour[1]:.6g} {colour[2]:.6g}\n{shown}illum 1\n\n"
         for name, colour in zip(plain, palette.tolist(), strict=True)
     )
     write_file(library_path, library.encode())
@@ -193,8 +202,10 @@ def write_glb(
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
     up: Float64[np.ndarray, "3"] = _Y,
+    uv: Float32[np.ndarray, "P 2"] | None = None,
+    pictures: Mapping[str, bytes] | None = None,
 ) -> Path:
-    """Write a mesh in colours of its vertices.
+    """Write a mesh in colours of its vertices, or in pictures.
 
     Args:
         path: File; its folder is made.
@@ -205,10 +216,28 @@ def write_glb(
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it.
         up: The unit vector that is up; its node turns it to +y, as glTF prescribes.
+        uv: Texture coordinates: u to the right, v downwards.
+        pictures: PNG by name; the first is shown in place of the colours, the others are variants, shown unlit.
+    Source:
+        Khronos Group, KHR_materials_variants and KHR_materials_unlit.
     """
-    material = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
+    material: dict[str, Any] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
     attributes = {"POSITION": positions, "NORMAL": normals, "COLOR_0": linear_rgb, **numbers}
-    return _write_glb(path, attributes, faces, material, {}, extras, up)
+    if uv is None or not pictures:
+        return _write_glb(path, attributes, faces, [material], {}, extras, up)
+    attributes = {**attributes, "TEXCOORD_0": uv}
+    del attributes["COLOR_0"]  # it would be multiplied with the picture
+    materials = []
+    for index, name in enumerate(pictures):
+        look = {"metallicFactor": 0.0, "baseColorTexture": {"index": index}}
+        materials.append({"name": name, "doubleSided": True, "pbrMetallicRoughness": look})
+        if index > 0:
+            materials[-1]["extensions"] = {"KHR_materials_unlit": {}}
+    mappings = [{"material": index, "variants": [index]} for index in range(len(pictures))]
+    of_primitive = {"KHR_materials_variants": {"mappings": mappings}}
+    variants = {"KHR_materials_variants": {"variants": [{"name": name} for name in pictures]}}
+    variants |= {"KHR_materials_unlit": {}} if len(pictures) > 1 else {}
+    return _write_glb(path, attributes, faces, materials, pictures, extras, up, of_primitive, variants)
 
 
 @dataclass(frozen=True)
@@ -266,7 +295,7 @@ def write_splats_glb(
         **numbers,
     }
     how = {own: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
-    return _write_glb(path, attributes, None, None, {}, extras, up, how)
+    return _write_glb(path, attributes, None, [], {}, extras, up, how, {own: {}})
 
 
 def write_splats_ply(
@@ -308,20 +337,22 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
     }
     attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals, "TEXCOORD_0": mesh.uv}
     pictures = {"base_colour": mesh.base_colour_png, "metallic_roughness": mesh.metallic_roughness_png}
-    return _write_glb(path, attributes, mesh.faces, material, pictures, extras)
+    return _write_glb(path, attributes, mesh.faces, [material], pictures, extras)
 
 
 def _write_glb(
     path: Path,
     attributes: Mapping[str, np.ndarray],
     faces: Int[np.ndarray, "F 3"] | None,
-    material: Mapping[str, Any] | None,
+    materials: Sequence[Mapping[str, Any]],
     pictures: Mapping[str, bytes],
     extras: Mapping[str, Any],
     up: Float64[np.ndarray, "3"] = _Y,
     extensions: Mapping[str, Any] | None = None,
+    used: Mapping[str, Any] | None = None,
 ) -> Path:
-    """A file of one mesh in one material, or of points: attributes, faces and pictures in one buffer."""
+    """A file of one mesh in the first of some materials, or of points: attributes, faces and pictures in one buffer;
+    `extensions` are those of the mesh, `used` all of the file with what they say of the whole, if anything."""
     data, views, accessors = bytearray(), [], []
 
     def add(content: bytes, **view: int) -> int:
@@ -349,7 +380,7 @@ def _write_glb(
         accessors.append(
             {"bufferView": view, "componentType": _UNSIGNED_INT, "count": faces.size, "type": "SCALAR"}
         )
-    if material is not None:
+    if materials:
         primitive["material"] = 0
     if extensions:
         primitive["extensions"] = dict(extensions)
@@ -363,14 +394,16 @@ def _write_glb(
         "samplers": [sampler],
         "images": images,
     }
+    said = {name: value for name, value in (used or {}).items() if value}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist()}],
         "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
-        **({} if material is None else {"materials": [material]}),
-        **({"extensionsUsed": list(extensions)} if extensions else {}),
+        **({"materials": list(materials)} if materials else {}),
+        **({"extensionsUsed": list(used)} if used else {}),
+        **({"extensions": said} if said else {}),
         **(textures if images else {}),
         "accessors": accessors,
         "bufferViews": views,

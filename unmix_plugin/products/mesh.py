@@ -9,8 +9,10 @@ Notation: `V` vertices, `F` faces.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,10 +23,13 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int
 
 from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.formats.files import grey_png_bytes, indexed_png_bytes, rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
+from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import (
     GridPoints,
@@ -34,6 +39,7 @@ from unmix_plugin.trained.surface import (
     look_at,
     look_from_above,
     may_be_solid,
+    property_names,
     sample_densities,
     sample_slice,
 )
@@ -214,6 +220,7 @@ def export_mesh(
     smoothing: float,
     keeps_unseen: bool,
     up: Literal["y", "z"] = "y",
+    texture_size: int | None = 0,
 ) -> list[Path]:
     """Sample the density, march through it, trim and colour the surface.
 
@@ -225,12 +232,22 @@ def export_mesh(
         smoothing: Standard deviation of the blur, cells.
         keeps_unseen: Whether surfaces that no camera sees stay.
         up: What is up in GLB; `z` turns nothing.
+        texture_size: Texels along the edges of the textures of GLB and OBJ; 0: none, None: as many as the charts need.
     """
     _require_sound(density, smoothing)
-    job.claim(_mesh_paths(job.folder, formats))
+    if texture_size is None and importlib.util.find_spec("xatlas") is None:
+        texture_size = 0
+        job.say("no textures, since xatlas is not installed: GLB and OBJ have colours of vertices")
+    names = job.materials.names if texture_size != 0 and {"glb", "obj"} & set(formats) else None
+    job.claim(_mesh_paths(job.folder, formats, names))
     mesh, threshold = find_surface(job, resolution, density, smoothing, keeps_unseen)
+    textures = None
+    if names is not None:
+        with job.working("making textures"):
+            textures = _textures(job.scene, mesh, texture_size)
+        job.say(f"textures of {textures.size} x {textures.size} texels")
     with job.working("making the mesh"):
-        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, up)
+        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, up, textures)
     job.say(
         f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
         f"at a density of {threshold * job.frame.scale:.4g} per world unit"
@@ -275,9 +292,76 @@ def _not_empty(mesh: TriangleMesh) -> TriangleMesh:
     return mesh
 
 
-def _mesh_paths(folder: Path, formats: Sequence[str]) -> list[Path]:
-    """Files that `_write_mesh` makes."""
-    return [path for kind in formats for path in _paths(folder, kind)]
+def _mesh_paths(folder: Path, formats: Sequence[str], textured: Sequence[str] | None = None) -> list[Path]:
+    """Files that `_write_mesh` makes; `textured` are the names of the materials if there are textures."""
+    paths = [path for kind in formats for path in _paths(folder, kind)]
+    if textured is not None and "obj" in formats:
+        names = ("colour", "segmentation", *property_names(tuple(textured)))
+        paths += [_texture_path(folder, name) for name in names]
+    return paths
+
+
+def _texture_path(folder: Path, name: str) -> Path:
+    return folder / f"mesh_{name}.png"
+
+
+_TEXTURE_SIZES = (1024, 2048, 4096)
+"""Tried one after the other until the charts fit."""
+_TEXTURE_BOUNDS = (16, 8192)
+_TEXELS = 1 << 16
+"""Looked at together."""
+
+
+@dataclass(frozen=True)
+class _Textures:
+    """Texture coordinates of a mesh, and what its surface looks like at every texel."""
+
+    atlas: Atlas
+    size: int
+    pictures: dict[str, bytes]
+    """PNG: `colour` (sRGB), `segmentation` (ids with a palette), `abundance_NAME` of each material (8 bits)."""
+
+
+def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Textures:
+    """Unwrap the mesh and look at the surface from straight above each texel.
+
+    Raises:
+        ConfigError: xatlas is not installed, or the charts don't fit into a texture of the size asked for.
+    """
+    low, high = _TEXTURE_BOUNDS
+    if size is not None and not low <= size <= high:
+        raise ConfigError(f"--texture-size is {size}; choose {low} to {high} texels, or 0 for no textures")
+    atlas, size = _unwrapped(mesh, _TEXTURE_SIZES if size is None else (size,))
+    texels, corners = texels_of(atlas, size), atlas.vertices[atlas.faces]
+    positions = torch.from_numpy(texels.of_corners(mesh.vertices, corners)).float()
+    normals = torch.from_numpy(texels.of_corners(mesh.normals, corners)).float()
+    normals = torch.nn.functional.normalize(normals, dim=1)
+    colours, ids, shares = [], [], []
+    for part in torch.arange(len(positions)).split(_TEXELS):
+        looks = SurfaceAppearance(scene.materials, *look_from_above(scene, positions[part], normals[part]))
+        colours.append(np.round(255 * looks.srgb).astype(np.uint8))
+        ids.append(looks.material_ids)
+        shares.append(np.round(255 * looks.abundances.numpy()).astype(np.uint8))
+    share_pictures = texels.texture(np.concatenate(shares))
+    names, palette = scene.materials.names, endmember_colours(scene.materials)
+    id_picture = texels.texture(np.concatenate(ids)[:, None])[..., 0]
+    pictures = {
+        "colour": rgba_png_bytes(texels.texture(np.concatenate(colours)), "diffuse colour, sRGB"),
+        "segmentation": indexed_png_bytes(id_picture, palette, description="material of each texel"),
+    }
+    for index, name in enumerate(property_names(names)):
+        about = f"share of {names[index]}: 0 to 255 are 0 to 1"
+        shown = np.ascontiguousarray(share_pictures[..., index])
+        pictures[name] = grey_png_bytes(shown, about)
+    return _Textures(atlas, size, pictures)
+
+
+def _unwrapped(mesh: TriangleMesh, sizes: Sequence[int]) -> tuple[Atlas, int]:
+    """Charts in the smallest texture that they fit into."""
+    for size in sizes[:-1]:
+        with suppress(ConfigError):
+            return unwrap(mesh.vertices, mesh.faces, size), size
+    return unwrap(mesh.vertices, mesh.faces, sizes[-1]), sizes[-1]
 
 
 def _require_sound(density: float | None, smoothing: float) -> None:
@@ -295,11 +379,13 @@ def _write_mesh(
     scene: TrainedScene,
     frame: Normalisation,
     up: Literal["y", "z"] = "y",
+    textures: _Textures | None = None,
 ) -> list[Path]:
     """Write a mesh with the colour, material and abundances of each vertex, seen from straight above it.
 
     PLY carries all of it; glTF positions, normals, colours (linear), `_MATERIAL` and abundances; OBJ positions,
-    normals, colours (sRGB) and the material of each face. Large coordinates are float64 in PLY and OBJ; glTF has them
+    normals, colours (sRGB) and the material of each face. Textures, if any, replace the colours of glTF and lie beside
+    an OBJ. Large coordinates are float64 in PLY and OBJ; glTF has them
     less `offset` in the extras of its mesh.
     """
     normals = mesh.normals
@@ -308,8 +394,12 @@ def _write_mesh(
     looks = SurfaceAppearance(scene.materials, *seen, scale=scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
-    glb = partial(_write_glb, up=world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0]))
-    writers = {"ply": _write_ply, "obj": _write_obj, "glb": glb}
+    glb = partial(
+        _write_glb,
+        up=world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0]),
+        textures=textures,
+    )
+    writers = {"ply": _write_ply, "obj": partial(_write_obj, textures=textures), "glb": glb}
     return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
 
 
@@ -328,12 +418,21 @@ def _write_ply(
 
 
 def _write_obj(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
+    path: Path,
+    mesh: TriangleMesh,
+    normals: Float32[np.ndarray, "V 3"],
+    looks: SurfaceAppearance,
+    textures: _Textures | None,
 ) -> list[Path]:
     # The material that most corners of a face have, that of the first where all differ.
     corners = looks.material_ids.astype(np.int64)[mesh.faces]
     materials = np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
-    return write_obj(
+    pictures, shown = [], None
+    if textures is not None:
+        for name, content in textures.pictures.items():
+            pictures.append(write_file(_texture_path(path.parent, name), content))
+        shown = (textures.atlas.uv, textures.atlas.faces, pictures[0].name)
+    written = write_obj(
         path.with_suffix(""),
         mesh.vertices,
         normals,
@@ -343,7 +442,9 @@ def _write_obj(
         looks.materials.names,
         looks.palette,
         looks.comments(_WHAT),
+        shown,
     )
+    return [*written, *pictures]
 
 
 def _write_glb(
@@ -352,9 +453,16 @@ def _write_glb(
     normals: Float32[np.ndarray, "V 3"],
     looks: SurfaceAppearance,
     up: Float64[np.ndarray, "3"],
+    textures: _Textures | None,
 ) -> list[Path]:
     positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
-    return [write_glb(path, positions, normals, looks.linear_rgb, mesh.faces, numbers, extras, up)]
+    faces, uv, pictures, colours = mesh.faces, None, None, looks.linear_rgb
+    if textures is not None:
+        chosen, faces, uv = textures.atlas.vertices, textures.atlas.faces, textures.atlas.uv
+        positions, normals, colours = positions[chosen], normals[chosen], colours[chosen]
+        numbers = {name: values[chosen] for name, values in numbers.items()}
+        pictures = textures.pictures
+    return [write_glb(path, positions, normals, colours, faces, numbers, extras, up, uv, pictures)]
 
 
 def gltf_content(

@@ -61,7 +61,7 @@ class Endmembers(Product):
 @dataclass(frozen=True)
 class Mesh(Product):
     """The surface as triangles: mesh.ply, mesh.glb or mesh.obj with position and normal in the scene's world
-    coordinates, colour and material; PLY and GLB with every abundance too."""
+    coordinates, colour, material and every abundance; GLB and OBJ with textures of them."""
 
     name = "mesh"
 
@@ -78,6 +78,9 @@ class Mesh(Product):
     """What to do with surfaces that no camera of the run sees, and that were therefore never learnt."""
     up: Literal["y", "z"] = "y"
     """What is up in GLB: y, as glTF prescribes and its viewers expect, or z: turned by nothing."""
+    texture_size: int | None = None
+    """Texels along the edges of textures in GLB and beside OBJ: colour, segmentation, abundances; None: as many as the
+    surface needs, from 1024 on. 0: none, colours of vertices instead."""
 
     def write(self, job: Job) -> list[Path]:
         """Sample the density, march through it, trim and colour the surface."""
@@ -91,6 +94,7 @@ class Mesh(Product):
             self.smoothing,
             self.unseen == "keep",
             self.up,
+            self.texture_size,
         )
 
 

@@ -310,7 +310,7 @@ class SurfaceAppearance:
         colours = np.round(255 * self.srgb).astype(np.uint8)
         named = {name: colours[:, axis] for axis, name in enumerate(("red", "green", "blue"))}
         shares = self.abundances.numpy().astype(np.float32)
-        columns = {name: shares[:, index] for index, name in enumerate(_property_names(self.materials.names))}
+        columns = {name: shares[:, index] for index, name in enumerate(property_names(self.materials.names))}
         return {**named, "material": self.material_ids, **columns}
 
     def comments(self, what: str) -> list[str]:
@@ -325,10 +325,10 @@ class SurfaceAppearance:
         ]
 
 
-def _property_names(names: tuple[str, ...]) -> list[str]:
+def property_names(names: tuple[str, ...]) -> list[str]:
     """Names of abundances as formats without spaces take them, all different.
 
-    >>> _property_names(("red clay", "red-clay", "leaf"))
+    >>> property_names(("red clay", "red-clay", "leaf"))
     ['abundance_red_clay', 'abundance_red_clay_1', 'abundance_leaf']
     """
     plain: list[str] = []

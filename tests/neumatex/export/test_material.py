@@ -12,11 +12,11 @@ from tests.neumatex.surfaces import LAYERED, PBR, ball, knot
 from tests.products.mesh_reading import loaded_mesh
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.export import pbr_fit
-from unmix_plugin.neumatex.export.atlas import _Atlas, _texels_of, _unwrap
 from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.export.product import _require_texture_size
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
+from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 
@@ -154,8 +154,12 @@ def test_impossible_sizes_are_refused(size):
         _require_texture_size(size)
 
 
+def unwrapped(mesh, texture_size):
+    return unwrap(mesh.vertices.double().numpy(), mesh.faces.numpy(), texture_size)
+
+
 def flat_atlas(uv, faces):
-    return _Atlas(np.arange(len(uv)), np.array(faces), np.array(uv, dtype=np.float32))
+    return Atlas(np.arange(len(uv)), np.array(faces), np.array(uv, dtype=np.float32))
 
 
 def areas_of(atlas):
@@ -165,7 +169,7 @@ def areas_of(atlas):
 
 def test_charts_keep_every_triangle_and_lie_in_the_unit_square():
     mesh = ball()
-    atlas = _unwrap(mesh, 256)
+    atlas = unwrapped(mesh, 256)
     assert len(atlas.faces) == len(mesh.faces)
     np.testing.assert_array_equal(atlas.vertices[atlas.faces], mesh.faces.numpy())
     assert atlas.uv.min() >= 0
@@ -176,16 +180,16 @@ def test_charts_keep_every_triangle_and_lie_in_the_unit_square():
 
 
 def test_no_texel_lies_in_two_charts():
-    atlas = _unwrap(ball(), 256)
-    texels = _texels_of(atlas, 256)
+    atlas = unwrapped(ball(), 256)
+    texels = texels_of(atlas, 256)
     assert len(np.unique(texels.places)) == len(texels.places)
     assert len(texels.places) == pytest.approx(areas_of(atlas).sum() * 256**2, rel=0.02)
 
 
 def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
     mesh, size = ball(3), 128
-    atlas = _unwrap(mesh, size)
-    texels = _texels_of(atlas, size)
+    atlas = unwrapped(mesh, size)
+    texels = texels_of(atlas, size)
     centres = np.stack([texels.places % size + 0.5, texels.places // size + 0.5], axis=1) / size
     np.testing.assert_allclose(texels.of_corners(atlas.uv, atlas.faces), centres, atol=1e-6)
     positions = texels.of_corners(mesh.vertices.numpy(), atlas.vertices[atlas.faces])
@@ -196,7 +200,7 @@ def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
 
 def test_two_triangles_that_fill_the_square_have_all_texels_once():
     atlas = flat_atlas([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
-    texels = _texels_of(atlas, 32)
+    texels = texels_of(atlas, 32)
     np.testing.assert_array_equal(texels.places, np.arange(32 * 32))
     assert set(texels.triangles.tolist()) == {0, 1}
     np.testing.assert_allclose(texels.weights.sum(axis=1), 1, atol=1e-12)
@@ -204,32 +208,39 @@ def test_two_triangles_that_fill_the_square_have_all_texels_once():
 
 def test_triangles_without_area_in_the_texture_have_no_texels():
     atlas = flat_atlas([[0.1, 0.1], [0.6, 0.6], [0.35, 0.35]], [[0, 1, 2]])
-    assert len(_texels_of(atlas, 64).places) == 0
+    assert len(texels_of(atlas, 64).places) == 0
 
 
 def test_a_texture_has_the_values_of_its_texels_and_beyond_them_those_of_the_nearest():
     atlas = flat_atlas([[0, 0], [0.5, 0], [0.5, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
-    texels = _texels_of(atlas, 8)
+    texels = texels_of(atlas, 8)
     rows = (texels.places // 8)[:, None].astype(np.float32)
     picture = texels.texture(rows)
     np.testing.assert_array_equal(picture[..., 0], np.repeat(np.arange(8.0)[:, None], 8, axis=1))
 
 
 def test_triangles_are_found_whatever_chunks_they_are_looked_at_in(monkeypatch):
-    atlas = _unwrap(ball(), 64)
-    whole = _texels_of(atlas, 64)
-    monkeypatch.setattr("unmix_plugin.neumatex.export.atlas._CHUNK", 37)
-    parts = _texels_of(atlas, 64)
+    atlas = unwrapped(ball(), 64)
+    whole = texels_of(atlas, 64)
+    monkeypatch.setattr("unmix_plugin.products.atlas._CHUNK", 37)
+    parts = texels_of(atlas, 64)
     np.testing.assert_array_equal(parts.places, whole.places)
     np.testing.assert_array_equal(parts.triangles, whole.triangles)
+
+
+def test_tiny_triangles_are_placed_too():
+    mesh = ball(4)
+    atlas = unwrap(1e-5 * mesh.vertices.double().numpy(), mesh.faces.numpy(), 512)
+    edges = np.linalg.norm(atlas.uv[atlas.faces] - atlas.uv[np.roll(atlas.faces, 1, axis=1)], axis=2)
+    assert edges.max() < 4 * np.median(edges)
 
 
 def test_without_xatlas_one_message_names_it(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(ConfigError, match="pip install xatlas"):
-        _unwrap(ball(1), 64)
+        unwrapped(ball(1), 64)
 
 
 def test_a_texture_too_small_for_the_charts_is_refused():
     with pytest.raises(ConfigError, match="--texture-size"):
-        _unwrap(ball(5), 16)
+        unwrapped(ball(5), 16)

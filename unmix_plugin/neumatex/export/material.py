@@ -19,13 +19,13 @@ from torch import Tensor
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.files import make_folder, rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import TexturedMesh, write_textured_glb
-from unmix_plugin.neumatex.export.atlas import BakedMaterial, bake
 from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.surface import Surface
+from unmix_plugin.products.atlas import Atlas, Texels, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -36,6 +36,41 @@ from unmix_plugin.trained.run_views import directions_to_world, positions_for_fi
 _TEXTURES = ("base_colour", "gltf_base_colour", "gltf_metallic_roughness")
 _NEURAL_TEXTURES = ("diffuse_colour", "latents_a", "latents_b")
 _COLOURS = ("red", "green", "blue")
+_CHUNK_BAKING = 1 << 17
+
+
+@dataclass(frozen=True)
+class BakedMaterial:
+    """A surface's parameters at the texels of an atlas."""
+
+    atlas: Atlas
+    texels: Texels
+    parameters: Float[Tensor, "T P"]
+    """[0, 1], on the CPU."""
+
+    def texture(self, values: Tensor) -> np.ndarray:
+        """Values of texels (T, C) as a texture (S, S, C), float32, filled beyond the charts."""
+        return self.texels.texture(values.detach().cpu().numpy().astype(np.float32))
+
+
+@torch.no_grad()
+def bake(mesh: Mesh, surface: Surface, texture_size: int) -> BakedMaterial:
+    """Unwrap a mesh and look up the surface's parameters at each texel.
+
+    Args:
+        mesh: Model space.
+        surface: Its materials.
+        texture_size: Width and height of the textures, texels.
+    Raises:
+        ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
+    """
+    atlas = unwrap(mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().numpy(), texture_size)
+    texels = texels_of(atlas, texture_size)
+    faces = atlas.vertices[atlas.faces]
+    positions = texels.of_corners(mesh.vertices.cpu().double().numpy(), faces)
+    points = torch.from_numpy(positions).float().to(mesh.vertices.device)
+    parameters = torch.cat([surface.parameters(part).cpu() for part in points.split(_CHUNK_BAKING)])
+    return BakedMaterial(atlas, texels, parameters)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@
   const colours = facts.colours.map((colour) => [...colour]);
   const tinted = new Set();
   const hidden = new Set();
-  let metresPerUnit = null;
+  let metresPerUnit = facts.metres_per_unit;
 
   // ---- colour -------------------------------------------------------------------------------------------------------
   const toLinear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
@@ -360,7 +360,20 @@
   const swatch = (k) => {
     const dot = make("span", { className: "dot" });
     dot.style.background = css(colours[k]);
-    return make("div", { className: "key" }, dot, names[k]);
+    return make("div", { className: "key" }, dot, `${names[k]}: ${unitText(Math.sqrt(areas()[k]), 2)}`);
+  };
+  // Of each material, a third of the triangles at each of its vertices; world units squared.
+  let knownAreas = null;
+  const areas = () => {
+    if (knownAreas) return knownAreas;
+    knownAreas = new Float64Array(256);
+    const [a, b, c] = [new Kit.Vector3(), new Kit.Vector3(), new Kit.Vector3()];
+    for (let f = 0; f < faces.length; f += 3) {
+      [a, b, c].forEach((corner, i) => corner.fromArray(positions, 3 * faces[f + i]));
+      const third = b.sub(a).cross(c.sub(a)).length() / 6;
+      for (let i = 0; i < 3; i++) knownAreas[materials[faces[f + i]]] += third;
+    }
+    return knownAreas;
   };
 
   const painters = {
@@ -382,7 +395,7 @@
       paintedFlat();
       const present = new Set(materials);
       $("legend").replaceChildren(...names.map((_, k) => k).filter((k) => present.has(k)).map(swatch));
-      return "the material with the largest share at each place";
+      return "the material with the largest share at each place, and the area of the surface that it covers";
     },
     confidence: () => { paintValues((v) => confidence[v], 0, 1); return "estimated probability that the material is right"; },
     index: () => {
@@ -575,11 +588,12 @@
   $("clear").onclick = () => { points.length = 0; rulerEnds.length = 0; showLength(); listPoints(); showMarks(); };
 
   // ---- lengths ------------------------------------------------------------------------------------------------------
-  const unitText = (length) => {
-    if (metresPerUnit === null) return `${shownNumber(length)} world units`;
+  const unitText = (length, power = 1) => {
+    const square = power === 2 ? "²" : "";
+    if (metresPerUnit === null) return `${shownNumber(length ** power)} world units${square}`;
     const metres = length * metresPerUnit;
     const [factor, unit] = metres >= 1 ? [1, "m"] : metres >= 0.01 ? [100, "cm"] : [1000, "mm"];
-    return `${shownNumber(metres * factor)} ${unit}`;
+    return `${shownNumber((metres * factor) ** power)} ${unit}${square}`;
   };
   const showLength = () => {
     const isWhole = rulerEnds.length === 2;
@@ -594,7 +608,7 @@
     if (!(metres > 0) || !(length > 0)) { $("length").textContent = "a length must be greater than 0"; return; }
     metresPerUnit = metres / length;
     showLength();
-    redraw();
+    paint();
   };
   const drawScaleBar = (height) => {
     const distance = camera.position.distanceTo(controls.target);
@@ -664,7 +678,7 @@
       `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
       facts.light ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
     ] : []),
-    ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
+    ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
   ];
   $("facts").replaceChildren(...about.map((text) => make("p", { className: "note", textContent: text })));
   document.querySelector("#head h1").textContent = facts.title;

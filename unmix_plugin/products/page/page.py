@@ -115,6 +115,7 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
 def _page(job: Job, content: PageContent, title: str) -> bytes:
     """The whole page."""
     arrays, layout = _packed(content.arrays)
+    scale = job.loaded.scale
     root = job.loaded.record.summary.get("root")
     name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
     facts = {
@@ -122,6 +123,8 @@ def _page(job: Job, content: PageContent, title: str) -> bytes:
         "subtitle": f"{job.loaded.config.method_name}, run {job.loaded.folder.path.name}",
         "made": f"unmix-nerf {__version__}, {datetime.now(timezone.utc):%Y-%m-%d}",
         "arrays": layout,
+        "metres_per_unit": None if scale is None else scale.metres_per_unit,
+        "scale": None if scale is None else scale.said,
         **content.facts,
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
         "cameras": _camera_facts(job.views("all"), job.frame),

@@ -1,11 +1,11 @@
-"""Texture coordinates, and the material of every texel.
+"""Texture coordinates of a mesh, and the place on it that every texel shows.
 
 A mesh is cut into charts, connected triangles that face about the same way, each seen flat along an axis; xatlas packs
 them side by side into the unit square. Cutting by direction takes time proportional to the triangles and can't fail; no
 length in a chart shrinks below half.
 
 Notation: `V` vertices of the mesh, `U` of the cut one (a vertex on a seam is there once a chart), `F` triangles, `S x
-S` texels, `T` of them in charts, `P` parameters. Texel (row, column) has its centre at u = (column + 0.5) / S,
+S` texels, `T` of them in charts. Texel (row, column) has its centre at u = (column + 0.5) / S,
 v = (row + 0.5) / S.
 """
 
@@ -17,13 +17,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, Int, Int64
-from torch import Tensor
+from jaxtyping import Float, Float32, Int, Int64, Shaped
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.surface import Surface
 
 _AXES = np.concatenate([np.eye(3), -np.eye(3)])
 _ROUNDS = 6
@@ -41,7 +37,6 @@ _CHUNK = 1 << 21
 """Texels of bounding boxes that are looked at together."""
 _EDGE = 1e-6
 """Barycentric weight down to which a texel on an edge counts as inside."""
-_CHUNK_BAKING = 1 << 17
 
 
 def _chart_labels(
@@ -117,7 +112,7 @@ def _components(axes: np.ndarray, links: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True)
-class _Atlas:
+class Atlas:
     """A mesh cut open."""
 
     vertices: Int64[np.ndarray, " U"]
@@ -128,11 +123,11 @@ class _Atlas:
     """Texture coordinates as glTF has them: u to the right, v downwards, [0, 1]."""
 
 
-def _unwrap(mesh: Mesh, texture_size: int) -> _Atlas:
+def unwrap(positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], texture_size: int) -> Atlas:
     """Cut a mesh into charts and pack them.
 
     Args:
-        mesh: Any.
+        positions, faces: Of any mesh.
         texture_size: Width and height of the textures, texels.
     Raises:
         ConfigError: xatlas is not installed, or the charts don't fit into a texture of this size.
@@ -143,17 +138,19 @@ def _unwrap(mesh: Mesh, texture_size: int) -> _Atlas:
         raise ConfigError(
             "texture coordinates need the package xatlas, which is not installed: pip install xatlas"
         )
-    positions, faces = mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().long().numpy()
+    faces = faces.astype(np.int64)
     charts, axes = _chart_labels(positions, faces)
     # A vertex is there once for each chart that it has a part in.
     keys, corners = np.unique(charts[:, None].astype(np.int64) * len(positions) + faces, return_inverse=True)
     cut, vertices = corners.reshape(faces.shape), keys % len(positions)
     axis_of_chart = np.zeros(charts.max() + 1, dtype=np.int64)
     axis_of_chart[charts] = axes
-    flat = _chart_uv(positions[vertices], axis_of_chart[keys // len(positions)]).astype(np.float32)
+    flat = _chart_uv(positions[vertices], axis_of_chart[keys // len(positions)])
+    # Triangles of less than about 1e-7 units of area would not be placed.
+    flat = (flat / np.linalg.norm(np.diff(flat[cut[:, :2]], axis=1), axis=2).mean()).astype(np.float32)
     packer = _packed(flat, cut, charts, texture_size)
     order, packed, uv = packer[0]
-    return _Atlas(vertices[order.astype(np.int64)], packed.astype(np.int64), uv.astype(np.float32))
+    return Atlas(vertices[order.astype(np.int64)], packed.astype(np.int64), uv.astype(np.float32))
 
 
 def _packed(flat: np.ndarray, cut: np.ndarray, charts: np.ndarray, texture_size: int) -> Any:
@@ -197,7 +194,7 @@ class Texels:
         """Values of vertices interpolated at the texels, (T, C)."""
         return np.einsum("tk,tkc->tc", self.weights, values[faces[self.triangles]])
 
-    def texture(self, values: Float[np.ndarray, "T C"]) -> np.ndarray:
+    def texture(self, values: Shaped[np.ndarray, "T C"]) -> np.ndarray:
         """Values of the texels as a texture (S, S, C); beyond the charts each texel has the value of the nearest."""
         from scipy.ndimage import distance_transform_edt
 
@@ -212,7 +209,7 @@ class Texels:
         return picture.reshape(self.size, self.size, -1)[nearest[0], nearest[1]]
 
 
-def _texels_of(atlas: _Atlas, size: int) -> Texels:
+def texels_of(atlas: Atlas, size: int) -> Texels:
     """The texels of S x S whose centres lie in a triangle; where triangles meet, in the first of them."""
     corners = atlas.uv.astype(np.float64)[atlas.faces] * size - 0.5
     parts = list(_inside(corners, size))
@@ -258,37 +255,3 @@ def _barycentric(corners: Float[np.ndarray, "N 3 2"], points: Int[np.ndarray, "N
     third = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / safe
     weights = np.stack([1 - second - third, second, third], axis=1)
     return np.where(is_flat[:, None], -1.0, weights)
-
-
-@dataclass(frozen=True)
-class BakedMaterial:
-    """A surface's parameters at the texels of an atlas."""
-
-    atlas: _Atlas
-    texels: Texels
-    parameters: Float[Tensor, "T P"]
-    """[0, 1], on the CPU."""
-
-    def texture(self, values: Tensor) -> np.ndarray:
-        """Values of texels (T, C) as a texture (S, S, C), float32, filled beyond the charts."""
-        return self.texels.texture(values.detach().cpu().numpy().astype(np.float32))
-
-
-@torch.no_grad()
-def bake(mesh: Mesh, surface: Surface, texture_size: int) -> BakedMaterial:
-    """Unwrap a mesh and look up the surface's parameters at each texel.
-
-    Args:
-        mesh: Model space.
-        surface: Its materials.
-        texture_size: Width and height of the textures, texels.
-    Raises:
-        ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
-    """
-    atlas = _unwrap(mesh, texture_size)
-    texels = _texels_of(atlas, texture_size)
-    faces = atlas.vertices[atlas.faces]
-    positions = texels.of_corners(mesh.vertices.cpu().double().numpy(), faces)
-    points = torch.from_numpy(positions).float().to(mesh.vertices.device)
-    parameters = torch.cat([surface.parameters(part).cpu() for part in points.split(_CHUNK_BAKING)])
-    return BakedMaterial(atlas, texels, parameters)
