@@ -19,7 +19,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import _draw_abundances, _write_view, colour_panel
+from unmix_plugin.products.abundances import _write_view, colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import _draw_endmembers
 from unmix_plugin.products.evaluation import (
     _draw_colour,
@@ -27,7 +27,7 @@ from unmix_plugin.products.evaluation import (
     _draw_matched_segmentation,
     material_look,
 )
-from unmix_plugin.products.segmentation import _draw_segmentation, _scores_of, paint_ids
+from unmix_plugin.products.segmentation import _scores_of, draw_segmentation, paint_ids
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
@@ -69,8 +69,8 @@ def rendered(given: Materials, height: int = 12, width: int = 16) -> PredictedVi
 def test_no_figure_is_cut_off_however_many_materials(count):
     given = materials(count, 32)
     view = rendered(given)
-    assert_has_white_margins(_draw_abundances("view", view, given))
-    assert_has_white_margins(_draw_segmentation("view", view, given))
+    assert_has_white_margins(draw_abundances("view", view, given))
+    assert_has_white_margins(draw_segmentation("view", view, given))
     plot = decoded(_draw_endmembers(given))
     assert plot[:, -2:].min() == 1.0
     assert plot.min() < 0.2
@@ -122,7 +122,7 @@ def test_ids_are_painted_in_their_own_colours():
 def test_the_segmentation_figure_shows_the_colours_of_the_endmembers():
     given = materials(4)
     view = rendered(given)
-    picture = decoded(_draw_segmentation("view", view, given)).reshape(-1, 3)
+    picture = decoded(draw_segmentation("view", view, given)).reshape(-1, 3)
     for index, colour in enumerate(endmember_colours(given)):
         near = np.abs(picture - colour).max(axis=1) < 0.02
         assert near.any() == bool((view.segmentation == index).any())

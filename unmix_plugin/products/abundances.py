@@ -48,7 +48,7 @@ def _write_view(
         if kind == "npy":
             write_file(path, array_bytes(shares))
         elif kind == "png":
-            write_file(path, _draw_abundances(view, rendered, materials))
+            write_file(path, draw_abundances(view, rendered, materials))
         elif kind == "envi":
             write_envi_cube(folder / view, shares, None, materials.names, about)
         else:
@@ -72,7 +72,7 @@ def colour_panel(view: PredictedView, bands: Bands) -> TitledPicture:
     return TitledPicture(picture(view.spectra, view.coverage, bands), title)
 
 
-def _draw_abundances(name: str, view: PredictedView, materials: Materials) -> bytes:
+def draw_abundances(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of the abundances of what is seen, fading where nothing is."""
     panels = [colour_panel(view, materials.bands)]
     panels += share_panels(view.shares, view.accumulation, materials.names, endmember_colours(materials))

@@ -43,7 +43,7 @@ def _write_view(folder: Path, view: str, rendered: PredictedView, materials: Mat
     """The id of a pixel is the index of its largest score."""
     scores_path, figure_path, labels_path = _view_paths(folder, view)
     write_file(scores_path, array_bytes(_scores_of(rendered, materials).numpy().astype(np.float32)))
-    write_file(figure_path, _draw_segmentation(view, rendered, materials))
+    write_file(figure_path, draw_segmentation(view, rendered, materials))
     palette = _id_palette(dict(enumerate(endmember_colours(materials))))
     write_file(labels_path, indexed_png_bytes(rendered.segmentation.numpy(), palette, NOTHING_ID))
 
@@ -66,7 +66,7 @@ def _scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W 
     return view.material_scores * (view.segmentation != NOTHING_ID)[..., None]
 
 
-def _draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
+def draw_segmentation(name: str, view: PredictedView, materials: Materials) -> bytes:
     """A figure of a view in colour and of its materials, with a legend of those that occur."""
     colours = endmember_colours(materials)
     ids = view.segmentation.numpy()

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from unmix_plugin.formats.files import rgba_png_bytes
 from unmix_plugin.neumatex.export.material import InColours
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
@@ -74,7 +75,7 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     transfer = _transfer(mesh, lit.mean(dim=1) * (1 - metallicity[:, 0]))
     openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
     lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
-    pictures = [_picture(light, scene.bands) for light in lights]
+    maps = [_picture(light, scene.bands) for light in lights]
     arrays |= {
         "positions": scene.frame.to_world(mesh.vertices.double().numpy()),
         "faces": mesh.faces.long().numpy(),
@@ -83,24 +84,24 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         "lit": lit.numpy(),
         "polish": torch.cat([roughness, metallicity, openness], dim=1).numpy(),
         "transfer": transfer.numpy(),
-        "mirrored": _blurred(torch.stack(pictures)).numpy().view("<u2"),
+        "mirrored": _blurred(torch.stack(maps)).numpy().view("<u2"),
         "tones": _tone_table(scene),
     }
     facts["lights"] = [
         {"name": name, "factors": [1.0] * len(facts["wavelengths_nm"]), "notes": []}
         | {"harmonics": rounded(_projected(picture).numpy())}
-        for name, picture in zip(scene.lights, pictures, strict=True)
+        for name, picture in zip(scene.lights, maps, strict=True)
     ]
     facts |= {"notes": notes, "colour": "with the tones of the pictures; shadows are soft"}
     facts["relit"] = {"map": [_MAP[1], _MAP[0], _LEVELS], "tones": _TONES, "stops": _STOPS}
     view = next((view for view in scene.views if view.split == "eval"), scene.views[0])
     seen = scene.look(view.camera)
     shown = {"in colour": seen["rgb"], "base colour": linear_to_srgb(seen["base_colour"].clamp(0, 1))}
-    bytes_of = {
-        f"{view.name}, {name}": (255 * values.clamp(0, 1)).round().byte().cpu().numpy()
+    pictures = {
+        f"{view.name}, {name}": rgba_png_bytes((255 * values.clamp(0, 1)).round().byte().cpu().numpy())
         for name, values in shown.items()
     }
-    return PageContent(arrays, facts, bytes_of)
+    return PageContent(arrays, facts, pictures)
 
 
 def _no_bands() -> dict[str, Any]:

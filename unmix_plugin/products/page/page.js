@@ -17,7 +17,7 @@
   const context = canvas.getContext("webgl2", { antialias: true, preserveDrawingBuffer: true });
   if (!context || !("DecompressionStream" in window)) {
     $("trouble").textContent =
-      "This browser can't draw in 3-D (it has no WebGL 2). Open the page in a current browser; here are two pictures.";
+      "This browser can't draw in 3-D (it has no WebGL 2). Open the page in a current browser; here are pictures instead.";
     return;
   }
 
@@ -137,12 +137,14 @@
     if (at < tokens.length) fail(`${tokens[at]} is not expected there`);
     return formula;
   };
+  const usedBands = new Set();
   const reflectanceAt = (nm) => {
     const centres = facts.wavelengths_nm;
     if (nm < facts.edges_nm[0] || nm > facts.edges_nm[B]) throw new Error(`${nm} nm is outside the bands`);
     let right = centres.findIndex((centre) => centre >= nm);
     if (right < 0) right = B - 1;
     const left = centres[right] <= nm || right === 0 ? right : right - 1;
+    [left, right].forEach((band) => usedBands.add(band));
     const part = left === right ? 0 : (nm - centres[left]) / (centres[right] - centres[left]);
     return (r) => r[left] + part * (r[right] - r[left]);
   };
@@ -401,9 +403,18 @@
     index: () => {
       const known = facts.indices[state.index];
       const text = state.formula || known?.formula || "";
+      usedBands.clear();
       const formula = parseFormula(text);
       const values = new Float32Array(V);
-      for (let v = 0; v < V; v++) values[v] = formula(reflectanceOf(spectrumOf([v], [1], null)));
+      const reflectance = new Array(B).fill(NaN);
+      for (let v = 0; v < V; v++) {
+        for (const b of usedBands) {
+          reflectance[b] = 0;
+          for (let k = 0; k < K; k++) reflectance[b] += scaled[v * K + k] * facts.endmembers[k][b];
+          if (facts.light) reflectance[b] = facts.light[b] > 0 ? reflectance[b] / facts.light[b] : NaN;
+        }
+        values[v] = formula(reflectance);
+      }
       const finite = values.filter(Number.isFinite).sort();
       if (!finite.length) throw new Error("the formula is undefined everywhere");
       let [low, high] = state.formula ? [finite[Math.floor(finite.length / 100)], finite[Math.floor(finite.length * 0.99)]] : known.range;

@@ -14,7 +14,7 @@ import base64
 import gzip
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -30,8 +30,10 @@ from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.products.abundances import draw_abundances
 from unmix_plugin.products.mesh import TriangleMesh, find_surface
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.segmentation import draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.library.material_library import measured_library
@@ -48,7 +50,7 @@ MOST_BYTES = 20_000_000
 _COARSER = 0.75
 """Part of the resolution that is tried next where a page would be too large."""
 _COARSEST = 16
-_LARGEST_PICTURE_PX = 900
+_PICTURE_PX = 320
 
 _LIGHTS = ("D65", "D50", "A", "FL2", "FL11", "LED-B3")
 _MOST_CAMERAS = 200
@@ -68,8 +70,8 @@ class PageContent:
     """`positions` (V, 3) in the world and `faces` (F, 3); of each vertex or of anything else, numbers by name."""
     facts: dict[str, Any]
     """As `spectral_facts` gives them, and more; `notes` are sentences to be said."""
-    pictures: dict[str, UInt8[np.ndarray, "H W 3"]]
-    """By caption, for browsers that can't draw in 3-D."""
+    pictures: dict[str, bytes]
+    """PNG by caption, for browsers that can't draw in 3-D."""
 
 
 @runtime_checkable
@@ -129,21 +131,22 @@ def _page(job: Job, content: PageContent, title: str) -> bytes:
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
         "cameras": _camera_facts(job.views("all"), job.frame),
     }
-    return _fill(facts, arrays, _jpegs(content.pictures))
+    return _fill(facts, arrays, content.pictures)
 
 
 def _mixture_content(job: Job, resolution: int) -> PageContent:
     """Of a scene of mixed materials."""
-    from unmix_plugin.products.segmentation import paint_ids
-
     mesh = find_surface(job, resolution)[0]
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
     view = [*job.views("eval"), *job.views("all")][0]
-    seen = job.scene.look(view.camera)
-    ids = paint_ids(seen["segmentation"].cpu().numpy(), dict(enumerate(endmember_colours(job.materials))))
-    shown = {f"{view.name} in colour": seen["rgb"].cpu().numpy(), f"{view.name}, materials": ids}
-    pictures = {caption: np.round(255 * values).astype(np.uint8) for caption, values in shown.items()}
+    enlarged = _PICTURE_PX / max(view.camera.width, view.camera.height)
+    size = [max(1, round(enlarged * side)) for side in (view.camera.width, view.camera.height)]
+    seen = job.render(replace(view, camera=view.camera.resized(*size)))
+    pictures = {
+        f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
+        f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
+    }
     return PageContent(arrays, {**spectral_facts(job.materials), "notes": []}, pictures)
 
 
@@ -331,21 +334,7 @@ def colour_map() -> list[list[int]]:
     return np.round(255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(int).tolist()
 
 
-def _jpegs(shown: dict[str, UInt8[np.ndarray, "H W 3"]]) -> list[dict[str, str]]:
-    """Pictures by caption as the template takes them."""
-    from PIL import Image
-
-    pictures = []
-    for caption, pixels in shown.items():
-        content = io.BytesIO()
-        picture = Image.fromarray(pixels).convert("RGB")
-        picture.thumbnail((_LARGEST_PICTURE_PX, _LARGEST_PICTURE_PX))
-        picture.save(content, format="JPEG", quality=85)
-        pictures.append({"caption": caption, "data": base64.b64encode(content.getvalue()).decode()})
-    return pictures
-
-
-def _fill(facts: dict[str, Any], arrays: str, pictures: list[dict[str, str]]) -> bytes:
+def _fill(facts: dict[str, Any], arrays: str, shown: dict[str, bytes]) -> bytes:
     """The template with scripts and data in it; nothing of the data can end its element."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -358,6 +347,7 @@ def _fill(facts: dict[str, Any], arrays: str, pictures: list[dict[str, str]]) ->
         raise ConfigError(
             f"the installation lacks the page's scripts ({error}); install unmix-nerf again"
         ) from error
+    pictures = {caption: base64.b64encode(content).decode() for caption, content in shown.items()}
     text = json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return (
         environment.get_template("page.html")
