@@ -12,7 +12,7 @@ from unmix_plugin.engine.configs import DeviceName
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """Train on the built-in scene, evaluate the run, export its abundance maps and its page in 3-D, and say where they are."""
+    """Train on the built-in scene, evaluate the run, export abundance maps and a page in 3-D, say where they are."""
 
     seconds: float = 45.0
     """Time to train."""
