@@ -1,4 +1,4 @@
-"""`unmix-demo`: does it work here, and what comes out? Train on the built-in scene, evaluate, export abundance maps and a page."""
+"""`unmix-demo`: does it work here, what comes out? Train on the built-in scene, evaluate, export maps and a page."""
 
 from __future__ import annotations
 
