@@ -1,5 +1,7 @@
 """What a page knows of an object: against closed forms on a ball, and opened in a browser."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -37,7 +39,7 @@ def test_what_an_object_hides_of_the_sky_comes_back_from_it_in_part():
     assert page._transfer(hollow, torch.ones(len(mesh.vertices))).abs().max() == 0
     floor = trimesh.creation.box((2.0, 2.0, 0.02)).subdivide_to_size(0.2)
     wall = trimesh.creation.box((0.02, 2.0, 2.0), trimesh.transformations.translation_matrix([1.0, 0, 1.0]))
-    joined = trimesh.util.concatenate([floor, wall.subdivide_to_size(0.2)])
+    joined: Any = trimesh.util.concatenate([floor, wall.subdivide_to_size(0.2)])
     corner = mesh_of(torch.from_numpy(joined.vertices.copy()), torch.from_numpy(joined.faces.copy()))
     near = ((corner.vertices - torch.tensor([0.9, 0.0, 0.01])).norm(dim=1)).argmin()
     dark, bright = (

@@ -136,8 +136,8 @@ def _resampled(mesh: Mesh, cell: float) -> Mesh:
     from trimesh.remesh import subdivide
 
     while 4 * len(faces) <= _MOST_TRIANGLES and _usual_edge(vertices, faces) > 1.5 * cell:
-        vertices, faces, more = subdivide(vertices, faces, vertex_attributes={"normals": normals})
-        normals = more["normals"]
+        split: Any = subdivide(vertices, faces, vertex_attributes={"normals": normals})
+        vertices, faces, normals = split[0], split[1], split[2]["normals"]
     return mesh_of(torch.from_numpy(vertices), torch.from_numpy(faces), torch.from_numpy(normals))
 
 
