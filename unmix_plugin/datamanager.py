@@ -157,6 +157,7 @@ class HyperspectralDataManager(DataManager):
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
             "num_train_pixels": self._num_train_pixels,
+            **({} if self.scene.fwhm_nm is None else {"fwhm_nm": self.scene.fwhm_nm.tolist()}),
             **({} if self.train_cameras.key_poses is None else {"line_rows": list(self._knots.rows)}),
             **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
         }

@@ -87,7 +87,8 @@ class UnmixModel(Model):
             ConfigError: more endmembers than bands.
         """
         config, metadata = self.config, self.metadata
-        self.bands = Bands.of(metadata["wavelengths_nm"])
+        centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
+        self.bands = Bands(np.array(centers, float), None if widths is None else np.array(widths, float))
         self.is_unbounded = bool(metadata.get("is_unbounded", False))
         self.has_backdrop = bool(metadata.get("has_backdrop", False))
         self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, self.has_backdrop)

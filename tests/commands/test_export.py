@@ -386,11 +386,11 @@ def test_own_reflectances_are_compared_with_too(solid, tmp_path):
     lines = [f"{wavelength},{0.1 + 0.05 * index}" for index, wavelength in enumerate(wavelengths)]
     (tmp_path / "mine.csv").write_text("\n".join(["wavelength,my very own", *lines]))
     common = ["--run", solid.run, "--output", tmp_path / "out", "--device", "cpu"]
-    common += ["--library", tmp_path / "mine.csv"]
+    common += ["--library", tmp_path / "mine.csv", "+builtin"]
     compared = ["--view", 0, "--pixel", "8,8", "--compare", "continuum"]
     assert run(export, "spectrum", *compared, *common).status == 0
     assert run(export, "report", "--max-views", 1, *common).status == 0
-    assert "184 known" in (tmp_path / "out" / "report.html").read_text()
+    assert "175 known" in (tmp_path / "out" / "report.html").read_text()
     ended = run(export, "spectrum", "--view", 0, "--pixel", "9,9", *common[:-1], tmp_path / "none.csv")
     assert ended.status == 2
     assert "none.csv: can't read" in ended.err

@@ -32,7 +32,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 BANDS = Bands.of(WAVELENGTHS_NM)
 EVERY_KIND = [
     "swap: [0, 2]",
-    "replace: {endmember: 1, library: checker/red}",
+    "replace: {endmember: 1, library: ColorChecker/red}",
     "retint: {endmember: 0, colour: '#808070'}",
     "scale: {endmember: 2, factor: 0.5}",
     "remove: 1",
@@ -84,14 +84,14 @@ def test_swapped_endmembers_exchange_their_looks_and_keep_their_places():
 
 
 def test_a_replaced_endmember_is_the_materials_reflectance_in_the_scenes_light():
-    result = edited(lit_scene(), "replace: {endmember: 1, library: checker/red}")
-    expected = measured_library().reflectance("checker/red", BANDS) * np.array(LIGHT)
+    result = edited(lit_scene(), "replace: {endmember: 1, library: ColorChecker/red}")
+    expected = measured_library().reflectance("ColorChecker/red", BANDS) * np.array(LIGHT)
     assert_close(result.materials.endmembers[1], torch.tensor(expected, dtype=torch.float32))
 
 
 def test_in_every_view_a_new_spectrum_shows_where_and_as_much_as_its_endmember_does():
     scene = lit_scene()
-    result = edited(scene, "replace: {endmember: 1, library: checker/red}")
+    result = edited(scene, "replace: {endmember: 1, library: ColorChecker/red}")
     change = result.materials.endmembers[1] - scene.materials.endmembers[1].detach()
     for view in range(2):
         coefficients = scene.look(CAMERAS[view]).coefficients
@@ -265,18 +265,18 @@ def test_a_relit_scene_knows_its_light_so_that_reflectance_stays():
 
 
 def test_edits_are_made_in_the_scenes_light_before_another_is_lit():
-    edit = "replace: {endmember: 1, library: checker/red}"
+    edit = "replace: {endmember: 1, library: ColorChecker/red}"
     together, one_by_one = edited(lit_scene(), edit, light="A"), edited(edited(lit_scene(), edit), light="A")
     assert_close(together.materials.endmembers, one_by_one.materials.endmembers)
 
 
 def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
     scene = make_scene(light=None)
-    result = edited(scene, "replace: {endmember: 1, library: checker/red}")
-    expected = torch.tensor(measured_library().reflectance("checker/red", BANDS), dtype=torch.float32)
+    result = edited(scene, "replace: {endmember: 1, library: ColorChecker/red}")
+    expected = torch.tensor(measured_library().reflectance("ColorChecker/red", BANDS), dtype=torch.float32)
     assert_close(result.materials.endmembers[1], expected)
     unknown, known = scene, lit_scene()
-    for made in (recipe("replace: {endmember: 1, library: checker/red}"), recipe(light="A")):
+    for made in (recipe("replace: {endmember: 1, library: ColorChecker/red}"), recipe(light="A")):
         assert "taken as flat (CIE illuminant E)" in str(assumption_of_light(unknown, made))
         assert edit_scene(unknown, made).notes[0] == assumption_of_light(unknown, made)
         assert assumption_of_light(known, made) is None
@@ -302,7 +302,7 @@ def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
         (["isolate: 0", "isolate: 1"], "line 3 (isolate): edits.yml, line 2 (isolate) isolates already"),
         (["remove: [0, 1, 2]"], "nothing is left"),
         (
-            ["replace: {endmember: 0, library: checker/red}"] * 2,
+            ["replace: {endmember: 0, library: ColorChecker/red}"] * 2,
             "'red' is replaced already by edits.yml, line 2",
         ),
         (["retint: {endmember: 0, colour: '808080'}"] * 2, "'red' is retinted already by edits.yml, line 2"),
@@ -312,8 +312,8 @@ def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
         ),
         (["rename: {endmember: 1, name: red}"], "line 2 (rename): endmember 0 is called 'red' already"),
         (
-            ["replace: {endmember: 0, library: checker/rde}"],
-            "the library has no 'checker/rde'; nearest: checker/red",
+            ["replace: {endmember: 0, library: ColorChecker/rde}"],
+            "the library has no 'ColorChecker/rde'; nearest: ColorChecker/red",
         ),
     ],
 )
@@ -344,11 +344,11 @@ def test_a_colour_that_no_surface_has_becomes_the_nearest_and_the_user_is_told(e
 
 def test_a_swapped_look_may_be_replaced_where_it_is_now():
     scene = lit_scene()
-    edit = "replace: {{endmember: {}, library: checker/{}}}"
+    edit = "replace: {{endmember: {}, library: ColorChecker/{}}}"
     first, second = edit.format(0, "red"), edit.format(0, "green")
     result = edited(scene, first, "swap: [0, 1]", second)
     library = measured_library()
-    for k, name in enumerate(["checker/green", "checker/red"]):
+    for k, name in enumerate(["ColorChecker/green", "ColorChecker/red"]):
         expected = library.reflectance(name, BANDS) * np.array(LIGHT)
         assert_close(result.materials.endmembers[k], torch.tensor(expected, dtype=torch.float32))
     with pytest.raises(ConfigError, match="'endmember_1' is replaced already"):
@@ -470,7 +470,7 @@ TO_RGB = WIDE_LIGHT[:, None] * rgb_matrix(WIDE_BANDS, torch.float64).numpy()
 def surface(name: str = "red", bands: Bands = WIDE_BANDS) -> _LitReflectance:
     return _LitReflectance(
         bands,
-        measured_library().reflectance(f"checker/{name}", bands, "hold"),
+        measured_library().reflectance(f"ColorChecker/{name}", bands, "hold"),
         illuminant_power("D50", bands),
     )
 

@@ -33,7 +33,7 @@ EVERY_EDIT = """\
 illuminant: d65
 edits:
   - swap: [red, 3]
-  - replace: {endmember: 2, library: checker/red}
+  - replace: {endmember: 2, library: ColorChecker/red}
   - replace:
       endmember: clay
       file: paints.csv
@@ -82,7 +82,7 @@ def test_every_edit_is_read_in_order_with_its_line(tmp_path):
     assert recipe.illuminant == Light("D65")
     assert recipe.operations == (
         Swap("red", 3),
-        Replace(2, LibrarySpectrum("checker/red")),
+        Replace(2, LibrarySpectrum("ColorChecker/red")),
         Replace("clay", FileSpectrum(tmp_path / "paints.csv", "ochre"), extrapolate=True),
         Retint(4, (0x33 / 255, 0x66 / 255, 0xCC / 255)),
         Retint(5, (0.1, 0.25, 1.0), "spectrum"),

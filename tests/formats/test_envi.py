@@ -1,7 +1,5 @@
 """ENVI images and libraries, read back with Spectral Python."""
 
-import contextlib
-import time
 from typing import Any
 
 import numpy as np
@@ -9,8 +7,8 @@ import pytest
 import spectral.io.envi as envi
 
 from tests.formats.cubes import BANDS, WAVELENGTHS_NM, full_disk, random_cube
-from unmix_plugin.errors import RunError, SpectrumError
-from unmix_plugin.formats.envi import envi_cube_rows, read_library_table, write_envi_cube, write_envi_library
+from unmix_plugin.errors import RunError
+from unmix_plugin.formats.envi import envi_cube_rows, write_envi_cube, write_envi_library
 from unmix_plugin.spectral.bands import Bands
 
 
@@ -131,90 +129,3 @@ def test_another_reader_gets_spectra_names_and_wavelengths(tmp_path):
 def test_names_must_be_as_many_as_spectra(tmp_path):
     with pytest.raises(ValueError, match="2 names and 5 wavelengths"):
         write_envi_library(tmp_path / "lib", SPECTRA, BANDS, NAMES[:2])
-
-
-def written_by_spectral(folder, **changed):
-    """A library of two spectra in three bands, written by Spectral Python; then lines of its header replaced."""
-    values = np.array([[0.1, 0.25, 0.5], [0.3, 0.2, 0.7]], dtype=np.float32)
-    header = {
-        "wavelength": [400.5, 500, 700],
-        "wavelength units": "Nanometers",
-        "spectra names": ["oak", "fir tree"],
-    }
-    envi.SpectralLibrary(values, header).save(str(folder / "trees"))
-    path = folder / "trees.hdr"
-    lines = path.read_text().splitlines()
-    for key, value in changed.items():
-        name = key.replace("_", " ")
-        lines = [line for line in lines if not line.startswith(name)] + (
-            [] if value is None else [f"{name} = {value}"]
-        )
-    path.write_text("\n".join(lines))
-    return path, values
-
-
-@pytest.mark.parametrize("suffix", [".hdr", ".sli"])
-def test_libraries_that_spectral_python_wrote_are_read_exactly(tmp_path, suffix):
-    path, values = written_by_spectral(tmp_path)
-    table = read_library_table(path.with_suffix(suffix))
-    assert table.names == ("oak", "fir tree")
-    np.testing.assert_array_equal(table.bands.centers_nm, [400.5, 500, 700])
-    np.testing.assert_array_equal(table.spectra, values.astype(np.float64))
-
-
-def test_envi_scale_units_and_byte_order_are_followed(tmp_path):
-    changed = {"wavelength": "{ 0.4, 0.5,\n 0.7 }", "wavelength_units": "Micrometers", "byte_order": 1}
-    path, values = written_by_spectral(tmp_path, **changed, reflectance_scale_factor=100)
-    path.with_suffix(".sli").write_bytes((100 * values).astype(">f4").tobytes())
-    table = read_library_table(path)
-    np.testing.assert_allclose(table.bands.centers_nm, [400, 500, 700])
-    np.testing.assert_allclose(table.spectra, values, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"wavelength": None}, "'wavelength' is missing or no list of numbers"),
-        ({"wavelength": "{400, 500}"}, "'wavelength' has 2 values for 3 bands"),
-        ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'Wavenumber'"),
-        ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
-        ({"lines": "two"}, "'lines' is two; expected a whole number"),
-        ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
-        ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
-        ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),
-        ({"data_ignore_value": 0.25}, "must be finite; found nan in 'oak' at 500 nm"),
-    ],
-)
-def test_a_spoilt_envi_library_is_refused_with_its_name_and_the_fault(tmp_path, changed, said):
-    path, _ = written_by_spectral(tmp_path, **changed)
-    with pytest.raises(SpectrumError, match=said) as caught:
-        read_library_table(path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "filling",
-    [
-        *(" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000),
-        *("\n" + " " * 200_000 + "x\n", "\na =" + "\n" * 200_000, "\n" + "description = {{}\n" * 20_000),
-    ],
-)
-def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
-    path, _ = written_by_spectral(tmp_path)
-    path.write_text(path.read_text() + filling)
-    started = time.process_time()
-    with contextlib.suppress(SpectrumError):
-        read_library_table(path)
-    assert time.process_time() - started < 2.0
-
-
-def test_missing_parts_of_an_envi_library_are_named(tmp_path):
-    path, _ = written_by_spectral(tmp_path)
-    path.with_suffix(".sli").unlink()
-    with pytest.raises(SpectrumError, match=r"no file of numbers beside this header; expected trees\.sli"):
-        read_library_table(path)
-    with pytest.raises(SpectrumError, match=r"none\.hdr: can't read"):
-        read_library_table(tmp_path / "none.sli")
-    path.write_text("something else")
-    with pytest.raises(SpectrumError, match="its first line is not 'ENVI'"):
-        read_library_table(path)

@@ -144,7 +144,7 @@ _RECIPE = b"""\
 illuminant: {light: D65, extrapolate: true}
 edits:
 - swap: &both [0, wood]
-- replace: {endmember: 2, library: checker/red}
+- replace: {endmember: 2, library: ColorChecker/red}
 - replace: {endmember: 3, file: paints.csv, spectrum: ochre, extrapolate: yes}
 - retint: {endmember: 4, colour: '#3366cc', match: spectrum}
 - scale: {endmember: 0, factor: 1.5}

@@ -15,7 +15,7 @@ from PIL import Image
 from tests.fuzz.mutation import Reader, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
-from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
@@ -161,7 +161,7 @@ def envi_header_reader() -> Reader:
     plain = "\n".join(line for line in other.splitlines() if "factor" not in line and "ignore" not in line)
     samples = tuple(text.encode() for text in (_ENVI, other, plain, _ENVI.replace("\n", "\r\n")))
     beside = (("library.sli", np.linspace(0, 9000, 6).astype("<f4").tobytes()),)
-    return Reader(samples, "library.hdr", read_library_table, (SpectrumError,), companions=beside)
+    return Reader(samples, "library.hdr", read_library, (SpectrumError,), companions=beside)
 
 
 def envi_values_reader() -> Reader:
@@ -169,7 +169,7 @@ def envi_values_reader() -> Reader:
     return Reader(
         samples,
         "library.sli",
-        read_library_table,
+        read_library,
         (SpectrumError,),
         companions=(("library.hdr", _ENVI.encode()),),
     )

@@ -18,8 +18,7 @@ from unmix_plugin.products.metamerism import (
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
-from unmix_plugin.spectral.library.material_library import MaterialLibrary
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable
+from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
@@ -42,10 +41,20 @@ def run_materials(*reflectances: np.ndarray, names: tuple[str, ...]) -> Material
     return Materials(BANDS, spectra, torch.zeros(0, 31), names=names)
 
 
-LIBRARY = MaterialLibrary(()).extended(
-    SpectraTable(BANDS, ("own/a", "own/b"), np.stack([hidden(0.35), GREY * 1.01])), "test"
+LIBRARY = MaterialLibrary(
+    (
+        LibraryMaterial("own/a", BANDS, hidden(0.35), "test"),
+        LibraryMaterial("own/b", BANDS, GREY * 1.01, "test"),
+    )
 )
-SHORT = SpectraTable(Bands.of([500, 600]), ("own/short",), np.array([[0.4, 0.4]]))
+
+
+def with_grey(name: str, *wavelengths_nm: float) -> MaterialLibrary:
+    """The library with a grey before it."""
+    grey = LibraryMaterial(name, Bands.of(wavelengths_nm), np.full(len(wavelengths_nm), 0.4), "test")
+    return MaterialLibrary((grey, *LIBRARY.materials))
+
+
 MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
 
 
@@ -64,7 +73,7 @@ def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first()
 
 
 def test_materials_that_do_not_reach_all_bands_are_passed_over():
-    longer = LIBRARY.extended(SHORT, "test")
+    longer = with_grey("own/short", 500, 600)
     found = _find_metamers(MATERIALS, SCENE_LIGHT, longer, *BOTH)
     assert "own/short" not in found.names
 
@@ -75,9 +84,7 @@ def test_bands_that_no_eye_sees_play_no_part():
     spectra = torch.full((2, 61), 0.4)
     spectra[:, :31] = MATERIALS.endmembers
     light = np.concatenate([SCENE_LIGHT, np.ones(30)])
-    library = LIBRARY.extended(
-        SpectraTable(Bands.of([390, 790]), ("own/wide",), np.full((1, 2), 0.4)), "test"
-    )
+    library = with_grey("own/wide", 390, 790)
     found = _find_metamers(
         Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, *BOTH
     )

@@ -197,7 +197,7 @@ CHANGES = (
     ("colour of gloss", (255, 200, 0), "gloss"),
     ("colour", (120, 110, 100), "retint"),
     ("name", "clay", "name: clay"),
-    ("replace by the known material", True, "library: pmc/"),
+    ("replace by the known material", True, "library: ColorChecker/"),
     ("swap with the other", True, "swap: [0, 2]"),
     ("light", "FL2", "illuminant: FL2"),
 )

@@ -82,7 +82,7 @@ edits:
   - swap: [clay, a]
   - remove: [clay, 2]
   - gloss: {scale: 0.5}
-  - replace: {endmember: a, library: pmc/Carrot}
+  - replace: {endmember: a, library: memory colours/carrot}
 """,
     )
     assert numbered(recipe, ("a", "b", "c")).operations == (
@@ -90,7 +90,7 @@ edits:
         Swap(1, 0),
         Remove((1, 2)),
         Gloss(None, 0.5),
-        Replace(0, LibrarySpectrum("pmc/Carrot")),
+        Replace(0, LibrarySpectrum("memory colours/carrot")),
     )
 
 

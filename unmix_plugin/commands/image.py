@@ -10,12 +10,15 @@ import tyro
 
 from unmix_plugin.captures.spectral_file import Axes, ReadOptions
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 if TYPE_CHECKING:
     import numpy as np
 
     from unmix_plugin.captures.spectral_file import SpectralFile
+    from unmix_plugin.spectral.features import NoiseFractions
+    from unmix_plugin.spectral.library.material_library import MaterialLibrary
+    from unmix_plugin.spectral.unmixing.image import UnmixedImage
 
 _CONFIDENT = 0.9
 
@@ -32,6 +35,11 @@ class ImageOptions:
     """What abundances are shares of: the area that a pixel shows, or the light between spectra of one peak, as
     reference maps of images from the air count. Auto is area, but light where a material is less than a quarter as
     bright as the brightest."""
+    library: tuple[Path, ...] = ()
+    """Known spectra, to which the angles of the materials are written: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin for the built-in ones."""
+    mnf: int = 0
+    """How many minimum noise fractions of the image to write: components in order of their noise."""
     output_dir: Path = Path("unmixed")
     """Results go to a folder in it, named like the file."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -52,7 +60,8 @@ def image(argv: list[str]) -> None:
     Raises:
         CaptureError: the file can't be read.
         ConfigError: results are there already.
-        SpectrumError: the image can't be unmixed so.
+        SpectrumError: the image can't be unmixed so, has no minimum noise fractions, or shares too few bands with a
+            library.
         RunError: the results can't be written.
     """
     options = tyro.cli(ImageOptions, prog="unmix-image", args=argv)
@@ -60,11 +69,16 @@ def image(argv: list[str]) -> None:
     from unmix_plugin.captures.calibration.calibration import find_missing
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.formats.files import refuse_to_overwrite
-    from unmix_plugin.products.unmixed_image import BandAxis, unmixed_image_paths, write_unmixed_image
+    from unmix_plugin.products.unmixed_image import (
+        BandAxis,
+        unmixed_image_paths,
+        write_unmixed_image,
+    )
     from unmix_plugin.spectral.unmixing.image import unmix_image
 
     folder = options.output_dir / (options.file.resolve().stem or "image")
-    refuse_to_overwrite(unmixed_image_paths(folder), options.overwrite)
+    paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
+    refuse_to_overwrite(paths, options.overwrite)
     opened = open_spectral_file(options.file, _reading(options))
     bands, wavelengths = _good_bands(opened)
     cube = opened.read(bands=bands)
@@ -74,16 +88,25 @@ def image(argv: list[str]) -> None:
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
     height, width, num_bands = cube.shape
+    library = _library(options, wavelengths)
     print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
+    fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
+    axis = BandAxis(wavelengths, bands + 1)
+    names = write_unmixed_image(folder, found, axis, library, fractions)
+    _say(found, mask, names)
+    for path in paths:
+        print(f"  {path}")
+
+
+def _say(found: UnmixedImage, mask: np.ndarray, names: list[str]) -> None:
+    """What was found, in a few lines."""
     if found.evidence:
         print(found.evidence)
-    axis = BandAxis(wavelengths, bands + 1)
-    names = write_unmixed_image(folder, found, axis)
     counts = found.abundances[mask].mean(axis=0)
     for name, share in zip(names, counts, strict=True):
         print(f"  {name:12s} {share:6.1%} of the {found.shares}")
@@ -91,8 +114,29 @@ def image(argv: list[str]) -> None:
     misfit = float(found.misfit[mask].mean())
     print(f"{sure:.0%} of the pixels are at least {_CONFIDENT:.0%} sure of their main material")
     print(f"mean angle between a pixel and its mixture: {misfit:.4f} rad")
-    for path in unmixed_image_paths(folder):
-        print(f"  {path}")
+
+
+def _fractions(cube: np.ndarray, mask: np.ndarray, count: int) -> NoiseFractions | None:
+    import numpy as np
+    import torch
+
+    from unmix_plugin.spectral.features import minimum_noise_fractions
+
+    if count < 0:
+        raise ConfigError(f"--mnf is {count}; expected a number of components, or 0 for none")
+    numbers = torch.from_numpy(np.where(mask[..., None], cube, 0).astype(np.float64))
+    return minimum_noise_fractions(numbers, torch.from_numpy(mask), count) if count else None
+
+
+def _library(options: ImageOptions, wavelengths: np.ndarray | None) -> MaterialLibrary | None:
+    from unmix_plugin.formats.libraries import library_of
+    from unmix_plugin.spectral.bands import Bands
+
+    if wavelengths is None:
+        raise CaptureError(
+            f"{options.file}: its wavelengths are not known, so no spectrum of a library can be compared"
+        )
+    return library_of(options.library, Bands.of(wavelengths))
 
 
 def _reading(options: ImageOptions) -> ReadOptions:

@@ -36,10 +36,12 @@ class RenderOptions:
     view: tuple[str, ...] = ()
     """Only these of the cameras, by name or by number from 0."""
     outputs: tuple[str, ...] = ()
-    """spectral, rgb, linear_rgb, diffuse, specular, abundances, material_scores, probe_probabilities, segmentation,
-    confidence, depth, ray_distance, normals, accumulation, pca, band:650nm, false-colour:860,650,550; index:ndvi or
-    index:(r800-r670)/(r800+r670), target:paint.csv or target:ace:paint.csv>0.5; or all (but those with a colon). None
-    given: spectral rgb abundances segmentation depth for single views, rgb for a path."""
+    """spectral, reflectance, continuum, derivative, second_derivative, rgb, linear_rgb, diffuse, specular, abundances,
+    material_scores, probe_probabilities, segmentation, confidence, depth, ray_distance, normals, accumulation, pca,
+    band:650nm, false-colour:860,650,550; index:ndvi or index:(r800-r670)/(r800+r670), target:paint.csv or
+    target:ace:paint.csv>0.5, library:mine.csv<0.1 or library:angle:mine.csv, absorption:650-700 (depth; or
+    absorption:centre:650-700, absorption:area:650-700); or all (but those with a colon). None given: spectral rgb
+    abundances segmentation depth for single views, rgb for a path."""
     formats: tuple[str, ...] = ()
     """envi, exr, npy, png, mp4; each output is written in those that suit it. None given: what suits each best. mp4 of
     spectra goes through the bands."""
@@ -160,7 +162,7 @@ def _render(
     from unmix_plugin.formats.files import refuse_to_overwrite, write_file
     from unmix_plugin.products.render.files import file_name, needs_legend
     from unmix_plugin.products.render.job import RenderJob, Survey, needs_survey, output_paths, take_survey
-    from unmix_plugin.products.render.pictures import draw_legend
+    from unmix_plugin.products.render.pictures import draw_legend, legend_csv
     from unmix_plugin.trained.camera_files import camera_file_bytes
 
     scene, asked = loaded.scene, dict.fromkeys(one.output for one in outputs)
@@ -170,11 +172,12 @@ def _render(
         for one in outputs
         if needs_legend(one, scene)
     }
+    tables = {folder / f"{file_name(output)}_legend.csv": output for output in asked if output.classes}
     frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
     camera_path = folder / f"cameras-{Path(options.cameras).stem}.json"
     camera_bytes = camera_file_bytes(cameras.views, frames_per_second, scene.frame)
     paths = [path for one in outputs for path in output_paths(folder, one, cameras)]
-    paths += legends
+    paths += [*legends, *tables]
     if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
         paths.append(camera_path)
     with processes.together():
@@ -200,8 +203,10 @@ def _render(
         return
     for path, output in legends.items():
         write_file(path, draw_legend(output, job.palette))
+    for path, output in tables.items():
+        write_file(path, legend_csv(output))
     _list(folder, outputs, cameras, job.palette)
-    for path in legends:
+    for path in (*legends, *tables):
         print(f"{path}  what the colours mean")
     print(f"{camera_path}  the cameras, to be given to --cameras again")
 

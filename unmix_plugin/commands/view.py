@@ -31,6 +31,9 @@ class ViewOptions:
     """Recipe (YAML) of edits of materials and light to start with."""
     illuminant: str | None = None
     """Light to start with: its name, such as D65, A or FL2, or a CSV file (wavelength,power)."""
+    library: tuple[Path, ...] = ()
+    """Known materials to compare with and to choose from, in place of the built-in ones: .csv, ENVI spectral libraries,
+    texts of ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     output_dir: Path = Path("outputs")
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
@@ -64,12 +67,13 @@ def prepared(options: ViewOptions) -> Viewer:
     Raises:
         RunError: the run is unusable.
         ConfigError: the method does not unmix spectra, the device is not there, or the recipe does not fit the run.
-        SpectrumError: there is no such light.
+        SpectrumError: there is no such light, or a library that can't be read or compared.
     """
 
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, working
     from unmix_plugin.editing.apply import assumption_of_light
     from unmix_plugin.editing.edited_run import requested_recipe
+    from unmix_plugin.formats.libraries import library_of
     from unmix_plugin.trained.open_run import load_run
     from unmix_plugin.viewer.rendering.scene import source_of_run
     from unmix_plugin.viewer.server import Viewer
@@ -83,6 +87,7 @@ def prepared(options: ViewOptions) -> Viewer:
     note = None if recipe is None else assumption_of_light(loaded.materials_scene, recipe)
     if note is not None:
         print(note, flush=True)
+    known = library_of(options.library, loaded.materials_scene.bands) if options.library else None
     with working(console, "looking at the scene"):
         return Viewer(
             source,
@@ -90,6 +95,7 @@ def prepared(options: ViewOptions) -> Viewer:
             lambda: _scene_of(source, options.data),
             lambda line: print(line, flush=True),
             recipe,
+            known,
         )
 
 

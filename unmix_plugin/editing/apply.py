@@ -56,7 +56,7 @@ from unmix_plugin.editing.recipe import (
 )
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
     brightness,
@@ -228,13 +228,12 @@ def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibra
     """Where a reflectance is looked up, and its name there."""
     if isinstance(spectrum, LibrarySpectrum):
         return measured_library(), spectrum.library
-    table = read_library_table(spectrum.file)
-    names = list(table.names)
+    library = MaterialLibrary(tuple(read_library(spectrum.file)))
+    names = library.names
     if spectrum.spectrum is None and len(names) > 1:
         raise SpectrumError(
             f"{spectrum.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"
         )
-    library = MaterialLibrary(()).extended(table, spectrum.file.name)
     return library, spectrum.spectrum or names[0]
 
 

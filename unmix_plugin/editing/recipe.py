@@ -66,7 +66,7 @@ class FileSpectrum:
     """A reflectance in a file of the user's."""
 
     file: Path
-    """CSV (wavelength,name,...), or an ENVI spectral library."""
+    """A library of any kind that `--library` takes."""
     spectrum: str | None = None
     """Which spectrum of the file; None if it has only one."""
 

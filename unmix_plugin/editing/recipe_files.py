@@ -4,7 +4,7 @@
     edits:
       - rename: {endmember: 0, name: wood}
       - swap: [wood, 3]
-      - replace: {endmember: 2, library: checker/red}
+      - replace: {endmember: 2, library: ColorChecker/red}
       - retint: {endmember: 4, colour: '#3366cc'}
       - remove: [5, 6]
 

@@ -103,8 +103,11 @@ def _load(entry_point: EntryPoint) -> MethodSpecification | BrokenPlugin:
     return found
 
 
-OutputKind = Literal["channels", "shares", "srgb", "linear", "picture", "grey", "map", "labels", "vectors"]
-"""What an output's numbers are, (height, width, ...): any channels, on black; a share or score of each class; sRGB on
+OutputKind = Literal[
+    "channels", "spectra", "shares", "srgb", "linear", "picture", "grey", "map", "labels", "vectors"
+]
+"""What an output's numbers are, (height, width, ...): any channels, on black; a number a band of what is seen, NaN
+where nothing is; a share or score of each class; sRGB on
 black (3); linear light on black (3); a picture not multiplied by opacity (3); one channel of light on black; any other
 number a pixel; uint8 ids, 255 where nothing is; unit vectors (3)."""
 
@@ -124,6 +127,8 @@ class Output:
     """Values at the ends of a colour map; None where only the views tell."""
     colour_map: str = "viridis"
     """As matplotlib names it."""
+    classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """Of labels: names of the ids from 0 and their sRGB colours, where they are not those of the scene's materials."""
 
 
 AnyOutput = TypeVar("AnyOutput", bound=Output)

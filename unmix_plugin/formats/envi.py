@@ -22,11 +22,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from unmix_plugin.engine.runs.atomic_files import write_errors_as, write_file
-from unmix_plugin.errors import SpectrumError
 from unmix_plugin.formats.files import RowSink, raw_rows
 from unmix_plugin.limits import MOST_TEXT_BYTES, read_bounded
-from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.bands import Bands
 
 HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
 
@@ -56,7 +54,6 @@ _DATA_SUFFIXES = (
     ".sli",
     ".lib",
 )
-_SMALLEST_SCALE = 1e-30
 _SHOWN_NM = (640.0, 550.0, 460.0)
 """Red, green and blue that a viewer shows first, as far as there are bands for them."""
 _NOT_SPACE, _BRACE = re.compile(r"\S"), re.compile(r"[{}]")
@@ -268,83 +265,6 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     return next((path for path in found if path.stat().st_size >= needed_bytes), found[0])
 
 
-def read_library_table(path: Path) -> SpectraTable:
-    """Reflectances from a CSV file or an ENVI spectral library (.hdr or .sli), told by the file's suffix.
-
-    Raises:
-        SpectrumError: another kind of file, or one that can't be read.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".csv":
-        return read_spectra_csv(path)
-    if suffix in (".hdr", ".sli"):
-        return _read_envi_library(path)
-    raise SpectrumError(f"{path}: a library is a .csv, or an ENVI spectral library (.hdr and .sli)")
-
-
-def _read_envi_library(path: Path) -> SpectraTable:
-    """Read and validate an ENVI spectral library.
-
-    Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
-    `reflectance scale factor` (values are divided by it) and `data ignore value`.
-    """
-    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
-    try:
-        header = read_header(header_path)
-        layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
-        num_spectra, num_bands, _ = layout.shape
-        data_path = data_beside(header_path, layout.num_bytes, ".sli")
-        found, needed = data_path.stat().st_size - layout.offset, layout.num_bytes - layout.offset
-        if found < needed:
-            raise ValueError(
-                f"{data_path.name} has {max(0, found)} bytes; {num_spectra} spectra of {num_bands} values need {needed}"
-            )
-        stored = np.fromfile(data_path, layout.dtype, num_spectra * num_bands, offset=layout.offset)
-        with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
-            values = stored.reshape(num_spectra, num_bands).astype(np.float64)
-            if "data ignore value" in header:
-                ignored = np.array(_number(header, "data ignore value")).astype(layout.dtype)
-                values[stored.reshape(values.shape) == ignored] = np.nan
-        unit = header.get("wavelength units", "").strip()
-        factor = nm_per_unit(unit or "nm")
-        if factor is None:
-            raise ValueError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
-        bands = Bands(_wavelengths(header, num_bands) * factor)
-        require_nanometres(bands.centers_nm)
-        names = header_items(header, "spectra names", ",") or [f"spectrum {i}" for i in range(num_spectra)]
-        if len(names) != num_spectra:
-            raise ValueError(f"{len(names)} 'spectra names' for {num_spectra} spectra")
-        scale = _number(header, "reflectance scale factor", "1")
-        if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
-            raise ValueError(
-                f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000"
-            )
-        return SpectraTable(bands, tuple(names), values / scale)
-    except OSError as error:
-        raise SpectrumError(f"{header_path}: can't read: {error.strerror or error}") from error
-    except (SpectrumError, ValueError) as error:
-        raise SpectrumError(f"{header_path}: {error}") from error
-
-
-def _wavelengths(header: Mapping[str, str], num_bands: int) -> np.ndarray:
-    try:
-        values = np.array([float(number) for number in header_items(header, "wavelength")])
-    except ValueError:
-        values = np.zeros(0)
-    if not len(values):
-        raise ValueError("'wavelength' is missing or no list of numbers")
-    if len(values) != num_bands:
-        raise ValueError(f"'wavelength' has {len(values)} values for {num_bands} bands")
-    return values
-
-
-def _number(header: Mapping[str, str], key: str, default: str = "") -> float:
-    try:
-        return float(header.get(key, default))
-    except ValueError:
-        raise ValueError(f"'{key}' is {header.get(key)}; expected a number") from None
-
-
 def envi_cube_paths(path_without_suffix: Path) -> list[Path]:
     """Files that `write_envi_cube` makes."""
     return [beside(path_without_suffix, ".hdr"), beside(path_without_suffix, ".img")]
@@ -463,8 +383,8 @@ def _entries(
 
 
 def wavelength_entries(bands: Bands) -> dict[str, HeaderValue]:
-    """Band centres and widths in nm; a width is that of the band's interval, an estimate from the spacing."""
-    widths = bands.widths_nm.round(6)
+    """Band centres and widths in nm; where the instrument's are unknown those of the bands' intervals."""
+    widths = (bands.widths_nm if bands.fwhm_nm is None else bands.fwhm_nm).round(6)
     return {"wavelength units": "Nanometers", "wavelength": bands.centers_nm, "fwhm": widths}
 
 

@@ -28,7 +28,7 @@ def _write_view(
     formats: Sequence[str], folder: Path, view: str, rendered: PredictedView, materials: Materials
 ) -> None:
     spectra, bands = rendered.spectra.numpy().astype(np.float32), materials.bands
-    about = f"{view}: radiance on black, 1 = full scale"
+    about = f"{view}: {materials.quantity} on black, 1 = full scale"
     for kind in formats:
         path = folder / f"{view}.{kind}"
         if kind == "npy":

@@ -2,28 +2,67 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Float64, Shaped
 
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.material_library import Comparison, MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, endmember_colours
 
 _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
 
 
-def export_endmembers(job: Job) -> list[Path]:
-    """Write table, library and plot."""
-    job.claim(_endmember_paths(job.folder))
-    return _write_endmembers(job.folder, job.materials)
+def export_endmembers(job: Job, library: Sequence[Path], comparison: Comparison) -> list[Path]:
+    """Write table, library and plot, and the angles to all spectra of a library.
+
+    Args:
+        job: The run and where to write.
+        library: Files of known spectra; none: the built-in ones.
+        comparison: How spectra are compared.
+    """
+    materials, angles = job.materials, job.folder / "angles.csv"
+    known = library_of(library, materials.bands)
+    job.claim([*_endmember_paths(job.folder), angles])
+    if job.scene.light_power is None:
+        job.say(LIGHT_UNKNOWN)
+    written = _write_endmembers(job.folder, materials)
+    spectra = materials.endmembers.detach().cpu().double().numpy()
+    table = angles_csv(known, materials.names, spectra, materials.bands, job.scene.light_power, comparison)
+    return [*written, write_file(angles, table)]
+
+
+def angles_csv(
+    library: MaterialLibrary,
+    names: Sequence[str],
+    spectra: Float[np.ndarray, "K B"],
+    bands: Bands,
+    light: Float64[np.ndarray, " B"] | None,
+    comparison: Comparison = "scale",
+) -> bytes:
+    """Angles in radians between all known spectra and all given ones: a row a known one, with its source and over how
+    many bands it was compared; empty where it covers too few.
+    """
+    angles, counts = library.angles(spectra, bands, light, comparison)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["known", "source", "bands", *names])
+    for material, count, row in zip(library.materials, counts, angles.T, strict=True):
+        shown = ["" if np.isnan(angle) else f"{angle:.6f}" for angle in row]
+        writer.writerow([material.name, material.source, count, *shown])
+    return text.getvalue().encode()
 
 
 def _endmember_paths(folder: Path) -> list[Path]:
@@ -39,7 +78,7 @@ def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
     """Write the endmembers as CSV (wavelength in nm, a column a spectrum), ENVI spectral library and plot."""
     table_path, *_, plot_path = _endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
-    about = "endmembers: radiance, 1 = full scale"
+    about = f"endmembers: {materials.quantity}, 1 = full scale"
     write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
     write_spectra_csv(table_path, materials.table())
     write_file(plot_path, _draw_endmembers(materials))
@@ -48,7 +87,8 @@ def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
 
 def _draw_endmembers(materials: Materials) -> bytes:
     """The spectra in the endmembers' colours."""
-    labels = ("wavelength (nm)", "radiance under the scene's light (1 = full scale)")
+    under = "reflectance" if materials.quantity == "reflectance" else "radiance under the scene's light"
+    labels = ("wavelength (nm)", f"{under} (1 = full scale)")
     spectra = materials.endmembers.detach().cpu().numpy()
     return draw_spectra(
         spectra, materials.bands.centers_nm, materials.names, endmember_colours(materials), labels

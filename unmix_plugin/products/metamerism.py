@@ -18,6 +18,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
 from unmix_plugin.formats.files import csv_bytes, write_file
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
@@ -29,7 +30,6 @@ from unmix_plugin.spectral.colour.difference import (
 )
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.run_materials import library_with
 
 _MOST_DRAWN = 12
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
@@ -50,7 +50,7 @@ def export_metamerism(
     """Compare all pairs in all lights; `alike` and `different` are bounds of CIEDE2000."""
     job.claim(_metamerism_paths(job.folder))
     with job.working("comparing colours"):
-        known = library_with(library)
+        known = library_of(library, job.materials.bands)
         found = _find_metamers(
             job.materials, job.scene.light_power, known, surfaces, lights, alike, different
         )

@@ -23,14 +23,9 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
-from unmix_plugin.spectral.maps.reflectance_maps import (
-    ReflectanceMap,
-    is_reflectance_map,
-    parse_reflectance_map,
-    seen_reflectance,
-)
-from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.materials import Materials, seen_reflectance
 from unmix_plugin.trained.measures import Scale
+from unmix_plugin.trained.reflectance_maps import ReflectanceMap, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
 
@@ -142,8 +137,8 @@ def _require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointSc
         if not is_reflectance_map(output) or not output.partition(":")[2]:
             raise ConfigError(
                 f"--outputs {output}: points take spectral indices, index:NAME or index:FORMULA such as "
-                "index:ndvi, and targets, target:FILE.csv or target:ace:FILE.csv; colour, material and abundances "
-                "are in every cloud"
+                "index:ndvi, targets, target:FILE.csv or target:ace:FILE.csv, library:FILE and absorption:LOW-HIGH; "
+                "colour, material and abundances are in every cloud"
             )
         name = _property_name(output, [score.property for score in scores])
         scores.append(_PointScore(output, name, parse_reflectance_map(output, bands)))

@@ -29,8 +29,8 @@ class Abundances(ViewProduct):
 
 @dataclass(frozen=True)
 class Cubes(ViewProduct):
-    """Spectral images: of each view radiance on black, (H, W, bands) float32, 1 = full scale, as ENVI (VIEW.hdr and
-    VIEW.img), spectral OpenEXR (VIEW.exr) or VIEW.npy."""
+    """Spectral images: of each view radiance or reflectance on black, (H, W, bands) float32, 1 = full scale, as ENVI
+    (VIEW.hdr and VIEW.img), spectral OpenEXR (VIEW.exr) or VIEW.npy."""
 
     name = "cubes"
 
@@ -46,16 +46,22 @@ class Cubes(ViewProduct):
 
 @dataclass(frozen=True)
 class Endmembers(Product):
-    """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, and a plot over
-    wavelength, endmembers.png."""
+    """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, a plot over
+    wavelength, endmembers.png, and angles.csv, their angles to all known spectra."""
 
     name = "endmembers"
 
+    library: tuple[Path, ...] = ()
+    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
+    compare: Literal["scale", "continuum"] = "scale"
+    """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
+
     def write(self, job: Job) -> list[Path]:
-        """Write table, library and plot."""
+        """Write table, library, plot and angles."""
         from unmix_plugin.products.endmembers import export_endmembers
 
-        return export_endmembers(job)
+        return export_endmembers(job, self.library, self.compare)
 
 
 @dataclass(frozen=True)
@@ -114,7 +120,8 @@ class Metamerism(Product):
     different: float = 4.0
     """Colour difference from which they look different."""
     library: tuple[Path, ...] = ()
-    """CSV files or ENVI spectral libraries with reflectances of your own, beside the measured ones."""
+    """Known spectra to pair in place of the built-in ones: .csv files, ENVI spectral libraries, texts of ECOSTRESS
+    or USGS, or folders of them; +builtin adds the built-in ones."""
 
     def write(self, job: Job) -> list[Path]:
         """Compare all pairs in all lights."""
@@ -171,7 +178,8 @@ class PointCloud(Product):
     num_points: int = 100_000
     """Most points to write; they cover what the run's cameras see evenly."""
     outputs: tuple[str, ...] = ()
-    """Numbers to add to each point: spectral indices and targets, as in index:ndvi target:ace:paint.csv."""
+    """Numbers to add to each point: spectral indices, targets, nearest known spectra and absorptions, as in index:ndvi
+    target:ace:paint.csv library:angle:mine.csv absorption:centre:650-700."""
 
     def write(self, job: Job) -> list[Path]:
         """Look through all cameras of the run, clean and thin what they see."""
@@ -207,7 +215,8 @@ class Report(Product):
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     library: tuple[Path, ...] = ()
-    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
 
     def write(self, job: Job) -> list[Path]:
         """Render, compare and lay out."""
@@ -269,7 +278,8 @@ class Spectrum(Product):
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     library: tuple[Path, ...] = ()
-    """Own reflectances to compare with too: .csv files or ENVI spectral libraries."""
+    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     compare: Literal["scale", "continuum"] = "scale"
     """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
 

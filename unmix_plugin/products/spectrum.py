@@ -18,6 +18,7 @@ from jaxtyping import Float
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -29,7 +30,6 @@ from unmix_plugin.trained.run_materials import (
     LIGHT_UNKNOWN,
     ShownMatch,
     endmember_colours,
-    library_with,
     match_json,
     relit,
     shown_matches,
@@ -79,13 +79,14 @@ def export_spectrum(
     else:
         raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
     light, matches = job.scene.light_power, []
+    known = library_of(library, job.materials.bands)
     if light is None:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
         job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
     else:
         spectra, bands = probe.spectra["predicted"][None], job.materials.bands
-        [matches] = shown_matches(spectra, bands, light, library_with(library), comparison=comparison)
+        [matches] = shown_matches(spectra, bands, light, known, comparison=comparison)
     probed = _ProbedPlace(title, facts, probe, measured, matches)
     return _write_spectrum(job.folder, name, probed, job.scene)
 
@@ -157,7 +158,7 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
         lines.plot(wavelengths, shown.spectrum, linestyle=style, linewidth=1.3, label=label)
-    lines.set(xlabel="wavelength (nm)", ylabel="radiance (1 = full scale)")
+    lines.set(xlabel="wavelength (nm)", ylabel=f"{materials.quantity} (1 = full scale)")
     lines.set_ylim(bottom=0.0)
     lines.set_title(place.title, loc="left", fontweight="bold")
     lines.legend(frameon=False)

@@ -16,8 +16,10 @@ from unmix_plugin.figures.pictures import ColourScale, TitledPicture, draw_panel
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
-from unmix_plugin.products.endmembers import draw_spectra
+from unmix_plugin.products.endmembers import angles_csv, draw_spectra
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.features import NoiseFractions
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.unmixing.image import UnmixedImage
 
@@ -36,15 +38,27 @@ class BandAxis:
     """Of the bands in the file, from 1."""
 
 
-def unmixed_image_paths(folder: Path) -> list[Path]:
+def unmixed_image_paths(folder: Path, has_library: bool = False, has_fractions: bool = False) -> list[Path]:
     """Files that `write_unmixed_image` makes."""
     cubes = [path for name in ("abundances", "confidence") for path in envi_cube_paths(folder / name)]
+    cubes += [folder / "angles.csv"] if has_library else []
+    cubes += [*envi_cube_paths(folder / "mnf"), folder / "mnf.csv"] if has_fractions else []
     return [*(folder / name for name in ("endmembers.csv", "endmembers.png", "maps.png")), *cubes]
 
 
-def write_unmixed_image(folder: Path, found: UnmixedImage, axis: BandAxis) -> list[str]:
+def write_unmixed_image(
+    folder: Path,
+    found: UnmixedImage,
+    axis: BandAxis,
+    library: MaterialLibrary | None = None,
+    fractions: NoiseFractions | None = None,
+) -> list[str]:
     """Write everything, and return the materials' names.
 
+    Args:
+        folder, found, axis: Where and what.
+        library: Known spectra to which angles are written, where wavelengths are known.
+        fractions: Minimum noise fractions, if asked for.
     Raises:
         RunError: the disk is full or refuses.
     """
@@ -68,7 +82,21 @@ def write_unmixed_image(folder: Path, found: UnmixedImage, axis: BandAxis) -> li
         "probability that the largest abundance is the largest in truth; angle between pixel and mixture, rad"
     )
     write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about)
+    if library is not None and bands is not None:
+        write_file(folder / "angles.csv", angles_csv(library, names, spectra, bands, None))
+    if fractions is not None:
+        _write_fractions(folder, fractions)
     return names
+
+
+def _write_fractions(folder: Path, found: NoiseFractions) -> None:
+    """Minimum noise fractions as a cube, and the ratio of signal to noise of all of them as a table."""
+    cube = found.components.numpy().astype(np.float32)
+    names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
+    about = "minimum noise fractions: noise 1; 0 where nothing was measured"
+    write_envi_cube(folder / "mnf", cube, None, names, about)
+    rows = [f"{number},{ratio:.9g}" for number, ratio in enumerate(found.signal_to_noise.tolist(), 1)]
+    write_file(folder / "mnf.csv", "\n".join(["component,signal to noise", *rows, ""]).encode())
 
 
 def _numbered_table(names: list[str], spectra: np.ndarray, numbers: np.ndarray) -> bytes:

@@ -103,6 +103,8 @@ class Scene:
     """The same of files that only an evaluation reads: labels, abundances, endmembers."""
     options: SceneOptions
     """How the scene was read."""
+    fwhm_nm: Float64[np.ndarray, " B"] | None = None
+    """Widths of the instrument's bands; None where they are unknown."""
 
     @property
     def has_backdrop(self) -> bool:
@@ -241,6 +243,7 @@ class _RecordedScene:
     """Entries of a data manager's metadata and summary; what a run lacks keeps its default."""
 
     wavelengths_nm: _Numbers = ()
+    fwhm_nm: _Numbers | None = None
     illuminant: _Numbers | None = None
     has_alpha: bool = False
     is_unbounded: bool = False
@@ -280,6 +283,8 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
     steps = zip(scene.wavelengths_nm, scene.wavelengths_nm[1:], strict=False)
     rules = {
         "wavelengths above 0 nm that increase": all(0 < low < high for low, high in steps),
+        "widths above 0 nm, one a band": scene.fwhm_nm is None
+        or (len(scene.fwhm_nm) == bands and min(scene.fwhm_nm, default=0) > 0),
         "an illuminant with a value a band, none negative": scene.illuminant is None
         or (len(scene.illuminant) == bands and min(scene.illuminant, default=0) >= 0),
         "endmembers with a value a band": all(len(row) == bands for row in scene.endmembers or ()),

@@ -40,6 +40,8 @@ class Bands:
 
     centers_nm: Float64[np.ndarray, " B"]
     """Band centres in nm: finite, positive, strictly increasing; stored as a read-only copy."""
+    fwhm_nm: Float64[np.ndarray, " B"] | None = None
+    """Full width at half maximum of the instrument in each band, nm; None where it is unknown. Not compared."""
 
     def __post_init__(self) -> None:
         centers = np.array(self.centers_nm, dtype=np.float64)
@@ -47,6 +49,8 @@ class Bands:
         _require_increasing(centers)
         centers.setflags(write=False)
         object.__setattr__(self, "centers_nm", centers)
+        if self.fwhm_nm is not None and self.fwhm_nm.shape != centers.shape:
+            raise SpectrumError(f"{len(centers)} bands need as many widths; found {self.fwhm_nm.shape}")
 
     @classmethod
     def of(cls, centers_nm: Sequence[object] | np.ndarray | Tensor) -> Bands:

@@ -20,8 +20,10 @@ from torch import Tensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
-from unmix_plugin.spectral.maps.reflectance_maps import seen_reflectance
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
+
+_FLAT = 0.999
+"""Least power of a band relative to the greatest for light to be flat."""
 
 OCCUPIED_ACCUMULATION = 0.5
 """A ray shows a material only where at least this much of it ends on something."""
@@ -108,6 +110,28 @@ class Coefficients:
         return Coefficients(torch.cat([part.packed for part in parts]), parts[0].num_endmembers)
 
 
+def seen_reflectance(
+    spectra: Float[Tensor, "*rays B"],
+    opacity: Float[Tensor, "*rays"],
+    light: Float[Tensor, "B"] | None,
+    smallest_opacity: float,
+) -> Float[Tensor, "*rays B"]:
+    """Reflectance of what is seen.
+
+    Args:
+        spectra, opacity: Radiance on black, and the opacity in [0, 1] by which it is multiplied.
+        light: Relative power of the scene's light; None: unknown, so that radiance is returned. NaN in bands that it
+            leaves dark.
+        smallest_opacity: NaN where there is less.
+    """
+    is_seen = (opacity >= smallest_opacity)[..., None]
+    radiance = torch.where(is_seen, spectra / opacity.clamp(min=1e-6)[..., None], torch.nan)
+    if light is None:
+        return radiance
+    power = light.to(radiance)
+    return radiance / torch.where(power > 0, power, torch.nan)
+
+
 SegmentationMethod = Literal["abundances", "probe"]
 
 
@@ -149,6 +173,12 @@ class Materials:
             object.__setattr__(self, "names", default_names(count))
         if len(set(self.names)) != count or len(self.names) != count:
             raise SpectrumError(f"{count} endmembers need {count} distinct names; found {list(self.names)}")
+
+    @property
+    def quantity(self) -> Literal["reflectance", "radiance"]:
+        """What the spectra are: reflectance where the light is flat, as after a white reference; radiance otherwise."""
+        is_flat = self.light is not None and bool((self.light >= _FLAT * self.light.max()).all())
+        return "reflectance" if is_flat else "radiance"
 
     def table(self) -> SpectraTable:
         """The endmembers with their names: spectra under the scene's light, [0, 1]."""

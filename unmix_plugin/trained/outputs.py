@@ -6,8 +6,8 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from jaxtyping import Float
@@ -15,12 +15,13 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import Output, OutputKind, no_output
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.maps.reflectance_maps import parse_reflectance_map
+from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.subspace import PcaColours
+from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
 
 if TYPE_CHECKING:
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -112,6 +113,23 @@ def _pca(view: MaterialView) -> Tensor:
     return PcaColours.fit(spectra[seen])(spectra) * seen[..., None]
 
 
+def _reflectance(view: MaterialView) -> Tensor:
+    return view.materials.reflectance(view.coefficients)
+
+
+def _continuum_removed(view: MaterialView) -> Tensor:
+    return continuum_removed(_reflectance(view), view.materials.bands.centers_nm).float()
+
+
+def _derivative(order: Literal[1, 2]) -> Callable[[MaterialView], Tensor]:
+    def compute(view: MaterialView) -> Tensor:
+        reflectance = _reflectance(view)
+        matrix = derivative_matrix(view.materials.bands.centers_nm, order)
+        return (reflectance.double() @ torch.from_numpy(matrix).to(reflectance.device)).float()
+
+    return compute
+
+
 def _scores(view: MaterialView) -> Tensor:
     return material_scores(view.spectra, view.materials.endmembers)
 
@@ -152,6 +170,34 @@ _TABLE = (
         "specular part",
         "view-dependent part of the radiance, 1 = full scale",
         compute=lambda view: view.materials.specular(view.coefficients),
+    ),
+    MaterialOutput(
+        "reflectance",
+        "spectra",
+        "reflectance",
+        "radiance over the scene's light, 1 = as bright as white, shading included; NaN where nothing is",
+        compute=_reflectance,
+    ),
+    MaterialOutput(
+        "continuum",
+        "spectra",
+        "continuum removed",
+        "reflectance over its continuum, the upper convex hull, at most 1; NaN where nothing is",
+        compute=_continuum_removed,
+    ),
+    MaterialOutput(
+        "derivative",
+        "spectra",
+        "derivative",
+        "derivative of the reflectance by wavelength, 1/nm; NaN where nothing is",
+        compute=_derivative(1),
+    ),
+    MaterialOutput(
+        "second_derivative",
+        "spectra",
+        "second derivative",
+        "second derivative of the reflectance by wavelength, 1/nm^2; NaN where nothing is",
+        compute=_derivative(2),
     ),
     MaterialOutput(
         "abundances",
@@ -237,42 +283,57 @@ class _Family:
     needs: str
     """What the argument is."""
     example: str
-    make: Callable[[str, str, Materials], _Made]
+    make: Callable[[str, str, Materials], MaterialOutput]
     """From name, argument and materials to the output; raises a ConfigError where the argument can't be read, and a
     SpectrumError where the bands don't cover it."""
 
 
-_Made: TypeAlias = tuple[str, Callable[[MaterialView], Tensor], tuple[float, float] | None]
-"""What an output's numbers are, how they are computed, and their usual range."""
-
-
-def _band(name: str, argument: str, materials: Materials) -> _Made:
+def _band(name: str, argument: str, materials: Materials) -> MaterialOutput:
     band = materials.bands.nearest(_wavelength_nm(argument, name))
     column = torch.eye(len(materials.bands))[:, band : band + 1]
-    what = f"radiance of one band on black, 1 = full scale: {argument}"
-    return what, lambda view: view.materials.through(view.coefficients, column)[..., 0], None
+    what = f"{materials.quantity} of one band on black, 1 = full scale: {argument}"
+    return MaterialOutput(
+        name,
+        "grey",
+        FAMILIES["band"].title,
+        what,
+        compute=lambda view: view.materials.through(view.coefficients, column)[..., 0],
+    )
 
 
-def _false_colour(name: str, argument: str, materials: Materials) -> _Made:
+def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOutput:
     wavelengths = [_wavelength_nm(part, name) for part in argument.split(",")]
     if len(wavelengths) != 3:
         raise ConfigError(
             f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
         )
     matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
-    what = f"three bands as red, green and blue, radiance on black: {argument}"
-    return what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1), None
+    what = f"three bands as red, green and blue, {materials.quantity} on black: {argument}"
+    return MaterialOutput(
+        name,
+        "linear",
+        FAMILIES["false-colour"].title,
+        what,
+        compute=lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
+    )
 
 
-def _reflectance_map(name: str, _: str, materials: Materials) -> _Made:
+def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
     asked = parse_reflectance_map(name, materials.bands)
-    caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+    caveat = _OF_RADIANCE if materials.light is None else ""
+    undefined = "; NaN where undefined" if asked.kind == "map" else ""
 
     def compute(view: MaterialView) -> Tensor:
         reflectance = view.materials.reflectance(view.coefficients)
         return asked.fit(reflectance[view.coefficients.is_occupied])(reflectance)
 
-    return f"{asked.what}{caveat}; NaN where undefined", compute, asked.usual_range
+    title, what = FAMILIES[name.partition(":")[0]].title, f"{asked.what}{caveat}{undefined}"
+    return MaterialOutput(
+        name, asked.kind, title, what, asked.usual_range, classes=asked.classes, compute=compute
+    )
+
+
+_OF_RADIANCE = "; of radiance, since the scene's light is unknown"
 
 
 def _wavelength_nm(text: str, name: str) -> float:
@@ -289,6 +350,8 @@ FAMILIES: dict[str, _Family] = {
     ),
     "index": _Family("map", "spectral index", "to know which", "index:ndvi", _reflectance_map),
     "target": _Family("map", "likeness to a target", "to know which", "target:paint.csv", _reflectance_map),
+    "library": _Family("labels", "nearest of a library", "a file", "library:mine.csv<0.1", _reflectance_map),
+    "absorption": _Family("map", "absorption", "wavelengths", "absorption:650-700", _reflectance_map),
 }
 """By the part of the name before the colon."""
 
@@ -306,12 +369,27 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
         SpectrumError: the bands don't cover what it needs.
     """
     if name in OUTPUTS:
-        return OUTPUTS[name]
+        return _told(OUTPUTS[name], materials)
     prefix, _, argument = name.partition(":")
     family = FAMILIES.get(prefix)
     if family is None:
         raise no_output(name, [*OUTPUTS, *FAMILIES], _output_names())
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
-    what, compute, value_range = family.make(name, argument, materials)
-    return MaterialOutput(name, family.kind, family.title, what, value_range, compute=compute)
+    return family.make(name, argument, materials)
+
+
+def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
+    """An output with the right words for its spectra: reflectance in flat light, radiance in any other."""
+    if output.kind == "channels" and materials.quantity == "reflectance":
+        return replace(output, what=output.what.replace("radiance", "reflectance"))
+    if output.kind != "spectra":
+        return output
+    if output.name == "reflectance" and materials.light is None:
+        raise SpectrumError(
+            "the scene's light is unknown, so that it has no reflectance: process it with a white reference (--white), "
+            "or name the light as illuminant_path in transforms.json"
+        )
+    if output.name.endswith("derivative"):
+        derivative_matrix(materials.bands.centers_nm)  # which refuses too few bands
+    return replace(output, what=output.what + (_OF_RADIANCE if materials.light is None else ""))

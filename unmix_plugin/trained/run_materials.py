@@ -7,23 +7,20 @@ Notation: `N` spectra, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
-from unmix_plugin.formats.envi import read_library_table
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
     Comparison,
     LibraryMatch,
     MaterialLibrary,
-    measured_library,
 )
 from unmix_plugin.spectral.materials import Materials
 
@@ -55,18 +52,6 @@ def relit(
     before = np.ones(len(light)) if recorded is None else np.asarray(recorded, dtype=np.float64)
     lit = before > DARK_LIGHT * before.max()
     return measured * np.divide(light, before, out=np.zeros_like(light), where=lit)
-
-
-def library_with(paths: Iterable[Path]) -> MaterialLibrary:
-    """The measured library with one's own files before it, the last one first.
-
-    Raises:
-        SpectrumError: as `read_library_table`.
-    """
-    library = measured_library()
-    for path in paths:
-        library = library.extended(read_library_table(path), path.name)
-    return library
 
 
 @dataclass(frozen=True)

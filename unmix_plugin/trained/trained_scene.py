@@ -105,8 +105,8 @@ class TrainedScene:
 
     @property
     def outputs(self) -> tuple[MaterialOutput, ...]:
-        """All outputs that take no argument."""
-        return tuple(OUTPUTS.values())
+        """All outputs that take no argument; without a known light no reflectance."""
+        return tuple(one for one in OUTPUTS.values() if one.name != "reflectance" or self.light is not None)
 
     def output(self, name: str) -> MaterialOutput:
         """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.

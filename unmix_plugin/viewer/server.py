@@ -13,6 +13,7 @@ from pathlib import Path
 import viser
 
 from unmix_plugin.editing import Recipe
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.access import ViewerOptions, free_port, start_notices
 from unmix_plugin.viewer.connections import LABEL, open_server, quiet, send_what_is_queued
@@ -37,6 +38,7 @@ class Viewer:
         read_scene: SceneReader,
         say: Callable[[str], None] = lambda _: None,
         recipe: Recipe | None = None,
+        library: MaterialLibrary | None = None,
     ) -> None:
         """
         Args:
@@ -45,6 +47,7 @@ class Viewer:
             read_scene: Reads the scene that the run was trained on.
             say: Prints a line on the user's terminal.
             recipe: Edits that every page starts with.
+            library: Known materials to compare with; None: the built-in ones.
         Raises:
             ConfigError: the recipe does not fit the run, environments were given and its method has none, or the token
                 can't be read.
@@ -54,7 +57,7 @@ class Viewer:
         self._say = say
         self._gate = Gate(options.host, options.secret(os.environ), say)
         self._kept_pages = KeptPages()
-        self.services = Services(source, read_scene, recipe, options.environments)
+        self.services = Services(source, read_scene, recipe, options.environments, library)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()

@@ -24,6 +24,7 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
+from unmix_plugin.spectral.library.material_library import MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice, RelightableScene, relit
 from unmix_plugin.trained.run_views import recorded_views
@@ -94,6 +95,7 @@ class Services:
         read_scene: SceneReader,
         recipe: Recipe | None = None,
         environments: Sequence[Path] = (),
+        library: MaterialLibrary | None = None,
     ) -> None:
         """Computes nothing yet; the scene is read beside everything else once `start` is called.
 
@@ -102,11 +104,12 @@ class Services:
             read_scene: Reads the scene.
             recipe: What every client sees the scene with at first.
             environments: Files of lights to offer beside those of the scene.
+            library: Known materials; None: the built-in ones.
         Raises:
             ConfigError: the recipe does not fit the run, or its method has no environments.
             SceneError: an environment map is missing, damaged or unusable.
         """
-        self.source = source
+        self.source, self._library = source, library
         self.views = recorded_views(source.record)
         self.scene: Scene | None = None
         """The scene, once it is read."""
@@ -133,6 +136,11 @@ class Services:
         if recipe is not None:
             self.first_recipe = numbered(recipe, self.maker.edited(Edit()).materials.names)
             self.maker.edited(Edit(self.first_recipe))
+
+    @property
+    def library(self) -> MaterialLibrary:
+        """Known materials that spectra are compared with."""
+        return measured_library() if self._library is None else self._library
 
     @cached_property
     def usable_lights(self) -> tuple[str, ...]:

@@ -60,6 +60,7 @@ OTHERS = {
     "notes": ["so & so"],
     "facts": [("<b>", "</dl>")],
     "cards": [],
+    "quantity": "radiance",
     "num_known": 0,
     "light_unknown": None,
     "figures": None,

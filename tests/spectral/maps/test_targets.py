@@ -15,6 +15,7 @@ from spectral import matched_filter as spy_matched_filter
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.maps.targets import (
@@ -22,8 +23,15 @@ from unmix_plugin.spectral.maps.targets import (
     Background,
     adaptive_coherence,
     matched_filter,
-    parse_target,
 )
+from unmix_plugin.spectral.maps.targets import (
+    parse_target as _parse_target,
+)
+
+
+def parse_target(text, bands):
+    return _parse_target(text, bands, read_library)
+
 
 # Mean (0.4, 0.3), sample covariance diag(0.02, 0.08) / 3.
 FOUR = torch.tensor([[0.5, 0.3], [0.3, 0.3], [0.4, 0.5], [0.4, 0.1]], dtype=torch.float64)
@@ -264,8 +272,8 @@ def test_a_target_says_what_its_numbers_are(gold):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"target: must be target:\[METHOD:\]FILE.csv"),
-        ("{0}/gold.txt", "must be .* as in paint.csv, ace:paint.csv"),
+        ("", r"target: must be target:\[METHOD:\]FILE\[#NAME\]"),
+        ("{0}/gold.pdf", "must be .* as in paint.csv, ace:paint.csv"),
         ("{0}/gold.csv<low", "must be .*<VALUE"),
         ("{0}/gold.csv<nan", "must be .*<VALUE"),
         ("{0}/gold.csv>0.1", "small scores of angle are alike, so its threshold is <0.1; found >0.1"),
@@ -291,7 +299,7 @@ def test_text_that_names_no_target_is_refused(gold, text, message):
 
 def test_a_target_that_does_not_reach_the_bands_is_refused_with_its_file_and_the_gap(gold):
     with pytest.raises(
-        SpectrumError, match=r"gold.csv: spectra at .* 50 nm above their range; .*nothing is extra"
+        SpectrumError, match=r"gold.csv: gold: spectra at .* 50 nm above their range; .*nothing is extra"
     ):
         parse_target(str(gold), Bands.of([450, 750]))
 

@@ -21,11 +21,12 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError, SpectrumError, counted
-from unmix_plugin.formats.envi import read_library_table
+from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.limits import MOST_TABLE_BYTES, allow_decoded, read_bounded
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
+from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
 ENVIRONMENT_SUFFIXES = (".exr", ".hdr")
@@ -194,11 +195,11 @@ def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
     path = Path(lamp)
     if path.suffix.lower() not in _FILES:
         return _lit_everywhere(illuminant_power(parse_light(lamp), bands), lamp, bands)
-    table = read_library_table(path)
-    if len(table.names) != 1:
-        raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(table.names)}: {table.names}")
+    library = MaterialLibrary(tuple(read_library(path)))
+    if len(library.names) != 1:
+        raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(library.names)}: {library.names}")
     try:
-        power = resample_spectra(table.spectra[0], table.bands, bands)
+        power = library.reflectance(library.names[0], bands)
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
     return _lit_everywhere(power, lamp, bands)

@@ -58,6 +58,7 @@ _PICTURE = _KindFormats(("png", "npy", "envi", "mp4"), ("png",))
 
 _BY_KIND: dict[OutputKind, _KindFormats] = {
     "channels": _KindFormats(("envi", "exr", "npy", "mp4"), ("envi",), ("envi",)),
+    "spectra": _KindFormats(("envi", "npy"), ("envi",), ("envi",)),
     "shares": _KindFormats(("envi", "exr", "npy", "png", "mp4"), ("envi", "png")),
     "srgb": _PICTURE,
     "linear": _KindFormats(("exr", "npy", "envi", "png", "mp4"), ("exr",)),
@@ -71,6 +72,11 @@ _COMPOSITE = _KindFormats(("png", "exr", "npy", "envi", "mp4"), ("png",))
 
 _REASONS = {
     ("channels", "png"): "a PNG shows colours: ask for rgb, band:NMnm, false-colour:NM,NM,NM or pca",
+    (
+        "spectra",
+        "png",
+    ): "a PNG shows colours: ask for band:NMnm, false-colour:NM,NM,NM or absorption:LOW-HIGH",
+    ("spectra", "exr"): "the layout of spectral EXR has no place for it",
     ("srgb", "exr"): "it is encoded for displays and EXR holds linear light: ask for linear_rgb",
     ("picture", "exr"): "it is made for displays and EXR holds linear light",
     ("labels", "envi"): "ids are written as PNG, with their palette, or .npy",
@@ -94,7 +100,9 @@ def file_name(output: Output) -> str:
     >>> file_name(Output("false-colour:860,650,550", "linear", "", ""))
     'false-colour-860-650-550'
     """
-    short = re.sub(r"[^:]*/", "", output.name) if output.name.startswith("target:") else output.name
+    short = (
+        re.sub(r"[^:]*/", "", output.name) if output.name.startswith(("target:", "library:")) else output.name
+    )
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
     is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES
     if len(plain) <= _LONGEST_FILE_NAME and not is_formula:
@@ -301,7 +309,7 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     width, height = setting.size
     names = setting.channels.get(output.name, (output.name,))
     shape = (height, width, len(names))
-    bands = setting.bands if output.kind == "channels" else None
+    bands = setting.bands if output.kind in ("channels", "spectra") else None
     description = f"{output.name}: {output.what}"
     with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description) as add:
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
@@ -347,7 +355,7 @@ def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
             ids[rows.first : rows.first + len(found)] = found
 
         yield add
-        write_file(path, indexed_png_bytes(ids, palette.by_id, NOTHING_ID, palette.describe(output)))
+        write_file(path, indexed_png_bytes(ids, palette.by_id(output), NOTHING_ID, palette.describe(output)))
         return
     canvas = _canvas(output, setting, 4)
     yield lambda rows: canvas.put(

@@ -39,10 +39,10 @@ from unmix_plugin.products.render.files import (
 )
 from unmix_plugin.products.render.pictures import Palette, scale_of
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.maps.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene, one_pixel
 
@@ -89,7 +89,7 @@ def take_survey(scene: RenderableScene, views: Sequence[RunView], outputs: Colle
         output.name: parse_reflectance_map(output.name, scene.bands).fit(reflectance) for output in maps
     }
     for output in maps:
-        if output.value_range is None:
+        if output.value_range is None and output.kind == "map":
             scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
     return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
 
@@ -342,9 +342,9 @@ def channel_names(
     for output in outputs:
         if output.kind in ("grey", "map", "labels"):
             continue
-        if output.kind not in ("channels", "shares"):
+        if output.kind not in ("channels", "spectra", "shares"):
             names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
-        elif output.kind == "channels" and bands is not None:
+        elif output.kind in ("channels", "spectra") and bands is not None:
             names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in bands.centers_nm)
         elif not isinstance(scene, TrainedScene):
             pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]

@@ -8,6 +8,8 @@ Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
 
 from __future__ import annotations
 
+import csv
+import io
 import re
 from dataclasses import dataclass
 
@@ -23,7 +25,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.figures.plotting import draw_colour_bar, draw_swatch, figure_bytes
+from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -52,11 +54,15 @@ class Palette:
             return Palette((), colormaps["tab20"](np.arange(255) % 20)[:, :3].astype(np.float64), surveyed)
         return Palette(materials.names, endmember_colours(materials), surveyed)
 
-    @property
-    def by_id(self) -> Float64[np.ndarray, "256 3"]:
+    def entries(self, output: Output) -> list[tuple[str, Colour]]:
+        """Names and colours of the output's ids or shares; none where they have no names."""
+        return list(output.classes) or list(zip(self.names, self.colours, strict=False))
+
+    def by_id(self, output: Output) -> Float64[np.ndarray, "256 3"]:
         """Colour of each id, neutral grey for those that stand for nothing."""
+        own = [colour for _, colour in output.classes] if output.classes else self.colours
         colours = np.full((256, 3), NEUTRAL)
-        colours[: len(self.colours)] = self.colours
+        colours[: len(own)] = own
         return colours
 
     def scale(self, output: Output) -> ColourScale | None:
@@ -124,7 +130,7 @@ def _symbols(
     if kind == "vectors":
         return (0.5 + 0.5 * np.asarray(values, dtype=np.float64))[:, :, None]
     if kind == "labels":
-        return palette.by_id[values][:, :, None]
+        return palette.by_id(output)[values][:, :, None]
     scale = palette.scale(output)
     assert scale is not None, output.name
     if output.name == "abundances":  # of what is seen: that a pixel is half covered is shown by its opacity
@@ -166,13 +172,23 @@ _LONGEST_NAME = 24
 _FONT_PT = 9
 
 
+def legend_csv(output: Output) -> bytes:
+    """What the ids of an output with classes of its own mean: `id,name,red,green,blue`, sRGB 0 to 255."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["id", "name", "red", "green", "blue"])
+    for index, (name, colour) in enumerate(output.classes):
+        writer.writerow([index, name, *np.round(255 * np.asarray(colour)).astype(int)])
+    return text.getvalue().encode()
+
+
 def draw_legend(output: Output, palette: Palette) -> bytes:
     """The legend of an output as a PNG."""
     from matplotlib.figure import Figure
 
     scale = palette.scale(output)
     has_names = output.kind in ("labels", "shares")
-    names = list(zip(palette.names, palette.colours, strict=False)) if has_names else []
+    names = palette.entries(output) if has_names else []
     bar = 0.0 if scale is None else _BAR_ROW
     height = 2 * _MARGIN + bar + -(-len(names) // _NAMES_A_ROW) * _NAME_ROW
     figure = Figure(figsize=(_WIDTH, height), facecolor="white")

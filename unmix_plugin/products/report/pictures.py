@@ -101,7 +101,11 @@ def error_chart(views: ReportViews) -> LineChart | None:
         ChartLine(nm, views.bias_of_bands, "mean of predicted less measured", "#c8501e", dash="dashed"),
     ]
     return LineChart(
-        lines, "wavelength (nm)", "radiance (1 = full scale)", from_zero=True, size=(900.0, 300.0)
+        lines,
+        "wavelength (nm)",
+        f"{views.materials.quantity} (1 = full scale)",
+        from_zero=True,
+        size=(900.0, 300.0),
     )
 
 
@@ -217,7 +221,7 @@ def material_cards(
         matches += partners.get(index, ())
         own = ChartLine(wavelengths, spectra[index], name, css_colour(colours[index]), 3.0)
         lines = [*(line for line, *_ in matches), own]
-        chart = LineChart(lines, "wavelength (nm)", "radiance", from_zero=True, size=(480.0, 240.0))
+        chart = LineChart(lines, "wavelength (nm)", materials.quantity, from_zero=True, size=(480.0, 240.0))
         cards.append(_MaterialCard(name, colours[index], float(proportions[index]), chart, matches))
     return cards
 

@@ -25,6 +25,7 @@ from unmix_plugin.engine.training.progress import read_metrics
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.figures.plotting import ChartLine, LineChart, css_colour, draw_chart
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.report import pictures
@@ -41,7 +42,7 @@ from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import DEFINITIONS, Evaluation, finite_or_none, scene_truth, view_truth
 from unmix_plugin.trained.open_run import LoadedRun, find_scene
-from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN, library_with
+from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 from unmix_plugin.trained.run_views import RunView, world_frame
 
 _VIEWS_WITH_SHARES = 2
@@ -62,7 +63,7 @@ def export_report(
     if max_views < 1:
         raise ConfigError(f"--max-views is {max_views}; choose at least 1")
     job.claim([job.folder / "report.html"])
-    known = library_with(library)
+    known = library_of(library, job.materials.bands)
     chosen = evenly(job.views("eval"), max_views)
     scene, notes = None, []
     if is_edited:
@@ -137,6 +138,7 @@ def _write_report(
             "notes": notes,
             "facts": _scene_facts(loaded, materials, figures),
             "cards": material_cards(materials, views.proportions, light, library, truth),
+            "quantity": materials.quantity,
             "num_known": len(library.names),
             "light_unknown": LIGHT_UNKNOWN if light is None else None,
             "figures": None if figures is None else _figure_rows(figures),
@@ -255,12 +257,18 @@ def _scene_facts(
         ("Views", f"{len(scene.train_cameras)} training, {len(scene.eval_cameras)} evaluation"),
         ("Image size", ", ".join(f"{width} x {height}" for width, height in sizes) + " pixels"),
         ("Scene box", " x ".join(f"{edge:.3g}" for edge in size) + " world units"),
-        ("Light", "recorded" if summary.get("illuminant") else "unknown, taken as flat"),
+        ("Light", _light_in_words(materials)),
         ("Comes with", ", ".join(known) or "images alone"),
         ("Endmembers", str(len(materials.names))),
         ("Training", f"{training.steps:,} steps, {training.train_seconds:,.0f} s"),
         ("Rays", f"{training.total_rays:,}"),
     ]
+
+
+def _light_in_words(materials: Materials) -> str:
+    if materials.light is None:
+        return "unknown, taken as flat"
+    return "taken out: values are reflectance" if materials.quantity == "reflectance" else "recorded"
 
 
 def _scene_name(loaded: LoadedRun) -> str:

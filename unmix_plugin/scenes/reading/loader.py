@@ -154,6 +154,7 @@ def _assemble(
     return Scene(
         root=root,
         wavelengths_nm=entry.wavelengths_nm,
+        fwhm_nm=entry.fwhm_nm,
         sensors=checked.sensors,
         frames=_name_frames(entry, located, checked.sensor_indices),
         cameras=make_cameras(entry, checked.sizes, normalisation),

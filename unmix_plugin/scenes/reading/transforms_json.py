@@ -408,6 +408,8 @@ class SceneEntry:
     """What cubes are divided by, where the options don't say."""
     metres_per_unit: float | None = None
     """Metres in a unit of the world that the poses come from."""
+    fwhm_nm: Float64[np.ndarray, " B"] | None = None
+    """Widths of the instrument's bands."""
 
 
 def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:
@@ -435,6 +437,7 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
         value_scale=_read_value_scale(content, faults),
+        fwhm_nm=_read_widths(content, faults),
         split_lists=_read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
@@ -492,6 +495,20 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
         faults.add(where, f"'{key}' is {describe(value)}; expected a path")
         return None
     return value.replace("\\", "/")
+
+
+def _read_widths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, " B"] | None:
+    values, centers = content.get("fwhm"), content.get("wavelengths")
+    if values is None or not isinstance(centers, list):
+        return None
+    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
+    known = [number for number in numbers if number is not None and number > 0]
+    if len(known) != len(centers) or len(numbers) != len(centers):
+        faults.add(
+            FILE_NAME, "'fwhm' must have a width in nm above 0 for each of the wavelengths, or be left out"
+        )
+        return None
+    return np.array(known)
 
 
 def _read_wavelengths(

@@ -13,16 +13,18 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, resample_spectra
-from unmix_plugin.spectral.metrics import spectral_angle
+from unmix_plugin.spectral.colour.difference import reflectance_to_lab
+from unmix_plugin.spectral.features import continuum_removed
+from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
 _CRI_NAMES = (
     "light greyish red",
@@ -38,10 +40,27 @@ _CRI_NAMES = (
     "strong green",
     "strong blue",
     "light yellowish pink",
-    "moderate olive green leaf",
-    "Asian skin",
+    "olive green leaf",
 )
-"""Appearance under daylight of the test colour samples of CIE 13.3:1995 and the one added in 2024, in their order."""
+"""Appearance under daylight of the test colour samples of CIE 13.3:1995, in their order."""
+
+_LEFT_OUT = ("skin", "caucasian", "oriental", "south asian", "african", "pork", "smurf")
+"""Of the built-in charts: skin, meat and figures of comics are no materials of scenes."""
+
+_HUES = (
+    "red",
+    "orange",
+    "yellow",
+    "yellow green",
+    "green",
+    "bluish green",
+    "blue",
+    "purplish blue",
+    "purple",
+    "magenta",
+)
+_HUE_BOUNDS_DEG = (43.0, 76.0, 106.0, 140.0, 178.0, 215.0, 255.0, 295.0, 333.0, 368.0)
+"""Where each hue ends in the plane of a* and b*, halfway between those of Munsell's at medium value and chroma."""
 
 
 Comparison = Literal["scale", "continuum"]
@@ -66,9 +85,11 @@ class LibraryMaterial:
     bands: Bands
     """Where it was measured."""
     reflectance: Float64[np.ndarray, " B"]
-    """Finite, not negative."""
+    """Not negative; NaN where nothing was measured."""
     source: str
     """Where the measurement is from."""
+    origin: tuple[Path, str] | None = None
+    """The file, and the spectrum's name in it; None for what comes with the program."""
 
 
 @dataclass(frozen=True)
@@ -101,15 +122,9 @@ class MaterialLibrary:
         """Full names, in order."""
         return tuple(material.name for material in self.materials)
 
-    def extended(self, table: SpectraTable, source: str) -> MaterialLibrary:
-        """This library with the reflectances of a table before its own; those of the same name are hidden."""
-        rows = zip(table.names, table.spectra, strict=True)
-        own = tuple(LibraryMaterial(name, table.bands, row, source) for name, row in rows)
-        others = tuple(material for material in self.materials if material.name not in table.names)
-        return MaterialLibrary(own + others)
-
     def find(self, name: str) -> LibraryMaterial:
-        """The material of a name: in full (`pmc/Carrot`), or its last part where only one has it; in any case.
+        """The material of a name: in full (`ColorChecker/blue`), or its last part where only one has it;
+        in any case.
 
         Raises:
             SpectrumError: no material or several of that name; the message has the nearest names.
@@ -129,18 +144,75 @@ class MaterialLibrary:
     ) -> Float64[np.ndarray, " B"]:
         """Reflectance of a material at other wavelengths, by linear interpolation.
 
-        Outside the measured range (`beyond`) it is refused, or the outermost value is held.
+        Where it was not measured (`beyond`) it is refused; or the outermost value is held, and gaps are bridged.
 
         Raises:
-            SpectrumError: as `find`; or bands outside the measured range that are not to be held.
+            SpectrumError: as `find`; or bands where it was not measured that are not to be held.
         """
         material = self.find(name)
         if beyond == "hold":
-            return np.interp(bands.centers_nm, material.bands.centers_nm, material.reflectance)
+            known = np.isfinite(material.reflectance)
+            return np.interp(bands.centers_nm, material.bands.centers_nm[known], material.reflectance[known])
         try:
-            return resample_spectra(material.reflectance, material.bands, bands)
+            found = resample_spectra(material.reflectance, material.bands, bands)
         except SpectrumError as error:
             raise SpectrumError(f"{material.name}: {error}") from error
+        if not np.isfinite(found).all():
+            gap = bands.centers_nm[np.argmin(np.isfinite(found))]
+            raise SpectrumError(f"{material.name} was not measured at {gap:g} nm; leave that band out")
+        return found
+
+    def resampled(self, bands: Bands) -> Float64[np.ndarray, "M B"]:
+        """Reflectance of every material at other wavelengths; NaN where it was not measured."""
+        rows = [
+            np.interp(bands.centers_nm, one.bands.centers_nm, one.reflectance, left=np.nan, right=np.nan)
+            for one in self.materials
+        ]
+        return np.array(rows).reshape(len(rows), len(bands))
+
+    def comparable(
+        self, bands: Bands, light: Float[np.ndarray, " B"] | None = None
+    ) -> Bool[np.ndarray, " M"]:
+        """Which materials cover half of the bands or more, and three at least, not counting bands without light."""
+        return self._compared_bands(bands, light).any(axis=1)
+
+    def _compared_bands(self, bands: Bands, light: Float[np.ndarray, " B"] | None) -> Bool[np.ndarray, "M B"]:
+        """Bands that each material is compared over; none of those that are passed over."""
+        lit = np.ones(len(bands), bool) if light is None else light > DARK_LIGHT * np.max(light)
+        shared = np.isfinite(self.resampled(bands)) & lit
+        enough = shared.sum(axis=1) >= max(_FEWEST_BANDS, _LEAST_OVERLAP * len(bands))
+        return shared & enough[:, None]
+
+    def angles(
+        self,
+        spectra: Float[np.ndarray, "N B"],
+        bands: Bands,
+        light: Float[np.ndarray, " B"] | None = None,
+        comparison: Comparison = "scale",
+    ) -> tuple[Float64[np.ndarray, "N M"], Int64[np.ndarray, " M"]]:
+        """Angle in radians between each spectrum and each material, and over how many bands a material is compared.
+
+        Materials that cover less than half of the bands, or less than three, are passed over: NaN and 0. So are bands
+        in which there is no light. Spectra that are not finite, or black, have no angles, NaN.
+
+        Args:
+            spectra: Radiance under `light`, or reflectance.
+            bands: Of the spectra.
+            light: Relative power of the light at the bands; None for flat light.
+            comparison: What is taken out before angles are measured.
+        """
+        shared, known = self._compared_bands(bands, light), self.resampled(bands)
+        power = np.ones(len(bands)) if light is None else np.where(light > 0, light, 1.0)
+        reflectance = spectra.astype(np.float64) / power
+        angles = np.full((len(spectra), len(known)), np.nan)
+        for used in np.unique(shared[shared.any(axis=1)], axis=0):
+            rows = (shared == used).all(axis=1)
+            pair = [torch.from_numpy(one[:, used]) for one in (reflectance, known[rows])]
+            if comparison == "continuum":
+                pair = [continuum_removed(one, bands.centers_nm[used]) for one in pair]
+            x, y = (one / one.norm(dim=1, keepdim=True) for one in pair)
+            angles[:, rows] = (x @ y.T).clamp(-1, 1).arccos().numpy()
+        return angles, shared.sum(axis=1)
 
     def nearest(
         self,
@@ -150,36 +222,21 @@ class MaterialLibrary:
         count: int = 3,
         comparison: Comparison = "scale",
     ) -> list[list[LibraryMatch]]:
-        """The materials that resemble each spectrum most, nearest first.
+        """The materials that resemble each spectrum most by their `angles`, nearest first.
 
-        Materials that cover less than half of the bands, or less than three, are passed over; so are bands in which
-        there is no light. Fewer than `count` come back if the library holds no more.
-
-        Args:
-            spectra: Radiance under `light`, or reflectance; finite.
-            bands: Of the spectra.
-            light: Relative power of the light at the bands; None for flat light.
-            count: How many materials.
-            comparison: What is taken out before angles are measured.
+        Fewer than `count` come back if the library holds no more that can be compared.
         """
-        lit = np.ones(len(bands), bool) if light is None else light > DARK_LIGHT * np.max(light)
-        reflectance = spectra if light is None else spectra / np.where(lit, light, 1.0)
-        found: list[list[LibraryMatch]] = [[] for _ in spectra]
-        for material in self.materials:
-            low, high = material.bands.centers_nm[[0, -1]]
-            shared = lit & (bands.centers_nm >= low) & (bands.centers_nm <= high)
-            if shared.sum() < max(_FEWEST_BANDS, _LEAST_OVERLAP * len(bands)):
-                continue
-            centers = bands.centers_nm[shared]
-            known = np.interp(centers, material.bands.centers_nm, material.reflectance)
-            compared = reflectance[:, shared].astype(np.float64)
-            if comparison == "continuum":
-                compared = _continuum_removed(compared, centers)
-                known = _continuum_removed(known[None], centers)[0]
-            angles = spectral_angle(torch.from_numpy(compared), torch.from_numpy(known)).numpy()
-            for matches, angle in zip(found, angles, strict=True):
-                matches.append(LibraryMatch(material.name, float(angle), len(centers), material.source))
-        return [sorted(matches, key=lambda match: match.angle_rad)[:count] for matches in found]
+        angles, counts = self.angles(spectra, bands, light, comparison)
+        return [
+            [
+                LibraryMatch(
+                    self.names[index], float(row[index]), int(counts[index]), self.materials[index].source
+                )
+                for index in np.argsort(row, kind="stable")[:count]
+                if np.isfinite(row[index])
+            ]
+            for row in angles
+        ]
 
     def _suggest(self, wanted: str) -> str:
         if not self.materials:
@@ -194,12 +251,13 @@ class MaterialLibrary:
 
 @lru_cache(maxsize=1)
 def measured_library() -> MaterialLibrary:
-    """The measured reflectances that colour-science carries, 183 of them; named `set/sample`.
+    """The measured reflectances that colour-science carries, named `set/sample`, without skin and figures of comics.
 
-    Sets: `pmc`, skin, fruit, vegetables, leaves and paints; `checker`, the ColorChecker; `cri`, test colour samples of
-    CIE 13.3; `cqs`, saturated ones of NIST's colour quality scale; `cie2017`, the 99 samples of CIE 224:2017. The
-    tables of `cqs` and `cie2017` go on beyond what was measured by repeating the outermost value; these flat ends are
-    cut off, so that they are not taken for data.
+    Sets: `ColorChecker`, its paints; `memory colours`, a chart of the colours of fruit, vegetables, leaves and sky;
+    `CIE 13.3`, test colour samples; `CQS`, saturated ones of NIST's colour quality scale; `CIE 224`, the 99 samples of
+    CIE 224:2017. Samples of the last two have numbers alone and are called by their colour too. Their tables go on
+    beyond what was measured by repeating the outermost value; these flat ends are cut off, so that they are not taken
+    for data.
     """
     # Guarded because importing colour-science changes how NumPy prints.
     with np.printoptions():
@@ -211,32 +269,52 @@ def measured_library() -> MaterialLibrary:
     known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
     samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
     table = load_TCS_CIE2017(SpectralShape(380, 780, 5))
-    bands = Bands.of(np.asarray(table.wavelengths))
-    cie2017 = [
-        LibraryMaterial(f"cie2017/{index:02d}", bands, values, "test colour samples, CIE 224:2017")
-        for index, values in enumerate(np.asarray(table.values, dtype=np.float64).T, 1)
-    ]
-    cqs = _materials("cqs", SDS_VS["NIST CQS 9.0"], "colour quality scale 9.0, NIST")
+    bands, numbered = Bands.of(np.asarray(table.wavelengths)), {}
+    for number, values in enumerate(np.asarray(table.values, dtype=np.float64).T, 1):
+        numbered[f"{_colour_in_words(values, bands)} {number}"] = (bands, values)
+    saturated = {}
+    for number, sample in enumerate(SDS_VS["NIST CQS 9.0"].values(), 1):
+        own, values = _as_bands(sample)
+        saturated[f"{_colour_in_words(values, own)} {number}"] = (own, values)
+    cqs = _materials("CQS", saturated, "colour quality scale 9.0, NIST")
+    cie2017 = _materials("CIE 224", numbered, "test colour samples, CIE 224:2017")
     return MaterialLibrary(
         (
-            *_materials("pmc", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart"),
-            *_materials("checker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997"),
-            *_materials("cri", samples, "test colour samples, CIE 13.3:1995 and CIE 2024"),
+            *_materials("ColorChecker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997"),
+            *_materials("memory colours", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart"),
+            *_materials("CIE 13.3", samples, "test colour samples, CIE 13.3:1995"),
             *map(_without_flat_ends, (*cqs, *cie2017)),
         )
     )
 
 
-def _materials(group: str, distributions: Mapping[str, Any], source: str) -> list[LibraryMaterial]:
-    return [
-        LibraryMaterial(
-            f"{group}/{sample}",
-            Bands.of(np.asarray(found.wavelengths)),
-            np.asarray(found.values, dtype=np.float64),
-            source,
-        )
-        for sample, found in distributions.items()
-    ]
+def _as_bands(sample: Any) -> tuple[Bands, Float64[np.ndarray, " B"]]:
+    return Bands.of(np.asarray(sample.wavelengths)), np.asarray(sample.values, dtype=np.float64)
+
+
+def _materials(group: str, samples: Mapping[str, Any], source: str) -> list[LibraryMaterial]:
+    """A set of samples, spectra of colour-science or bands with values."""
+    found = []
+    for given, sample in samples.items():
+        name = given.partition(" (")[0].lower()
+        if not any(word in name for word in _LEFT_OUT):
+            bands, values = sample if isinstance(sample, tuple) else _as_bands(sample)
+            found.append(LibraryMaterial(f"{group}/{name}", bands, values, source))
+    return found
+
+
+def _colour_in_words(reflectance: Float64[np.ndarray, " B"], bands: Bands) -> str:
+    """What a surface looks like in even light, as in `dark greyish blue`."""
+    lightness, a, b = reflectance_to_lab(reflectance, np.ones(len(bands)), bands)
+    chroma = np.hypot(a, b)
+    tone = "dark " if lightness < 40 else "light " if lightness > 70 else "strong " if chroma > 55 else ""
+    if chroma < 7:
+        return f"{tone}grey"
+    hue = (np.degrees(np.arctan2(b, a)) - 8.0) % 360.0 + 8.0
+    word = _HUES[int(np.searchsorted(_HUE_BOUNDS_DEG, hue))]
+    if word == "orange" and lightness < 60 and chroma < 55:
+        word = "brown"
+    return f"{tone}{'greyish ' if chroma < 20 else ''}{word}"
 
 
 def _without_flat_ends(material: LibraryMaterial) -> LibraryMaterial:
@@ -244,35 +322,6 @@ def _without_flat_ends(material: LibraryMaterial) -> LibraryMaterial:
     inside = slice(changes[0], changes[-1] + 2)
     bands = Bands.of(material.bands.centers_nm[inside])
     return replace(material, bands=bands, reflectance=material.reflectance[inside])
-
-
-def _continuum_removed(
-    spectra: Float64[np.ndarray, "N B"], wavelengths_nm: Float64[np.ndarray, " B"]
-) -> Float64[np.ndarray, "N B"]:
-    """Spectra over their continuum, the upper convex hull (Clark and Roush 1984): below 1 where something absorbs.
-
-    >>> _continuum_removed(np.array([[0.2, 0.2, 0.4]]), np.array([400.0, 500.0, 600.0])).round(3)
-    array([[1.   , 0.667, 1.   ]])
-    """
-    hulls = np.stack([_upper_hull(row, wavelengths_nm) for row in spectra])
-    return np.divide(spectra, hulls, out=np.ones_like(spectra), where=hulls > 0)
-
-
-def _upper_hull(
-    spectrum: Float64[np.ndarray, " B"], wavelengths_nm: Float64[np.ndarray, " B"]
-) -> Float64[np.ndarray, " B"]:
-    """Monotone chain: corners that lie below the line between their neighbours are dropped."""
-    corners: list[int] = []
-    for index in range(len(spectrum)):
-        while len(corners) >= 2:
-            first, second = corners[-2:]
-            run, whole = (wavelengths_nm[[second, index]] - wavelengths_nm[first]).tolist()
-            rise, whole_rise = (spectrum[[second, index]] - spectrum[first]).tolist()
-            if rise * whole > whole_rise * run:
-                break
-            corners.pop()
-        corners.append(index)
-    return np.interp(wavelengths_nm, wavelengths_nm[corners], spectrum[corners])
 
 
 def _last_part(name: str) -> str:

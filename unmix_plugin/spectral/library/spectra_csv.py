@@ -91,21 +91,31 @@ def read_spectra_csv(path: Path) -> SpectraTable:
             length; a value that is not a number, not finite or negative; wavelengths that do not increase.
     """
     try:
-        header, rows = _read_rows(path)
+        header, values = read_number_table(path)
         if header[0].lower() not in ("wavelength", "wavelength_nm", "wavelengths"):
             raise SpectrumError(f"the first column must be headed 'wavelength' (in nm); found '{header[0]}'")
         if len(header) == 1:
             raise SpectrumError("no spectra: there is no column beside 'wavelength'")
         names = tuple(header[1:])
         _validate_names(names)
-        values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
-        if len(values) == 0:
-            raise SpectrumError("there is a header but no row of values")
         bands = Bands(values[:, 0].copy())
         require_nanometres(bands.centers_nm)
         return SpectraTable(bands, names, np.ascontiguousarray(values[:, 1:].T))
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
+
+
+def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]]:
+    """The header of a CSV file, and its rows of numbers; at least one.
+
+    Raises:
+        SpectrumError: missing, unreadable or empty; a row of another length; a value that is not a number.
+    """
+    header, rows = _read_rows(path)
+    values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
+    if len(values) == 0:
+        raise SpectrumError("there is a header but no row of values")
+    return header, values
 
 
 def read_illuminant_csv(path: Path, bands: Bands) -> Float64[np.ndarray, " B"]:
@@ -169,13 +179,14 @@ def _parse_row(row: list[str], line: int, header: list[str]) -> list[float]:
     try:
         return [float(cell) for cell in row]
     except ValueError:
-        wrong = next(i for i, cell in enumerate(row) if not _is_number(cell))
+        wrong = next(i for i, cell in enumerate(row) if not is_number(cell))
         raise SpectrumError(
             f"line {line}, column '{header[wrong]}': '{row[wrong].strip()}' is not a number"
         ) from None
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Whether a text is a number, NaN and infinity among them."""
     try:
         float(cell)
     except ValueError:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
+from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.metrics import spectral_angle
 
 LOADING = 1e-3
@@ -36,7 +37,7 @@ _LEAST_DISTANCE = 1e-4
 _DetectionMethod = Literal["angle", "mf", "ace"]
 """Spectral angle, matched filter, adaptive coherence estimator."""
 _GRAMMAR = re.compile(
-    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.csv)(#(?P<name>.*?))?"
+    rf"((?P<method>{'|'.join(get_args(_DetectionMethod))}):)?(?P<file>.+?\.(csv|sli|hdr|txt|asc))(#(?P<name>.*?))?"
     r"(\s*(?P<side>[<>])\s*(?P<limit>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\s*)?",
     re.IGNORECASE | re.DOTALL,
 )
@@ -196,26 +197,34 @@ class _TargetScore:
         return torch.where(_is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
 
 
-def parse_target(text: str, bands: Bands) -> _Target:
-    """The text after `target:` in the name of an output, `[METHOD:]FILE.csv[#NAME][<VALUE | >VALUE]`.
+def parse_target(text: str, bands: Bands, read: Callable[[Path], Sequence[LibraryMaterial]]) -> _Target:
+    """The text after `target:` in the name of an output, `[METHOD:]FILE[#NAME][<VALUE | >VALUE]`.
+
+    Args:
+        text: `FILE` is any that `read` takes.
+        bands: Of the reflectances to come.
+        read: Reads a library of spectra.
 
     Raises:
         ConfigError: text of another form, no such file, no or several spectra that could be meant, a threshold on the
             wrong side or one that says the same of every pixel.
-        SpectrumError: the file is not a table of spectra, does not cover the bands, is not in reflectances (the angle
+        SpectrumError: the file is not a library of spectra, does not cover the bands, is not in reflectances (the angle
             takes any unit), or has no angle to anything.
     """
     match = _GRAMMAR.fullmatch(text)
     if match is None:
-        raise ConfigError(f"target:{text} must be target:[METHOD:]FILE.csv[#NAME][<VALUE], as in {_EXAMPLES}")
+        raise ConfigError(f"target:{text} must be target:[METHOD:]FILE[#NAME][<VALUE], as in {_EXAMPLES}")
     prefix = match["method"] or ""
     named: _DetectionMethod | None = next((known for known in _SIDES if known == prefix), None)
     file = match["file"] if named or not prefix else f"{prefix}:{match['file']}"
     method: _DetectionMethod = "angle" if named is None else named
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
-    table = _table(file, bands)
-    name = _chosen(match["name"], table, file)
-    reflectance = table.spectra[table.names.index(name)]
+    library = _found(file, read)
+    name = _chosen(match["name"], library.names, file)
+    try:
+        reflectance = library.reflectance(name, bands)
+    except SpectrumError as error:
+        raise SpectrumError(f"{file}: {error}") from error
     _validate(reflectance, method, f"'{name}' ({file})")
     return _Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
 
@@ -235,30 +244,26 @@ def _threshold(method: _DetectionMethod, side: str, limit: float) -> float:
     return limit
 
 
-def _table(file: str, bands: Bands) -> SpectraTable:
-    """The file's spectra at the bands."""
+def _found(file: str, read: Callable[[Path], Sequence[LibraryMaterial]]) -> MaterialLibrary:
+    """The file's spectra."""
     if not Path(file).exists():
         prefix, colon, _ = file.partition(":")
         near = difflib.get_close_matches(prefix.lower(), _SIDES, n=1, cutoff=0.6) if colon else []
         hint = f"; did you mean the method {near[0]}: (they are {', '.join(_SIDES)})?" if near else ""
         raise ConfigError(f"there is no file {file} with the spectrum of a target{hint}")
-    table = read_spectra_csv(Path(file))
-    try:
-        return table.resampled(bands)
-    except SpectrumError as error:
-        raise SpectrumError(f"{file}: {error}") from error
+    return MaterialLibrary(tuple(read(Path(file))))
 
 
-def _chosen(name: str | None, table: SpectraTable, file: str) -> str:
+def _chosen(name: str | None, names: Sequence[str], file: str) -> str:
     """The spectrum that is meant."""
-    listed = ", ".join(table.names[:8]) + (", ..." if len(table.names) > 8 else "")
+    listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     if name is None:
-        if len(table.names) == 1:
-            return table.names[0]
-        raise ConfigError(f"{file} has {len(table.names)} spectra; say which, as in {file}#NAME: {listed}")
-    if name in table.names:
+        if len(names) == 1:
+            return names[0]
+        raise ConfigError(f"{file} has {len(names)} spectra; say which, as in {file}#NAME: {listed}")
+    if name in names:
         return name
-    hint = did_you_mean(name, table.names, form="{} ")
+    hint = did_you_mean(name, names, form="{} ")
     raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
 
 

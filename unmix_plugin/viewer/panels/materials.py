@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 
 from unmix_plugin.editing import (
+    FileSpectrum,
     Gloss,
     LibrarySpectrum,
     Light,
@@ -26,7 +27,7 @@ from unmix_plugin.editing import (
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.library.material_library import LibraryMatch, measured_library
+from unmix_plugin.spectral.library.material_library import LibraryMatch, LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.viewer.page import (
     Chart,
@@ -35,6 +36,7 @@ from unmix_plugin.viewer.page import (
     index_in,
     new_file,
     number,
+    paragraph,
     swatches,
     table,
     text,
@@ -48,26 +50,29 @@ _ALIKE_RAD = 0.1
 
 
 def _nearest_materials(
-    spectra: Float[np.ndarray, "N B"], materials: Materials, count: int
+    library: MaterialLibrary, spectra: Float[np.ndarray, "N B"], materials: Materials, count: int
 ) -> list[list[LibraryMatch]]:
     """Known materials that spectra resemble, seen in the light of `materials`."""
     light = None if materials.light is None else materials.light.cpu().double().numpy()
-    return measured_library().nearest(spectra, materials.bands, light, count)
+    return library.nearest(spectra, materials.bands, light, count)
 
 
 def _likeness(match: LibraryMatch) -> str:
-    """A known material and its spectral angle; matches that say little are marked."""
+    """A known material, its spectral angle and its source; matches that say little are marked."""
     remark = "" if match.angle_rad <= _ALIKE_RAD else ", not alike"
-    return f"{match.name} ({match.angle_rad:.3f} rad{remark})"
+    return f"{match.name} ({match.angle_rad:.3f} rad{remark}; {match.source})"
 
 
-def likeness_rows(spectrum: Float[np.ndarray, "B"], materials: Materials) -> list[tuple[str, str]]:
+def likeness_rows(
+    library: MaterialLibrary, spectrum: Float[np.ndarray, "B"], materials: Materials
+) -> list[tuple[str, str]]:
     """Rows of a table of the three known materials that a spectrum resembles most."""
-    matches = _nearest_materials(spectrum[None], materials, 3)[0]
+    matches = _nearest_materials(library, spectrum[None], materials, 3)[0]
     return [("like" if rank == 0 else "", _likeness(match)) for rank, match in enumerate(matches)]
 
 
 _NO_RECIPE = "none saved yet"
+_NO_MATERIAL = "choose one"
 _OWN_LIGHT = "as recorded"
 _COMMON_LIGHTS = ("D65", "D50", "A", "E", "C", "FL2", "FL7", "FL11")
 _FACTOR_BOUNDS = (0.0, 5.0)
@@ -147,13 +152,10 @@ class MaterialsPanel:
             self._gloss = gui.add_slider("gloss", *_FACTOR_BOUNDS, 0.05, 1.0)
             self._gloss_colour = gui.add_rgb("colour of gloss", _WHITE)
             self._name = gui.add_text("name", names[0])
-            self._library = gui.add_dropdown("known material", measured_library().names)
-            self._session.add_button(
-                "replace by the known material",
-                lambda: self._change(
-                    Replace(self._index, LibrarySpectrum(text(self._library.value)), extrapolate=True)
-                ),
-            )
+            names_known = (_NO_MATERIAL, *self._session.services.library.names)
+            self._known = gui.add_dropdown("known material", names_known)
+            self._known_source = gui.add_html("")
+            self._session.add_button("replace by the known material", self._replace)
             self._other = gui.add_dropdown("other endmember", names, initial_value=names[-1])
             self._session.add_button(
                 "swap with the other",
@@ -161,6 +163,7 @@ class MaterialsPanel:
                     with_swap(self._recipe, Swap(self._index, index_in(self._other)))
                 ),
             )
+        self._known.on_update(self._session.guarded(self._show_known))
         self._on(self._factor, lambda: self._change(Scale(self._index, _factor(self._factor))))
         self._on(self._colour, lambda: self._change(Retint(self._index, _srgb(self._colour.value))))
         for control in (self._gloss, self._gloss_colour):
@@ -198,6 +201,23 @@ class MaterialsPanel:
 
     def _change(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
         self._change_recipe(with_change(self._recipe, change), (type(change), change.endmember))
+
+    def _chosen_known(self) -> LibraryMaterial | None:
+        name = text(self._known.value)
+        return None if name == _NO_MATERIAL else self._session.services.library.find(name)
+
+    def _show_known(self) -> None:
+        """Say where the known material is from, and over which wavelengths."""
+        chosen = self._chosen_known()
+        said = "" if chosen is None else f"{chosen.source}; {chosen.bands}"
+        self._known_source.content = paragraph(said) if said else ""
+
+    def _replace(self) -> None:
+        chosen = self._chosen_known()
+        if chosen is None:
+            raise ConfigError("choose a known material first")
+        spectrum = LibrarySpectrum(chosen.name) if chosen.origin is None else FileSpectrum(*chosen.origin)
+        self._change(Replace(self._index, spectrum, extrapolate=True))
 
     def _type_name(self) -> None:
         self._named = self._index
@@ -271,7 +291,7 @@ class MaterialsPanel:
             self._light.options = self._lights(recipe.illuminant)
             self._light.value = _OWN_LIGHT if recipe.illuminant is None else str(recipe.illuminant.light)
             spectrum = materials.endmembers[index].double().cpu().numpy()
-            self._alike.content = table(likeness_rows(spectrum, materials))
+            self._alike.content = table(likeness_rows(self._session.services.library, spectrum, materials))
             self._text.value = recipe_to_yaml(recipe)
         finally:
             self._is_showing = False
@@ -296,7 +316,7 @@ class MaterialsPanel:
         """Every endmember with its colour, its nearest known material, and whether it is hidden."""
         hidden, isolated = visibility(self._recipe)
         spectra = materials.endmembers[:_LONGEST_LIST].double().cpu().numpy()
-        matches = _nearest_materials(spectra, materials, 1)
+        matches = _nearest_materials(self._session.services.library, spectra, materials, 1)
         entries = []
         for index, (name, found) in enumerate(zip(materials.names, matches, strict=False)):
             is_gone = index in hidden or (isolated and index not in isolated)

@@ -189,7 +189,7 @@ class ProbePanel:
                 ("material", shown.name),
                 ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
                 ("measured in", shown.measured_in or "no training view at hand sees the point"),
-                *likeness_rows(shown.predicted, shown.materials),
+                *likeness_rows(self._session.services.library, shown.predicted, shown.materials),
             ]
         )
         names, wavelengths = shown.materials.names, shown.materials.bands.centers_nm

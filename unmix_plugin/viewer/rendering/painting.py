@@ -482,7 +482,7 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     values = _unpremultiplied(materials.through(frame.coefficients, column), frame.coverage)[..., 0]
     scale, label = (
         _percentile_range(reference, low_at_most=0.0),
-        f"radiance at {bands.centers_nm[band]:.0f} nm",
+        f"{materials.quantity} at {bands.centers_nm[band]:.0f} nm",
     )
     return _paint_scaled(values, frame.coverage, settings, scale, label)
 

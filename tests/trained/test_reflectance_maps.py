@@ -9,7 +9,8 @@ from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.maps.reflectance_maps import parse_reflectance_map, seen_reflectance
+from unmix_plugin.spectral.materials import seen_reflectance
+from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
 
 LIGHT = [0.5, 0.8, 1.0, 0.9, 0.6]
 INDEX = "index:(r650-r500)/(r650+r500)"

@@ -1,0 +1,244 @@
+"""Files of known spectra: tables, ENVI libraries, texts of ECOSTRESS and USGS."""
+
+import contextlib
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import spectral.io.envi as envi
+from spectral.database.ecostress import read_ecostress_file
+from spectral.database.usgs import SampleData
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.formats.libraries import library_of, read_library
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.material_library import measured_library
+
+NAN = np.nan
+
+
+def written_by_spectral(folder, **changed):
+    """A library of two spectra in three bands, written by Spectral Python; then lines of its header replaced."""
+    values = np.array([[0.1, 0.25, 0.5], [0.3, 0.2, 0.7]], dtype=np.float32)
+    header = {
+        "wavelength": [400.5, 500, 700],
+        "wavelength units": "Nanometers",
+        "spectra names": ["oak", "fir tree"],
+    }
+    envi.SpectralLibrary(values, header).save(str(folder / "trees"))
+    path = folder / "trees.hdr"
+    lines = path.read_text().splitlines()
+    for key, value in changed.items():
+        name = key.replace("_", " ")
+        lines = [line for line in lines if not line.startswith(name)] + (
+            [] if value is None else [f"{name} = {value}"]
+        )
+    path.write_text("\n".join(lines))
+    return path, values
+
+
+@pytest.mark.parametrize("suffix", [".hdr", ".sli"])
+def test_libraries_that_spectral_python_wrote_are_read_exactly(tmp_path, suffix):
+    path, values = written_by_spectral(tmp_path)
+    found = read_library(path.with_suffix(suffix))
+    assert [one.name for one in found] == ["oak", "fir tree"]
+    np.testing.assert_array_equal(found[0].bands.centers_nm, [400.5, 500, 700])
+    np.testing.assert_array_equal([one.reflectance for one in found], values.astype(np.float64))
+
+
+def test_envi_scale_units_and_byte_order_are_followed(tmp_path):
+    changed = {"wavelength": "{ 0.4, 0.5,\n 0.7 }", "wavelength_units": "Micrometers", "byte_order": 1}
+    path, values = written_by_spectral(tmp_path, **changed, reflectance_scale_factor=100)
+    path.with_suffix(".sli").write_bytes((100 * values).astype(">f4").tobytes())
+    found = read_library(path)
+    np.testing.assert_allclose(found[0].bands.centers_nm, [400, 500, 700])
+    np.testing.assert_allclose([one.reflectance for one in found], values, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"wavelength": None}, "'wavelength' is missing or no list of numbers"),
+        ({"wavelength": "{400, 500}"}, "'wavelength' has 2 values for 3 bands"),
+        ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'Wavenumber'"),
+        ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
+        ({"lines": "two"}, "'lines' is two; expected a whole number"),
+        ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
+        ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
+        ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),
+    ],
+)
+def test_a_spoilt_envi_library_is_refused_with_its_name_and_the_fault(tmp_path, changed, said):
+    path, _ = written_by_spectral(tmp_path, **changed)
+    with pytest.raises(SpectrumError, match=said) as caught:
+        read_library(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "filling",
+    [
+        *(" " * 200_000 + "\n", "\n" * 200_000, "a" * 200_000, "=" * 200_000, "{\n" * 100_000),
+        *("\n" + " " * 200_000 + "x\n", "\na =" + "\n" * 200_000, "\n" + "description = {{}\n" * 20_000),
+    ],
+)
+def test_a_long_envi_header_takes_time_in_proportion(tmp_path, filling):
+    path, _ = written_by_spectral(tmp_path)
+    path.write_text(path.read_text() + filling)
+    started = time.process_time()
+    with contextlib.suppress(SpectrumError):
+        read_library(path)
+    assert time.process_time() - started < 2.0
+
+
+def test_missing_parts_of_an_envi_library_are_named(tmp_path):
+    path, _ = written_by_spectral(tmp_path)
+    path.with_suffix(".sli").unlink()
+    with pytest.raises(SpectrumError, match=r"no file of numbers beside this header; expected trees\.sli"):
+        read_library(path)
+    with pytest.raises(SpectrumError, match=r"none\.hdr: can't read"):
+        read_library(tmp_path / "none.sli")
+    path.write_text("something else")
+    with pytest.raises(SpectrumError, match="its first line is not 'ENVI'"):
+        read_library(path)
+
+
+def spectra_of(path):
+    """Names, wavelengths and values of each spectrum."""
+    return [(one.name, one.bands.centers_nm.tolist(), one.reflectance.tolist()) for one in read_library(path)]
+
+
+def written(folder, name, text):
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what_is_missing(tmp_path):
+    text = (
+        "Wavelength (um),clay (%),ash\n0.7,40,-1.23e34\n0.5,20,0.1\n0.6,30,-999\n0.4,-0.1,0.3\n0.8,nan,0.2\n"
+    )
+    (clay, ash) = read_library(written(tmp_path, "mine.csv", text))
+    assert (clay.name, ash.name, clay.source, ash.origin) == (
+        "clay",
+        "ash",
+        "mine.csv",
+        (tmp_path / "mine.csv", "ash"),
+    )
+    np.testing.assert_allclose(clay.bands.centers_nm, [400, 500, 600, 700])
+    np.testing.assert_allclose(clay.reflectance, [0, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(ash.reflectance, [0.3, 0.1, NAN, NAN, 0.2])
+
+
+ECOSTRESS = """Name: Acer  rubrum
+Type: vegetation
+Class: tree
+First Column: X
+Second Column: Y
+X Units: Wavelength (micrometers)
+Y Units: Reflectance (percent)
+First X Value: 0.7
+Last X Value: 0.4
+Number of X Values: 4
+
+  0.7000\t 44.0
+  0.6000\t 12.5
+  0.5000\t  8.0
+  0.4000\t  5.0
+"""
+
+
+def test_values_that_a_header_marks_as_ignored_are_gaps(tmp_path):
+    path, _ = written_by_spectral(tmp_path, data_ignore_value=0.25)
+    np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its file open
+def test_a_text_of_ecostress_is_read_as_spectral_python_reads_it(tmp_path):
+    path = written(tmp_path, "maple.spectrum.txt", ECOSTRESS)
+    text = ECOSTRESS.replace("Number of X Values: 4", "Measurement: Directional\nNumber of X Values: 4")
+    other = read_ecostress_file(str(written(tmp_path, "other.txt", text)))
+    [(name, wavelengths, values)] = spectra_of(path)
+    assert name == "Acer rubrum"
+    np.testing.assert_allclose(wavelengths, np.array(other.x) * 1000)
+    np.testing.assert_allclose(values, np.array(other.y) / 100)
+
+
+def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_channels(tmp_path):
+    (tmp_path / "ChapterM").mkdir()
+    path = tmp_path / "ChapterM" / "splib07a_Kaolinite.txt"
+    path.write_text(
+        " splib07a Record=11: Kaolinite CM3 BR93-34A   ASDFRb AREF\n -1.23e34\n 0.4\n-1.23e34\n 0.5\n"
+    )
+    with pytest.raises(
+        SpectrumError, match="4 values without wavelengths, and 0 lists of 4 wavelengths lie beside"
+    ):
+        read_library(path)
+    head = " splib07a Record=1: Wavelengths ASD 0.35-2.5 microns 2151 ch\n"
+    (tmp_path / "splib07a_Wavelengths_ASD.txt").write_text(head + "0.5\n0.6\n0.7\n0.8\n")
+    (tmp_path / "splib07a_Wavelengths_BECK.txt").write_text(head + "0.5\n0.6\n0.7\n")
+    [(name, wavelengths, values)] = spectra_of(path)
+    assert name == "Kaolinite CM3 BR93-34A ASDFRb AREF"
+    np.testing.assert_allclose(wavelengths, [600, 700, 800])
+    np.testing.assert_allclose(values, [0.4, NAN, 0.5])
+    np.testing.assert_allclose(SampleData.read_from_file(str(path)).values[1], 0.4)
+    older = "USGS Digital Spectral Library splib06a\n(-1.23e34  indicates a deleted number)\n"
+    older += "Olivine GDS70\ncopy of r 9\n"
+    older += "  0.2051  -1.23e34  0.0\n  0.5  0.31  0.01\n  0.6  0.32  0.01\n"
+    [(name, wavelengths, values)] = spectra_of(written(tmp_path, "olivine.asc", older))
+    assert (name, wavelengths, values) == ("Olivine GDS70", [500.0, 600.0], [0.31, 0.32])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("x.csv", "name,value\n400,1\n", "the first column must be headed 'wavelength' .* found 'name'"),
+        ("x.csv", "wavelength\n400\n", "there is no column beside the wavelengths"),
+        ("x.csv", "wavelength,a,a\n400,1,1\n", "each spectrum needs a name of its own"),
+        ("x.csv", "wavelength,a\n0.4,1\n", "look like micrometres"),
+        ("x.csv", "wavelength,a\n400,-999\n", "'a' has no value that was measured"),
+        ("x.csv", "wavelength,a\n400,1\n500,-0.1\n", "must not be negative; found -0.1 in 'a' at 500 nm"),
+        ("x.txt", "hello\n", "there are no numbers in it"),
+        ("x.txt", "400 1\nend\n", "'end' stands among the numbers"),
+        ("x.txt", "400\n500\n", "no lines with a wavelength and a value"),
+        (
+            "x.txt",
+            ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelength", "Wavenumber"),
+            "'X Units' is",
+        ),
+        ("x.txt", ECOSTRESS.replace("Reflectance", "Transmittance"), "'Y Units' is .* expected reflectance"),
+        ("x.pdf", "", r"a library is a \.csv, an ENVI spectral library"),
+    ],
+)
+def test_what_is_no_library_is_refused_with_its_name_and_the_fault(tmp_path, name, text, said):
+    with pytest.raises(SpectrumError, match=said) as caught:
+        read_library(written(tmp_path, name, text))
+    assert name in str(caught.value)
+
+
+def test_own_files_are_the_library_alone_unless_the_built_in_ones_are_asked_for(tmp_path):
+    first = written(tmp_path, "a.csv", "wavelength,moss,sand\n400,1,2\n550,3,3\n700,4,2\n")
+    second = written(tmp_path, "b.csv", "wavelength,moss\n400,1\n550,2\n700,1\n")
+    assert library_of([]).names == measured_library().names == library_of([Path("+builtin")]).names
+    assert library_of([first]).names == ("moss", "sand")
+    both = library_of([first, second, Path("+builtin")])
+    assert both.names == ("moss", "sand", "moss (b.csv)", *measured_library().names)
+    assert both.find("moss (b.csv)").origin == (second, "moss")
+
+
+def test_a_folder_stands_for_the_libraries_in_it(tmp_path):
+    written(tmp_path, "a.csv", "wavelength,moss\n400,1\n500,2\n")
+    written(tmp_path, "maple.spectrum.txt", ECOSTRESS)
+    written(tmp_path, "maple.ancillary.txt", "Genus: Acer\n")
+    written_by_spectral(tmp_path)
+    assert library_of([tmp_path]).names == ("moss", "Acer rubrum", "oak", "fir tree")
+    (tmp_path / "none").mkdir()
+    with pytest.raises(SpectrumError, match="none: no library in this folder"):
+        library_of([tmp_path / "none"])
+
+
+def test_a_library_that_shares_too_few_bands_is_refused(tmp_path):
+    path = written(tmp_path, "ir.csv", "wavelength,clay\n1000,1\n1500,3\n2500,4\n")
+    with pytest.raises(SpectrumError, match=r"from 1000 to 2500 nm, can.t be compared: each covers"):
+        library_of([path], Bands.of(np.linspace(400, 700, 31)))

@@ -1,0 +1,296 @@
+"""Files of known spectra, read in one way for every command that takes one: tables, ENVI libraries, text files.
+
+| suffix | what |
+|---|---|
+| .csv | `wavelength,NAME,...`, one row a wavelength; `wavelength_um` if in micrometres, `NAME (%)` if in percent |
+| .sli, .hdr | ENVI spectral library |
+| .txt, .asc | one spectrum: of ECOSTRESS or ASTER, of USGS (splib06, splib07), or two columns of numbers alone |
+
+Wavelengths may stand in any order. What a file marks as not measured, by NaN, -1.23e34 (USGS), -999 and the like, is
+NaN.
+
+Sources: Baldridge et al. 2009 and Meerdink et al. 2019 (ASTER, ECOSTRESS); Kokaly et al. 2017, USGS Data Series 1035.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from unmix_plugin.errors import SpectrumError
+from unmix_plugin.formats.envi import data_beside, header_items, read_header, read_layout
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
+from unmix_plugin.spectral.library.material_library import (
+    LibraryMaterial,
+    MaterialLibrary,
+    measured_library,
+)
+from unmix_plugin.spectral.library.spectra_csv import is_number, read_number_table
+
+BUILT_IN = "+builtin"
+"""Stands among a user's files for the spectra that come with the program."""
+
+LIBRARY_SUFFIXES = ("csv", "sli", "hdr", "txt", "asc")
+_HIGHEST_MARKER = -99.0
+"""Numbers from here downwards stand for what was not measured."""
+_NOISE = 0.02
+"""Part of its greatest value by which noise may take a spectrum below 0."""
+_LARGEST_UM = 100.0
+"""Greatest wavelength of a text file that doesn't say in which unit: up to here it is micrometres."""
+_SMALLEST_SCALE = 1e-30
+
+
+def library_of(paths: Iterable[Path], bands: Bands | None = None) -> MaterialLibrary:
+    """The spectra of a user's files alone, or the built-in ones where there are none or `+builtin` stands among them.
+
+    Own spectra come first. One whose name another has is called `NAME (FILE)`.
+
+    Args:
+        paths: Files, folders of files, or `+builtin`.
+        bands: What spectra will be compared at.
+    Raises:
+        SpectrumError: a file that can't be read; none of the user's spectra can be compared at the bands.
+    """
+    asked = list(dict.fromkeys(paths))
+    own = [
+        one
+        for path in asked
+        if str(path) != BUILT_IN
+        for file in (_libraries_in(path) if path.is_dir() else [path])
+        for one in read_library(file)
+    ]
+    if bands is not None and own and not MaterialLibrary(tuple(_named(own))).comparable(bands).any():
+        low = min(one.bands.centers_nm[0] for one in own)
+        high = max(one.bands.centers_nm[-1] for one in own)
+        raise SpectrumError(
+            f"the library's spectra, from {low:g} to {high:g} nm, can't be compared: each covers less than half of "
+            f"{bands}"
+        )
+    built_in = measured_library().materials if not own or Path(BUILT_IN) in asked else ()
+    return MaterialLibrary(tuple(_named([*own, *built_in])))
+
+
+def read_library(path: Path) -> list[LibraryMaterial]:
+    """All spectra of a file; at least one.
+
+    Raises:
+        SpectrumError: another kind of file, or one that can't be read; negative values that are not noise.
+    """
+    readers = {"csv": _read_csv, "sli": _read_envi, "hdr": _read_envi, "txt": _read_text, "asc": _read_text}
+    reader = readers.get(path.suffix.lower()[1:])
+    if reader is None:
+        raise SpectrumError(
+            f"{path}: a library is a .csv, an ENVI spectral library (.hdr and .sli), or a text file (.txt, .asc) as "
+            f"ECOSTRESS and USGS have them; {BUILT_IN} adds the built-in spectra"
+        )
+    try:
+        names, wavelengths_nm, spectra = reader(path)
+        return _materials(names, wavelengths_nm, spectra, path)
+    except OSError as error:
+        raise SpectrumError(f"{error.filename or path}: can't read: {error.strerror or error}") from error
+    except (SpectrumError, ValueError) as error:
+        raise SpectrumError(f"{path}: {error}") from error
+
+
+def _libraries_in(folder: Path) -> list[Path]:
+    """Files of spectra in a folder, without what ECOSTRESS and USGS put beside them."""
+    kinds = [f".{suffix}" for suffix in LIBRARY_SUFFIXES if suffix != "hdr"]  # each .sli has its own
+    found = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in kinds]
+    found = [path for path in found if not _BESIDE_SPECTRA.search(path.name)]
+    if not found:
+        raise SpectrumError(f"{folder}: no library in this folder ({', '.join(kinds)})")
+    return found
+
+
+_BESIDE_SPECTRA = re.compile(r"ancillary|wavelengths|bandpass|readme", re.IGNORECASE)
+
+
+def _named(materials: Sequence[LibraryMaterial]) -> list[LibraryMaterial]:
+    """With names that differ."""
+    taken: dict[str, LibraryMaterial] = {}
+    for one in materials:
+        name, number = one.name, 1
+        while name in taken:
+            number += 1
+            name = f"{one.name} ({one.source}{'' if number == 2 else f' {number - 1}'})"
+        taken[name] = LibraryMaterial(name, one.bands, one.reflectance, one.source, one.origin)
+    return list(taken.values())
+
+
+_Table = tuple[Sequence[str], Float64[np.ndarray, " B"], Float64[np.ndarray, "K B"]]
+"""Names, wavelengths in nm in any order, spectra."""
+
+
+def _materials(
+    names: Sequence[str], wavelengths_nm: np.ndarray, spectra: np.ndarray, path: Path
+) -> list[LibraryMaterial]:
+    """In order of wavelength, with NaN for what was not measured; of values at one wavelength the mean."""
+    require_nanometres(wavelengths_nm)
+    centers, places = np.unique(wavelengths_nm, return_inverse=True)
+    bands, found = Bands(centers), []
+    for name, row in zip(names, spectra, strict=True):
+        measured = np.isfinite(row) & (row > _HIGHEST_MARKER)
+        counts = np.bincount(places[measured], minlength=len(centers))
+        if not counts.any():
+            raise SpectrumError(f"'{name}' has no value that was measured")
+        sums = np.bincount(places[measured], row[measured], len(centers))
+        values = np.divide(sums, counts, out=np.full(len(centers), np.nan), where=counts > 0)
+        least = np.nanmin(values)
+        if least < -_NOISE * np.nanmax(values):
+            wavelength = centers[np.nanargmin(values)]
+            raise SpectrumError(
+                f"spectra must not be negative; found {least:g} in '{name}' at {wavelength:g} nm"
+            )
+        inside = slice(*(np.flatnonzero(counts)[[0, -1]] + (0, 1)))
+        own = bands if counts.all() else Bands(centers[inside])
+        found.append(LibraryMaterial(name, own, np.maximum(values[inside], 0), path.name, (path, name)))
+    return found
+
+
+_CSV_HEAD = re.compile(
+    r"(?:wave ?length|wl|lambda)s?[\s_]*[\[(]?\s*(?:in )?([^\])]*?)\s*[\])]?", re.IGNORECASE
+)
+_PERCENT = re.compile(r"[\s_]*[\[(](?:%|percent|per cent)[\])]\s*$", re.IGNORECASE)
+
+
+def _read_csv(path: Path) -> _Table:
+    header, values = read_number_table(path)
+    head = _CSV_HEAD.fullmatch(header[0])
+    factor = None if head is None else nm_per_unit(head[1] or "nm")
+    if factor is None:
+        raise SpectrumError(
+            f"the first column must be headed 'wavelength' (in nm) or 'wavelength_um'; found '{header[0]}'"
+        )
+    if len(header) == 1:
+        raise SpectrumError("no spectra: there is no column beside the wavelengths")
+    names = [_PERCENT.sub("", name) for name in header[1:]]
+    percent = [name != given for name, given in zip(names, header[1:], strict=True)]
+    if not all(names) or len(set(names)) < len(names):
+        raise SpectrumError(f"each spectrum needs a name of its own; found {names}")
+    return names, values[:, 0] * factor, values[:, 1:].T / np.where(percent, 100.0, 1.0)[:, None]
+
+
+def _read_envi(path: Path) -> _Table:
+    """Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
+    `reflectance scale factor` (values are divided by it) and `data ignore value`."""
+    header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
+    header = read_header(header_path)
+    layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
+    num_spectra, num_bands, _ = layout.shape
+    data_path = data_beside(header_path, layout.num_bytes, ".sli")
+    found, needed = data_path.stat().st_size - layout.offset, layout.num_bytes - layout.offset
+    if found < needed:
+        raise ValueError(
+            f"{data_path.name} has {max(0, found)} bytes; {num_spectra} spectra of {num_bands} values need {needed}"
+        )
+    stored = np.fromfile(data_path, layout.dtype, num_spectra * num_bands, offset=layout.offset)
+    with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
+        values = stored.reshape(num_spectra, num_bands).astype(np.float64)
+        if "data ignore value" in header:
+            ignored = np.array(_number(header, "data ignore value")).astype(layout.dtype)
+            values[stored.reshape(values.shape) == ignored] = np.nan
+    unit = header.get("wavelength units", "").strip()
+    factor = nm_per_unit(unit or "nm")
+    if factor is None:
+        raise ValueError(f"'wavelength units' is {unit!r}; expected Nanometers or Micrometers")
+    names = header_items(header, "spectra names", ",") or [f"spectrum {i}" for i in range(num_spectra)]
+    if len(names) != num_spectra:
+        raise ValueError(f"{len(names)} 'spectra names' for {num_spectra} spectra")
+    scale = _number(header, "reflectance scale factor", "1")
+    if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
+        raise ValueError(f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000")
+    return names, _wavelengths(header, num_bands) * factor, values / scale
+
+
+def _wavelengths(header: Mapping[str, str], num_bands: int) -> np.ndarray:
+    try:
+        values = np.array([float(number) for number in header_items(header, "wavelength")])
+    except ValueError:
+        values = np.zeros(0)
+    if not len(values):
+        raise ValueError("'wavelength' is missing or no list of numbers")
+    if len(values) != num_bands:
+        raise ValueError(f"'wavelength' has {len(values)} values for {num_bands} bands")
+    return values
+
+
+def _number(header: Mapping[str, str], key: str, default: str = "") -> float:
+    try:
+        return float(header.get(key, default))
+    except ValueError:
+        raise ValueError(f"'{key}' is {header.get(key)}; expected a number") from None
+
+
+_UNITS_OF_X = {"micromet": 1000.0, "micron": 1000.0, "nanomet": 1.0}
+
+
+def _read_text(path: Path) -> _Table:
+    """A spectrum with lines of text before its numbers: one a line (splib07), or a wavelength and a value."""
+    words, numbers = _words_and_numbers(path)
+    said = {key.strip().lower(): value.strip() for key, _, value in (line.partition(":") for line in words)}
+    record = re.match(r"\s*(\S+) Record=\d+:\s*(.*\S)", words[0]) if words else None
+    is_usgs = record is not None or any("USGS" in line for line in words[:3])
+    if record is not None and len(numbers[0]) == 1:
+        values = np.array([row[0] for row in numbers])
+        return [_plain(record[2])], _usgs_wavelengths(path, len(values)), values[None]
+    rows = np.array([row[:2] for row in numbers if 2 <= len(row) <= 3])
+    if not len(rows):
+        raise SpectrumError("no lines with a wavelength and a value")
+    kept = rows[:, 0] > 0
+    wavelengths, values = rows[kept].T
+    unit = said.get("x units", "").lower()
+    factor = next((factor for word, factor in _UNITS_OF_X.items() if word in unit), None)
+    if factor is None:
+        if unit:
+            raise SpectrumError(f"'X Units' is {said['x units']!r}; expected micrometers or nanometers")
+        factor = 1000.0 if wavelengths.max(initial=0) < _LARGEST_UM else 1.0
+    quantity = said.get("y units", "reflectance").lower()
+    if "reflectance" not in quantity:
+        raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
+    # The second line from the last before the numbers of splib06 is the title.
+    title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
+    return [_plain(title)], wavelengths * factor, values[None] / (100.0 if "percent" in quantity else 1.0)
+
+
+def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
+    """Lines of text before the numbers, and the numbers of each line after; empty lines left out."""
+    text = read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig", "replace")
+    words: list[str] = []
+    numbers: list[list[float]] = []
+    for line in filter(str.strip, text.splitlines()):
+        parts = line.replace(",", " ").split()
+        if all(map(is_number, parts)):
+            numbers.append([float(part) for part in parts])
+        elif numbers:
+            raise SpectrumError(f"{line.strip()[:40]!r} stands among the numbers")
+        else:
+            words.append(line)
+    if not numbers:
+        raise SpectrumError("there are no numbers in it")
+    return words, numbers
+
+
+def _usgs_wavelengths(path: Path, count: int) -> Float64[np.ndarray, " B"]:
+    """Of splib07, whose spectra are lists of values alone: the one list of wavelengths of that length nearby."""
+    folders = (path.parent, path.resolve().parent.parent)
+    near = [one for folder in folders for one in sorted(folder.glob("*[Ww]avelengths*.txt"))]
+    lists = {np.ravel(rows).tobytes(): np.ravel(rows) for rows in map(_column, near) if len(rows) == count}
+    if len(lists) != 1:
+        raise SpectrumError(
+            f"it has {count} values without wavelengths, and {len(lists)} lists of {count} wavelengths lie beside it "
+            "or above; put the *Wavelengths*.txt of its spectrometer there"
+        )
+    return next(iter(lists.values())) * 1000.0
+
+
+def _column(path: Path) -> list[float]:
+    return [row[0] for row in _words_and_numbers(path)[1] if len(row) == 1]
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.split())
