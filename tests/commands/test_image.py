@@ -24,6 +24,7 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     bands = Bands.of(np.linspace(450, 900, cube.shape[2]))
     write_envi_cube(tmp_path / "field", cube, bands, None, "a field")
     words = (tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
+    words += ("--library", "+builtin", "--mnf", 2)
     ended = run(image, *words)
     assert ended.status == 0, ended.err
     assert "40 x 40 pixels, 24 bands" in ended.out
@@ -36,6 +37,12 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     abundances = open_spectral_file(folder / "abundances.hdr").read()
     assert abundances.shape == (40, 40, 3)
     np.testing.assert_allclose(abundances.reshape(-1, 3)[1:].sum(axis=1), 1, atol=1e-5)
+    assert open_spectral_file(folder / "mnf.hdr").read().shape == (40, 40, 2)
+    assert len((folder / "mnf.csv").read_text().splitlines()) == 1 + 24
+    with (folder / "angles.csv").open() as file:
+        angles = list(csv.DictReader(file))
+    assert [angles[0][key] for key in ("known", "bands")] == ["ColorChecker/blue sky", "17"]
+    assert 0 < float(angles[0]["material 1"]) < np.pi / 2
     for name in ("endmembers.png", "maps.png"):
         assert min(picture_size(folder / name)) > 200
     again = run(image, *words)
@@ -68,6 +75,8 @@ def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
         (lambda cube: 0 * cube, (), "the image is black"),
         (lambda cube: np.full_like(cube, np.nan), (), "no pixel holds a measurement in all bands"),
         (lambda cube: cube[5:6, 5:6], (), "only 1 distinct pixels"),
+        (lambda cube: cube, ("--library", "+builtin"), "its wavelengths are not known, so no spectrum of a library"),
+        (lambda cube: cube, ("--mnf", -1), "--mnf is -1; expected a number of components"),
         (lambda cube: cube, ("--endmembers", 30), "between 1 and the number of bands, 24; found 30"),
     ],
 )

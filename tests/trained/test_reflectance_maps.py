@@ -8,6 +8,7 @@ from torch.testing import assert_close
 from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
+from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import seen_reflectance
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
@@ -81,3 +82,72 @@ def test_what_a_map_is_names_the_index_or_the_target(target):
     bands = Bands.of(WAVELENGTHS_NM)
     assert "r650" in parse_reflectance_map(INDEX, bands).what
     assert "paint" in parse_reflectance_map(f"target:ace:{target}", bands).what
+
+
+LIBRARY = "wavelength,rising,falling,flat\n" + "\n".join(f"{nm},{nm},{1200 - nm},500" for nm in WAVELENGTHS_NM)
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """A file of three reflectances of one shape each."""
+    path = tmp_path_factory.mktemp("libraries") / "mine.csv"
+    path.write_text(LIBRARY)
+    return path
+
+
+def test_a_library_maps_the_nearest_within_the_limit_and_its_angle(library):
+    bands = Bands.of(WAVELENGTHS_NM)
+    rows = np.array([np.array(WAVELENGTHS_NM), 1200 - np.array(WAVELENGTHS_NM), np.full(len(bands), 500.0)])
+    generator = np.random.default_rng(0)
+    spectra = generator.uniform(0.1, 1, (2, 30, 1)) * rows[generator.integers(0, 3, (2, 30))]
+    spectra *= generator.uniform(0.8, 1.2, spectra.shape)
+    spectra[0, 0], spectra[1, 3] = np.nan, 0.0
+    cosines = spectra @ rows.T / np.linalg.norm(spectra, axis=-1, keepdims=True).clip(1e-9) / np.linalg.norm(rows, axis=1)
+    angles = np.arccos(np.clip(cosines, -1, 1))
+    expected = np.where(angles.min(axis=-1) <= 0.12, angles.argmin(axis=-1), 255)
+    expected[0, 0] = expected[1, 3] = 255
+    asked = parse_reflectance_map(f"library:{library}<0.12", bands)
+    found = asked.fit(torch.zeros(0, len(bands)))(torch.from_numpy(spectra))
+    np.testing.assert_array_equal(found.numpy(), expected)
+    assert {0, 1, 2, 255} <= set(expected.ravel().tolist())
+    assert [name for name, _ in asked.classes] == ["rising", "falling", "flat"]
+    least = parse_reflectance_map(f"library:angle:{library}", bands).fit(torch.zeros(0, len(bands)))
+    found = least(torch.from_numpy(spectra))
+    assert found.isnan().nonzero().tolist() == [[0, 0], [1, 3]]
+    np.testing.assert_allclose(found[1, 4:], angles[1, 4:].min(axis=-1), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "said"),
+    [
+        ("library:none.csv", ConfigError, "there is no file or folder none.csv with a library"),
+        ("library:{}<4", ConfigError, "the largest angle must lie between 0 and 3.142 rad"),
+        ("library:angle:{}<0.1", ConfigError, "the angle itself takes no threshold"),
+        ("absorption:red", ConfigError, r"must be absorption:\[depth|centre|area:\]LOW-HIGH in nm"),
+        ("absorption:width:450-650", ConfigError, r"must be absorption:\[depth|centre|area:\]LOW-HIGH in nm"),
+        ("absorption:4.5.0-650", ConfigError, r"must be absorption:\[depth|centre|area:\]LOW-HIGH in nm"),
+        ("absorption:650-450", SpectrumError, "needs three bands or more from 650 to 450 nm"),
+        ("absorption:500-560", SpectrumError, "needs three bands or more from 500 to 560 nm, all of it covered"),
+        ("absorption:450-2250", SpectrumError, "needs three bands or more from 450 to 2250 nm, all of it covered"),
+    ],
+)
+def test_a_map_that_makes_no_sense_is_refused(library, name, error, said):
+    with pytest.raises(error, match=said):
+        parse_reflectance_map(name.format(library), Bands.of(WAVELENGTHS_NM))
+
+
+def test_reflectance_is_an_output_where_the_light_is_known_and_words_follow_the_light():
+    lit, flat, unknown = make_scene(light=LIGHT), make_scene(light=[0.7] * 5), make_scene()
+    view = lit.look(CAMERA)
+    seen = view.opacity >= 0.5
+    expected = view["spectral"][seen] / view.opacity[seen][:, None] / torch.tensor(LIGHT)
+    assert_close(view["reflectance"][seen], expected)
+    assert view["reflectance"][~seen].isnan().all()
+    assert [scene.materials.quantity for scene in (lit, flat, unknown)] == ["radiance", "reflectance", "radiance"]
+    assert flat.output("spectral").what.startswith("reflectance on black")
+    assert flat.output("band:500nm").what.startswith("reflectance of one band")
+    assert lit.output("spectral").what.startswith("radiance on black")
+    assert "of radiance, since the scene's light is unknown" in unknown.output("continuum").what
+    assert "reflectance" not in [output.name for output in unknown.outputs]
+    with pytest.raises(SpectrumError, match="the scene's light is unknown, so that it has no reflectance"):
+        unknown.output("reflectance")

@@ -132,6 +132,8 @@ def _library(options: ImageOptions, wavelengths: np.ndarray | None) -> MaterialL
     from unmix_plugin.formats.libraries import library_of
     from unmix_plugin.spectral.bands import Bands
 
+    if not options.library:
+        return None
     if wavelengths is None:
         raise CaptureError(
             f"{options.file}: its wavelengths are not known, so no spectrum of a library can be compared"

@@ -217,3 +217,11 @@ def test_garbage_in_place_of_any_value_is_a_fault_and_never_a_crash(tmp_path):
     assert all(str(folder.root) in message for message in refused)
     # A principal point may lie outside the picture, and a scene may name no test views.
     assert accepted == [(("cy",), -1), (("test_filenames",), [])]
+
+
+def test_widths_of_bands_are_read_and_must_be_one_a_band(folder):
+    count = len(load_scene(folder.root).wavelengths_nm)
+    folder.edit(lambda c: c.update(fwhm=[7.5] * count))
+    np.testing.assert_array_equal(load_scene(folder.root).fwhm_nm, np.full(count, 7.5))
+    folder.edit(lambda c: c.update(fwhm=[7.5, -1]))
+    assert "'fwhm' must have a width in nm above 0 for each of the wavelengths" in fault_of(folder)

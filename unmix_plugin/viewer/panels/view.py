@@ -104,7 +104,8 @@ class LayerPanel:
         formula = self._gui.add_text(
             "formula",
             "" if index in names else index,
-            hint="Such as (r650-r550)/(r650+r550), where r650 is the reflectance at 650 nm; empty: the index above.",
+            hint="Such as (r650-r550)/(r650+r550), where r650 is the reflectance at 650 nm; or "
+            "absorption:centre:650-700 (or depth, area); empty: the index above.",
         )
 
         def chosen() -> str:

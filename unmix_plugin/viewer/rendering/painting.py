@@ -36,12 +36,13 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
     srgb_to_linear,
 )
-from unmix_plugin.spectral.maps.indices import available_indices, parse_index
+from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
+from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import BLOCK_STYLE, choice, number, paragraph, swatches, text
@@ -425,7 +426,7 @@ _LONGEST_LABEL = 120
 
 
 def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
-    """The index that is chosen, over the background where it is undefined or hardly anything is seen."""
+    """The index or absorption that is chosen, over the background where it is undefined or hardly anything is seen."""
     materials, bands = frame.materials, frame.materials.bands
     if not settings.index:
         edges, centers = bands.edges_nm, bands.centers_nm
@@ -433,17 +434,20 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
             f"no spectral index is chosen: type a formula of the wavelengths from {edges[0]:g} to {edges[-1]:g} nm "
             f"that the bands cover, such as r{float(centers[-1]):g}/r{float(centers[0]):g}"
         )
-    index, rows = parse_index(settings.index, bands), frame.coefficients.flatten()
+    # Of the outputs with an argument only these: others read files, which a page must not name.
+    is_absorption = settings.index.startswith("absorption:")
+    asked = parse_reflectance_map(settings.index if is_absorption else f"index:{settings.index}", bands)
+    index, rows = asked.fit(torch.empty(0, len(bands))), frame.coefficients.flatten()
     # Chunk by chunk: the spectra of a whole picture may not fit into memory.
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
     values = torch.cat([index(materials.reflectance(chunk)) for chunk in chunks]).unflatten(
         0, frame.opacity.shape
     )
-    scale = settings.value_range or index.usual_range
+    scale = settings.value_range or asked.usual_range
     if scale is None:
         seen = index(materials.reflectance(aids.reference))
         scale = _percentile_range(seen[seen.isfinite()])
-    what = index.what if len(index.what) <= _LONGEST_LABEL else f"{index.what[:_LONGEST_LABEL]}..."
+    what = asked.what if len(asked.what) <= _LONGEST_LABEL else f"{asked.what[:_LONGEST_LABEL]}..."
     label = what if materials.light is not None else f"{what}; of radiance: light unknown"
     if bool((frame.opacity > OCCUPIED_ACCUMULATION).any()) and not bool(values.isfinite().any()):
         label += (
