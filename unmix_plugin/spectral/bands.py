@@ -49,8 +49,6 @@ class Bands:
         _require_increasing(centers)
         centers.setflags(write=False)
         object.__setattr__(self, "centers_nm", centers)
-        if self.fwhm_nm is not None and self.fwhm_nm.shape != centers.shape:
-            raise SpectrumError(f"{len(centers)} bands need as many widths; found {self.fwhm_nm.shape}")
 
     @classmethod
     def of(cls, centers_nm: Sequence[object] | np.ndarray | Tensor) -> Bands:
