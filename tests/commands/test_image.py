@@ -75,7 +75,11 @@ def test_a_matrix_of_bands_and_pixels_is_an_image_by_its_size(cube, tmp_path):
         (lambda cube: 0 * cube, (), "the image is black"),
         (lambda cube: np.full_like(cube, np.nan), (), "no pixel holds a measurement in all bands"),
         (lambda cube: cube[5:6, 5:6], (), "only 1 distinct pixels"),
-        (lambda cube: cube, ("--library", "+builtin"), "its wavelengths are not known, so no spectrum of a library"),
+        (
+            lambda cube: cube,
+            ("--library", "+builtin"),
+            "its wavelengths are not known, so no spectrum of a library",
+        ),
         (lambda cube: cube, ("--mnf", -1), "--mnf is -1; expected a number of components"),
         (lambda cube: cube, ("--endmembers", 30), "between 1 and the number of bands, 24; found 30"),
     ],

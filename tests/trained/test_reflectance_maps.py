@@ -84,7 +84,9 @@ def test_what_a_map_is_names_the_index_or_the_target(target):
     assert "paint" in parse_reflectance_map(f"target:ace:{target}", bands).what
 
 
-LIBRARY = "wavelength,rising,falling,flat\n" + "\n".join(f"{nm},{nm},{1200 - nm},500" for nm in WAVELENGTHS_NM)
+LIBRARY = "wavelength,rising,falling,flat\n" + "\n".join(
+    f"{nm},{nm},{1200 - nm},500" for nm in WAVELENGTHS_NM
+)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +104,12 @@ def test_a_library_maps_the_nearest_within_the_limit_and_its_angle(library):
     spectra = generator.uniform(0.1, 1, (2, 30, 1)) * rows[generator.integers(0, 3, (2, 30))]
     spectra *= generator.uniform(0.8, 1.2, spectra.shape)
     spectra[0, 0], spectra[1, 3] = np.nan, 0.0
-    cosines = spectra @ rows.T / np.linalg.norm(spectra, axis=-1, keepdims=True).clip(1e-9) / np.linalg.norm(rows, axis=1)
+    cosines = (
+        spectra
+        @ rows.T
+        / np.linalg.norm(spectra, axis=-1, keepdims=True).clip(1e-9)
+        / np.linalg.norm(rows, axis=1)
+    )
     angles = np.arccos(np.clip(cosines, -1, 1))
     expected = np.where(angles.min(axis=-1) <= 0.12, angles.argmin(axis=-1), 255)
     expected[0, 0] = expected[1, 3] = 255
@@ -127,8 +134,16 @@ def test_a_library_maps_the_nearest_within_the_limit_and_its_angle(library):
         ("absorption:width:450-650", ConfigError, r"must be absorption:\[depth|centre|area:\]LOW-HIGH in nm"),
         ("absorption:4.5.0-650", ConfigError, r"must be absorption:\[depth|centre|area:\]LOW-HIGH in nm"),
         ("absorption:650-450", SpectrumError, "needs three bands or more from 650 to 450 nm"),
-        ("absorption:500-560", SpectrumError, "needs three bands or more from 500 to 560 nm, all of it covered"),
-        ("absorption:450-2250", SpectrumError, "needs three bands or more from 450 to 2250 nm, all of it covered"),
+        (
+            "absorption:500-560",
+            SpectrumError,
+            "needs three bands or more from 500 to 560 nm, all of it covered",
+        ),
+        (
+            "absorption:450-2250",
+            SpectrumError,
+            "needs three bands or more from 450 to 2250 nm, all of it covered",
+        ),
     ],
 )
 def test_a_map_that_makes_no_sense_is_refused(library, name, error, said):
@@ -143,7 +158,11 @@ def test_reflectance_is_an_output_where_the_light_is_known_and_words_follow_the_
     expected = view["spectral"][seen] / view.opacity[seen][:, None] / torch.tensor(LIGHT)
     assert_close(view["reflectance"][seen], expected)
     assert view["reflectance"][~seen].isnan().all()
-    assert [scene.materials.quantity for scene in (lit, flat, unknown)] == ["radiance", "reflectance", "radiance"]
+    assert [scene.materials.quantity for scene in (lit, flat, unknown)] == [
+        "radiance",
+        "reflectance",
+        "radiance",
+    ]
     assert flat.output("spectral").what.startswith("reflectance on black")
     assert flat.output("band:500nm").what.startswith("reflectance of one band")
     assert lit.output("spectral").what.startswith("radiance on black")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from jaxtyping import Float, Float64, Shaped
 
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
-from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
@@ -56,13 +54,12 @@ def angles_csv(
     many bands it was compared; empty where it covers too few.
     """
     angles, counts = library.angles(spectra, bands, light, comparison)
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["known", "source", "bands", *names])
-    for material, count, row in zip(library.materials, counts, angles.T, strict=True):
-        shown = ["" if np.isnan(angle) else f"{angle:.6f}" for angle in row]
-        writer.writerow([material.name, material.source, count, *shown])
-    return text.getvalue().encode()
+    known = zip(library.materials, counts, angles.T, strict=True)
+    rows = [
+        [one.name, one.source, count, *("" if np.isnan(angle) else f"{angle:.6f}" for angle in row)]
+        for one, count, row in known
+    ]
+    return csv_bytes([["known", "source", "bands", *names], *rows])
 
 
 def _endmember_paths(folder: Path) -> list[Path]:

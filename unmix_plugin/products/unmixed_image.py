@@ -95,8 +95,8 @@ def _write_fractions(folder: Path, found: NoiseFractions) -> None:
     names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
     about = "minimum noise fractions: noise 1; 0 where nothing was measured"
     write_envi_cube(folder / "mnf", cube, None, names, about)
-    rows = [f"{number},{ratio:.9g}" for number, ratio in enumerate(found.signal_to_noise.tolist(), 1)]
-    write_file(folder / "mnf.csv", "\n".join(["component,signal to noise", *rows, ""]).encode())
+    rows = [(number, f"{ratio:.9g}") for number, ratio in enumerate(found.signal_to_noise.tolist(), 1)]
+    write_file(folder / "mnf.csv", csv_bytes([("component", "signal to noise"), *rows]))
 
 
 def _numbered_table(names: list[str], spectra: np.ndarray, numbers: np.ndarray) -> bytes:

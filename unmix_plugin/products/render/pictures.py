@@ -8,8 +8,6 @@ Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from dataclasses import dataclass
 
@@ -26,6 +24,7 @@ from unmix_plugin.figures.pictures import (
     premultiplied_over_neutral,
 )
 from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes
+from unmix_plugin.formats.files import csv_bytes
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -174,12 +173,11 @@ _FONT_PT = 9
 
 def legend_csv(output: Output) -> bytes:
     """What the ids of an output with classes of its own mean: `id,name,red,green,blue`, sRGB 0 to 255."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["id", "name", "red", "green", "blue"])
-    for index, (name, colour) in enumerate(output.classes):
-        writer.writerow([index, name, *np.round(255 * np.asarray(colour)).astype(int)])
-    return text.getvalue().encode()
+    rows = [
+        [index, name, *np.round(255 * np.asarray(colour)).astype(int)]
+        for index, (name, colour) in enumerate(output.classes)
+    ]
+    return csv_bytes([["id", "name", "red", "green", "blue"], *rows])
 
 
 def draw_legend(output: Output, palette: Palette) -> bytes:
