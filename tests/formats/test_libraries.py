@@ -161,8 +161,8 @@ def test_a_text_of_ecostress_is_read_as_spectral_python_reads_it(tmp_path):
     other = read_ecostress_file(str(written(tmp_path, "other.txt", text)))
     [(name, wavelengths, values)] = spectra_of(path)
     assert name == "Acer rubrum"
-    np.testing.assert_allclose(wavelengths, np.array(other.x) * 1000)
-    np.testing.assert_allclose(values, np.array(other.y) / 100)
+    np.testing.assert_allclose(wavelengths, np.array(vars(other)["x"]) * 1000)
+    np.testing.assert_allclose(values, np.array(vars(other)["y"]) / 100)
 
 
 def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_channels(tmp_path):
@@ -182,7 +182,7 @@ def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_chann
     assert name == "Kaolinite CM3 BR93-34A ASDFRb AREF"
     np.testing.assert_allclose(wavelengths, [600, 700, 800])
     np.testing.assert_allclose(values, [0.4, NAN, 0.5])
-    np.testing.assert_allclose(SampleData.read_from_file(str(path)).values[1], 0.4)
+    np.testing.assert_allclose(vars(SampleData.read_from_file(str(path)))["values"][1], 0.4)
     older = "USGS Digital Spectral Library splib06a\n(-1.23e34  indicates a deleted number)\n"
     older += "Olivine GDS70\ncopy of r 9\n"
     older += "  0.2051  -1.23e34  0.0\n  0.5  0.31  0.01\n  0.6  0.32  0.01\n"

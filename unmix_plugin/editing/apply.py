@@ -229,7 +229,7 @@ def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibra
     if isinstance(spectrum, LibrarySpectrum):
         return measured_library(), spectrum.library
     library = MaterialLibrary(tuple(read_library(spectrum.file)))
-    names = library.names
+    names = list(library.names)
     if spectrum.spectrum is None and len(names) > 1:
         raise SpectrumError(
             f"{spectrum.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.registry import OutputKind
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.figures.plotting import Colour, distinct_colours, own_colours
+from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.libraries import library_of, read_library
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import AbsorptionMeasure, absorption
@@ -46,7 +46,7 @@ class ReflectanceMap:
     fit: Callable[[Float[Tensor, "N B"]], Score]
     """From the reflectances of what else there is in the views to the numbers, which may be judged against them."""
     kind: OutputKind = "map"
-    classes: tuple[tuple[str, Colour], ...] = ()
+    classes: tuple[tuple[str, tuple[float, ...]], ...] = ()
     """Names of ids and their sRGB colours, where the numbers are ids."""
 
 
@@ -131,7 +131,7 @@ def _nearest(
 ) -> tuple[Float[Tensor, "*rays"], Tensor]:
     """Angle to the nearest spectrum of a library, NaN where there is none, and its number."""
     rows = spectra.reshape(-1, len(bands)).double().cpu().numpy()
-    lit = np.isfinite(rows).any(axis=0)  # bands that the light leaves dark are NaN everywhere
+    lit = np.asarray(np.isfinite(rows).any(axis=0))  # bands that the light leaves dark are NaN everywhere
     angles, _ = library.angles(np.where(lit, rows, 0.0), bands, lit.astype(np.float64))
     least = torch.from_numpy(np.nan_to_num(angles, nan=np.inf)).min(dim=1)
     values = torch.where(least.values.isfinite(), least.values, torch.nan)
@@ -140,7 +140,7 @@ def _nearest(
 
 
 _ABSORPTION = re.compile(
-    r"((?P<measure>depth|centre|center|area):)?\s*(?P<low>[\d.]+)\s*-\s*(?P<high>[\d.]+)\s*(nm)?"
+    r"((?P<measure>depth|centre|center|area):)?\s*(?P<low>\d+(\.\d+)?)\s*-\s*(?P<high>\d+(\.\d+)?)\s*(nm)?"
 )
 _MEASURES: dict[str, tuple[AbsorptionMeasure, str]] = {
     "depth": ("depth", "depth of the deepest absorption below the continuum"),
@@ -153,15 +153,12 @@ _MEASURES: dict[str, tuple[AbsorptionMeasure, str]] = {
 def _absorption(argument: str, bands: Bands) -> ReflectanceMap:
     """`[depth|centre|area:]LOW-HIGH`, wavelengths in nm."""
     match = _ABSORPTION.fullmatch(argument.strip())
-    try:
-        low, high = (float(match[side]) for side in ("low", "high")) if match else (0.0, 0.0)
-    except ValueError:
-        match = None
     if match is None:
         raise ConfigError(
             f"absorption:{argument} must be absorption:[depth|centre|area:]LOW-HIGH in nm, as in "
             "absorption:centre:2150-2250"
         )
+    low, high = float(match["low"]), float(match["high"])
     chosen = np.flatnonzero((bands.centers_nm >= low) & (bands.centers_nm <= high))
     if low >= high or not (bands.contains(low) and bands.contains(high)) or len(chosen) < 3:
         raise SpectrumError(

@@ -174,7 +174,7 @@ class MaterialLibrary:
         self, bands: Bands, light: Float[np.ndarray, " B"] | None = None
     ) -> Bool[np.ndarray, " M"]:
         """Which materials cover half of the bands or more, and three at least, not counting bands without light."""
-        return self._compared_bands(bands, light).any(axis=1)
+        return np.asarray(self._compared_bands(bands, light).any(axis=1))
 
     def _compared_bands(self, bands: Bands, light: Float[np.ndarray, " B"] | None) -> Bool[np.ndarray, "M B"]:
         """Bands that each material is compared over; none of those that are passed over."""
