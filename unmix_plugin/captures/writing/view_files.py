@@ -367,6 +367,8 @@ class WorkFolder:
                 for folder in ("cubes", "images", "masks", _VIEWS):
                     remove_stale_temporaries(self.path / folder)
                 return True
+            if self._lock is not None:
+                self._lock.release()  # Windows removes no file that is open
             with write_errors_as(self.path):
                 shutil.rmtree(self.path)
         make_folder(self.path)

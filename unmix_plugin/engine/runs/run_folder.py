@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from unmix_plugin.errors import RunError
 
 
@@ -140,12 +142,6 @@ def _file_name(name: str) -> str:
     return re.sub(r"[^\w.+-]", "_", name).strip(".")
 
 
-try:
-    import fcntl
-except ImportError:  # Windows: there the lock guards nothing
-    fcntl = None  # type: ignore[assignment]
-
-
 class RunLock:
     """Held from its making to `release`, or to the end of the process, however it ends."""
 
@@ -155,30 +151,21 @@ class RunLock:
         Raises:
             RunError: another process has it, or the file can't be made.
         """
-        self._descriptor: int | None = None
-        flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+        self._lock = FileLock(path, timeout=0, is_singleton=True, thread_local=False)
         try:
-            self._descriptor = os.open(path, flags, 0o666)
-            if fcntl is not None:
-                fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock.acquire()
+        except Timeout as error:
+            raise RunError(
+                f"another {holder} writes to {path.parent}; stop it first, or wait for its end"
+            ) from error
+        except NotImplementedError:  # a file system without locks
+            return
         except OSError as error:
-            if self._descriptor is None:
+            if error.errno not in (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS):  # the same
                 raise RunError(f"can't write {path}: {error.strerror or error}") from error
-            if error.errno in (errno.EAGAIN, errno.EACCES):  # others: no locks here
-                other = os.read(self._descriptor, 20).decode(errors="replace")
-                raise RunError(
-                    f"another {holder} writes to {path.parent} (process {other}); stop it first, or wait for its end"
-                ) from error
-        try:
-            os.ftruncate(self._descriptor, 0)
-            os.write(self._descriptor, str(os.getpid()).encode())
-        except OSError as error:  # a pipe, or a full disk
-            raise RunError(f"can't write {path}: {error.strerror or error}") from error
 
     def release(self) -> None:
         """Let others train the run."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
+        self._lock.release()
 
     __del__ = release
