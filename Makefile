@@ -10,13 +10,14 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum wheel platforms audit lint format bench site clean help
+.PHONY: demo test test-all test-minimum test-portable wheel platforms audit lint format bench site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
 	@echo "make test    run the tests, less the slow ones"
 	@echo "make test-all   run every test, and check each shape annotation while they run"
 	@echo "make test-minimum   run the core of the tests on the lowest versions that are allowed"
+	@echo "make test-portable   run the tests, less the slow ones, with what only POSIX has taken away"
 	@echo "make wheel   build sdist and wheel into dist, and use the wheel without the repository"
 	@echo "make platforms   look whether every dependency has wheels on every system (needs the network)"
 	@echo "make audit   look for known holes in what is pinned (needs the network)"
@@ -52,6 +53,10 @@ test: $(VENV)/.installed-dev $(VENV)/.system-packages
 
 test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 	$(BIN)/python -m pytest --numprocesses 2 --jaxtyping-packages=unmix_plugin,beartype.beartype
+
+# As on Windows: without the modules, functions and signals that only POSIX has, and with a narrow console.
+test-portable: $(VENV)/.installed-dev
+	PYTHONPATH=tests/without_posix $(BIN)/python -m pytest --numprocesses 2 -m "not slow"
 
 # Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
 test-minimum:

@@ -8,6 +8,7 @@ import difflib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
+from importlib import metadata
 from typing import Any
 
 
@@ -47,6 +48,20 @@ def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: s
     """
     near = difflib.get_close_matches(word, list(known), n=3, cutoff=likeness)
     return form.format(f"did you mean {' or '.join(near)}?") if near else ""
+
+
+def install_hint(extra: str) -> str:
+    """The command that installs what an extra of this package needs; the same for a clone, a release and every shell.
+
+    >>> install_hint("lmrm")
+    'python -m pip install "diffusers>=..."'
+    """
+    try:
+        needed = [line.partition(";") for line in metadata.requires("unmix-nerf") or ()]
+    except metadata.PackageNotFoundError:  # the sources alone
+        needed = []
+    found = [name.strip() for name, _, marker in needed if re.search(rf"extra == .{extra}\b", marker)]
+    return " ".join(["python -m pip install", *(f'"{name}"' for name in found or [f"unmix-nerf[{extra}]"])])
 
 
 def counted(number: int, noun: str) -> str:

@@ -411,3 +411,12 @@ def test_a_capture_of_nothing_but_background_is_refused(tmp_path: Path):
         write_cube(capture.root, name, generator.integers(98, 104, (HEIGHT, WIDTH, 9)).astype(np.uint16))
     with pytest.raises(CaptureError, match="no view shows anything but background"):
         process(capture.root, tmp_path / "scene", mask="auto", scale=4000.0)
+
+
+def test_a_library_that_poses_need_is_asked_for_before_any_view_is_written(
+    interrupted, writer, tmp_path: Path, monkeypatch
+):
+    monkeypatch.setattr("importlib.util.find_spec", {}.get)
+    with pytest.raises(CaptureError, match=r'pycolmap, .* is not installed: python -m pip install "opencv'):
+        process(interrupted.root, tmp_path / "new", poses="estimate")
+    assert writer.written == []

@@ -10,6 +10,7 @@ from contextlib import suppress
 import pytest
 import torch
 
+from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError, SceneError
 
@@ -71,19 +72,19 @@ def test_output_that_nobody_reads_to_the_end_is_no_error(command):
     assert process.returncode == 141
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_to_end_cleans_up_first(number, status):
+@pytest.mark.parametrize("number", SIGNALS_TO_END)
+def test_a_signal_to_end_cleans_up_first(number):
     cleaned = []
 
     def command(_argv):
         try:
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
         finally:
             cleaned.append(True)
 
     before = signal.signal(number, signal.SIG_DFL)
     try:
-        assert end_of(command) == status
+        assert end_of(command) == {"SIGTERM": 143, "SIGHUP": 129}[number.name]
         assert signal.getsignal(number) is signal.SIG_DFL
     finally:
         signal.signal(number, before)
@@ -147,7 +148,7 @@ def test_an_interrupt_exits_130(capsys):
 def test_an_interrupt_that_an_import_loses_is_still_one(capsys):
     def command(_words):
         with suppress(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         raise AttributeError("module 'numpy' has no attribute 'matrix'")
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -188,6 +189,7 @@ def as_process(command, *, redirect="", **environment):
     return subprocess.run(words, capture_output=True, env={**os.environ, **environment}, check=False)
 
 
+@needs_posix
 @pytest.mark.parametrize("redirect", [">&-", "2>&-", ">&- 2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_change_no_exit_code(redirect):
     assert as_process("lambda _: print('line')", redirect=redirect).returncode == 0
@@ -195,6 +197,7 @@ def test_closed_streams_change_no_exit_code(redirect):
     assert as_process(failing, redirect=redirect).returncode == 2
 
 
+@needs_posix
 def test_text_that_a_stream_has_no_letters_for_is_written_in_another_way():
     ended = as_process("lambda _: print('\u00b5m', '\\udcff')", PYTHONIOENCODING="ascii", PYTHONUTF8="0")
     assert (ended.returncode, ended.stdout) == (0, b"\\xb5m \xff\n"), ended.stderr

@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -193,7 +192,7 @@ def test_ctrl_c_saves_exits_130_and_says_how_to_go_on_which_then_works(trained, 
 
     def interrupted_at_3(self):
         if self.step == 3:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
         return step(self)
 
     monkeypatch.setattr(Trainer, "_train_step", interrupted_at_3)

@@ -1,7 +1,6 @@
 """`unmix-view`: what is printed, what is served, and how it ends."""
 
 import json
-import os
 import signal
 from contextlib import contextmanager
 
@@ -12,6 +11,7 @@ from tests.commands.running import run
 from tests.commands.test_bad_runs import SPOILT, contents
 from tests.commands.watching import START_S, address, looking, started, visited
 from tests.formats.video_reading import read_video
+from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.view import ViewOptions, prepared, view
 from unmix_plugin.editing import Recipe, Scale, recipe_to_yaml
@@ -46,13 +46,13 @@ def test_an_address_or_an_edit_that_is_none_is_refused(trained, words, message):
     assert message in ended.err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", SIGNALS_TO_END)
 def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
     def visit(printed):
         printed("stop with Ctrl-C")
         with looking(address(printed)) as page:
             wait_for_control(page, "layer")
-            os.kill(os.getpid(), number)
+            signal.raise_signal(number)
             page.wait_until(lambda: page.is_closed)
 
     ended = visited(visit, view, "--run", trained.run, "--device", "cpu", "--viewer.port", "0")
@@ -60,6 +60,7 @@ def test_a_run_is_served_until_it_is_asked_to_end(trained, number):
     assert ended.out.splitlines()[-2:] == ["stop with Ctrl-C", "stopped"]
 
 
+@needs_posix
 def test_a_run_is_served_by_a_process_of_its_own_until_ctrl_c(trained):
     with started("view", "--run", trained.run, "--device", "cpu", "--viewer.port", "0") as command:
         with looking(command.address) as page:

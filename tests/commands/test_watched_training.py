@@ -1,7 +1,6 @@
 """The viewer beside `unmix-train`: what is printed, what is served, and how both end."""
 
 import io
-import os
 import signal
 import threading
 
@@ -10,6 +9,7 @@ import pytest
 
 from tests.commands.running import SMALL_METHOD, run
 from tests.commands.watching import START_S, address, looking, started, visited
+from tests.systems import needs_posix
 from tests.viewer_page import Page
 from unmix_plugin.commands import train as train_module
 from unmix_plugin.commands.train import parse_all, train
@@ -25,6 +25,7 @@ def training_argv(trained, folder, *words):
     ]
 
 
+@needs_posix
 def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_path):
     words = training_argv(trained, tmp_path, "--max-num-iterations", "20")
     with started("train", *words, "--viewer.keep-open") as command:
@@ -100,7 +101,7 @@ def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
         for _ in range(3):
             with looking(address(printed)):
                 pass
-        os.kill(os.getpid(), signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
 
     ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
     assert ended.status == 130

@@ -1,7 +1,6 @@
 """Commands with a viewer: started in a process of their own or in this one, and pages that look at them."""
 
 import io
-import os
 import re
 import signal
 import subprocess
@@ -108,7 +107,7 @@ def visited(visit, command, *words):
         except BaseException as error:  # noqa: BLE001 - raised again below, once the command has ended
             failures.append(error)
             if not is_over.is_set():
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)
 
     visitor = threading.Thread(target=visit_and_note_failures)
     visitor.start()

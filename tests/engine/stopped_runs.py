@@ -1,7 +1,6 @@
 """Trainings without a display, to their end or stopped after a step."""
 
 import io
-import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +33,7 @@ def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> 
 
 def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> Interrupted:
     trainer = quiet_trainer(config)
-    call_after_step(trainer, step, lambda: os.kill(os.getpid(), number))
+    call_after_step(trainer, step, lambda: signal.raise_signal(number))
     with pytest.raises(Interrupted) as caught:
         trainer.train()
     return caught.value

@@ -1,7 +1,6 @@
 """A run that was stopped and resumed is the run that was never stopped."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 import torch
 
 from tests.engine.stopped_runs import call_after_step, finished, newest, quiet_trainer, stop_at
+from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
@@ -20,8 +20,8 @@ from unmix_plugin.errors import RunError
 
 
 def press_ctrl_c_twice() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
-    os.kill(os.getpid(), signal.SIGINT)
+    signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(signal.SIGINT)
 
 
 def train_lines(run: Path) -> list[dict]:
@@ -31,7 +31,7 @@ def train_lines(run: Path) -> list[dict]:
 
 
 @pytest.mark.parametrize(
-    ("number", "average_decay"), [(signal.SIGINT, None), (signal.SIGTERM, 0.9), (signal.SIGHUP, 0.9)]
+    ("number", "average_decay"), [(signal.SIGINT, None), *((number, 0.9) for number in SIGNALS_TO_END)]
 )
 def test_stopped_and_resumed_equals_straight_to_the_bit(
     short_config: TrainerConfig, number: int, average_decay: float | None
@@ -111,12 +111,13 @@ def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(sho
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@needs_posix
 def test_a_lost_terminal_may_say_so_twice(short_config: TrainerConfig):
     trainer = quiet_trainer(short_config)
 
     def hang_up_twice() -> None:
         for _ in range(2):
-            os.kill(os.getpid(), signal.SIGHUP)
+            signal.raise_signal(signal.SIGHUP)
 
     call_after_step(trainer, 6, hang_up_twice)
     with pytest.raises(Interrupted) as caught:
@@ -124,11 +125,12 @@ def test_a_lost_terminal_may_say_so_twice(short_config: TrainerConfig):
     assert caught.value.step == 6
 
 
+@needs_posix
 def test_under_nohup_a_lost_terminal_changes_nothing(short_config: TrainerConfig):
     previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         trainer = quiet_trainer(short_config)
-        call_after_step(trainer, 6, lambda: os.kill(os.getpid(), signal.SIGHUP))
+        call_after_step(trainer, 6, lambda: signal.raise_signal(signal.SIGHUP))
         assert trainer.train().steps == 12
     finally:
         signal.signal(signal.SIGHUP, previous)

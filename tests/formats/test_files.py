@@ -2,6 +2,7 @@
 
 import errno
 import os
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.formats.cubes import full_disk, random_cube
+from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.files import (
     array_bytes,
@@ -41,6 +43,24 @@ def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatc
         write_file(path, b"new")
     assert path.read_bytes() == b"old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_file_that_somebody_reads_is_replaced_once_it_is_free(tmp_path, monkeypatch):
+    """Windows replaces no file that is open."""
+    path, replace, refusals = write_file(tmp_path / "file", b"old"), Path.replace, [PermissionError] * 2
+
+    def busy(self, target):
+        if refusals:
+            raise refusals.pop()
+        return replace(self, target)
+
+    monkeypatch.setattr(atomic_files, "_READERS_S", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(Path, "replace", busy)
+    write_file(path, b"new")
+    assert path.read_bytes() == b"new"
+    refusals.extend([PermissionError(errno.EACCES, "someone reads")] * 9)
+    with pytest.raises(RunError, match=r"can't write .*file: Permission denied; choose a folder"):
+        write_file(path, b"newer")
 
 
 def test_existing_files_are_counted_and_refused_unless_overwriting_was_asked_for(tmp_path):

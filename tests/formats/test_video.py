@@ -1,6 +1,5 @@
 """MP4 video, read back with imageio."""
 
-import os
 import subprocess
 import sys
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.formats.video_reading import read_video
+from tests.systems import needs_posix
 from unmix_plugin.errors import RunError
 from unmix_plugin.formats import video
 from unmix_plugin.formats.video import video_frames
@@ -85,7 +85,7 @@ def test_an_encoder_that_fails_is_quoted_and_leaves_nothing(tmp_path, monkeypatc
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no such limit")
+@needs_posix
 @pytest.mark.parametrize("count", [2, 60])
 def test_the_real_encoder_out_of_space_leaves_nothing(tmp_path, count):
     code = (

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import random
-import resource
-import sys
 import time
 import zlib
 from dataclasses import dataclass, field
@@ -12,6 +10,7 @@ from pathlib import Path
 
 from tests.fuzz.mutation import Reader
 from tests.fuzz.readers import READERS
+from tests.systems import most_memory
 
 
 @dataclass
@@ -45,11 +44,6 @@ def prepare(reader: Reader, folder: Path) -> Path:
     return folder / reader.file_name
 
 
-def _peak_bytes() -> int:
-    """The most memory that this process ever had."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-
-
 def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     """Run cases of a reader.
 
@@ -64,7 +58,7 @@ def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     for case in cases:
         path.unlink(missing_ok=True)  # some file systems flush a file that is truncated and written again
         path.write_bytes(case_bytes(name, reader, seed, case))
-        size, started = _peak_bytes(), time.process_time()
+        size, started = most_memory(), time.process_time()
         try:
             reader.read(path)
             outcome.accepted += 1
@@ -75,7 +69,7 @@ def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
         seconds = time.process_time() - started
         if seconds > outcome.slowest_s:
             outcome.slowest_s, outcome.slowest_case = seconds, case
-        if (grown := _peak_bytes() - size) > outcome.most_bytes:
+        if (grown := most_memory() - size) > outcome.most_bytes:
             outcome.most_bytes, outcome.largest_case = grown, case
         outcome.cases += 1
     return outcome

@@ -1,6 +1,8 @@
 """Where the viewer listens, what its user reads about that, and where its token comes from."""
 
+import errno
 import socket
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -34,6 +36,18 @@ def test_when_no_port_near_is_free_that_is_said(taken, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.access._PORTS_TRIED", 1)
     with pytest.raises(ConfigError, match=f"no free port from {taken} to {taken} at"):
         free_port("127.0.0.1", taken)
+
+
+def test_a_port_that_windows_keeps_for_itself_is_not_free(monkeypatch):
+    def forbidden(_self, _address):
+        raise OSError(errno.EACCES, "forbidden by its access permissions")
+
+    monkeypatch.setattr(socket.socket, "bind", forbidden)
+    with pytest.raises(ConfigError, match="a port above 1023"):
+        free_port("127.0.0.1", 7007)
+    monkeypatch.setattr("unmix_plugin.viewer.access.os", SimpleNamespace(name="nt"))
+    with pytest.raises(ConfigError, match="no free port from 7007"):
+        free_port("127.0.0.1", 7007)
 
 
 @pytest.mark.parametrize("host", ["203.0.113.7", "no-such-host.invalid"])

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, install_hint
 from unmix_plugin.formats.envi import HeaderValue, beside, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
     SIZE_BOUNDS,
@@ -151,9 +151,7 @@ def _print_of_markers() -> Blend:
     try:
         import cv2
     except ImportError as error:
-        raise ConfigError(
-            "OpenCV, which prints markers, is not installed; pip install 'unmix-nerf[sfm]'"
-        ) from error
+        raise ConfigError(f"OpenCV, which prints markers, is not installed: {install_hint('sfm')}") from error
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, MARKER_FAMILY))
     cells = dictionary.markerSize + 2  # with the black border
     steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) == 3]

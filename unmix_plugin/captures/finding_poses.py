@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32
 from unmix_plugin.captures.calibration.calibration import Calibration
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan
-from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses
+from unmix_plugin.captures.poses.estimation import contrast_picture, estimate_poses, require_pycolmap
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import (
     Sightings,
@@ -63,6 +63,8 @@ def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
         parse_angles(options.angles, [view.name for view in capture.views])
     if options.poses in (MARKERS, TURNTABLE) or options.marker_size is not None:
         require_opencv()
+    if options.poses == ESTIMATE:
+        require_pycolmap()
 
 
 def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:

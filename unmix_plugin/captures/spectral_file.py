@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, install_hint
 
 Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 """What the axes of an array are, the slowest first: y rows, x columns, b bands."""
@@ -374,7 +374,7 @@ def import_extra(package: str) -> ModuleType:
         return import_module(package)
     except ImportError as error:
         raise CaptureError(
-            f"the package {package.partition('.')[0]} isn't installed ({error}): pip install 'unmix-nerf[captures]'"
+            f"the package {package.partition('.')[0]} isn't installed ({error}): {install_hint('captures')}"
         ) from error
 
 

@@ -72,7 +72,7 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
         _say("interrupted", is_debug)
         sys.exit(INTERRUPTED)
     except Exception as error:  # noqa: BLE001 - the one border where any error becomes an exit code
-        if isinstance(error, BrokenPipeError) and _is_output_closed():
+        if isinstance(error, OSError) and _is_output_closed(error):
             sys.exit(BROKEN_PIPE)
         # An import in C can lose the KeyboardInterrupt and go on without what it was about to import.
         message, status = ("interrupted", INTERRUPTED) if interrupts else _verdict(error)
@@ -135,20 +135,22 @@ def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _is_output_closed() -> bool:
+def _is_output_closed(error: OSError) -> bool:
     """Whether standard output is a pipe whose reader has gone; what is left in it is then thrown away."""
     try:
         output = sys.stdout.fileno()
     except OSError:
         return False
-    if not hasattr(select, "poll"):  # Windows has none
-        return False
-    watch = select.poll()
-    watch.register(output, 0)
-    if not watch.poll(0):
-        return False
-    os.dup2(os.open(os.devnull, os.O_WRONLY), output)  # Python would complain when it ends
-    return True
+    is_of_pipe = isinstance(error, BrokenPipeError)
+    if hasattr(select, "poll"):
+        watch = select.poll()
+        watch.register(output, 0)
+        is_closed = is_of_pipe and bool(watch.poll(0))
+    else:  # Windows has none, and may say EINVAL of a pipe without a reader
+        is_closed = is_of_pipe or (error.errno == errno.EINVAL and error.filename is None)
+    if is_closed:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output)  # Python would complain when it ends
+    return is_closed
 
 
 def _verdict(error: Exception) -> tuple[str, int]:

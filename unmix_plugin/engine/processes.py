@@ -293,6 +293,7 @@ def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
     shared = {
+        **({"USE_LIBUV": "0"} if sys.platform == "win32" else {}),  # PyTorch is built without it there
         "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // count)),
         **os.environ,
         "WORLD_SIZE": str(count),

@@ -6,13 +6,14 @@ Source of the tags: ITU-T H.273; colours are those of BT.709, whose primaries sR
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import IO, Any, TypeAlias
 
 import numpy as np
 
@@ -24,6 +25,13 @@ FrameSink: TypeAlias = Callable[[np.ndarray], None]
 
 _QUALITY = 16
 """Constant rate factor of x264: 0 is lossless, 18 is hard to tell from it."""
+
+OWN_GROUP: dict[str, Any] = (
+    {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
+    if os.name == "nt"
+    else {"start_new_session": True}
+)
+"""How a process is started that Ctrl-C does not reach: it is for us, and we end the process."""
 
 _TAGS = "colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 
@@ -49,9 +57,8 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
         command = _command(temporary, (width + width % 2, height + height % 2), frames_per_second)
-        # A session of its own: Ctrl-C is for us, and we end the encoder.
         encoder = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, start_new_session=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, **OWN_GROUP
         )
         stdin = encoder.stdin
         assert stdin is not None

@@ -31,6 +31,9 @@ _SMALLEST_PART = 512
 _PARTS_PER_THREAD = 2
 """Parts are smaller than a thread's share, so that a thread that the machine holds up leaves its work to the others."""
 
+_KERNELS_BYTES = 1 << 22
+"""Room that a folder of compiled kernels needs to be worth keeping."""
+
 _RECORDED: dict[Any, Any] = {}
 """A launch of each kernel on a CPU, without its arguments."""
 _PACKING = Lock()
@@ -62,10 +65,12 @@ def warp() -> Any:
 
 
 def _is_initialised(wp: Any) -> bool:
-    """Initialise Warp; False if its cache of kernels can't be written, as where the home folder is read-only."""
+    """Initialise Warp; False if its cache of kernels can't be written: a read-only home folder, a full disk."""
     try:
         wp.init()
-        with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir):
+        with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir) as file:
+            file.write(bytes(_KERNELS_BYTES))
+            file.flush()
             return True
     except OSError:
         return False
@@ -77,7 +82,7 @@ def _standard_error_closed() -> Iterator[None]:
     sys.stderr.flush()
     saved = os.dup(2)
     try:
-        with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
+        with open(os.devnull, "wb") as nowhere:  # noqa: PTH123 - a device, not a path
             os.dup2(nowhere.fileno(), 2)
         yield
     finally:

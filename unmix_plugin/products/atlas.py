@@ -136,7 +136,8 @@ def unwrap(positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], t
     """
     if importlib.util.find_spec("xatlas") is None:
         raise ConfigError(
-            "texture coordinates need the package xatlas, which is not installed: pip install xatlas"
+            "texture coordinates need the package xatlas, which is not installed (Python 3.14 has no wheel of it, so "
+            "that a C++ compiler is needed): python -m pip install xatlas"
         )
     faces = faces.astype(np.int64)
     charts, axes = _chart_labels(positions, faces)

@@ -272,7 +272,7 @@ def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
             continue
         stems = [str(value) if key == "name" else Path(str(value)).stem for value in values]
         names = [re.sub(r"[^\w.+-]", "_", stem).strip(".") for stem in stems]
-        if all(names) and len(set(names)) == len(names):
+        if all(names) and len({name.casefold() for name in names}) == len(names):
             return names
         if key == "name":
             raise ConfigError(f"{path}: two frames have one name, or a name that no file can have")

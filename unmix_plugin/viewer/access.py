@@ -120,7 +120,8 @@ def _bound_port(host: str, port: int) -> int | None:
             probe.bind(address)
             return int(probe.getsockname()[1])
     except OSError as error:
-        if error.errno == errno.EADDRINUSE:
+        # Windows keeps whole ranges of ports for itself, and forbids them.
+        if error.errno == errno.EADDRINUSE or (os.name == "nt" and error.errno == errno.EACCES):
             return None
         raise ConfigError(
             f"can't listen at --viewer.host {host}, port {port}: {error.strerror or error}; "

@@ -99,7 +99,7 @@ def test_a_crash_of_colmap_is_told_with_its_log(room, tmp_path, monkeypatch):
 
 def test_without_pycolmap_the_extra_is_named(room, tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
-    with pytest.raises(CaptureError, match=r"pip install 'unmix-nerf\[sfm\]'"):
+    with pytest.raises(CaptureError, match=r'-m pip install "opencv-python-headless>=.*" "pycolmap>='):
         estimate_poses(room[0], tmp_path)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import resource
 import struct
 import time
 import zipfile
@@ -22,6 +21,7 @@ from PIL import Image
 
 from tests.captures.file_factory import header_text
 from tests.captures.layouts.data_sets import write_exr
+from tests.systems import most_memory
 from unmix_plugin import limits
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.errors import CaptureError
@@ -161,10 +161,10 @@ def test_what_would_take_endless_work_is_refused_before_it_is_decoded(tmp_path, 
     monkeypatch.setattr(limits, "_MOST_RATIO", 1)
     write, message = HOSTILE[name]
     write(tmp_path / name)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = most_memory()
     with quick(), pytest.raises(CaptureError, match=message) as refused:
         open_spectral_file(tmp_path / name)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+    assert most_memory() - before < 200_000_000
     assert name in str(refused.value)
     assert "expected" in str(refused.value)
 

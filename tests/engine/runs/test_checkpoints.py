@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.systems import needs_posix
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint, save_checkpoint
@@ -151,7 +152,7 @@ def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(os.name == "nt", reason="forks")
+@needs_posix
 def test_twenty_real_kills_during_saving_leave_complete_checkpoints(tmp_path: Path):
     done = subprocess.run(
         [sys.executable, "-c", KILLING, str(tmp_path)],

@@ -237,7 +237,7 @@ def test_tiny_triangles_are_placed_too():
 
 def test_without_xatlas_one_message_names_it(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match="pip install xatlas"):
+    with pytest.raises(ConfigError, match="-m pip install xatlas"):
         unwrapped(ball(1), 64)
 
 

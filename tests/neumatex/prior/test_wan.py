@@ -178,5 +178,5 @@ def test_without_the_extra_the_message_names_it(monkeypatch, tmp_path):
         return real_import(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", without_diffusers)
-    with pytest.raises(ConfigError, match=r"pip install 'unmix-nerf\[lmrm\]'"):
+    with pytest.raises(ConfigError, match='-m pip install "diffusers>=0'):
         read_wan_prior(tmp_path, num_parameters=9)

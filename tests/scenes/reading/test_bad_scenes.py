@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from tests.scenes.scene_factory import HEIGHT, WIDTH, SceneFolder, fault_of, make_scene, set_frame
+from tests.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.faults import MAX_LISTED, Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour
@@ -232,6 +233,7 @@ def test_the_tables_must_lie_in_the_scene_folder_too(folder, tmp_path, key):
     )
 
 
+@needs_posix
 def test_a_pipe_is_no_plain_file(folder):
     os.mkfifo(folder.root / "pipe")
     fault = fault_of(folder.edit(set_frame(2, hyperspectral_file_path="pipe")))

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Shaped, UInt8
 
 from unmix_plugin.captures.poses.colmap import read_colmap
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.errors import CaptureError, install_hint, name_some
 
 _LEAST_VIEWS = 3
 _LEAST_SHARE = 0.5
@@ -68,6 +68,18 @@ _OTHER_POSES = "give poses of another program with --poses FILE"
 _WHAT_TO_DO = f"{_SMALLER_STEPS}; {_TEXTURE}; {_STILL}; {_OTHER_POSES}"
 
 
+def require_pycolmap() -> None:
+    """Look, before anything is computed, whether COLMAP is there.
+
+    Raises:
+        CaptureError: it is not.
+    """
+    if importlib.util.find_spec("pycolmap") is None:
+        raise CaptureError(
+            f"poses can't be estimated: pycolmap is not installed: {install_hint('sfm')}, or give other poses"
+        )
+
+
 def estimate_poses(
     pictures: Mapping[str, UInt8[np.ndarray, "H W"]],
     folder: Path,
@@ -91,10 +103,7 @@ def estimate_poses(
     """
     from scipy.ndimage import binary_erosion
 
-    if importlib.util.find_spec("pycolmap") is None:
-        raise CaptureError(
-            "poses can't be estimated: pycolmap is not installed; pip install 'unmix-nerf[sfm]', or give other poses"
-        )
+    require_pycolmap()
     if len(pictures) < _LEAST_VIEWS:
         raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_WHAT_TO_DO}")
     files = {name: f"{index:06d}.png" for index, name in enumerate(sorted(pictures))}

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean
+from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, install_hint
 
 Corners: TypeAlias = Float64[np.ndarray, "4 2"]
 Sightings: TypeAlias = dict[str, dict[int, Corners]]
@@ -70,7 +70,7 @@ def require_opencv() -> Any:
         import cv2
     except ImportError as error:
         raise CaptureError(
-            "OpenCV, which finds markers, is not installed; pip install 'unmix-nerf[sfm]', or give other poses"
+            f"OpenCV, which finds markers, is not installed: {install_hint('sfm')}, or give other poses"
         ) from error
     return cv2
 

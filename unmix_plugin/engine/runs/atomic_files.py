@@ -7,6 +7,7 @@ import contextlib
 import errno
 import json
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,9 @@ from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, read_bounded
 
 _CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
+
+_READERS_S = (0.02, 0.1, 0.5, 1.0) if os.name == "nt" else ()
+"""Waits for readers of a file to be replaced: Windows lets nobody replace one that is open, as by a virus scanner."""
 
 _MAKE_ROOM, _ELSEWHERE = "; make room or choose another folder", "; choose a folder that you may write to"
 _RAISE_LIMIT = "; raise the limit of a file's size (ulimit -f), or choose a folder on another file system"
@@ -49,7 +53,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         yield temporary
         with write_errors_as(path):
             _sync(temporary, os.O_RDWR)
-            temporary.replace(path)
+            _replace(temporary, path)
             if os.name != "nt":  # Windows can't sync a folder, and needn't
                 _sync(path.parent, os.O_RDONLY)
     finally:
@@ -104,7 +108,9 @@ def write_errors_as(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise cannot_write(path, error.strerror or str(error)) from error
+        # Windows has words of its own, in its user's language.
+        known = os.strerror(error.errno) if error.errno is not None else ""
+        raise cannot_write(path, known if known in _ADVICE else error.strerror or str(error)) from error
 
 
 def cannot_write(path: Path, reason: str) -> RunError:
@@ -116,6 +122,16 @@ def remove_stale_temporaries(folder: Path) -> None:
     """Remove what writers that were killed left behind in `folder`."""
     for path in folder.glob(".*.tmp"):
         path.unlink(missing_ok=True)
+
+
+def _replace(temporary: Path, path: Path) -> None:
+    """Give a file its name, also where somebody who reads the old one has to be waited for."""
+    for seconds in _READERS_S:
+        with contextlib.suppress(PermissionError):
+            temporary.replace(path)
+            return
+        time.sleep(seconds)
+    temporary.replace(path)
 
 
 def _sync(path: Path, flags: int) -> None:

@@ -213,7 +213,7 @@ def read_posed_pictures(
     """
     located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
     faults.raise_if_any()
-    names = _names([str(files.colours.relative_to(root)) for files in located if files is not None])
+    names = _names([files.colours.relative_to(root).as_posix() for files in located if files is not None])
     named = [
         replace(files, name=name) for name, files in zip(names, located, strict=True) if files is not None
     ]

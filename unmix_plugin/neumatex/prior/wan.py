@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, install_hint
 from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS, Readers, Triplane
 
 if TYPE_CHECKING:
@@ -167,7 +167,7 @@ def diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLW
         from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
     except ImportError as error:
         raise ConfigError(
-            "the large prior needs diffusers, which is not installed; pip install 'unmix-nerf[lmrm]'"
+            f"the large prior needs diffusers, which is not installed: {install_hint('lmrm')}"
         ) from error
     return WanTransformer3DModel, AutoencoderKLWan
 

@@ -101,7 +101,9 @@ def file_name(output: Output) -> str:
     'false-colour-860-650-550'
     """
     short = (
-        re.sub(r"[^:]*/", "", output.name) if output.name.startswith(("target:", "library:")) else output.name
+        re.sub(r"[^:]*[/\\]", "", output.name)
+        if output.name.startswith(("target:", "library:"))
+        else output.name
     )
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
     is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES

@@ -22,6 +22,7 @@ from jaxtyping import Float32
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
+from unmix_plugin.formats.video import OWN_GROUP
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
@@ -144,7 +145,10 @@ class VideoQueue:
                         stdout=subprocess.PIPE,
                         stderr=subprocess.STDOUT,
                         text=True,
-                        start_new_session=True,
+                        encoding="utf-8",
+                        errors="replace",
+                        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+                        **OWN_GROUP,
                     )
                     self._running = (job, process)
             if process is not None:
