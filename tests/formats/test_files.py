@@ -47,7 +47,11 @@ def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatc
 
 def test_a_file_that_somebody_reads_is_replaced_once_it_is_free(tmp_path, monkeypatch):
     """Windows replaces no file that is open."""
-    path, replace, refusals = write_file(tmp_path / "file", b"old"), Path.replace, [PermissionError] * 2
+    path, replace, refusals = (
+        write_file(tmp_path / "file", b"old"),
+        Path.replace,
+        [PermissionError(errno.EACCES, "someone reads")] * 2,
+    )
 
     def busy(self, target):
         if refusals:

@@ -6,14 +6,13 @@ Source of the tags: ITU-T H.273; colours are those of BT.709, whose primaries sR
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import IO, TypeAlias
 
 import numpy as np
 
@@ -26,12 +25,8 @@ FrameSink: TypeAlias = Callable[[np.ndarray], None]
 _QUALITY = 16
 """Constant rate factor of x264: 0 is lossless, 18 is hard to tell from it."""
 
-OWN_GROUP: dict[str, Any] = (
-    {"creationflags": getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)}
-    if os.name == "nt"
-    else {"start_new_session": True}
-)
-"""How a process is started that Ctrl-C does not reach: it is for us, and we end the process."""
+OWN_GROUP = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+"""With a session of its own, where there are any: Ctrl-C does not reach the process, since it is for us, who end it."""
 
 _TAGS = "colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
 
@@ -58,7 +53,12 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
         command = _command(temporary, (width + width % 2, height + height % 2), frames_per_second)
         encoder = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log, **OWN_GROUP
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=log,
+            start_new_session=True,
+            creationflags=OWN_GROUP,
         )
         stdin = encoder.stdin
         assert stdin is not None

@@ -148,7 +148,8 @@ class VideoQueue:
                         encoding="utf-8",
                         errors="replace",
                         env={**os.environ, "PYTHONIOENCODING": "utf-8"},
-                        **OWN_GROUP,
+                        start_new_session=True,
+                        creationflags=OWN_GROUP,
                     )
                     self._running = (job, process)
             if process is not None:
