@@ -151,7 +151,6 @@ def test_a_spoilt_run_folder_is_refused_by_every_command_and_left_alone(run_copy
 BESIDE = {
     "piped metrics": (piped("metrics.jsonl"), train, ["unmix-nerf", "--load-run"], "is no regular file"),
     "piped log": (piped("run.log"), train, ["unmix-nerf", "--load-run"], "run.log"),
-    "metrics in a report": (piped("metrics.jsonl"), export, ["report", "--run"], "is no regular file"),
     "camera of another size": (camera_of_another_size, evaluate, ["--run"], "is not the one that"),
 }
 

@@ -5,6 +5,7 @@ import csv
 import gzip
 import importlib.metadata
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -400,14 +401,39 @@ def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
     page = (exported[0] / "report" / "report.html").read_text()
     outline = assert_self_contained(page)
     assert outline.ids == [
-        "scene", "views", "materials", "abundances", "segmentation", "figures", "error", "worst", "training",
-        "settings", "versions",
+        "scene", "views", "materials", "abundances", "segmentation", "figures", "error", "worst", "settings",
+        "versions",
     ]  # fmt: skip
     assert "Rendered: 1 of 2 evaluation views." in outline.text
     assert "Of the 1 views rendered for this report." in outline.text
     assert "intersection over union" in outline.text
-    assert 'alt="loss over training"' in page
+    assert re.search(r"6 materials told apart in 6 views: endmember_\d \(\d+% of what is seen", outline.text)
+    assert re.search(r"estimated probability of \d+% on average", outline.text)
     assert "num_endmembers" in outline.text
+
+
+def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):
+    given = [
+        "--title",
+        "Panel <A>",
+        "--author",
+        "A. Nobody",
+        "--object",
+        "icon",
+        "--notes",
+        "found in 1931\nwaxed",
+    ]
+    assert run(export, *words("report", "--run", solid_copy, *given, "--number", "12.7")).status == 0
+    ended = run(export, *words("report", "--run", solid_copy, "--overwrite", "--number", ""))
+    assert ended.status == 0, ended.err
+    page = (solid_copy / "exports" / "report" / "report.html").read_text()
+    assert "<h1>Panel &lt;A&gt;</h1>" in page
+    assert all(text in page for text in ("A. Nobody", "icon", "found in 1931\nwaxed"))
+    assert "12.7" not in page
+    kept = solid_copy / "report.json"
+    kept.write_text(kept.read_text().replace('"icon"', "[1]"))
+    ended = run(export, *words("report", "--run", solid_copy, "--overwrite"))
+    assert (ended.status, "report.json is damaged" in ended.err) == (2, True)
 
 
 def test_a_report_quotes_the_figures_that_eval_found(solid_copy):

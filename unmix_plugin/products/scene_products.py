@@ -217,13 +217,24 @@ class Report(Product):
     library: tuple[Path, ...] = ()
     """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
     ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
+    title: str | None = None
+    """Heading of the report. It and the following are kept with the run; an empty text removes one."""
+    author: str | None = None
+    """Who made it."""
+    object: str | None = None
+    """What was imaged."""
+    number: str | None = None
+    """Its inventory number."""
+    notes: str | None = None
+    """What a reader should know of the object and its capture."""
 
     def write(self, job: Job) -> list[Path]:
         """Render, compare and lay out."""
         from unmix_plugin.products.report.report import export_report
 
         is_edited = self.edits is not None or self.illuminant is not None
-        return export_report(job, self.max_views, self.data, self.library, is_edited)
+        about = {name: getattr(self, name) for name in ("title", "author", "object", "number", "notes")}
+        return export_report(job, self.max_views, self.data, self.library, is_edited, about)
 
 
 @dataclass(frozen=True)

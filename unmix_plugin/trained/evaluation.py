@@ -63,6 +63,8 @@ class PredictedView:
     """Cosine of the spectrum to each endmember."""
     has_sky: bool = False
     """Whether a sky is behind all that is seen."""
+    confidence: Float[Tensor, "H W"] | None = None
+    """Estimated probability that the segmentation is right."""
 
     @property
     def coverage(self) -> Float[Tensor, "H W"]:
@@ -79,8 +81,9 @@ def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = No
     """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
     view = scene.look(camera, subpixels)
-    has_sky = scene.field.has_sky
-    return PredictedView(*(view[name].detach().cpu() for name in names), has_sky=has_sky)
+    parts = (view[name].detach().cpu() for name in names)
+    confidence = view["confidence"].detach().cpu()
+    return PredictedView(*parts, has_sky=scene.field.has_sky, confidence=confidence)
 
 
 def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:

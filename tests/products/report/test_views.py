@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import math
 
 import numpy as np
@@ -17,7 +16,6 @@ from unmix_plugin.products.report.report import (
     _figure_rows,
     _png_url,
     _render_page,
-    _training_charts,
     _view_values,
 )
 from unmix_plugin.spectral.bands import Bands
@@ -65,7 +63,10 @@ OTHERS = {
     "light_unknown": None,
     "figures": None,
     "figures_source": "",
-    "training": [],
+    "num_main": 0,
+    "unknown": [],
+    "summary": "",
+    "about": "",
     "settings": "{}",
     "versions": [],
 }
@@ -170,25 +171,14 @@ def test_bands_that_no_known_material_covers_are_said():
 
 
 def test_figures_come_with_their_definitions_or_with_what_to_do():
-    rows = _figure_rows({"psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
-    text = shown_texts(gathered([]), figures=rows, figures_source="From a file.")["figures"]
-    assert all(part in text for part in ("31.25", "as it was then", "no truth", "From a file."))
+    rows = _figure_rows({"ssim": 0.9, "psnr": 31.25, "miou": None, "definitions": {"psnr": "as it was then"}})
+    assert [name for name, *_ in rows] == ["psnr", "ssim"]
+    others = {"num_main": 1, "unknown": ["miou"], "figures_source": "From a file."}
+    text = shown_texts(gathered([]), figures=rows, **others)["figures"]
+    assert all(
+        part in text for part in ("31.25", "as it was then", "the truth for it: miou.", "From a file.")
+    )
     assert "run unmix-eval" in shown_texts(gathered([]))["figures"]
-
-
-def test_a_training_is_drawn_with_its_evaluations(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    train = {"split": "train", "loss": 0.1, "psnr": 20, "lr/field": 0.01}
-    evaluated = {"split": "eval_all", "psnr": 19}
-    records = [
-        {"step": second, **kind, "seconds": second} for kind in (train, evaluated) for second in (1, 2)
-    ]
-    path.write_text("\n".join(map(json.dumps, records)))
-    charts = _training_charts(path)
-    assert [chart.y_label for chart in charts] == ["loss", "PSNR (dB)", "learning rate", "rays a second"]
-    assert [line.label for line in charts[1].lines] == ["training batches", "evaluation views"]
-    assert "evaluation views" in shown_texts(gathered([]), training=charts)["training"]
-    assert _training_charts(tmp_path / "none") == []
 
 
 def test_lines_that_a_killed_run_left_incomplete_are_passed_over(tmp_path):

@@ -162,6 +162,8 @@ def _against_labels(
     ]
 
 
+NEAR_RAD = 0.1
+"""Spectral angle above which the nearest known material is no match."""
 _STYLES = (("dashed", "#4b545c"), ("dotted", "#7a838b"), ("solid", "#a2aab1"))
 
 
@@ -293,11 +295,15 @@ class ReportViews:
         self._with_shares = frozenset(with_shares)
         self._squares, self._offsets, self._pixels = np.zeros(num_bands), np.zeros(num_bands), 0
         self._amounts = np.zeros(len(materials.names))
+        self._sure, self._seen = 0.0, 0.0
 
     def add(self, name: str, view: PredictedView, truth: ViewTruth | None) -> None:
         """Count a view, and make its pictures."""
         self._amounts += as_numpy(view.abundances).sum(axis=(0, 1))
         opacity = as_numpy(view.accumulation)
+        if view.confidence is not None:
+            self._sure += float((as_numpy(view.confidence) * opacity).sum())
+            self._seen += float(opacity.sum())
         maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
         shares = tuple(_eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
         predicted = _eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
@@ -316,6 +322,11 @@ class ReportViews:
     def proportions(self) -> Float64[np.ndarray, " K"]:
         """Part of all that is seen that each endmember is, summing to 1."""
         return self._amounts / max(self._amounts.sum(), 1e-12)
+
+    @property
+    def confidence(self) -> float | None:
+        """Mean estimated probability that the main material of what is seen is right; None where nothing is."""
+        return self._sure / self._seen if self._seen > 0 else None
 
     @property
     def rmse_of_bands(self) -> Float64[np.ndarray, " B"]:

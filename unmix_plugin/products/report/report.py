@@ -8,7 +8,7 @@ import io
 import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from unmix_plugin import __version__
-from unmix_plugin.engine.runs.atomic_files import read_plain_json
+from unmix_plugin.engine.runs.atomic_files import read_plain_json, read_run_json, write_run_json
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.training.progress import read_metrics
-from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.figures.plotting import ChartLine, LineChart, css_colour, draw_chart
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.errors import ConfigError, RunError, counted
+from unmix_plugin.figures.plotting import LineChart, css_colour, draw_chart
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import SHARE_SCALE
@@ -31,6 +31,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.products.report import pictures
 from unmix_plugin.products.report.pictures import (
     ERROR_SCALE,
+    NEAR_RAD,
     ReportViews,
     TrueMaterials,
     evenly,
@@ -41,6 +42,7 @@ from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import DEFINITIONS, Evaluation, finite_or_none, scene_truth, view_truth
+from unmix_plugin.trained.measures import describe_length
 from unmix_plugin.trained.open_run import LoadedRun, find_scene
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 from unmix_plugin.trained.run_views import RunView, world_frame
@@ -49,7 +51,12 @@ _VIEWS_WITH_SHARES = 2
 
 
 def export_report(
-    job: Job, max_views: int, data: Path | None, library: Sequence[Path], is_edited: bool
+    job: Job,
+    max_views: int,
+    data: Path | None,
+    library: Sequence[Path],
+    is_edited: bool,
+    about: Mapping[str, str | None],
 ) -> list[Path]:
     """Render, compare and lay out.
 
@@ -59,11 +66,12 @@ def export_report(
         data: Scene folder, where it is no longer where the run was trained on it.
         library: Files of reflectances to compare with too.
         is_edited: Whether the scene differs from the one that was trained.
+        about: `title`, `author`, `object`, `number` and `notes`; None: as the run keeps them.
     """
     if max_views < 1:
         raise ConfigError(f"--max-views is {max_views}; choose at least 1")
     job.claim([job.folder / "report.html"])
-    known = library_of(library, job.materials.bands)
+    known, said = library_of(library, job.materials.bands), _about(job.loaded.folder, about)
     chosen = evenly(job.views("eval"), max_views)
     scene, notes = None, []
     if is_edited:
@@ -80,7 +88,7 @@ def export_report(
     if len(chosen) < len(job.loaded.record.eval_cameras):
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
     with job.working("laying out the report"):
-        return [_write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes)]
+        return [_write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes, said)]
 
 
 def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
@@ -122,6 +130,7 @@ def _write_report(
     library: MaterialLibrary,
     stored_figures: dict[str, Any] | None,
     notes: Sequence[str],
+    about: Mapping[str, str],
 ) -> Path:
     """Write `report.html`; without `stored_figures`, with those of `views` if they were compared."""
     materials, light = views.materials, loaded.materials_scene.light_power
@@ -130,20 +139,25 @@ def _write_report(
         figures = finite_or_none(views.evaluation.figures())
         source = f"Of the {len(views.shown)} views rendered for this report."
     truth = _true_materials(loaded, light)
+    cards = material_cards(materials, views.proportions, light, library, truth)
+    unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
     page = _render_page(
         {
-            "title": f"{_scene_name(loaded)}: spectral unmixing report",
+            "title": about.get("title") or f"{_scene_name(loaded)}: materials and spectra",
             "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
             "page": _page_link(folder, loaded),
+            "summary": _summary(loaded, views, cards, figures, library.names),
+            "about": about.get("notes", ""),
             "notes": notes,
-            "facts": _scene_facts(loaded, materials, figures),
-            "cards": material_cards(materials, views.proportions, light, library, truth),
+            "facts": _scene_facts(loaded, materials, about),
+            "cards": cards,
             "quantity": materials.quantity,
             "num_known": len(library.names),
             "light_unknown": LIGHT_UNKNOWN if light is None else None,
             "figures": None if figures is None else _figure_rows(figures),
+            "num_main": sum(name in _MAIN_FIGURES for name, *_ in _figure_rows(figures or {})),
+            "unknown": unknown,
             "figures_source": source,
-            "training": _training_charts(loaded.folder.metrics_path),
             "settings": json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1),
             "versions": _version_rows(loaded),
             **_view_values(views),
@@ -228,40 +242,28 @@ def _svg_url(chart: LineChart) -> str:
 
 
 _PACKAGES = ("torch", "warp-lang", "numpy", "scipy", "scikit-image", "colour-science", "matplotlib", "pillow")
-_MAIN_FIGURES = {
-    "psnr": ("PSNR", " dB"),
-    "sam": ("spectral angle", " rad"),
-    "miou": ("mean IoU", ""),
-    "abundance_rmse": ("abundance RMSE", ""),
-}
-_COLOURS = ("#0b5cad", "#c8501e", "#2d8659", "#7d4fb0")
+_MAIN_FIGURES = ("psnr", "sam", "rmse", "miou", "accuracy", "abundance_rmse", "endmember_angle")
+_NAMED_MATERIALS = 4
+_LONGEST_ABOUT = 20_000
 
 
-def _scene_facts(
-    loaded: LoadedRun, materials: Materials, figures: Mapping[str, Any] | None
-) -> list[tuple[str, str]]:
-    """What was trained on what, and how well that went, in a few words."""
-    scene, training = loaded.record, loaded.training
-    summary, cameras = scene.summary, scene.train_cameras
+def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What the report is of, in a few words."""
+    scene, world = loaded.record, loaded.materials_scene
     size = (scene.scene_box.size.cpu().double().numpy() / world_frame(scene).scale).tolist()
+    cameras = scene.train_cameras
     sizes = sorted({cameras.size(index) for index in range(len(cameras))}, reverse=True)
-    known = [word for word in ("alpha", "labels", "abundances") if summary.get(f"has_{word}")]
+    named = [(word.capitalize(), about[word]) for word in ("object", "number", "author") if about.get(word)]
     return [
-        *(
-            (label, f"{figures[key]:.4g}{unit}")
-            for key, (label, unit) in _MAIN_FIGURES.items()
-            if figures is not None and figures.get(key) is not None
-        ),
+        *named,
         ("Scene", _scene_name(loaded)),
+        ("Views", f"{len(cameras)} to learn from, {len(scene.eval_cameras)} to check with"),
+        ("Pixels of a view", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("Bands", str(materials.bands)),
-        ("Views", f"{len(scene.train_cameras)} training, {len(scene.eval_cameras)} evaluation"),
-        ("Image size", ", ".join(f"{width} x {height}" for width, height in sizes) + " pixels"),
-        ("Scene box", " x ".join(f"{edge:.3g}" for edge in size) + " world units"),
         ("Light", _light_in_words(materials)),
-        ("Comes with", ", ".join(known) or "images alone"),
-        ("Endmembers", str(len(materials.names))),
-        ("Training", f"{training.steps:,} steps, {training.train_seconds:,.0f} s"),
-        ("Rays", f"{training.total_rays:,}"),
+        ("Size of the scene", " x ".join(describe_length(edge, world.scale) for edge in size)),
+        *([("Scale", world.scale.said)] if world.scale is not None else []),
+        ("Training", f"{loaded.training.train_seconds:,.0f} s"),
     ]
 
 
@@ -271,6 +273,57 @@ def _light_in_words(materials: Materials) -> str:
     return "taken out: values are reflectance" if materials.quantity == "reflectance" else "recorded"
 
 
+def _summary(
+    loaded: LoadedRun,
+    views: ReportViews,
+    cards: Sequence[Any],
+    figures: Mapping[str, Any] | None,
+    known_names: Collection[str],
+) -> str:
+    """What was found and how sure, in two or three sentences."""
+    named = []
+    ordered = sorted(cards, key=lambda card: -card.proportion)
+    for card in ordered[:_NAMED_MATERIALS]:
+        near = [
+            line.label for line, angle, _ in card.matches if angle <= NEAR_RAD and line.label in known_names
+        ]
+        like = f", most like {near[0]}" if near else ""
+        named.append(f"{card.name} ({card.proportion:.0%} of what is seen{like})")
+    if len(ordered) > _NAMED_MATERIALS:
+        named.append(f"and {len(ordered) - _NAMED_MATERIALS} more")
+    count, known = len(loaded.record.train_cameras), figures or {}
+    text = f"{counted(len(cards), 'material')} told apart in {counted(count, 'view')}: {', '.join(named)}."
+    errors = [
+        f"{say} {known[name]:.2g}{unit}"
+        for name, say, unit in (
+            ("sam", "spectra are off by", " rad"),
+            ("rmse", "values by", " of full scale"),
+        )
+        if known.get(name) is not None
+    ]
+    if errors:
+        text += f" In views that were kept apart from training, {' and '.join(errors)}, on average."
+    if views.confidence is not None:
+        text += f" A pixel's main material is right with an estimated probability of {views.confidence:.0%} on average."
+    return text if errors else f"{text} Not compared with measured views."
+
+
+def _about(run: RunFolder, given: Mapping[str, str | None]) -> dict[str, str]:
+    """Title, author, object, number and notes: what is given now, beside what the run keeps from before."""
+    path, kept = run.path / "report.json", {}
+    if path.exists():
+        kept = {name: read_run_json(path).get(name) or "" for name in given}
+        if not all(isinstance(text, str) for text in kept.values()):
+            raise RunError(f"{path} is damaged: it should hold texts; remove it")
+    about = {name: kept.get(name, "") if text is None else text for name, text in given.items()}
+    too_long = [name for name, text in about.items() if len(text) > _LONGEST_ABOUT]
+    if too_long:
+        raise ConfigError(f"--{too_long[0]} is longer than {_LONGEST_ABOUT} letters")
+    if about != kept and any(text is not None for text in given.values()):
+        write_run_json(path, dict(about))
+    return about
+
+
 def _scene_name(loaded: LoadedRun) -> str:
     """What the run calls its scene: the folder's name."""
     root = loaded.record.summary.get("root")
@@ -278,40 +331,12 @@ def _scene_name(loaded: LoadedRun) -> str:
 
 
 def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Each figure of merit, as `eval/metrics.json` has it, with its definition."""
+    """Each figure of merit that is known, as `eval/metrics.json` has it, with its definition; the main ones first."""
     definitions = {**DEFINITIONS, **(values.get("definitions") or {})}
     return [
-        (name, "no truth" if values[name] is None else f"{values[name]:.4g}", definitions[name])
-        for name in DEFINITIONS
-        if name in values
-    ]
-
-
-def _training_charts(path: Path) -> list[LineChart]:
-    """Loss, PSNR, learning rates and speed over training, from a run's `metrics.jsonl`; none without a record."""
-    records = read_metrics(path)
-    train = [record for record in records if record.get("split") == "train"]
-    if len(train) < 2:
-        return []
-    rates = sorted({key for record in train for key in record if key.startswith("lr/")})
-    evaluated = [record for record in records if record.get("split") == "eval_all"]
-    psnr = [_line(train, "psnr", "training batches", _COLOURS[0])]
-    if len(evaluated) > 1:
-        psnr.append(_line(evaluated, "psnr", "evaluation views", _COLOURS[1]))
-    learning_rates = [
-        _line(train, key, key.removeprefix("lr/"), colour)
-        for key, colour in zip(rates, _COLOURS, strict=False)
-    ]
-    charts = [
-        ("loss", [_line(train, "loss", "loss", _COLOURS[0])], True),
-        ("PSNR (dB)", psnr, False),
-        ("learning rate", learning_rates, True),
-        ("rays a second", [_line(train, "rays_per_second", "rays a second", _COLOURS[0])], False),
-    ]
-    return [
-        LineChart(lines, "seconds of training", label, is_log, size=(520.0, 260.0))
-        for label, lines, is_log in charts
-        if lines
+        (name, f"{values[name]:.4g}", definitions[name])
+        for name in dict.fromkeys((*_MAIN_FIGURES, *DEFINITIONS))
+        if values.get(name) is not None
     ]
 
 
@@ -327,16 +352,6 @@ def _version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
         ("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
         *((name, version) for name in _PACKAGES if (version := _version(name)) is not None),
     ]
-
-
-def _line(records: Sequence[Mapping[str, Any]], key: str, label: str, colour: str) -> ChartLine:
-    seconds = np.array([_number(record.get("seconds")) for record in records])
-    values = np.array([_number(record.get(key)) for record in records])
-    return ChartLine(seconds, values, label, colour)
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else np.nan
 
 
 def _version(package: str) -> str | None:
