@@ -133,8 +133,8 @@ def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_p
     said = " ".join(ended.err.split())
     assert f"{words[0]} compares with what is known in the run's own bands" in said
     assert (
-        "It goes with abundances, cubes, endmembers, mesh, page, pca, point-cloud, poses, segmentation, splats, "
-        "volume" in said
+        "It goes with abundances, cubes, endmembers, mesh, page, pca, point-cloud, poses, regions, segmentation, "
+        "splats, volume" in said
     )
     assert not (tmp_path / "out").exists()
 

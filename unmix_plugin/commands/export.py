@@ -116,7 +116,8 @@ def _write(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -
     for file in written:
         print(file)
     if written:
-        print(f"{counted(len(written), 'file')} written to {job.folder}")
+        folder = job.folder if written[0].is_relative_to(job.folder) else written[0].parent
+        print(f"{counted(len(written), 'file')} written to {folder}")
 
 
 def _open(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -> Job:

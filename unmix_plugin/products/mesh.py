@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
+from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, views_of, world_up
 from unmix_plugin.trained.surface import (
     GridPoints,
     SeenSurface,
@@ -268,13 +268,31 @@ def find_surface(
         ConfigError: nothing is as dense as was asked for.
         RunError: no camera of the run sees a surface.
     """
-    scene, surface = job.scene, job.surface(_NUM_RAYS)
+    return surface_of(
+        job.scene, resolution, density, smoothing, keeps_unseen, follow=job.follow, working=job.working
+    )
+
+
+def surface_of(
+    scene: TrainedScene,
+    resolution: int,
+    density: float | None = None,
+    smoothing: float = 1.0,
+    keeps_unseen: bool = False,
+    follow: Callable[[str, Sequence[Any]], Iterable[Any]] = lambda _doing, items: items,
+    working: Callable[[str], AbstractContextManager[None]] = lambda _doing: nullcontext(),
+) -> tuple[TriangleMesh, float]:
+    """`find_surface` of a scene alone; `follow` and `working` show how far it is."""
+    cameras = [view.camera for view in views_of(scene.views, "all")]
+    surface = SeenSurface(scene, _NUM_RAYS, cameras)
+    for camera in follow("looking at the surface", cameras):
+        surface.look(camera)
     grid = GridPoints.over(scene.scene_box.aabb, resolution)
-    slices = job.follow("sampling the density", range(grid.shape[0]))
+    slices = follow("sampling the density", range(grid.shape[0]))
     densities = np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices])
-    with job.working("finding the surface"):
+    with working("finding the surface"):
         ends = surface.points()
-        threshold = _surface_density(scene, ends) if density is None else density / job.frame.scale
+        threshold = _surface_density(scene, ends) if density is None else density / scene.frame.scale
         solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
         mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
         if density is None:

@@ -203,6 +203,39 @@ class Poses(Product):
 
 
 @dataclass(frozen=True)
+class Regions(Product):
+    """Named parts of the surface, kept with the run: area, abundances, mean spectrum and its standard deviation of each
+    of them and of each material (regions.csv, regions-spectra.csv, and the library regions.sli). With --add a region is
+    kept, with --remove one is forgotten."""
+
+    name = "regions"
+
+    add: str | None = None
+    """Name of a region to keep, which one of the next five options says."""
+    box: tuple[str, str] | None = None
+    """Two opposite corners of a box, in the world ("0.1 0.2 0.5") or by pixels of views (VIEW:column,row)."""
+    material: str | None = None
+    """Name or number of an endmember: where it has the largest share."""
+    view: str | None = None
+    """View of --polygon or --mask: its name, or its number among the evaluation views."""
+    polygon: str | None = None
+    """Corners in that view, column and row: "120,80 180,80 150,140"; what is seen inside."""
+    mask: Path | None = None
+    """Picture of that view's size: what is seen where it is white."""
+    remove: str | None = None
+    """Name of a region to forget."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Keep or forget a region, or measure all of them."""
+        from unmix_plugin.products.regions import RegionRequest, change_regions, export_regions
+
+        asked = RegionRequest(self.box, self.material, self.view, self.polygon, self.mask)
+        if self.add is None and self.remove is None and asked == RegionRequest():
+            return export_regions(job)
+        return change_regions(job, self.add, self.remove, asked)
+
+
+@dataclass(frozen=True)
 class Report(Product):
     """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
     known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
@@ -275,8 +308,9 @@ class Segmentation(ViewProduct):
 
 @dataclass(frozen=True)
 class Spectrum(Product):
-    """Spectrum of a pixel (--view 3 --pixel 120,80) or of a point of space (--point=0.1,-0.2,0.5): predicted, and
-    measured where the scene folder is found, as CSV and plot; abundances and nearest known materials as JSON."""
+    """Spectrum of a pixel (--view 3 --pixel 120,80), of a point of space (--point=0.1,-0.2,0.5) or of a kept region
+    (--region NAME, with its standard deviation): predicted, and of a pixel measured where the scene folder is found, as
+    CSV and plot; abundances and nearest known materials as JSON."""
 
     name = "spectrum"
 
@@ -286,6 +320,8 @@ class Spectrum(Product):
     """Column and row, from 0 at the top left, as in 120,80."""
     point: str | None = None
     """Point in the scene's world coordinates, as in 0.1,0.2,0.5."""
+    region: str | None = None
+    """Name of a region that is kept with the run (unmix-export regions)."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     library: tuple[Path, ...] = ()
@@ -298,7 +334,7 @@ class Spectrum(Product):
         """Probe the place and write what is there."""
         from unmix_plugin.products.spectrum import export_spectrum
 
-        place = (self.view, self.pixel, self.point)
+        place = (self.view, self.pixel, self.point, self.region)
         return export_spectrum(job, place, self.data, self.library, self.compare)
 
 
@@ -350,6 +386,7 @@ PRODUCTS: tuple[RunWork, ...] = (
     Pca(),
     PointCloud(),
     Poses(),
+    Regions(),
     Report(),
     Scale(),
     Segmentation(),

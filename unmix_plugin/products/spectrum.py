@@ -17,9 +17,11 @@ from jaxtyping import Float
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
+from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.regions import measured_surface
 from unmix_plugin.spectral.library.material_library import Comparison
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
@@ -42,7 +44,7 @@ _MOST_BARS = 12
 
 def export_spectrum(
     job: Job,
-    place: tuple[str | None, str | None, str | None],
+    place: tuple[str | None, str | None, str | None, str | None],
     data: Path | None,
     library: Sequence[Path],
     comparison: Comparison,
@@ -51,19 +53,33 @@ def export_spectrum(
 
     Args:
         job: The run and where to write.
-        place: View and pixel, or a point, as the command line has them.
+        place: View and pixel, a point, or a region, as the command line has them.
         data: Scene folder, where it is no longer where the run was trained on it.
         library: Files of reflectances to compare with too.
         comparison: How spectra are compared.
     """
-    view_name, pixel_text, point_text = place
-    measured = None
-    if point_text is not None and view_name is None and pixel_text is None:
+    view_name, pixel_text, point_text, region = place
+    measured = spread = None
+    others = (view_name, pixel_text, point_text)
+    if region is not None and others == (None, None, None):
+        title, name = f"region {region}", f"region_{region}"
+        kept = job.loaded.measures.region(region)
+        job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
+        found = measured_surface(job).measure(kept, region)
+        probe, spread = (
+            Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None),
+            found.spread,
+        )
+        facts: dict[str, Any] = {"region": region, "area_square_units": found.area}
+        job.say(f"{region}: {found.said(job.materials.names, job.scene.scale)}")
+    elif region is not None:
+        raise ConfigError("give --region alone, without a pixel or a point")
+    elif point_text is not None and view_name is None and pixel_text is None:
         point = _numbers(point_text, 3, "--point", "0.1,0.2,0.5")
         name = f"point_{'_'.join(f'{value:g}' for value in point)}"
         job.claim(_spectrum_paths(job.folder, name))
         probe = job.scene.probe_point(point[0], point[1], point[2])
-        facts: dict[str, Any] = {"point": point}
+        facts = {"point": point}
         title = f"point {', '.join(f'{value:g}' for value in point)}"
     elif point_text is None and view_name is not None and pixel_text is not None:
         if not re.fullmatch(r"\s*\d+\s*,\s*\d+\s*", pixel_text):
@@ -77,7 +93,9 @@ def export_spectrum(
         title = f"{view.name}, column {column}, row {row}"
         measured = _measured(job, view, (column, row), data)
     else:
-        raise ConfigError("give a pixel with --view and --pixel, or a point with --point")
+        raise ConfigError(
+            "give a pixel with --view and --pixel, a point with --point, or a region with --region"
+        )
     light, matches = job.scene.light_power, []
     known = library_of(library, job.materials.bands)
     if light is None:
@@ -87,8 +105,12 @@ def export_spectrum(
     else:
         spectra, bands = probe.spectra["predicted"][None], job.materials.bands
         [matches] = shown_matches(spectra, bands, light, known, comparison=comparison)
-    probed = _ProbedPlace(title, facts, probe, measured, matches)
-    return _write_spectrum(job.folder, name, probed, job.scene)
+    probed = _ProbedPlace(title, facts, probe, measured, matches, spread)
+    written = _write_spectrum(job.folder, name, probed, job.scene)
+    if spread is not None:
+        mean = probe.spectra["predicted"][None].astype(np.float32)
+        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), "mean spectrum")
+    return written
 
 
 def _measured(
@@ -121,6 +143,8 @@ class _ProbedPlace:
     """Spectrum that the scene has there, in the light of the prediction."""
     matches: Sequence[ShownMatch]
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
+    spread: Float[np.ndarray, " B"] | None = None
+    """Standard deviation, of a region."""
 
 
 def _spectrum_paths(folder: Path, name: str) -> list[Path]:
@@ -137,6 +161,8 @@ def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: Trained
     columns = dict(place.probe.spectra)
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
+    if place.spread is not None:
+        columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     table = SpectraTable(materials.bands, tuple(columns), np.stack(list(columns.values())))
     write_spectra_csv(table_path, table)
     facts = {**_facts(place, materials), "scale": describe_scale(scene.scale)}
@@ -155,6 +181,11 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     if place.measured is not None:
         lines.plot(wavelengths, place.measured, color="0.55", linewidth=3.5, label="measured")
     lines.plot(wavelengths, place.probe.spectra["predicted"], color="black", linewidth=1.8, label="predicted")
+    if place.spread is not None:
+        mean = place.probe.spectra["predicted"]
+        lines.fill_between(
+            wavelengths, mean - place.spread, mean + place.spread, color="0.85", label="± 1 std. dev."
+        )
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
         lines.plot(wavelengths, shown.spectrum, linestyle=style, linewidth=1.3, label=label)

@@ -1,4 +1,5 @@
-"""What a user measured in a run, kept in its folder as `measures.json`: how long a unit of its world is.
+"""What a user measured and marked in a run, kept in its folder as `measures.json`: how long a unit of its world is, and
+named regions of its surface.
 
 The world is that of the scene's poses, in which probes and exports give positions.
 """
@@ -7,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
 from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.regions import MOST_REGIONS, Region, check_name, region_from_json, region_to_json
 
 _LONGEST_TEXT = 200
 _CENTIMETRES_FROM_M, _METRES_FROM_M = 0.01, 1.0
@@ -53,6 +55,20 @@ class Measures:
 
     scale: Scale | None = None
     """As it was set for the run; None: as its scene says, if it does."""
+    regions: Mapping[str, Region] = field(default_factory=dict)
+    """By name, in the order in which they were kept."""
+
+    def region(self, name: str) -> Region:
+        """A region by its name.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        if name not in self.regions:
+            kept = ", ".join(self.regions) or "none; unmix-export regions --add NAME keeps one"
+            hint = did_you_mean(name, list(self.regions), likeness=0.4, form=" ({})")
+            raise ConfigError(f"there is no region {name!r}{hint}; kept are {kept}")
+        return self.regions[name]
 
 
 def describe_scale(scale: Scale | None) -> str:
@@ -114,8 +130,16 @@ def read_measures(run: RunFolder) -> Measures:
         return Measures()
     values = read_run_json(path)
     try:
-        return Measures(_scale_from_json(values.get("scale")))
-    except (LookupError, TypeError, ValueError, OverflowError, ConfigError) as error:
+        return Measures(_scale_from_json(values.get("scale")), _regions_from_json(values.get("regions", {})))
+    except (
+        AttributeError,
+        LookupError,
+        TypeError,
+        ValueError,
+        RuntimeError,
+        OverflowError,
+        ConfigError,
+    ) as error:
         raise RunError(f"{path} is damaged: {error}; remove it, and measure again") from error
 
 
@@ -126,14 +150,32 @@ def write_measures(run: RunFolder, measures: Measures) -> Path:
         RunError: the disk is full or refuses.
     """
     scale = measures.scale
-    values = {} if scale is None else {"scale": {"metres_per_unit": scale.metres_per_unit, "how": scale.how}}
-    write_run_json(_path(run), values)
+    kept = {} if scale is None else {"scale": {"metres_per_unit": scale.metres_per_unit, "how": scale.how}}
+    regions = {name: region_to_json(region) for name, region in measures.regions.items()}
+    write_run_json(_path(run), {**kept, "regions": regions})
     return _path(run)
 
 
 def keep_scale(run: RunFolder, scale: Scale) -> Path:
     """Set the scale of a run, in place of the one before; the file."""
     return write_measures(run, replace(read_measures(run), scale=scale))
+
+
+def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
+    """Keep a region with a run, in place of one of its name; None removes that. The file.
+
+    Raises:
+        ConfigError: the name can't be one, there are too many regions, or there is none to remove.
+    """
+    name, measures = check_name(name), read_measures(run)
+    if region is None:
+        measures.region(name)
+    regions = {key: kept for key, kept in measures.regions.items() if key != name}
+    if region is not None:
+        regions[name] = region
+    if len(regions) > MOST_REGIONS:
+        raise ConfigError(f"a run keeps at most {MOST_REGIONS} regions; remove one first")
+    return write_measures(run, replace(measures, regions=regions))
 
 
 def scale_between(first: Sequence[float], second: Sequence[float], distance_m: float) -> Scale:
@@ -202,6 +244,12 @@ def _scale_from_json(values: Any) -> Scale | None:
     if type(metres) not in (int, float) or not isinstance(how, str) or len(how) > _LONGEST_TEXT:
         raise ValueError(f"its scale is {str(values)[:80]}")
     return Scale(float(metres), "".join(letter for letter in how if letter.isprintable()))
+
+
+def _regions_from_json(values: Any) -> dict[str, Region]:
+    if len(values) > MOST_REGIONS:
+        raise ValueError(f"{len(values)} regions, more than {MOST_REGIONS}")
+    return {check_name(name): region_from_json(region) for name, region in values.items()}
 
 
 def _path(run: RunFolder) -> Path:

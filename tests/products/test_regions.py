@@ -1,0 +1,117 @@
+"""Regions of a surface that is known exactly: their size, what is in them, what is kept of them and what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
+from tests.trained.camera_scenes import FRAME
+from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.products.mesh import TriangleMesh
+from unmix_plugin.products.regions import MeasuredSurface
+from unmix_plugin.trained.measures import keep_region, read_measures
+from unmix_plugin.trained.regions import Box, InView, OfMaterial, check_name, polygon_mask
+
+SCENE = replace(ball_scene(), frame=FRAME)
+WORLD_RADIUS = RADIUS / FRAME.scale
+MIDDLE = FRAME.to_world(np.zeros(3))
+[CAMERA] = cameras_around([(0.3, 0.1, 1.0)])
+
+
+def box(low, high):
+    """In the world; FRAME keeps the vertical, in which the ball's two materials lie above each other."""
+    (a, b, c), (x, y, z) = (MIDDLE + low).tolist(), (MIDDLE + high).tolist()
+    return Box((a, b, c), (x, y, z))
+
+
+@pytest.fixture(scope="module")
+def surface():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    return MeasuredSurface(SCENE, TriangleMesh(np.asarray(ball.vertices), np.asarray(ball.faces)))
+
+
+def test_a_box_has_its_part_of_a_ball(surface):
+    all_of_it = surface.measure(box([-9.0] * 3, [9.0] * 3), "all")
+    assert all_of_it.area == pytest.approx(4 * np.pi * WORLD_RADIUS**2, rel=0.01)
+    cap = surface.measure(box([-9.0, -9.0, WORLD_RADIUS / 2], [9.0] * 3), "cap")
+    assert cap.area == pytest.approx(np.pi * WORLD_RADIUS**2, rel=0.02)
+    np.testing.assert_allclose(cap.abundances, [1, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(cap.spread, 0, atol=1e-6)
+
+
+def test_mean_and_spread_are_those_of_the_area(surface):
+    whole = surface.measure(box([-9.0] * 3, [9.0] * 3), "all")
+    upper, lower = (SHADE * SCENE.materials.endmembers.detach().double().numpy())[:2]
+    np.testing.assert_allclose(whole.abundances, [0.5, 0.5, 0], atol=0.03)
+    np.testing.assert_allclose(whole.mean, (upper + lower) / 2, atol=0.03)
+    np.testing.assert_allclose(whole.spread, np.abs(upper - lower) / 2, atol=0.03)
+
+
+def test_a_material_is_where_it_prevails(surface):
+    half = surface.measure(OfMaterial(0), "upper")
+    assert half.area == pytest.approx(2 * np.pi * WORLD_RADIUS**2, rel=0.03)
+    assert half.abundances[0] > 0.99
+    for number, message in ((2, "has nothing of the surface in it"), (3, "no material 3; it has 3")):
+        with pytest.raises(ConfigError, match=message):
+            surface.measure(OfMaterial(number), "other")
+
+
+def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
+    seen = surface.measure(InView(CAMERA, np.ones((40, 40), bool)), "seen")
+    # A camera at a distance of 3 sees the cap above radius / 3; the last pixel before the outline is much of its area.
+    assert seen.area == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - RADIUS / 3), rel=0.12)
+    middle = [(16.0, 16.0), (24.0, 16.0), (24.0, 24.0), (16.0, 24.0)]
+    patch = surface.measure(InView(CAMERA, polygon_mask(middle, (40, 40))), "patch")
+    pixel = (3 - RADIUS) / float(CAMERA.focal_px[0, 0]) / FRAME.scale
+    assert patch.area == pytest.approx((8 * pixel) ** 2, rel=0.05)
+    with pytest.raises(ConfigError, match="has nothing of the surface"):
+        surface.measure(
+            InView(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40))), "corner"
+        )
+
+
+def test_regions_come_back_as_they_were_kept(tmp_path):
+    run, mask = RunFolder(tmp_path), np.random.default_rng(0).random((40, 40)) > 0.5
+    kept = {"a b": Box((0.0, 1.0, 2.0), (1.0, 2.0, 3.0)), "m": OfMaterial(2), "v": InView(CAMERA, mask)}
+    for name, region in kept.items():
+        keep_region(run, name, region)
+    found = read_measures(run).regions
+    assert (found["a b"], found["m"], list(found)) == (kept["a b"], kept["m"], list(kept))
+    view = found["v"]
+    assert isinstance(view, InView)
+    np.testing.assert_array_equal(view.mask, mask)
+    keep_region(run, "m", None)
+    assert list(read_measures(run).regions) == ["a b", "v"]
+    with pytest.raises(ConfigError, match="no region 'm'"):
+        keep_region(run, "m", None)
+
+
+@pytest.mark.parametrize("name", ["", " ", "../x", "a/b", ".x", "a\nb", "x" * 65])
+def test_names_that_no_file_can_have_are_refused(name):
+    with pytest.raises(ConfigError, match="can't be the name of a region"):
+        check_name(name)
+
+
+@pytest.mark.parametrize(
+    "regions",
+    [
+        [],
+        {"../x": {"kind": "material", "material": 0}},
+        {"x": {"kind": "sphere"}},
+        {"x": {"kind": "material", "material": -1}},
+        {"x": {"kind": "box", "low": [0, 0, 0], "high": [1, 1]}},
+        {"x": {"kind": "box", "low": [0, 0, 0], "high": [1, 0, 1]}},
+        {"x": {"kind": "view", "camera": CAMERA.to_json(), "runs": [10]}},
+        {"x": {"kind": "view", "camera": CAMERA.to_json(), "runs": [-1, 1601]}},
+        {"x": {"kind": "view", "camera": {}, "runs": [1600]}},
+        {str(number): {"kind": "material", "material": 0} for number in range(300)},
+    ],
+)
+def test_damaged_regions_are_refused(regions, tmp_path):
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "regions": regions}))
+    with pytest.raises(RunError, match=r"measures\.json is damaged"):
+        read_measures(RunFolder(tmp_path))

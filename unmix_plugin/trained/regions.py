@@ -1,0 +1,138 @@
+"""Named parts of a scene's surface: a box of the world, a material, or what a view shows inside a mask.
+
+Notation: `H x W` pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError
+
+MOST_REGIONS = 256
+"""That are kept with a run."""
+
+_LONGEST_NAME = 64
+_MOST_PIXELS = 1 << 26
+
+
+@dataclass(frozen=True)
+class Box:
+    """What lies in a box of the world."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+            raise ConfigError(
+                f"the box from {self.low} to {self.high} has no volume; give two opposite corners"
+            )
+
+
+@dataclass(frozen=True)
+class OfMaterial:
+    """Where a material has the largest share, as segmentations show it."""
+
+    material: int
+    """Number of its endmember."""
+
+
+@dataclass(frozen=True, eq=False)
+class InView:
+    """What a camera sees in some of its pixels, and nothing that is hidden behind it."""
+
+    camera: Cameras
+    """One camera, model space."""
+    mask: Bool[np.ndarray, "H W"]
+
+
+Region: TypeAlias = Box | OfMaterial | InView
+
+
+def check_name(name: str) -> str:
+    """A name for a region, without spaces around it.
+
+    Raises:
+        ConfigError: it can't be one, or not that of a file.
+    """
+    name = name.strip()
+    if (
+        not 0 < len(name) <= _LONGEST_NAME
+        or not name.isprintable()
+        or set(name) & set('/\\:,"<>|?*')
+        or name[0] == "."
+    ):
+        raise ConfigError(
+            f"{name[:80]!r} can't be the name of a region; expected 1 to {_LONGEST_NAME} letters, digits, "
+            "spaces, - or _"
+        )
+    return name
+
+
+def polygon_mask(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose centres lie inside a polygon.
+
+    Args:
+        corners: x, y in pixels from the top left corner of the image, at least 3.
+        size: Width and height of the image.
+    Raises:
+        ConfigError: fewer corners, or no pixel inside.
+    """
+    from skimage.draw import polygon2mask
+
+    if len(corners) < 3:
+        raise ConfigError(f"a polygon has 3 corners or more; found {len(corners)}")
+    # Rows and columns; the centre of the first pixel is at 0 there and at 0.5 here.
+    mask = polygon2mask(size[::-1], [(y - 0.5, x - 0.5) for x, y in corners])
+    if not mask.any():
+        raise ConfigError("the polygon has no pixel of the view in it")
+    return mask.astype(bool)
+
+
+def region_to_json(region: Region) -> dict[str, Any]:
+    """Numbers and lists; `region_from_json` restores the same region."""
+    if isinstance(region, Box):
+        return {"kind": "box", "low": list(region.low), "high": list(region.high)}
+    if isinstance(region, OfMaterial):
+        return {"kind": "material", "material": region.material}
+    flat = region.mask.reshape(-1)
+    ends = np.flatnonzero(np.diff(flat)) + 1
+    lengths = np.diff(np.concatenate([[0], ends, [flat.size]]))
+    # Runs of pixels outside and inside in turn, row after row, the first outside.
+    runs = [*([0] if flat[0] else []), *lengths.tolist()]
+    return {"kind": "view", "camera": region.camera.to_json(), "runs": runs}
+
+
+def region_from_json(values: Any) -> Region:
+    """The region that `region_to_json` wrote.
+
+    Raises:
+        LookupError, TypeError, ValueError, RuntimeError, ConfigError: it is none.
+    """
+    kind = values["kind"]
+    if kind == "box":
+        low, high = ([float(number) for number in values[key]] for key in ("low", "high"))
+        if len(low) != 3 or len(high) != 3:
+            raise ValueError("a box that has not 3 numbers a corner")
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    if kind == "material":
+        if type(values["material"]) is not int or values["material"] < 0:
+            raise ValueError(f"material {str(values['material'])[:40]}")
+        return OfMaterial(values["material"])
+    if kind != "view":
+        raise ValueError(f"a region of the kind {str(kind)[:40]!r}")
+    camera, runs = Cameras.from_json(values["camera"]), values["runs"]
+    pixels = camera.width * camera.height
+    if len(camera) != 1 or pixels > _MOST_PIXELS or not all(type(run) is int and run >= 0 for run in runs):
+        raise ValueError("a view without one camera and runs of pixels")
+    if sum(runs) != pixels:
+        raise ValueError(f"runs of {sum(runs)} pixels in a view of {pixels}")
+    mask = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    return InView(camera, mask.reshape(camera.height, camera.width))
