@@ -55,6 +55,7 @@ def gathered(offsets, with_truth=True, materials=MATERIALS):
 OTHERS = {
     "title": "Title <x>",
     "subtitle": "run",
+    "page": None,
     "notes": ["so & so"],
     "facts": [("<b>", "</dl>")],
     "cards": [],
