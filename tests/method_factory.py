@@ -122,15 +122,15 @@ def losses_of(
     opacities: torch.Tensor,
     abundances: torch.Tensor | None = None,
     sparsity: float = 0.0,
+    certainty: float = 0.0,
 ) -> dict[str, torch.Tensor]:
     """Losses of pixels, with one ray each, that are rendered so; `spectra` are on black."""
     count, none = len(spectra), torch.zeros(0)
     abundances = torch.zeros(count, model.num_endmembers) if abundances is None else abundances
     nothing = Coefficients(torch.zeros(count, 2), 0)
     visible = object.__new__(_VisibleSamples)  # only what is learnt without gradients looks at them
-    rendered = RenderedRays(
-        nothing, abundances, 0, torch.tensor(sparsity), torch.zeros(0, 3), none, none.long(), visible
-    )
+    sums = torch.tensor(sparsity), torch.tensor(certainty)
+    rendered = RenderedRays(nothing, abundances, 0, *sums, torch.zeros(0, 3), none, none.long(), visible)
     [measured] = from_batch({"pixels": torch.arange(count), **batch}, count, model.seen_by.num_channels)
     compared = ComparedPixels(measured, 1.0, slice(0, count, 1), spectra, opacities, abundances)
     return model.losses(TrainingBatch(CorrectedRays(make_rays(count)), rendered, [compared]))

@@ -262,7 +262,7 @@ class UnmixModel(Model):
         config, rendered = self.config, step.rendered
         weights = loss_weights(config.losses, self.preset, self._progress, config.as_published)
         losses = self.comparison.losses(step.compared, set(weights), self.generator)
-        losses["sparsity"] = rendered.sparsity
+        losses["sparsity"], losses["certainty"] = rendered.sparsity, rendered.certainty
         surfaces = [part.measured.surfaces_of_rays() for part in step.compared]
         if "surface" in weights and (known := [each for each in surfaces if each is not None]):
             light = (rendered.weights, rendered.positions, rendered.ray_indices)

@@ -27,7 +27,7 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
     model = make_model(losses=LossConfig(background=background, rgb=1.0, abundances=0.0))
     spectra, alpha = torch.rand(8, NUM_BANDS), torch.rand(8)
     losses = losses_of(model, {"spectra": spectra, "alpha": alpha}, spectra, alpha)
-    assert set(losses) == {"spectral", "rgb"}
+    assert set(losses) == {"spectral", "rgb", "certainty"}
     assert all(float(loss) < 1e-12 for loss in losses.values())
 
 
@@ -119,6 +119,18 @@ def test_sparsity_is_asked_for_early_and_only_where_no_alpha_says_what_is_empty(
         found.append(float(losses.get("sparsity", 0.0)) / WITHOUT_ALPHA.sparsity_loss_weight)
     assert found == pytest.approx([3.0, 0.75, 0.0, 0.0])
     assert "sparsity" not in losses_of(make_model(), batch, batch["spectra"], torch.zeros(4), sparsity=3.0)
+
+
+@pytest.mark.parametrize("has_alpha", [True, False])
+def test_certain_abundances_cost_less_and_less(has_alpha):
+    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
+    model = make_model(has_alpha=has_alpha)
+    begin_step, found = model.get_training_callbacks()[0].func, []
+    for progress in (0.0, 0.5, 1.0):
+        begin_step(1, progress)
+        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), certainty=3.0)
+        found.append(float(losses.get("certainty", 0.0)))
+    assert found == pytest.approx([0.03, 0.0075, 0.0])
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():

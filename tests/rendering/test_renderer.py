@@ -16,7 +16,7 @@ from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
-from unmix_plugin.rendering.renderer import VolumeRenderer, points_of, visible_samples
+from unmix_plugin.rendering.renderer import VolumeRenderer, _mean_log, points_of, visible_samples
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -75,6 +75,20 @@ def test_sparsity_counts_the_samples_that_density_is_spread_over(density):
     ]
     expected = sum(carrying) / 20 * math.log1p(density / 0.03)
     assert float(spread) == pytest.approx(expected, rel=0.05)
+
+
+def test_a_softmax_that_is_sure_still_learns_that_it_should_not_be():
+    """The certainty of even abundances is the opacity times log K; where one share is 1, its gradient stays."""
+    renderer, field = make()
+    bundle = rays(20)
+    with torch.no_grad():
+        field.table.zero_()
+        rendered = renderer.render(field, bundle)
+        opacity = rendered.coefficients.accumulation.mean()
+        assert_close(rendered.certainty, opacity * math.log(field.num_endmembers))
+    logits = torch.tensor([[0.0, 40.0, 5.0]], requires_grad=True)
+    (-_mean_log(logits.softmax(dim=1)).sum()).backward()
+    assert_close(logits.grad, torch.tensor([[-1 / 3, 2 / 3, -1 / 3]]))
 
 
 def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ray():

@@ -28,6 +28,8 @@ from unmix_plugin.operators.occupancy import cells_at
 from unmix_plugin.rendering.front_to_back import FrontToBack, composite_front_to_back
 from unmix_plugin.spectral.materials import Coefficients
 
+_SMALLEST_SHARE = 1e-30
+"""Of an abundance whose logarithm is taken: 0 has none."""
 _FIRST_SAMPLES = 8
 """Of each ray, that are evaluated before it is known whether light gets farther."""
 
@@ -121,6 +123,10 @@ def visible_samples(
     )
 
 
+def _mean_log(shares: Float[Tensor, "S K"]) -> Float[Tensor, "S"]:
+    return shares.clamp(min=_SMALLEST_SHARE).log().mean(dim=1)
+
+
 def points_of(
     samples: PackedSamples, ray_bundle: RayBundle
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
@@ -148,6 +154,9 @@ class RenderedRays:
     sparsity: Float[Tensor, ""]
     """Sum of log(1 + tau / 0.03) over the samples of a ray that are visible, tau their optical depth; mean over rays.
     The same light stopped by few samples gives less of it than by many: surfaces little, floaters much."""
+    certainty: Float[Tensor, ""]
+    """Weighted sum over the samples of a ray of the cross entropy of their abundances with even ones, at least log K;
+    mean over rays. Weights have no gradient."""
     positions: Float[Tensor, "S 3"]
     """Visible samples, in the unit cube."""
     weights: Float[Tensor, "S"]
@@ -229,6 +238,7 @@ class VolumeRenderer:
             mixtures,
             seen.num_evaluated,
             torch.log1p(depths / _SPARSE_DEPTH).sum() / max(len(ray_bundle), 1),
+            (weights.detach() * -_mean_log(outputs["abundances"])).sum() / max(len(ray_bundle), 1),
             self.space.to_unit(positions).detach(),
             weights,
             kept.ray_indices,
