@@ -3,7 +3,8 @@
     python benchmarks/fresh_clone.py [--folder DIR]
 
 Clones the repository (what is committed) into a new folder and times `make demo` there, from nothing and once more:
-these two commands take a newcomer to a page of the demo that can be mailed.
+these two commands take a newcomer to a page of the demo that can be mailed. Then the same from a wheel alone, which is
+installed into an empty environment: two commands as well.
 From nothing: caches of pip, of kernels and of the demo scene are looked for in an empty folder, so the first run
 downloads every package. Takes about six minutes and the disk space of a virtual environment.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import tempfile
+import venv
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,11 +52,23 @@ def main(options: Options) -> None:
         clone, caches = options.folder or temporary / "unmix-nerf", temporary / "caches"
         words = ["git", "clone", "--quiet", "--no-hardlinks", str(_common.REPOSITORY), str(clone)]
         if options.dry_run:
-            print(" ".join(words), f"cd {clone}", f"XDG_CACHE_HOME={caches} make demo", "make demo", sep="\n")
+            print(
+                " ".join(words),
+                f"cd {clone}",
+                f"XDG_CACHE_HOME={caches} make demo",
+                "make demo",
+                "pip install WHEEL",
+                "unmix-demo",
+                sep="\n",
+            )
             return
         _common.run_command(words)
-        measured = {name: make_demo(clone, caches, name) for name in ("from nothing", "once installed")}
-    setting = {"command": "make demo", "caches": "empty at first", "load averages": load_averages(measured)}
+        commands = ("make demo, from nothing", "make demo, once installed")
+        measured = {name: make_demo(clone, caches / "clone", name) for name in commands}
+        measured["wheel alone, pip install and unmix-demo"] = use_wheel(
+            clone, temporary / "wheel", caches / "wheel"
+        )
+    setting = {"caches": "empty at first", "load averages": load_averages(measured)}
     question = "A fresh clone: seconds until the demo has trained and its pictures are written"
     report = _common.Report("fresh_clone", question, setting, machine, judge(measured), measured)
     _common.publish(report, _common.results_folder(options.results, quick=False))
@@ -63,13 +77,44 @@ def main(options: Options) -> None:
 def make_demo(clone: Path, caches: Path, name: str) -> dict[str, Any]:
     """Time one `make demo`, and count what it wrote."""
     load_average = _machine.load_average()
-    print(f"make demo, {name} ...", flush=True)
+    print(name, "...", flush=True)
     ended = _common.run_command(["make", "demo"], cwd=clone, env=environment(caches))
     print("\n".join(ended.output.splitlines()[-3:]), flush=True)
-    run = max((clone / "outputs").glob("demo/unmix-nerf/*"), key=lambda path: path.stat().st_mtime)
+    return left_in(clone, ended.seconds, load_average)
+
+
+def use_wheel(clone: Path, folder: Path, caches: Path) -> dict[str, Any]:
+    """Time what a user without the repository types: the wheel into an empty environment, then the demo."""
+    build = [
+        str(clone / ".venv/bin/python"),
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(folder),
+    ]
+    _common.run_command([*build, str(clone)])
+    [wheel] = folder.glob("*.whl")
+    venv.create(folder / "environment", with_pip=True)
+    programs, load_average = folder / "environment/bin", _machine.load_average()
+    print("pip install, unmix-demo ...", flush=True)
+    install = ["install", "--quiet", "--constraint", str(clone / "constraints.txt"), str(wheel)]
+    installed = _common.run_command([str(programs / "pip"), *install], cwd=folder, env=environment(caches))
+    ended = _common.run_command([str(programs / "unmix-demo")], cwd=folder, env=environment(caches))
+    return {
+        **left_in(folder, installed.seconds + ended.seconds, load_average),
+        "install_seconds": installed.seconds,
+    }
+
+
+def left_in(folder: Path, seconds: float, load_average: float) -> dict[str, Any]:
+    """What a demo left in a folder, and how long it took."""
+    run = max((folder / "outputs").glob("demo/unmix-nerf/*"), key=lambda path: path.stat().st_mtime)
     metrics = json.loads((run / "eval" / "metrics.json").read_text(encoding="utf-8"))
     return {
-        "seconds": ended.seconds,
+        "seconds": seconds,
         "load_average_at_start": load_average,
         "page_megabytes": (run / "exports" / "page" / "page.html").stat().st_size / 1e6,
         "pictures": {part: len(list((run / part).rglob("*.png"))) for part in ("eval", "exports")},
@@ -91,8 +136,8 @@ def load_averages(measured: dict[str, dict[str, Any]]) -> list[float]:
 def judge(measured: dict[str, dict[str, Any]]) -> list[_common.Figure]:
     """Both times, and what there is to look at."""
     figures = [
-        limit.judge(f"make demo, {name}", found["seconds"])
-        for limit, (name, found) in zip((FIRST, AGAIN), measured.items(), strict=True)
+        limit.judge(name, found["seconds"])
+        for limit, (name, found) in zip((FIRST, AGAIN, FIRST), measured.items(), strict=True)
     ]
     last = list(measured.values())[-1]
     pictures = ", ".join(f"{count} in {part}/" for part, count in last["pictures"].items())

@@ -77,6 +77,7 @@ def test_a_wheel_declares_commands_and_methods(wheel):
 def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
     metadata = Parser().parsestr(metadata_file(wheel, "METADATA"))
     assert metadata["License-Expression"] == "Apache-2.0"
+    assert metadata["Requires-Python"] == ">=3.10"  # so that pip refuses older ones in one message
     assert metadata["Version"] == __import__("unmix_plugin").__version__
     assert str(metadata.get_payload()).strip()
     needed = [line for line in metadata.get_all("Requires-Dist", []) if "extra ==" not in line]

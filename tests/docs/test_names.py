@@ -23,6 +23,7 @@ OF_OTHERS = {
     "--debug",
     "--constraint",
     "--help-all",
+    "--index-url",
     "--pipeline",
     "--pipeline.model.resolution",
     "--rows",
