@@ -34,7 +34,7 @@ def written(tmp_path_factory):
     return folder, cameras, products, [truth(cameras, index, survey) for index in range(2)]
 
 
-@pytest.mark.parametrize(("kind", "count"), [("npy", 17), ("envi", 16)])
+@pytest.mark.parametrize(("kind", "count"), [("npy", 20), ("envi", 19)])
 def test_numbers_are_what_the_model_renders_bit_for_bit(written, kind, count):
     folder, cameras, products, expected = written
     chosen = [product for product in products if product.format == kind]
