@@ -121,6 +121,17 @@ def header_text(cube: np.ndarray, interleave: str, change: dict[str, str | None]
     return "ENVI\n" + "".join(f"{key} = {value}\n" for key, value in entries.items() if value is not None)
 
 
+def present(value: Any) -> Any:
+    """A value that has to be there."""
+    assert value is not None
+    return value
+
+
+def linear_values_of(file: SpectralFile) -> np.ndarray:
+    """All numbers after its gains and offsets, which must be there."""
+    return present(file.linear).apply(file.read(), slice(None))
+
+
 def centres_nm(file: SpectralFile) -> np.ndarray:
     """Its wavelengths, which must be there."""
     assert file.bands.wavelengths_nm is not None, file.notes

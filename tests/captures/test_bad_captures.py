@@ -91,7 +91,7 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"white_rectangle": ("cow", 0, 0, 4, 4)}, "--white-rectangle cow"),
     (
         {"white_rectangle": ("view_00", 20, 0, 10, 4)},
-        "--white-rectangle view_00 20 0 10 4 .* leaves the view",
+        "--white-rectangle view_00 20 0 10 4 .* leaves the image",
     ),
     (REFERENCES | {"white_reflectance": "99"}, "is 99 to 99; expected"),
     (REFERENCES | {"white_reflectance": "a.csv"}, "expected a number such as"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.captures.file_factory import open_band_file, write_band_file, xmp_packet
+from tests.captures.file_factory import open_band_file, present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
     RadiometricModel,
     XmpTags,
@@ -60,8 +60,7 @@ def test_a_damaged_packet_has_no_tags(packet):
     ],
 )
 def test_a_band_has_its_centre_and_width(tags, centre, width):
-    table = band_of(tags)
-    assert table is not None
+    table = present(band_of(tags))
     np.testing.assert_array_equal((table.wavelengths_nm, table.fwhm_nm), (centre, width))
     assert next(iter(tags)).rpartition(":")[2] in table.evidence
 
@@ -73,9 +72,8 @@ def test_no_wavelength_is_made_up(centre):
 
 def test_exif_rationals_become_numbers(tmp_path):
     exif = {"ExposureTime": 0.0004725, "FNumber": 2.8, "ISOSpeed": 400, "FocalPlaneXResolution": 266.667}
-    path = write_band_file(
-        tmp_path / "a.tif", np.zeros((2, 3)), {}, exif, black_level=[4800, 4801, 4802, 4803]
-    )
+    levels = [4800, 4801, 4802, 4803]
+    path = write_band_file(tmp_path / "a.tif", np.zeros((2, 3)), {}, exif, black_level=levels)
     found = open_band_file(path).metadata["exif"]
     assert {name: found[name] for name in exif} == pytest.approx(exif, rel=1e-6)
     assert found["BlackLevel"] == [4800.0, 4801.0, 4802.0, 4803.0]
@@ -131,9 +129,7 @@ def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
 
 
 def model_of(file: SpectralFile) -> RadiometricModel:
-    model = radiometric_model(file)
-    assert model is not None
-    return model
+    return present(radiometric_model(file))
 
 
 def micasense_by_hand(p: int, x: int, y: int) -> float:
@@ -213,9 +209,8 @@ def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     file.metadata["exif"]["Model"] = "RedEdge"
     mended = model_of(file)
     values = pixels[:1, :, None].astype(np.float64)
-    np.testing.assert_allclose(
-        mended.apply(values, slice(1)) / plain.apply(values, slice(1)), (1.0 / 6329.0) / 0.000274, rtol=1e-4
-    )
+    ratio = mended.apply(values, slice(1)) / plain.apply(values, slice(1))
+    np.testing.assert_allclose(ratio, (1.0 / 6329.0) / 0.000274, rtol=1e-4)
 
 
 def test_exif_that_holds_text_is_refused(tmp_path, pixels):
@@ -232,17 +227,9 @@ def test_a_file_without_calibration_has_no_model(tmp_path, pixels):
 @pytest.mark.parametrize(
     ("tags", "exif", "message"),
     [
-        (
-            MICASENSE | {"Camera:VignettingPolynomial": ["1"]},
-            EXIF,
-            "VignettingPolynomial should hold 6 numbers",
-        ),
+        (MICASENSE | {"Camera:VignettingPolynomial": ["1"]}, EXIF, "VignettingPolynomial should hold 6 numb"),
         (MICASENSE, {"ISOSpeed": 400}, "ExposureTime should hold 1 positive number; it is absent"),
-        (
-            MICASENSE,
-            EXIF | {"ExposureTime": 0.0},
-            r"ExposureTime should hold 1 positive number; found \[0.0\]",
-        ),
+        (MICASENSE, EXIF | {"ExposureTime": 0.0}, r"ExposureTime should hold .*; found \[0.0\]"),
         (SEQUOIA, {"ExposureTime": 0.0008, "FNumber": 2.2}, "EXIF ISOSpeedRatings should hold"),
         (SEQUOIA | {"Camera:VignettingPolynomial2D": "0.4"}, EXIF, "VignettingPolynomial2D should hold 5"),
         (SEQUOIA | {"Camera:VignettingPolynomial2DName": "-1,0"}, EXIF, "powers"),

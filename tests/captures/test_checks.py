@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.captures.file_factory import present
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.checks import (
     SeenView,
@@ -62,15 +63,13 @@ def test_nothing_is_wrong_with_a_good_capture(sound):
 
 
 def test_light_that_stands_still_has_no_slope(sound):
-    found = _slope_of_light(sound, ball_points())
-    assert found is not None
+    found = present(_slope_of_light(sound, ball_points()))
     assert abs(found[0]) < 0.08
 
 
 def test_light_that_moves_with_the_camera_is_found(tmp_path: Path):
     views = _views(tmp_path, ring_of(32), light=None)
-    found = _slope_of_light(views, ball_points())
-    assert found is not None
+    found = present(_slope_of_light(views, ball_points()))
     assert 0.4 < found[0] < 1.6
     assert any(
         finding.startswith("light moves with the camera") for finding in check_views(views, ball_points())[0]
@@ -147,11 +146,8 @@ def test_saturated_missing_and_empty_views_are_named(sound):
         replace(sound[2], record=record_of("view_2", matter_share=0.0)),
         *sound[3:],
     ]
-    assert [finding.split(":")[1].split(" (")[0].strip() for finding in _pixels(views)] == [
-        "view_0",
-        "view_1",
-        "view_2",
-    ]
+    named = [finding.split(":")[1].split(" (")[0].strip() for finding in _pixels(views)]
+    assert named == ["view_0", "view_1", "view_2"]
 
 
 SIDE = 120
@@ -174,10 +170,8 @@ def ring_of(
     """Positions of cameras around the ball, in turn at the elevations."""
     angles = np.radians(np.linspace(0.0, span_deg, count, endpoint=span_deg < 360.0))
     heights = np.radians([elevations_deg[index % len(elevations_deg)] for index in range(count)])
-    around = np.stack(
-        [np.cos(angles) * np.cos(heights), np.sin(angles) * np.cos(heights), np.sin(heights)], axis=1
-    )
-    return list(4.0 * around)
+    flat = np.cos(heights)
+    return list(4.0 * np.column_stack([np.cos(angles) * flat, np.sin(angles) * flat, np.sin(heights)]))
 
 
 def view_at(

@@ -135,22 +135,16 @@ def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureVie
 
 
 def turned_camera(seed: int) -> PosedCamera:
-    pose = np.column_stack(
-        [Rotation.from_euler("xyz", [seed, 0.3, 2.0 * seed]).as_matrix(), np.array([1.0, 2.0, 3.0]) * seed]
-    )
-    return PosedCamera(pose, SMALL_LENS)
+    rotation = Rotation.from_euler("xyz", [seed, 0.3, 2.0 * seed]).as_matrix()
+    return PosedCamera(np.column_stack([rotation, seed * np.array([1.0, 2.0, 3.0])]), SMALL_LENS)
 
 
 def test_rotations_in_the_files_turn_a_lens_against_another():
     views = [rig_view("r1", sensor, ANGLES[sensor]) for sensor in "abc"]
     posed = {"r1b": turned_camera(3)}
     completed, notes = _complete_rigs(views, posed)
-    to_reference = {
-        sensor: Rotation.from_euler(
-            "XYZ", [float(text) for text in angles.split(",")], degrees=True
-        ).as_matrix()
-        for sensor, angles in ANGLES.items()
-    }
+    numbers = {sensor: [float(text) for text in angles.split(",")] for sensor, angles in ANGLES.items()}
+    to_reference = {x: Rotation.from_euler("XYZ", n, degrees=True).as_matrix() for x, n in numbers.items()}
     base = posed["r1b"].camera_to_world
     for sensor in "ac":
         expected = base[:, :3] @ FLIP @ to_reference["b"].T @ to_reference[sensor] @ FLIP
@@ -179,12 +173,7 @@ def test_offsets_between_posed_lenses_go_before_those_in_the_files():
 
 
 def test_views_without_any_help_are_left_out_and_said():
-    views = [
-        rig_view("r1", "a"),
-        rig_view("r1", "b"),
-        rig_view("r2", "a", ANGLES["a"]),
-        rig_view("r2", "b", ANGLES["b"]),
-    ]
+    views = [rig_view("r1", "a"), rig_view("r1", "b"), *(rig_view("r2", x, ANGLES[x]) for x in "ab")]
     completed, notes = _complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}
     assert any("1 view of lens b left out: there is no pose, and nothing says" in note for note in notes)

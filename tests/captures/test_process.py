@@ -22,6 +22,7 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
+from tests.captures.file_factory import present
 from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.options import ProcessOptions
@@ -54,6 +55,12 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
         assert (source["sha256"], source["bytes"]) == (hashlib.sha256(data).hexdigest(), len(data))
 
 
+def bright_square() -> np.ndarray:
+    square = np.zeros((HEIGHT, WIDTH), bool)
+    square[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = True
+    return square
+
+
 def test_background_is_cut_out_at_the_threshold_of_the_border(tmp_path: Path):
     capture = make_capture(tmp_path / "capture", noise=4.0)
     references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
@@ -61,11 +68,9 @@ def test_background_is_cut_out_at_the_threshold_of_the_border(tmp_path: Path):
     process(capture.root, tmp_path / "scene", mask="black", **references)
 
     scene = load_scene(tmp_path / "scene")
-    expected = np.zeros((HEIGHT, WIDTH), bool)
-    expected[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = True
+    expected = bright_square()
     for index in range(4):
-        alpha = scene.alpha(index)
-        assert alpha is not None
+        alpha = present(scene.alpha(index))
         np.testing.assert_array_equal(alpha > 0.5, expected)
         assert scene.cube(index)[~expected].max() == 0.0
 
@@ -101,9 +106,8 @@ def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path):
     counts = np.fromfile(capture.root / "view_00.raw", "<u2").reshape(HEIGHT, len(WAVELENGTHS_NM), WIDTH)
     corner = counts[4:6, :3, 6:8].mean()
     record = json.loads((tmp_path / "scene" / "process.json").read_text())
-    assert scene.cube(0)[0, 0, 0] == pytest.approx(
-        corner / record["decisions"]["scale"]["calibrated"], abs=1e-4
-    )
+    scale = record["decisions"]["scale"]["calibrated"]
+    assert scene.cube(0)[0, 0, 0] == pytest.approx(corner / scale, abs=1e-4)
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
@@ -132,11 +136,8 @@ def test_views_without_a_pose_are_left_out(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     write_poses(capture.root / "transforms.json", ["view_00", "view_02", "view_03"])
     process(capture.root, tmp_path / "scene")
-    assert [frame.name for frame in load_scene(tmp_path / "scene").frames] == [
-        "view_00",
-        "view_02",
-        "view_03",
-    ]
+    names = [frame.name for frame in load_scene(tmp_path / "scene").frames]
+    assert names == ["view_00", "view_02", "view_03"]
 
 
 def test_pictures_become_linear_bands(tmp_path: Path):
@@ -161,9 +162,8 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
     panel = np.linspace(0.5, 0.9, len(WAVELENGTHS_NM))
     rows = [
-        f"{nm:g},{value:.6f}"
-        for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)  # its colour is not the lamp's
-    ]
+        f"{nm:g},{value:.6f}" for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)
+    ]  # of another colour
     (tmp_path / "panel.csv").write_text("\n".join(["wavelength,reflectance", *rows]))
     process(capture.root, tmp_path / "scene", white_reflectance=str(tmp_path / "panel.csv"), **references)
 
@@ -183,9 +183,8 @@ def test_a_panel_in_a_view_serves_as_white(tmp_path: Path):
         0, 41, counts.shape, np.uint16
     )  # otherwise its top is a plateau
     write_cube(capture.root, "view_00", counts)
-    process(
-        capture.root, tmp_path / "scene", white_rectangle=("view_00", 4, 5, 6, 7), white_reflectance="0.5"
-    )
+    panel = {"white_rectangle": ("view_00", 4, 5, 6, 7), "white_reflectance": "0.5"}
+    process(capture.root, tmp_path / "scene", **panel)
     cube = load_scene(tmp_path / "scene").cube(0)
     white = counts[4:10, 5:12].mean(axis=(0, 1))
     np.testing.assert_allclose(cube, 0.5 * counts / white, atol=1e-4)
@@ -262,9 +261,8 @@ def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path
     process(interrupted.root, tmp_path / "whole")
     for path in sorted((tmp_path / "whole").rglob("*")):
         if path.is_file() and path.name != "process.json":
-            assert (
-                tmp_path / "scene" / path.relative_to(tmp_path / "whole")
-            ).read_bytes() == path.read_bytes()
+            mine = tmp_path / "scene" / path.relative_to(tmp_path / "whole")
+            assert mine.read_bytes() == path.read_bytes()
     assert len(load_scene(tmp_path / "scene").frames) == 4
 
 
@@ -294,17 +292,16 @@ def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "scene"]
 
 
-def test_a_scene_may_be_written_to_the_working_directory(tmp_path: Path, monkeypatch):
+def test_a_scene_may_be_written_to_the_working_directory_but_not_to_the_root_of_the_disk(
+    tmp_path: Path, monkeypatch
+):
     capture = make_capture(tmp_path / "capture")
     (tmp_path / "scene").mkdir()
     monkeypatch.chdir(tmp_path / "scene")
     process(capture.root, Path())
     assert (tmp_path / "scene" / "transforms.json").is_file()
-
-
-def test_the_root_of_the_disk_is_no_scene(tmp_path: Path):
     with pytest.raises(ConfigError, match="can't be a scene"):
-        process(make_capture(tmp_path / "capture").root, Path("/"))
+        process(capture.root, Path("/"))
 
 
 NAMES = ["view_00", "view_01", "view_02", "view_03"]
@@ -349,17 +346,13 @@ def test_wavelengths_from_short_to_long_are_questioned(tmp_path: Path):
     assert "taken for red" not in notes_of(tmp_path / "capture", tmp_path / "usual")
 
 
-def test_turned_pictures_are_read_as_stored_with_a_note(tmp_path: Path):
+def test_turned_pictures_are_read_as_stored_with_a_note_and_their_poses_name_the_orientation(tmp_path: Path):
     write_views(tmp_path / "capture", 90, turned=("view_01", "view_02"))
     told = notes_of(tmp_path / "capture", tmp_path / "scene")
     assert "EXIF's orientation of 2 of 4 pictures is ignored" in told
-
-
-def test_poses_of_turned_pictures_name_the_orientation(tmp_path: Path):
-    write_views(tmp_path / "capture", 90, turned=("view_01",))
     write_poses(tmp_path / "capture" / "transforms.json", NAMES[1:3], width=HEIGHT, height=WIDTH)
     with pytest.raises(CaptureError, match="or store them turned as EXIF's orientation says"):
-        notes_of(tmp_path / "capture", tmp_path / "scene")
+        notes_of(tmp_path / "capture", tmp_path / "other")
 
 
 def test_a_backdrop_that_nobody_named_is_cut_out_and_said(tmp_path: Path):
@@ -369,16 +362,13 @@ def test_a_backdrop_that_nobody_named_is_cut_out_and_said(tmp_path: Path):
     process(capture.root, tmp_path / "scene", mask="auto", **references)
 
     scene = load_scene(tmp_path / "scene")
-    square = np.zeros((HEIGHT, WIDTH), bool)
-    square[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = True
+    square = bright_square()
     for index, frame in enumerate(scene.frames):
-        alpha = scene.alpha(index)
-        assert alpha is not None
+        alpha = present(scene.alpha(index))
         np.testing.assert_array_equal(alpha > 0.5, square)
         assert scene.cube(index)[~square].max() == 0.0
-        np.testing.assert_allclose(
-            scene.cube(index)[square], capture.reflectance[frame.name][square], atol=0.02
-        )
+        expected = capture.reflectance[frame.name][square]
+        np.testing.assert_allclose(scene.cube(index)[square], expected, atol=0.02)
     report = (tmp_path / "scene" / "report.txt").read_text()
     assert "backdrop found, black (0.020): 25% of the pixels are matter" in report
     record = json.loads((tmp_path / "scene" / "process.json").read_text())
@@ -392,9 +382,7 @@ def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     generator = np.random.default_rng(0)
     for name in capture.reflectance:
-        counts = generator.integers(200, 3000, (HEIGHT, WIDTH, 1)) * np.linspace(
-            0.5, 1.0, len(WAVELENGTHS_NM)
-        )
+        counts = generator.integers(200, 3000, (HEIGHT, WIDTH, 1)) * np.linspace(0.5, 1.0, 9)
         write_cube(capture.root, name, counts.astype(np.uint16))
 
     process(capture.root, tmp_path / "scene", mask="auto")

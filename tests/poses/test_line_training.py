@@ -1,40 +1,30 @@
 """Training on line cameras: rays by row, a whole view rendered in all bands, and the run folder that gives it back."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.engine.stopped_runs import quiet_trainer, stop_at
-from tests.method_factory import CONFIG
-from tests.poses.test_training import trained
+from tests.engine.stopped_runs import stop_at
+from tests.poses.test_training import config_for, trained
 from tests.scenes.line_factory import make_line_scene
-from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.poses.refinement import PoseRefinement
-from unmix_plugin.settings import HyperspectralDataManagerConfig, PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 
 @pytest.fixture(scope="module")
-def trainer(tmp_path_factory) -> Trainer:
-    folder: Path = tmp_path_factory.mktemp("lines")
-    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
-    config = replace(
-        unmix_nerf.config,
-        data=make_line_scene(folder / "scene").root,
-        output_dir=folder / "runs",
-        max_num_iterations=12,
-        device="cpu",
-        pipeline=PipelineConfig(datamanager=data, model=replace(CONFIG, num_endmembers=1)),
-    )
-    trainer = quiet_trainer(config)
-    trainer.train()
-    return trainer
+def folder(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("lines")
+    make_line_scene(place / "scene")
+    return place
+
+
+@pytest.fixture(scope="module")
+def trainer(folder) -> Trainer:
+    return trained(config_for(folder, "fixed"))
 
 
 def test_training_rays_start_where_their_row_was_taken(trainer):
@@ -58,27 +48,12 @@ def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(trainer):
     assert float(found["spectral"].std()) > 0
 
 
-def refining(folder: Path) -> TrainerConfig:
-    refinement = PoseConfig(start=0.0, coarse_steps=2)
-    model = replace(CONFIG, num_endmembers=1, poses="refine", pose_refinement=refinement)
-    data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
-    return replace(
-        unmix_nerf.config,
-        data=folder / "scene",
-        output_dir=folder / "runs",
-        max_num_iterations=8,
-        device="cpu",
-        pipeline=PipelineConfig(datamanager=data, model=model),
-    )
-
-
-def test_refined_training_on_line_cameras_goes_on_exactly_where_it_stopped(tmp_path):
-    make_line_scene(tmp_path / "scene")
-    straight = trained(refining(tmp_path)).pipeline
+def test_refined_training_on_line_cameras_goes_on_exactly_where_it_stopped(folder):
+    config = config_for(folder, steps=8, coarse_steps=2)
+    straight = trained(config).pipeline
     poses, given = straight.model.poses, straight.datamanager.train_cameras
     assert isinstance(poses, PoseRefinement)
     assert not torch.equal(poses.refined(given).image_rays(0).directions, given.image_rays(0).directions)
-    stopped = stop_at(refining(tmp_path), 6)
-    resumed = trained(load_config(stopped.run)).pipeline.model.state_dict()
+    resumed = trained(load_config(stop_at(config, 6).run)).pipeline.model.state_dict()
     for name, value in straight.model.state_dict().items():
         assert torch.equal(value, resumed[name]), name

@@ -89,9 +89,7 @@ def test_gradients_of_moved_rays_are_those_of_finite_differences():
 def steps_to(corrections: torch.Tensor, knots: Knots) -> torch.Tensor:
     """Steps that add up to these corrections at the knots."""
     parts = corrections.split(knots.counts)
-    return torch.cat(
-        [part if len(part) == 1 else torch.linalg.solve(row_waves(len(part)), part) for part in parts]
-    )
+    return torch.cat([p if len(p) == 1 else torch.linalg.solve(row_waves(len(p)), p) for p in parts])
 
 
 @pytest.mark.parametrize("pixel_size", [0.1, 0.003])
@@ -114,11 +112,9 @@ def test_what_moves_all_views_alike_is_no_correction(pixel_size):
 
 
 def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
-    rows = (0,) * 6
-    found = PoseRefinement(rows)
-    places = 4 * torch.nn.functional.normalize(
-        torch.randn(6, 3, generator=torch.Generator().manual_seed(0)), dim=1
-    )
+    found = PoseRefinement((0,) * 6)
+    places = torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
+    places *= 4 / places.norm(dim=1, keepdim=True)
     found.begin(places, box_around(torch.zeros(3)), 0.1)
     found.gauge.zero_()
     with torch.no_grad():
@@ -148,28 +144,31 @@ def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
     assert found.is_free.tolist() == [True, True, True, False]
 
 
-def test_when_most_views_run_away_all_are_undone():
+def with_runaways(count: int) -> PoseRefinement:
+    """Of four views, the last ones far off."""
     found = PoseRefinement((0,) * 4)
     with torch.no_grad():
         found.steps.fill_(0.01)
-        found.steps[1:, 0] = 1.0
+        found.steps[4 - count :, 0] = 1.0
+    return found
+
+
+def test_when_most_views_run_away_all_are_undone():
+    found = with_runaways(3)
     found.undo_runaways()
     assert not bool(found.is_free.any())
     assert torch.equal(found.corrections.detach(), torch.zeros(4, 6))
 
 
 def test_while_the_grid_is_coarse_a_view_that_runs_away_may_try_again():
-    found = PoseRefinement((0,) * 4)
-    with torch.no_grad():
-        found.steps.fill_(0.01)
-        found.steps[2, 0] = 1.0
+    found = with_runaways(1)
     found.undo_runaways(is_final=False)
     assert bool(found.is_free.all())
-    assert torch.equal(found.corrections[2].detach(), torch.zeros(6))
-    assert bool((found.corrections[[0, 1, 3]] != 0).all())
+    assert torch.equal(found.corrections[3].detach(), torch.zeros(6))
+    assert bool((found.corrections[:3] != 0).all())
     with torch.no_grad():
-        found.steps[2, 0] = 0.1
-    assert float(found.corrections[2, 0].detach()) == pytest.approx(0.1)
+        found.steps[3, 0] = 0.1
+    assert float(found.corrections[3, 0].detach()) == pytest.approx(0.1)
 
 
 def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
@@ -181,10 +180,8 @@ def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():
     with torch.no_grad():
         found.steps[:, 5] = 0.2
         moved = found(rays).origins.norm(dim=1)
-    assert_close(
-        float(found.figures(found.free_steps())["pose_shift"]),
-        float((moved / torch.tensor([4.0, 2.0])).mean()),
-    )
+    shift = found.figures(found.free_steps())["pose_shift"]
+    assert_close(float(shift), float((moved / torch.tensor([4.0, 2.0])).mean()))
     assert float(moved[0]) > 0.1
 
 
@@ -290,33 +287,29 @@ def test_levels_without_weight_change_nothing():
 KNOTS = 10
 
 
-def observed(errors: torch.Tensor, matter: torch.Tensor | None = None, steps: int = 20) -> RobustWeights:
+def observed(errors: torch.Tensor, matter: torch.Tensor | None = None) -> RobustWeights:
     """After steps in which each knot had one pixel with this error."""
     robust = RobustWeights(len(errors))
     shown = torch.ones(len(errors), dtype=torch.bool) if matter is None else matter
-    for _ in range(steps):
+    for _ in range(20):
         robust.observe(torch.arange(len(errors)), errors, shown)
     robust.update(Processes())
     return robust
 
 
-def test_all_count_alike_while_their_errors_are_alike():
-    errors = torch.linspace(1.0, LARGEST_RATIO, KNOTS) * 1e-3
-    assert_close(observed(errors).weights, torch.ones(KNOTS))
-
-
-def test_what_is_far_worse_than_the_median_weighs_less_by_the_square():
-    errors = torch.full((KNOTS,), 1e-3)
-    errors[3] *= 10 * LARGEST_RATIO
-    expected = torch.ones(KNOTS)
-    expected[3] = 0.01
-    assert_close(observed(errors).weights, expected)
-
-
-def test_pixels_that_show_nothing_tell_nothing_of_a_pose():
-    errors, matter = torch.full((KNOTS,), 1e-3), torch.ones(KNOTS, dtype=torch.bool)
-    errors[3], matter[3] = 1.0, False
-    assert_close(observed(errors, matter).weights, torch.ones(KNOTS))
+@pytest.mark.parametrize(
+    ("others", "bad", "matter", "weight"),
+    [
+        (torch.linspace(1.0, LARGEST_RATIO, KNOTS), None, True, 1.0),  # alike
+        (torch.ones(KNOTS), 10 * LARGEST_RATIO, True, 0.01),  # by the square of what is too much
+        (torch.ones(KNOTS), 1000.0, False, 1.0),  # pixels that show nothing
+    ],
+)
+def test_what_is_far_worse_than_the_median_weighs_less_by_the_square(others, bad, matter, weight):
+    errors, shown, expected = 1e-3 * others, torch.ones(KNOTS, dtype=torch.bool), torch.ones(KNOTS)
+    if bad is not None:
+        errors[3], shown[3], expected[3] = 1e-3 * bad, matter, weight
+    assert_close(observed(errors, shown).weights, expected)
 
 
 def test_a_pose_that_fits_again_is_an_inlier_again():
@@ -328,12 +321,9 @@ def test_a_pose_that_fits_again_is_an_inlier_again():
         robust.observe(torch.arange(KNOTS), torch.full((KNOTS,), 1e-3), torch.ones(KNOTS, dtype=torch.bool))
     robust.update(Processes())
     assert_close(robust.weights, torch.ones(KNOTS))
-
-
-def test_before_anything_was_seen_all_count():
-    robust = RobustWeights(KNOTS)
-    robust.update(Processes())
-    assert_close(robust.weights, torch.ones(KNOTS))
+    unseen = RobustWeights(KNOTS)
+    unseen.update(Processes())
+    assert_close(unseen.weights, torch.ones(KNOTS))
 
 
 def gradients(weight: float) -> tuple[torch.Tensor, torch.Tensor]:

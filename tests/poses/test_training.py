@@ -23,9 +23,13 @@ from unmix_plugin.settings import HyperspectralDataManagerConfig, PoseConfig
 from unmix_plugin.trained.open_run import open_run
 
 
-def config_for(folder: Path, poses: Literal["fixed", "refine"] = "refine", steps: int = 12) -> TrainerConfig:
+def config_for(
+    folder: Path, poses: Literal["fixed", "refine"] = "refine", steps: int = 12, **refinement: Any
+) -> TrainerConfig:
     data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
-    model = replace(CONFIG, num_endmembers=1, poses=poses, pose_refinement=PoseConfig(start=0.0))
+    model = replace(
+        CONFIG, num_endmembers=1, poses=poses, pose_refinement=PoseConfig(start=0.0, **refinement)
+    )
     return replace(
         unmix_nerf.config,
         data=folder / "scene",

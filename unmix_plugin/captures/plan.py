@@ -71,10 +71,8 @@ def make_plan(
     sensors: dict[str, Sensor] = {}
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
-        all_of_it = tuple(
-            view for view in capture.views if view.sensor == name or not (name and view.release)
-        )
-        sensors[name] = prepare_sensor(name, same, options, replace(references, views=all_of_it))
+        every = tuple(v for v in capture.views if v.sensor == name or not (name and v.release))
+        sensors[name] = prepare_sensor(name, same, options, replace(references, views=every))
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}

@@ -62,14 +62,8 @@ class PosedViews:
 
 
 def given_poses(capture: Capture, where: str | None) -> PoseSet:
-    """The poses of a file, or those of the layout.
-
-    Args:
-        capture: Its folder is where a path is looked for that is not in the working directory.
-        where: As the user gives it; None for the layout's.
-    Raises:
-        CaptureError: there are none, or they can't be read.
-    """
+    """The poses of a file, in the working directory or the capture's folder, or those of the layout. Raises
+    CaptureError: there are none, or they can't be read."""
     if where is None:
         if capture.poses is None:
             why = "".join(f" ({note})" for note in capture.notes if "poses" in note)
@@ -166,14 +160,8 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
 def _complete_rigs(
     views: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
 ) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
-    """Give views without pose that of another lens of the same release, moved by the rig.
-
-    Args:
-        views: Of any layout; those without `release` are left as they are.
-        cameras: By the name of the view, for some of them.
-    Returns:
-        Cameras of more views, and what was done, one sentence a lens.
-    """
+    """Cameras by view, also of views that get the pose of another lens of their release, moved by the rig; and what
+    was done, one sentence a lens."""
     releases: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         if view.release:
@@ -200,9 +188,7 @@ def _complete_rigs(
         "poses": "got the pose of another lens of their release, moved as in other releases",
         "files": "got the pose of another lens of their release, turned as the files say, at the same place",
     }
-    notes = (
-        f"{counted(count, 'view')} of lens {sensor} {said[kind]}" for (sensor, kind), count in how.items()
-    )
+    notes = [f"{counted(n, 'view')} of lens {sensor} {said[kind]}" for (sensor, kind), n in how.items()]
     return completed, tuple(notes)
 
 

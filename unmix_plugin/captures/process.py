@@ -100,7 +100,7 @@ def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, Lens]:
 
 
 def _refuse_late(lenses: dict[str, Lens]) -> None:
-    """Refuse lenses that pictures would have to be brought into, once they are written and poses were found in them."""
+    """Refuse lenses that pictures would have to be brought into, as they are written already."""
     if lenses:
         raise CaptureError(
             f"the lens of {name_some(list(lenses))} is not found in the pictures, and its own is not one that scenes "
@@ -164,9 +164,7 @@ def _by_size(capture: Capture) -> Capture:
         for view in capture.views
     ]
     listed = sorted({f"{view.cube.shape[1]} x {view.cube.shape[0]}" for view in capture.views})
-    note = (
-        f"views have {len(listed)} sizes ({name_some(listed)}, width x height): each is a sensor of its own"
-    )
+    note = f"views have {len(listed)} sizes ({name_some(listed)}, width x height), each a sensor of its own"
     return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 

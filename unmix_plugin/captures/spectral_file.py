@@ -237,9 +237,7 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
 
     no_data = {repr(part.no_data) for part in parts}
     ranges = {part.valid_range for part in parts}
-    differing = [
-        what for what, found in (("no-data values", no_data), ("valid ranges", ranges)) if len(found) > 1
-    ]
+    differing = ["no-data values"] * (len(no_data) > 1) + ["valid ranges"] * (len(ranges) > 1)
     # Metadata that differ are listed by part.
     same = {
         key: value
@@ -275,11 +273,11 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
 def _stack_linears(parts: list[SpectralFile]) -> Linear | None:
     """Gains and offsets of all parts, those of parts without any being 1 and 0."""
     stated = [part.linear.evidence for part in parts if part.linear is not None]
-    each = [
-        part.linear or Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts if stated
-    ]
-    gains, offsets = [linear.gains for linear in each], [linear.offsets for linear in each]
-    return Linear(np.concatenate(gains), np.concatenate(offsets), stated[0]) if stated else None
+    if not stated:
+        return None
+    each = [part.linear or Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts]
+    gains, offsets = (np.concatenate([getattr(x, name) for x in each]) for name in ("gains", "offsets"))
+    return Linear(gains, offsets, stated[0])
 
 
 def _stack_tables(parts: list[SpectralFile]) -> BandTable:

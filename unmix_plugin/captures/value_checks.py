@@ -251,16 +251,15 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
         and record.brightness < _BLACK_SHARE * record.background_brightness
         and record.background_spread > _TEXTURE
     ]
-    hollow = [sample.record.name for sample in samples if sample.is_hollow]
-    if inverted:
+    wrong, how = inverted, "matter is black while the background has light and texture"
+    if not wrong:
+        wrong = [sample.record.name for sample in samples if sample.is_hollow]
+        wrong = wrong if 2 * len(wrong) > len(samples) else []
+        how = "mask takes the border of the picture for matter and its middle for background"
+    if wrong:
         findings.append(
-            f"{counted(len(inverted), 'view')} whose matter is black while the background has light and texture "
-            f"({name_some(inverted, 5)}): are the masks the wrong way round? White is matter"
-        )
-    elif 2 * len(hollow) > len(samples):
-        findings.append(
-            f"{counted(len(hollow), 'view')} whose mask takes the border of the picture for matter and its middle for "
-            f"background ({name_some(hollow, 5)}): are the masks the wrong way round? White is matter"
+            f"{counted(len(wrong), 'view')} whose {how} ({name_some(wrong, 5)}): are the masks the wrong way round? "
+            "White is matter"
         )
     shares = np.array([record.matter_share for record in records])
     if len(shares) <= _NEIGHBOURS or np.ptp(shares) == 0:

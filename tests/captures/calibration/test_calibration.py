@@ -68,10 +68,9 @@ def test_a_wider_white_is_averaged_over_its_columns_and_said_so():
 def test_a_panel_is_the_mean_of_its_rectangle():
     counts = _noisy(np.full((LINES, SAMPLES, NUM), 800.0))
     found = panel_reference(file_of(counts), (2, 3, 4, 5), "a view")
-    np.testing.assert_allclose(
-        found.rows(ALL, ALL, ALL_BANDS)[0, 0], counts[2:6, 3:8].mean(axis=(0, 1)), rtol=1e-6
-    )
-    with pytest.raises(ConfigError, match="leaves the view of 40 rows and 24 columns"):
+    mean = counts[2:6, 3:8].mean(axis=(0, 1))
+    np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS)[0, 0], mean, rtol=1e-6)
+    with pytest.raises(ConfigError, match="leaves the image of 40 rows and 24 columns"):
         panel_reference(file_of(counts), (38, 0, 4, 4), "a view")
 
 
@@ -96,10 +95,8 @@ def test_blocks_of_any_size_give_the_same_values(rows: int, binning: int):
         part = calibration.rows(file, first, last)
         np.testing.assert_array_equal(part.values, whole.values[first:last])
         np.testing.assert_array_equal(part.saturated, whole.saturated[first:last])
-    n = binning
-    squares = counts[: raster.height * n, : raster.width * n].reshape(
-        raster.height, n, raster.width, n, BANDS
-    )
+    h, w, n = raster.height, raster.width, binning
+    squares = counts[: h * n, : w * n].reshape(h, n, w, n, BANDS)
     np.testing.assert_allclose(whole.values, squares.mean(axis=(1, 3)), rtol=1e-6)
     np.testing.assert_array_equal(whole.saturated, (squares >= 3500).any(axis=(1, 3)))
 

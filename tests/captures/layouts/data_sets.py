@@ -30,9 +30,8 @@ def write_json(path: Path, content: object) -> None:
 def write_exr(path: Path, channels: dict[str, np.ndarray], kind: type = np.float32) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-    OpenEXR.File(header, {name: np.ascontiguousarray(a, dtype=kind) for name, a in channels.items()}).write(
-        str(path)
-    )
+    arrays = {name: np.ascontiguousarray(a, dtype=kind) for name, a in channels.items()}
+    OpenEXR.File(header, arrays).write(str(path))
 
 
 def stokes(intensity: np.ndarray, alpha: np.ndarray | None = None) -> dict[str, np.ndarray]:
@@ -52,9 +51,8 @@ def write_nespof(root: Path, wavelengths: tuple[int, ...] = (450, 460, 470), alp
     frames = {"train": [], "val": []}
     for index in range(5):
         split = "val" if index == 0 else "train"
-        frames[split].append(
-            {"file_path": f"./{split}/r_{index}", "rotation": 0.01, "transform_matrix": pose(index)}
-        )
+        frame = {"file_path": f"./{split}/r_{index}", "rotation": 0.01, "transform_matrix": pose(index)}
+        frames[split].append(frame)
         for wavelength in wavelengths:
             opacity = np.linspace(0, 1, 35, dtype=np.float32).reshape(5, 7) if alpha else None
             path = root / str(wavelength) / split / f"r_{index}.exr"
@@ -100,17 +98,10 @@ def write_unmix(root, written="eval", named="val", **top):
         np.save(root / real / f"{name}.npy", cube(index))
         write_picture(root / real / f"{name}.png")
         Image.fromarray(np.full((6, 8), index, np.uint8)).save(root / real / f"{name}_seg.png")
-        frames.append(
-            {
-                "file_path": f"./{folder}/{name}.png",
-                "hyperspectral_file_path": f"{folder}/{name}.npy",
-                "seg_file_path": f"{folder}/{name}_seg.png",
-                "transform_matrix": pose(index),
-            }
-        )
-    write_json(
-        root / "transforms.json", LENS | {"wavelengths": [450, 500, 550, 600]} | top | {"frames": frames}
-    )
+        files = {"file_path": f"./{folder}/{name}.png", "hyperspectral_file_path": f"{folder}/{name}.npy"}
+        frames.append(files | {"seg_file_path": f"{folder}/{name}_seg.png", "transform_matrix": pose(index)})
+    bands = {"wavelengths": [450, 500, 550, 600]}
+    write_json(root / "transforms.json", LENS | bands | top | {"frames": frames})
 
 
 def write_hs(root, kind=torch.uint8):
@@ -121,11 +112,7 @@ def write_hs(root, kind=torch.uint8):
         tensor = (values * 255).to(kind) if kind == torch.uint8 else values.to(kind)
         torch.save(tensor, root / "plant" / "torch" / f"frame_{index:05d}.pt")
         write_picture(root / "images" / f"frame_{index:05d}.jpg")
-        frames.append(
-            {
-                "file_path": f"images/frame_{index:05d}.jpg",
-                "hyperspectral_file_path": f"plant/torch/frame_{index:05d}.pt",
-                "transform_matrix": pose(index),
-            }
-        )
+        paths = (f"images/frame_{index:05d}.jpg", f"plant/torch/frame_{index:05d}.pt", pose(index))
+        keys = ("file_path", "hyperspectral_file_path", "transform_matrix")
+        frames.append(dict(zip(keys, paths, strict=True)))
     write_json(root / "transforms.json", LENS | {"frames": frames})

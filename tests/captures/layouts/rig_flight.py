@@ -20,12 +20,8 @@ PX_A_MM = 20.0
 OPENCV_TO_OPENGL = np.diag([1.0, -1.0, -1.0])
 VIGNETTING = {(0, 0): 0.55, (1, 0): 1.5, (2, 0): -1.5, (0, 1): 0.4, (0, 2): -0.4}
 """Coefficient of x^n y^m; 1.025 at the centre."""
-EXIF = {
-    "FNumber": 2.2,
-    "ISOSpeedRatings": 100,
-    "FocalPlaneXResolution": PX_A_MM,
-    "FocalPlaneYResolution": PX_A_MM,
-}
+EXIF = {"FNumber": 2.2, "ISOSpeedRatings": 100}
+EXIF |= {"FocalPlaneXResolution": PX_A_MM, "FocalPlaneYResolution": PX_A_MM}
 
 
 @dataclass(frozen=True)
@@ -44,23 +40,15 @@ class LensOfRig:
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+NIR_BENDS = (-0.1, 0.05, 0.0, 0.001, -0.002)
 LENSES = (
     LensOfRig("GRE", "Green", 550, 40, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (5.2e5, 2100.0, 300.0), 0.004, 3.0),
     LensOfRig("RED", "Red", 660, 40, (1.5, -2.0, 0.7), (0.03, 0.0, 0.0), (4.1e5, 2000.0, 100.0), 0.006, 3.1),
     LensOfRig(
-        "REG", "RedEdge", 735, 10, (-1.0, 0.5, -1.2), (0.0, 0.02, 0.0), (3.3e5, 1900.0, 200.0), 0.008, 2.9
+        "REG", "RedEdge", 735, 10, (-1, 0.5, -1.2), (0.0, 0.02, 0.0), (3.3e5, 1900.0, 200.0), 0.008, 2.9
     ),
     LensOfRig(
-        "NIR",
-        "NIR",
-        790,
-        40,
-        (0.4, 1.1, 2.0),
-        (0.03, 0.02, 0.0),
-        (4.8e5, 2050.0, 400.0),
-        0.005,
-        3.0,
-        (-0.1, 0.05, 0.0, 0.001, -0.002),
+        "NIR", "NIR", 790, 40, (0.4, 1.1, 2), (0.03, 0.02, 0), (4.8e5, 2050, 400), 0.005, 3.0, NIR_BENDS
     ),
 )
 

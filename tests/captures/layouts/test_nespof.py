@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.captures.file_factory import centres_nm, present
 from tests.captures.layouts.data_sets import (
     PLAIN,
     intensity,
@@ -51,13 +52,9 @@ def test_poses_and_field_of_view_belong_to_the_views(scene):
         assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
 
 
-def test_a_scene_without_alpha_has_no_opacity(tmp_path):
+def test_labels_lie_in_seg_and_a_scene_without_alpha_has_no_opacity(tmp_path):
     write_nespof(tmp_path, alpha=False)
     assert find_nespof(tmp_path, PLAIN).views[0].alpha is None
-
-
-def test_labels_lie_in_seg(tmp_path):
-    write_nespof(tmp_path)
     (tmp_path / "seg" / "train").mkdir(parents=True)
     Image.fromarray(np.zeros((5, 7), np.uint8)).save(tmp_path / "seg" / "train" / "r_3.png")
     labels = [view.labels for view in find_nespof(tmp_path, PLAIN).views]
@@ -79,9 +76,7 @@ def test_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
 def test_given_wavelengths_replace_the_names_of_folders(tmp_path):
     write_nespof(tmp_path)
     options = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
-    wavelengths = find_nespof(tmp_path, options).views[0].cube.bands.wavelengths_nm
-    assert wavelengths is not None
-    assert wavelengths.tolist() == [500.0, 510.0, 520.0]
+    assert centres_nm(find_nespof(tmp_path, options).views[0].cube).tolist() == [500.0, 510.0, 520.0]
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
@@ -92,31 +87,18 @@ def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, 
     assert _open_opacity(tmp_path / "a.exr") is None
 
 
-def test_channels_are_known_by_name_wherever_they_stand(tmp_path):
+def test_channels_are_known_by_name_wherever_they_stand_and_others_are_refused(tmp_path):
     write_exr(tmp_path / "a.exr", {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
     assert (_open_intensity(tmp_path / "a.exr").read() == 2.0).all()
-    alpha = _open_opacity(tmp_path / "a.exr")
-    assert alpha is not None
-    assert (alpha.read() == 0.5).all()
-
-
-def test_other_channels_are_refused(tmp_path):
+    assert (present(_open_opacity(tmp_path / "a.exr")).read() == 0.5).all()
     write_exr(tmp_path / "a.exr", {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
     with pytest.raises(CaptureError, match="has the channels G, R; expected s0 to s3"):
         _open_intensity(tmp_path / "a.exr")
 
 
-def _without_a_folder(root):
-    shutil.rmtree(root / "460" / "train")
-
-
 def _cut_short(root):
     path = root / "450" / "val" / "r_0.exr"
     path.write_bytes(path.read_bytes()[:20])
-
-
-def _of_another_size(root):
-    write_exr(root / "460" / "val" / "r_0.exr", stokes(np.zeros((5, 8))))
 
 
 def _outside(root):
@@ -127,9 +109,12 @@ def _outside(root):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (_without_a_folder, r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"),
+        (lambda root: shutil.rmtree(root / "460/train"), r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"),
         (_cut_short, r"r_0.exr can't be read as OpenEXR"),
-        (_of_another_size, "the bands of one view have one size"),
+        (
+            lambda root: write_exr(root / "460/val/r_0.exr", stokes(np.zeros((5, 8)))),
+            "of one view have one size",
+        ),
         (_outside, "leaves the folder"),
     ],
 )
@@ -161,12 +146,10 @@ def test_real_captures_have_one_folder_a_view(tmp_path):
 
 def test_poses_go_with_views_in_the_order_of_names(tmp_path):
     write_real(tmp_path, views=("v10", "v2", "v1"))
-    poses = find_nespof_real(tmp_path, PLAIN).poses
-    assert poses is not None
+    poses = present(find_nespof_real(tmp_path, PLAIN).poses)
     for index, name in enumerate(("v1", "v10", "v2")):
         np.testing.assert_allclose(poses.cameras[name].camera_to_world, pose(index)[:3], atol=1e-12)
-        lens = poses.cameras[name].lens
-        assert lens is not None
+        lens = present(poses.cameras[name].lens)
         assert (lens.height, lens.width, lens.focal_px) == (5, 7, (9.0, 9.0))
 
 

@@ -4,11 +4,12 @@ import json
 import math
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import write_band_file
+from tests.captures.file_factory import present, write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
     HEIGHT,
@@ -74,8 +75,7 @@ def test_what_is_left_out_or_ignored_is_said(flight):
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
 def test_every_lens_has_its_own_intrinsics(flight, lens):
-    found = _view(find_rig(flight, PLAIN), 0, lens.ending).lens
-    assert found is not None
+    found = present(_view(find_rig(flight, PLAIN), 0, lens.ending).lens)
     x, y = (rays(lens)[..., :2] / -rays(lens)[..., 2:]).transpose(2, 0, 1)
     pixels = project(found, x, -y)
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
@@ -272,14 +272,16 @@ DJI = {
 
 def file_with(xmp, exif=EXIF) -> SpectralFile:
     metadata = {"xmp": xmp, "exif": exif}
+    size = (LENS_HEIGHT, LENS_WIDTH, 1)
     return SpectralFile(
-        Path("a.tif"),
-        "tiff",
-        (LENS_HEIGHT, LENS_WIDTH, 1),
-        np.dtype("u2"),
-        lambda *_: np.zeros(0),
-        metadata=metadata,
+        Path("a.tif"), "tiff", size, np.dtype("u2"), lambda *_: np.zeros(0), metadata=metadata
     )
+
+
+def known_lens(file: SpectralFile) -> tuple[Any, tuple[str, ...]]:
+    lens, notes = lens_of(file)
+    assert lens is not None
+    return lens, notes
 
 
 def project(lens: Lens, x, y):
@@ -312,16 +314,14 @@ def perspective_by_hand(x, y, focal=1449.36):
 
 
 def test_the_third_radial_term_is_kept():
-    lens, notes = lens_of(file_with(PERSPECTIVE))
-    assert lens is not None
+    lens, notes = known_lens(file_with(PERSPECTIVE))
     assert worst_px(lens, perspective_by_hand) < 1e-6
     assert notes == ()
 
 
 def test_without_a_third_term_nothing_is_fitted():
     tags = PERSPECTIVE | {"Camera:PerspectiveDistortion": ["-0.097", "0.14", "0", "0.0003", "0.0007"]}
-    lens, notes = lens_of(file_with(tags))
-    assert lens is not None
+    lens, notes = known_lens(file_with(tags))
     assert lens.distortion == (-0.097, 0.14, 0.0003, 0.0007)
     assert lens.focal_px == (1449.36, 1449.36)
     assert lens.center_px == pytest.approx((2.35 * 266.667 + 0.5, 1.8 * 266.667 + 0.5))
@@ -331,16 +331,14 @@ def test_without_a_third_term_nothing_is_fitted():
 @pytest.mark.parametrize("unit", [{"Camera:PerspectiveFocalLengthUnits": "mm"}, {}])
 def test_a_focal_length_in_millimetres_is_told_by_its_unit_or_size(unit):
     tags = PERSPECTIVE | {"Camera:PerspectiveFocalLength": "5.435"} | unit
-    lens, _ = lens_of(file_with(tags))
-    assert lens is not None
+    lens, _ = known_lens(file_with(tags))
     assert worst_px(lens, lambda x, y: perspective_by_hand(x, y, 5.435 * 266.667)) < 0.1
 
 
 @pytest.mark.parametrize(("unit", "resolution"), [(2, 266.667 * 25.4), (3, 2666.67), (4, 266.667)])
 def test_the_unit_of_the_focal_plane_counts(unit, resolution):
     exif = {f"FocalPlane{axis}Resolution": resolution for axis in "XY"} | {"FocalPlaneResolutionUnit": unit}
-    lens, _ = lens_of(file_with(PERSPECTIVE, exif))
-    assert lens is not None
+    lens, _ = known_lens(file_with(PERSPECTIVE, exif))
     assert worst_px(lens, perspective_by_hand) < 0.1
 
 
@@ -356,8 +354,7 @@ def fisheye_by_hand(x, y):
 
 
 def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
-    lens, _ = lens_of(file_with(FISHEYE))
-    assert lens is not None
+    lens, _ = known_lens(file_with(FISHEYE))
     worst = worst_px(lens, fisheye_by_hand)
     assert 0.3 < worst < 4.0
     assert lens.resampled_from is not None
@@ -369,8 +366,7 @@ def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
 
 
 def test_the_lens_of_dji_counts_from_its_optical_centre():
-    lens, _ = lens_of(file_with(DJI, {}))
-    assert lens is not None
+    lens, _ = known_lens(file_with(DJI, {}))
 
     def by_hand(x, y):
         square = x * x + y * y
@@ -415,6 +411,5 @@ def test_a_panchromatic_band_is_left_out_with_a_note(flight, tmp_path):
         path.write_bytes(path.read_bytes().replace(b"CentralWavelength>790<", b"CentralWavelength>390<"))
     capture = find_rig(tmp_path / "flight", PLAIN)
     assert {view.sensor for view in capture.views} == {"green", "red", "rededge"}
-    assert any(
-        "10 images of bands too broad for one wavelength left out: NIR" in note for note in capture.notes
-    )
+    said = "10 images of bands too broad for one wavelength left out: NIR"
+    assert any(said in note for note in capture.notes)

@@ -4,12 +4,14 @@ From the folder of each layout to a scene that loads, with the values and splits
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from tests.captures.file_factory import centres_nm, present
 from tests.captures.layouts.data_sets import (
     LENS,
     PLAIN,
@@ -54,10 +56,8 @@ def test_cubes_pictures_and_labels_are_found_where_the_converter_left_them(tmp_p
 
 
 def test_lists_go_before_folders(tmp_path):
-    lists = {
-        "train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)],
-        "test_filenames": ["train/frame_00002.npy"],
-    }
+    lists: dict[str, list[str]] = {"train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)]}
+    lists["test_filenames"] = ["train/frame_00002.npy"]
     write_unmix(tmp_path, "eval", "val", **lists)
     splits = [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views]
     assert splits[:3] == ["train", "train", "eval"]
@@ -70,14 +70,11 @@ def test_one_folder_for_all_says_nothing(tmp_path):
 
 def test_wavelengths_are_those_of_the_file_unless_given(tmp_path):
     write_unmix(tmp_path)
-    bands = find_unmix_nerf(tmp_path, PLAIN).views[0].cube.bands
-    assert bands.wavelengths_nm is not None
-    assert bands.wavelengths_nm.tolist() == [450.0, 500.0, 550.0, 600.0]
-    assert "transforms.json" in bands.evidence
+    cube = find_unmix_nerf(tmp_path, PLAIN).views[0].cube
+    assert centres_nm(cube).tolist() == [450.0, 500.0, 550.0, 600.0]
+    assert "transforms.json" in cube.bands.evidence
     given = ReadOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
-    bands = find_unmix_nerf(tmp_path, given).views[0].cube.bands
-    assert bands.wavelengths_nm is not None
-    assert bands.wavelengths_nm.tolist() == [400.0, 410.0, 420.0, 430.0]
+    assert centres_nm(find_unmix_nerf(tmp_path, given).views[0].cube).tolist() == [400.0, 410.0, 420.0, 430.0]
 
 
 def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
@@ -98,12 +95,10 @@ def test_wavelengths_are_never_made_up(tmp_path, stated):
 
 def test_poses_come_by_the_names_of_views(tmp_path):
     write_unmix(tmp_path)
-    poses = find_unmix_nerf(tmp_path, PLAIN).poses
-    assert poses is not None
+    poses = present(find_unmix_nerf(tmp_path, PLAIN).poses)
     assert sorted(poses.cameras) == [f"frame_0000{index}" for index in range(5)]
     np.testing.assert_allclose(poses.cameras["frame_00004"].camera_to_world, pose(4)[:3], atol=1e-6)
-    lens = poses.cameras["frame_00004"].lens
-    assert lens is not None
+    lens = present(poses.cameras["frame_00004"].lens)
     assert lens.focal_px == (9.0, 9.0)
 
 
@@ -129,6 +124,9 @@ def test_missing_cubes_are_counted_and_another_layout_named(tmp_path):
         (tmp_path / "train" / f"frame_0000{index}.npy").unlink()
     with pytest.raises(CaptureError, match=r"lacks 3 files .*train/frame_00000.npy.*nerfstudio"):
         find_unmix_nerf(tmp_path, PLAIN)
+    edit(tmp_path, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
+    with pytest.raises(CaptureError, match=r"frames\[2\] has no 'hyperspectral_file_path'"):
+        find_unmix_nerf(tmp_path, PLAIN)
 
 
 @pytest.mark.parametrize("text", ["../outside.npy", "/etc/passwd", "link.npy"])
@@ -142,21 +140,11 @@ def test_paths_that_leave_the_folder_are_refused(tmp_path, text):
         find_unmix_nerf(root, PLAIN)
 
 
-def test_a_frame_without_a_cube_is_refused(tmp_path):
-    write_unmix(tmp_path)
-    edit(tmp_path, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
-    with pytest.raises(CaptureError, match=r"frames\[2\] has no 'hyperspectral_file_path'"):
-        find_unmix_nerf(tmp_path, PLAIN)
-
-
 def test_views_that_would_share_a_name_are_refused(tmp_path):
     write_unmix(tmp_path)
-    (tmp_path / "train" / "frame 00000.npy").write_bytes(
-        (tmp_path / "train" / "frame_00000.npy").read_bytes()
-    )
-    edit(
-        tmp_path, lambda content: content["frames"][1].update(hyperspectral_file_path="train/frame 00000.npy")
-    )
+    shutil.copy(tmp_path / "train/frame_00000.npy", tmp_path / "train/frame 00000.npy")
+    twin = {"hyperspectral_file_path": "train/frame 00000.npy"}
+    edit(tmp_path, lambda content: content["frames"][1].update(twin))
     with pytest.raises(CaptureError, match="would both be the view 'frame_00000'"):
         find_unmix_nerf(tmp_path, PLAIN)
 
@@ -209,11 +197,8 @@ def test_frames_may_name_envi_headers_in_a_folder_of_their_own(tmp_path):
     import spectral.io.envi
 
     (tmp_path / "raw").mkdir()
-    spectral.io.envi.save_image(
-        str(tmp_path / "raw" / "a.hdr"),
-        cube(3),
-        metadata={"wavelength": [450, 500, 550, 600], "wavelength units": "nm"},
-    )
+    bands = {"wavelength": [450, 500, 550, 600], "wavelength units": "nm"}
+    spectral.io.envi.save_image(str(tmp_path / "raw" / "a.hdr"), cube(3), metadata=bands)
     frames = [{"file_path": "a.hdr", "transform_matrix": pose(0)}]
     write_json(tmp_path / "transforms.json", LENS | {"datadir": "raw", "frames": frames})
     (view,) = find_nerfstudio(tmp_path, PLAIN).views
@@ -228,11 +213,8 @@ def test_pictures_of_blender_have_no_suffix_and_a_file_for_each_split(tmp_path):
         frame = {"file_path": f"./{split}/r_0", "transform_matrix": pose(index)}
         write_json(tmp_path / f"transforms_{split}.json", {"camera_angle_x": 0.7, "frames": [frame]})
     capture = find_nerfstudio(tmp_path, PLAIN)
-    assert [(view.name, view.split) for view in capture.views] == [
-        ("test_r_0", "eval"),
-        ("train_r_0", "train"),
-        ("val_r_0", "eval"),
-    ]
+    splits = {view.name: view.split for view in capture.views}
+    assert splits == {"test_r_0": "eval", "train_r_0": "train", "val_r_0": "eval"}
     assert capture.poses is not None
     np.testing.assert_allclose(capture.poses.cameras["test_r_0"].camera_to_world, pose(2)[:3], atol=1e-6)
 
@@ -241,9 +223,8 @@ def test_a_turned_picture_stays_as_it_is_stored(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
-    write_json(
-        tmp_path / "transforms.json", LENS | {"frames": [{"file_path": "a.jpg", "transform_matrix": pose(0)}]}
-    )
+    frames = [{"file_path": "a.jpg", "transform_matrix": pose(0)}]
+    write_json(tmp_path / "transforms.json", LENS | {"frames": frames})
     assert find_nerfstudio(tmp_path, PLAIN).views[0].cube.shape == (6, 8, 3)
 
 
@@ -270,8 +251,7 @@ def test_nespof(tmp_path):
     assert names(scene, scene.eval_indices) == ["r_0"]
     assert names(scene, scene.train_indices) == ["r_1", "r_2", "r_3", "r_4"]
     index = [frame.name for frame in scene.frames].index("r_3")
-    alpha = scene.alpha(index)
-    assert alpha is not None
+    alpha = present(scene.alpha(index))
     np.testing.assert_allclose(alpha, np.linspace(0, 1, 35).reshape(5, 7), atol=0.003)
     seen = alpha > 0
     expected = np.stack([intensity(3, wavelength) for wavelength in (450, 460, 470)], axis=-1) / 2.0
@@ -290,8 +270,7 @@ def test_unmix_nerf(tmp_path):
     scene = process("unmix-nerf", tmp_path / "hotdog", tmp_path / "scene", scale=1.0, mask="none")
     assert names(scene, scene.eval_indices) == ["frame_00003", "frame_00004"]
     np.testing.assert_allclose(scene.cube(1), cube(1), atol=1e-4)
-    labels = scene.labels(4)
-    assert labels is not None
+    labels = present(scene.labels(4))
     assert (labels == 4).all()
 
 
@@ -299,9 +278,8 @@ def test_hs_nerf_asks_for_wavelengths(tmp_path):
     write_hs(tmp_path / "basil")
     with pytest.raises(CaptureError, match=r"wavelengths of its 4 bands are unknown .*--wavelengths"):
         process("hs-nerf", tmp_path / "basil", tmp_path / "scene")
-    scene = process(
-        "hs-nerf", tmp_path / "basil", tmp_path / "scene", wavelengths="450,500,550,600", scale=1.0
-    )
+    options = {"wavelengths": "450,500,550,600", "scale": 1.0}
+    scene = process("hs-nerf", tmp_path / "basil", tmp_path / "scene", **options)
     assert scene.wavelengths_nm.tolist() == [450.0, 500.0, 550.0, 600.0]
     np.testing.assert_allclose(scene.cube(2), cube(2), atol=1.01 / 255)
 

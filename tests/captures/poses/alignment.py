@@ -5,22 +5,17 @@ Notation: `N` cameras, `P` points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from tests.captures.poses.pose_factory import LENS
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.engine.geometry.camera_paths import focus_point
-from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.placement import Placement
-
-MOST_POINTS = 400
-"""Points that are projected into each camera."""
-LEAST_CAMERAS = 3
 
 
 @dataclass(frozen=True)
@@ -55,137 +50,70 @@ def align_poses(
         names: True name of each estimated one; None where both are the same.
         points: In the true world, less its offset; None takes the sparse points of the true poses, or of the estimated
             ones, or points around where the cameras look.
-    Raises:
-        CaptureError: fewer than 3 cameras with lenses are in both.
     """
-    pairs = names if names is not None else {name: name for name in estimated.cameras}
-    shared = {
-        mine: theirs
-        for mine, theirs in pairs.items()
-        if mine in estimated.cameras
-        and theirs in truth.cameras
-        and estimated.cameras[mine].lens
-        and truth.cameras[theirs].lens
-    }
-    if len(shared) < LEAST_CAMERAS:
-        raise CaptureError(
-            f"{len(shared)} cameras with lenses are in both {estimated.source} and {truth.source}; expected at least "
-            f"{LEAST_CAMERAS} of the same name"
-        )
-    mine = [estimated.cameras[name] for name in shared]
-    theirs = [truth.cameras[name] for name in shared.values()]
-    reach = _extent(theirs)
-    scale = reach / _extent(mine)
-    for _ in range(2):  # the marks beside the estimated cameras have a length that the scale has to fit
-        scale = similarity_of(_markers(mine, reach / scale), _markers(theirs, reach)).scale
-    first = similarity_of(_markers(mine, reach / scale), _markers(theirs, reach))
-    if points is None:
-        points = _points_of(truth, estimated, first, theirs)
-    points = points[:: max(1, len(points) // MOST_POINTS)]
-    refined = _refine(first, mine, theirs, points)
-    return _alignment(refined, tuple(shared.values()), mine, theirs, points)
-
-
-def similarity_of(source: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray, "P 3"]) -> Placement:
-    """The similarity that maps points to points with the least squares (Umeyama 1991)."""
-    source_middle, target_middle = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - source_middle, target - target_middle
-    u, singular, vt = np.linalg.svd(b.T @ a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = (u * signs) @ vt
-    scale = float((singular * signs).sum() / (a**2).sum())
-    return Placement(rotation, target_middle / scale - rotation @ source_middle, scale)
-
-
-def _extent(cameras: Sequence[PosedCamera]) -> float:
-    """Mean distance of cameras from their middle; 1 where they are at one place."""
-    positions = np.stack([camera.camera_to_world[:, 3] for camera in cameras])
-    return float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()) or 1.0
-
-
-def _markers(cameras: Sequence[PosedCamera], reach: float) -> Float64[np.ndarray, "P 3"]:
-    """Positions of cameras, and points beside them along their axes, which settle the rotation of cameras in a row."""
-    poses = np.stack([camera.camera_to_world for camera in cameras])
-    positions = poses[:, :, 3]
-    return np.concatenate([positions, *(positions + reach * poses[:, :, axis] for axis in range(3))])
-
-
-def _points_of(
-    truth: PoseSet, estimated: PoseSet, similarity: Placement, theirs: Sequence[PosedCamera]
-) -> Float64[np.ndarray, "P 3"]:
-    """Points to project, in the true world: sparse ones of either, or a cross around where the cameras look."""
-    if truth.points is not None:
-        return truth.points
-    if estimated.points is not None:
-        return similarity.to_scene(estimated.points)
-    poses = np.stack([camera.camera_to_world for camera in theirs])
-    reach = _extent(theirs)
-    middle = focus_point(poses)
-    if middle is None:
-        middle = (poses[:, :, 3] - reach * poses[:, :, 2]).mean(axis=0)
-    cross = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    return middle + 0.1 * reach * cross
-
-
-def _refine(
-    first: Placement,
-    mine: Sequence[PosedCamera],
-    theirs: Sequence[PosedCamera],
-    points: Float64[np.ndarray, "P 3"],
-) -> Placement:
-    """The similarity with the least squares in pixels, from a first one."""
-    from scipy.optimize import least_squares
-
+    pairs = names or {name: name for name in estimated.cameras}
+    shared = {a: b for a, b in pairs.items() if a in estimated.cameras and b in truth.cameras}
+    assert len(shared) >= 3
+    mine, theirs = [estimated.cameras[a] for a in shared], [truth.cameras[b] for b in shared.values()]
+    first, reach = _first_guess(_stacked(mine), _stacked(theirs))
+    if points is None and (points := truth.points) is None:
+        found = estimated.points
+        points = _around(_stacked(theirs), reach) if found is None else first.to_scene(found)
+    points = points[:: max(1, len(points) // 400)]
     wanted = np.stack([camera.pixels_of(points) for camera in theirs])
-    seen = np.isfinite(wanted) & _inside(wanted, theirs)[..., None]
+    sizes = np.array([[c.lens.width, c.lens.height] for c in theirs if c.lens is not None])[:, None]
+    with np.errstate(invalid="ignore"):
+        inside = np.asarray(((wanted >= 0) & (wanted <= sizes)).all(axis=-1))
+    seen = np.isfinite(wanted).all(axis=-1) & (inside | (inside.sum(axis=1) == 0)[:, None])
     pivot = points.mean(axis=0)
 
     def changed(step: np.ndarray) -> Placement:
-        """The first similarity, then a turn, growth and shift about the middle of the points."""
+        """The first guess, then a turn, growth and shift about the middle of the points."""
         turn, growth = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[3]))
-        scale = first.scale * growth
         shift = pivot + step[4:] - growth * turn @ pivot
-        translation = turn @ first.translation + shift / scale
-        return Placement(turn @ first.rotation, translation, scale)
+        scale = first.scale * growth
+        return Placement(turn @ first.rotation, turn @ first.translation + shift / scale, scale)
 
-    def errors(step: np.ndarray) -> np.ndarray:
-        found = np.stack([camera.moved(changed(step)).pixels_of(points) for camera in mine])
-        return np.nan_to_num((found - wanted)[seen], nan=1e4)
+    def off(way: Placement) -> Float64[np.ndarray, "N P 2"]:
+        return np.stack([camera.moved(way).pixels_of(points) for camera in mine]) - wanted
 
-    reach = _extent(theirs)
-    scales = np.array([1e-3, 1e-3, 1e-3, 1e-3, 1e-3 * reach, 1e-3 * reach, 1e-3 * reach])
-    step = least_squares(errors, np.zeros(7), x_scale=scales).x
-    return changed(step)
-
-
-def _inside(pixels: Float64[np.ndarray, "N P 2"], cameras: Sequence[PosedCamera]) -> Bool[np.ndarray, "N P"]:
-    """Which points lie in the pictures; all of a picture that shows none."""
-    sizes = np.array([[c.lens.width, c.lens.height] for c in cameras if c.lens is not None])[:, None]
-    with np.errstate(invalid="ignore"):
-        inside = np.asarray(((pixels >= 0) & (pixels <= sizes)).all(axis=-1))
-    return inside | (inside.sum(axis=1) == 0)[:, None]
-
-
-def _alignment(
-    similarity: Placement,
-    names: tuple[str, ...],
-    mine: Sequence[PosedCamera],
-    theirs: Sequence[PosedCamera],
-    points: Float64[np.ndarray, "P 3"],
-) -> Alignment:
-    aligned = [camera.moved(similarity) for camera in mine]
-    wanted = np.stack([camera.pixels_of(points) for camera in theirs])
-    squared = ((np.stack([camera.pixels_of(points) for camera in aligned]) - wanted) ** 2).sum(axis=-1)
-    squared[~_inside(wanted, theirs)] = np.nan
-    found, true = (np.stack([camera.camera_to_world for camera in those]) for those in (aligned, theirs))
-    cosines = ((found[:, :, :3] * true[:, :, :3]).sum(axis=(1, 2)) - 1.0) / 2.0
+    scales = 1e-3 * np.array([1, 1, 1, 1, reach, reach, reach])
+    errors = lambda step: np.nan_to_num(off(changed(step))[seen].ravel(), nan=1e4)  # noqa: E731
+    best = changed(least_squares(errors, np.zeros(7), x_scale=scales).x)
+    squared = np.where(seen, (off(best) ** 2).sum(axis=-1), np.nan)
+    found, true = _stacked([camera.moved(best) for camera in mine]), _stacked(theirs)
+    turns = Rotation.from_matrix(found[:, :, :3].transpose(0, 2, 1) @ true[:, :, :3]).magnitude()
+    places = np.linalg.norm(found[:, :, 3] - true[:, :, 3], axis=1)
     return Alignment(
-        similarity,
-        names,
-        np.sqrt(np.nanmean(squared, axis=1)),
-        np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))),
-        np.linalg.norm(found[:, :, 3] - true[:, :, 3], axis=1),
+        best, tuple(shared.values()), np.sqrt(np.nanmean(squared, axis=1)), np.degrees(turns), places
     )
+
+
+def _stacked(cameras: list[PosedCamera]) -> Float64[np.ndarray, "N 3 4"]:
+    return np.stack([camera.camera_to_world for camera in cameras])
+
+
+def _first_guess(
+    mine: Float64[np.ndarray, "N 3 4"], theirs: Float64[np.ndarray, "N 3 4"]
+) -> tuple[Placement, float]:
+    """By the mean turn, middle and extent of the cameras; and the extent of the true ones."""
+    middles = [poses[:, :, 3].mean(axis=0) for poses in (mine, theirs)]
+    extents = [
+        float(np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean()) or 1.0
+        for poses, middle in zip((mine, theirs), middles, strict=True)
+    ]
+    scale = extents[1] / extents[0]
+    turns = Rotation.from_matrix(theirs[:, :, :3] @ mine[:, :, :3].transpose(0, 2, 1))
+    rotation = turns.mean().as_matrix()
+    return Placement(rotation, middles[1] / scale - rotation @ middles[0], scale), extents[1]
+
+
+def _around(poses: Float64[np.ndarray, "N 3 4"], reach: float) -> Float64[np.ndarray, "P 3"]:
+    """A cross around where the cameras look."""
+    middle = focus_point(poses)
+    if middle is None:
+        middle = (poses[:, :, 3] - reach * poses[:, :, 2]).mean(axis=0)
+    return middle + 0.1 * reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 
 
 SIMILARITY = Placement(
@@ -194,16 +122,11 @@ SIMILARITY = Placement(
 
 
 def elsewhere(poses: PoseSet) -> PoseSet:
-    back = Placement(
-        SIMILARITY.rotation.T,
-        -SIMILARITY.scale * SIMILARITY.rotation.T @ SIMILARITY.translation,
-        1 / SIMILARITY.scale,
-    )
-    return replace(poses, cameras={name: camera.moved(back) for name, camera in poses.cameras.items()})
+    back = SIMILARITY.rotation.T
+    way = Placement(back, -SIMILARITY.scale * back @ SIMILARITY.translation, 1 / SIMILARITY.scale)
+    return replace(poses, cameras={name: camera.moved(way) for name, camera in poses.cameras.items()})
 
 
 def in_a_row() -> PoseSet:
-    cameras = {
-        str(x): PosedCamera(np.column_stack([np.eye(3), [x, 0.0, 5.0 + 0.1 * x]]), LENS) for x in range(4)
-    }
-    return PoseSet(cameras, "a row")
+    poses = {str(x): np.column_stack([np.eye(3), [x, 0.0, 5.0 + 0.1 * x]]) for x in range(4)}
+    return PoseSet({name: PosedCamera(pose, LENS) for name, pose in poses.items()}, "a row")

@@ -32,9 +32,9 @@ def transforms(poses: dict[str, np.ndarray], **top: Any) -> dict[str, Any]:
     """Content of a transforms.json."""
     (fl_x, fl_y), (cx, cy), (k1, k2, p1, p2) = LENS.focal_px, LENS.center_px, LENS.distortion
     lens = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "k1": k1, "k2": k2, "p1": p1, "p2": p2}
+    below = [0, 0, 0, 1]
     frames = [
-        {"file_path": name, "transform_matrix": [*pose.tolist(), [0, 0, 0, 1]]}
-        for name, pose in poses.items()
+        {"file_path": name, "transform_matrix": [*pose.tolist(), below]} for name, pose in poses.items()
     ]
     return {"w": LENS.width, "h": LENS.height, **lens, **top, "frames": frames}
 
@@ -50,6 +50,13 @@ def assert_same_poses(found: PoseSet, expected: dict[str, np.ndarray], atol: flo
         camera_to_world = found.cameras[name].camera_to_world.copy()
         camera_to_world[:, 3] += found.offset
         np.testing.assert_allclose(camera_to_world, pose, atol=atol, err_msg=name)
+
+
+def lens_of(found: PoseSet) -> Any:
+    """That of the first camera, which must be there."""
+    lens = next(iter(found.cameras.values())).lens
+    assert lens is not None
+    return lens
 
 
 def llff_table(poses, hwf=(480.0, 640.0, 500.0)):
@@ -101,13 +108,8 @@ RADIAL = "<CDist>322 241</CDist><CoeffDist>{a}</CoeffDist><CoeffDist>-1e-14</Coe
 
 
 PERSPECTIVE = {
-    "projection_type": "perspective",
-    "width": 640,
-    "height": 480,
-    "focal": 0.8,
-    "k1": 0.1,
-    "k2": -0.05,
-}
+    "projection_type": "perspective", "width": 640, "height": 480, "focal": 0.8, "k1": 0.1, "k2": -0.05,
+}  # fmt: skip
 BROWN = {
     "projection_type": "brown", "width": 480, "height": 640, "focal_x": 0.8, "focal_y": 0.75, "c_x": 0.01, "c_y": -0.02,
     "k1": 0.1, "k2": -0.05, "k3": 0.0, "p1": 0.001, "p2": 0.002,
@@ -120,10 +122,8 @@ def world_to_camera(pose):
 
 
 def as_json(rotation, translation):
-    return {
-        "rotation": Rotation.from_matrix(rotation).as_rotvec().tolist(),
-        "translation": translation.tolist(),
-    }
+    turn = Rotation.from_matrix(rotation).as_rotvec()
+    return {"rotation": turn.tolist(), "translation": translation.tolist()}
 
 
 def reconstruction(camera=PERSPECTIVE):

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import FLIP, LENS, assert_same_poses, ring
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
@@ -74,8 +75,7 @@ def test_lenses_see_what_colmaps_own_projection_sees(tmp_path, model):
     made = make_model(model, MODELS[model])
     made.write_binary(tmp_path)
     found = read_poses(tmp_path)
-    lens = next(iter(found.cameras.values())).lens
-    assert lens is not None
+    lens = present(next(iter(found.cameras.values())).lens)
     ideal = np.random.default_rng(0).uniform([-0.3, -0.22], [0.3, 0.22], (50, 2))
     wanted = made.cameras[7].img_from_cam(np.column_stack([ideal, np.ones(50)]))
     if lens.resampled_from is not None:
@@ -93,29 +93,19 @@ def test_a_lens_that_can_not_be_followed_is_refused(tmp_path):
         read_poses(tmp_path)
 
 
-def test_of_several_models_the_one_with_the_most_images_is_read(tmp_path):
-    for number in ("0", "1"):
-        (tmp_path / "sparse" / number).mkdir(parents=True)
-    make_model().write_binary(tmp_path / "sparse" / "1")
-    smaller = make_model()
-    for number in (1, 2):
-        smaller.deregister_frame(number)
-    smaller.write_binary(tmp_path / "sparse" / "0")
-    found = read_poses(tmp_path)
-    assert len(found.cameras) == 6
-    assert any("2 COLMAP models" in note for note in found.notes)
-
-
-def test_the_largest_model_is_found_in_deeper_folders_and_the_others_are_named(tmp_path):
+@pytest.mark.parametrize(
+    "places", [("sparse/0", "sparse/1"), ("c/sparse/0", "c/sparse/0/m/0", "c/sparse/0/m/1")]
+)
+def test_of_several_models_the_one_with_the_most_images_is_read_and_the_others_named(tmp_path, places):
     smaller = make_model()
     smaller.deregister_frame(1)
-    for place, made in (("0", smaller), ("0/models/0", smaller), ("0/models/1", make_model())):
-        (tmp_path / "colmap/sparse" / place).mkdir(parents=True, exist_ok=True)
-        made.write_binary(tmp_path / "colmap/sparse" / place)
+    for place in places:
+        (tmp_path / place).mkdir(parents=True, exist_ok=True)
+        (make_model() if place == places[-1] else smaller).write_binary(tmp_path / place)
     found = read_poses(tmp_path)
     assert_same_poses(found, expected())
-    (note,) = (note for note in found.notes if "3 COLMAP models" in note)
-    assert str(Path("sparse/0/models/0")) in note
+    (note,) = (note for note in found.notes if f"{len(places)} COLMAP models" in note)
+    assert str(Path(places[-2])) in note
 
 
 @pytest.mark.parametrize("second_line", ["", "\n", "10.5 11.5 1 20 21 -1\n"])
@@ -128,27 +118,26 @@ def test_images_keep_their_poses_whatever_stands_between_their_lines(tmp_path, s
     assert_same_poses(read_poses(tmp_path), expected())
 
 
-def test_an_image_whose_camera_is_missing_is_refused(tmp_path):
-    make_model().write_text(tmp_path)
-    lines = (tmp_path / "cameras.txt").read_text().splitlines()
-    (tmp_path / "cameras.txt").write_text("\n".join(line for line in lines if line.startswith("#")))
-    with pytest.raises(CaptureError, match="has no camera 7"):
-        read_poses(tmp_path)
-
-
-def test_a_line_that_is_cut_short_is_named(tmp_path):
-    make_model().write_text(tmp_path)
-    path = tmp_path / "images.txt"
-    path.write_text(path.read_text()[:-40].rsplit(" ", 4)[0])
-    with pytest.raises(CaptureError, match=r"images.txt, line \d+: found .*expected number, quaternion"):
-        read_poses(tmp_path)
-
-
-def test_absurd_counts_are_refused_before_anything_is_allocated(tmp_path):
-    make_model().write_binary(tmp_path)
-    path = tmp_path / "points3D.bin"
-    path.write_bytes(struct.pack("<Q", 2**60) + path.read_bytes()[8:])
-    with pytest.raises(CaptureError, match=r"promises 1152921504606846976 points, but only"):
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        ("cameras.txt", lambda _: b"# no cameras", "has no camera 7"),
+        (
+            "images.txt",
+            lambda data: data[:-40].rsplit(b" ", 4)[0],
+            r"images.txt, line \d+: .*expected number, quat",
+        ),
+        (
+            "points3D.bin",
+            lambda data: struct.pack("<Q", 2**60) + data[8:],
+            "promises 1152921504606846976 points",
+        ),
+    ],
+)
+def test_a_damaged_file_is_refused_by_name_before_anything_is_allocated(tmp_path, name, spoil, message):
+    (make_model().write_text if name.endswith("txt") else make_model().write_binary)(tmp_path)
+    (tmp_path / name).write_bytes(spoil((tmp_path / name).read_bytes()))
+    with pytest.raises(CaptureError, match=message):
         read_poses(tmp_path)
 
 

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from tests.captures.file_factory import present
 from tests.captures.poses.alignment import align_poses
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.captures.poses import estimation
@@ -60,8 +61,7 @@ def test_poses_of_a_textured_scene_are_found_to_a_part_of_a_pixel(room, tmp_path
     assert any("registered 8 of 8 views with a mean reprojection error of 0." in note for note in found.notes)
     assert align_poses(replace(found, points=None), truth).rms_px < 0.5
     assert (tmp_path / "colmap.log").stat().st_size > 0
-    lens = found.cameras["view 0"].lens
-    assert lens is not None
+    lens = present(found.cameras["view 0"].lens)
     np.testing.assert_allclose(lens.focal_px, LENS.focal_px, rtol=0.05)
 
 

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from tests.captures.file_factory import present
 from tests.captures.poses.alignment import align_poses, elsewhere
 from tests.commands.running import run
 from tests.scenes.scene_factory import look_at
@@ -104,9 +105,8 @@ def test_the_family_is_that_of_the_markers():
 def test_a_number_twice_in_a_picture_is_left_out_and_said():
     corners = board(2, 2)
     camera = cameras(1, PINHOLE).cameras["view_0"]
-    shown = np.minimum(
-        picture(camera, corners), picture(camera, {0: corners[3] + np.array([0.08, 0.0, 0.0])})
-    )
+    again = {0: corners[3] + np.array([0.08, 0.0, 0.0])}
+    shown = np.minimum(picture(camera, corners), picture(camera, again))
     found, notes = find_markers({"one": shown}, FAMILY)
     assert 0 not in found["one"]
     assert set(found["one"]) >= {1, 2}
@@ -127,8 +127,7 @@ def test_poses_lens_scale_and_up_follow_from_markers():
     assert aligned.names == tuple(truth.cameras)
     assert aligned.rms_px < 0.15
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
-    lens = found.cameras["view_0"].lens
-    assert lens is not None
+    lens = present(found.cameras["view_0"].lens)
     assert lens.focal_px[0] == pytest.approx(350.0, rel=0.01)
     assert lens.distortion[0] == pytest.approx(-0.12, abs=0.05)
     assert found.has_world
@@ -240,18 +239,12 @@ def test_a_scene_of_marked_pictures_has_their_poses_in_metres(folder, tmp_path):
     [
         (
             ["--poses", "markers", "--marker-family", "5x5_50"],
-            "no markers of DICT_5X5_50 are in the pictures, but some",
+            "no markers of DICT_5X5_50 are in the pictures, but",
         ),
-        (
-            ["--poses", "markers", "--marker-size", "50"],
-            "--marker-size 50: expected metres",
-        ),
+        (["--poses", "markers", "--marker-size", "50"], "--marker-size 50: expected metres"),
         (["--poses", "markers", "--angles", "0:360:60"], "--poses turntable and --angles go together"),
         (["--poses", "turntable"], "--poses turntable and --angles go together"),
-        (
-            ["--poses", "turntable", "--angles", "0:360:10"],
-            "gives 36 angles (the end of a range is none of them) for 6",
-        ),
+        (["--poses", "turntable", "--angles", "0:360:10"], "gives 36 angles"),
         (["--marker-size", "0.05"], "--marker-size goes with --poses estimate, markers, turntable"),
     ],
 )

@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import (
     LENS,
     assert_same_poses,
+    lens_of,
     llff_table,
     ring,
     transforms,
@@ -21,6 +23,7 @@ from tests.captures.poses.pose_factory import (
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.scenes.placement import Placement
 
 
 def read(tmp_path, content, **options):
@@ -49,18 +52,14 @@ def test_a_bare_list_has_poses_without_lenses(tmp_path):
 
 
 def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_the_pictures(tmp_path):
-    poses = {
-        f"./{split}/r_{index}": pose
-        for split, index, pose in zip(("train", "val") * 3, range(6), ring().values(), strict=True)
-    }
+    poses = {f"./{('train', 'val')[i % 2]}/r_{i}": pose for i, pose in enumerate(ring().values())}
     for split in ("train", "val"):
         own = {name: pose for name, pose in poses.items() if split in name}
         content = {"camera_angle_x": math.pi / 2, "frames": transforms(own)["frames"]}
         write_json(tmp_path / f"transforms_{split}.json", content)
     found = read_poses(tmp_path, {"r_0": (512, 400)})
     assert sorted(found.cameras) == sorted(name.removeprefix("./") for name in poses)
-    lens = found.cameras["val/r_1"].lens
-    assert lens is not None
+    lens = present(found.cameras["val/r_1"].lens)
     assert (lens.width, lens.height, lens.center_px) == (512, 400, (256.0, 200.0))
     assert lens.focal_px == pytest.approx((256.0, 256.0))
 
@@ -69,20 +68,19 @@ def test_the_size_is_taken_from_the_picture_where_nothing_else_tells_it(tmp_path
     poses = {"view.png": next(iter(ring().values()))}
     Image.new("RGB", (30, 20)).save(tmp_path / "view.png")
     found = read(tmp_path, {"fl_x": 40.0, "frames": transforms(poses)["frames"]})
-    lens = found.cameras["view.png"].lens
-    assert lens is not None
+    lens = present(found.cameras["view.png"].lens)
     assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (30, 20, (40.0, 40.0), (15.0, 10.0))
 
 
 def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
     turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     shift, scale = np.array([1.0, -2.0, 3.0]), 0.5
+    way = Placement(turn, shift, scale)
     applied = {
-        name: np.column_stack([turn @ pose[:, :3], scale * (turn @ pose[:, 3] + shift)])
-        for name, pose in ring().items()
+        name: np.column_stack([turn @ pose[:, :3], way.to_scene(pose[:, 3])]) for name, pose in ring().items()
     }
     points = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
-    moved = scale * (points @ turn.T + shift)
+    moved = way.to_scene(points)
     red = np.array([255, 0], np.uint8)
     columns = {axis: moved[:, index] for index, axis in enumerate("xyz")}
     write_ply(tmp_path / "sparse.ply", {**columns, "red": red, "green": red, "blue": red})
@@ -105,12 +103,7 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "hints",
-    [
-        {},
-        {"aabb_scale": 1, "scale": 0.5, "from_na": True},
-        {"applied_transform": np.eye(4).tolist(), "scale": 1},
-    ],
+    "hints", [{}, {"scale": 0.5, "from_na": True}, {"applied_transform": np.eye(4).tolist()}]
 )
 def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
     found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
@@ -120,27 +113,19 @@ def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
 
 def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     terms = {"k1": 0.01, "k2": -0.02, "k3": 0.001, "k4": -0.002, "p1": 0.0, "p2": 0.0}
-    marked = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, is_fisheye=True))
-    named = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, camera_model="OPENCV_FISHEYE"))
-    plain = read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, is_fisheye=False))
-    lenses = [next(iter(found.cameras.values())).lens for found in (marked, named, plain)]
+    keys = ({"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": False})
+    each = [read(tmp_path, transforms(ring(), fl_x=900, fl_y=900, **terms, **key)) for key in keys]
+    lenses = [next(iter(found.cameras.values())).lens for found in each]
     assert lenses[0] == lenses[1] != lenses[2]
     with pytest.raises(CaptureError, match="'is_fisheye' is true and camera_model \"PINHOLE\""):
         read(tmp_path, transforms(ring(), **terms, is_fisheye=True, camera_model="PINHOLE"))
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("latlong", True),
-        ("equirectangular", True),
-        ("orthographic", True),
-        ("from_mitsuba", True),
-        ("k6", 0.1),
-        ("skew", -0.5),
-        ("fisheye624_params", [0.0, 1.0]),
-    ],
-)
+REFUSED = dict.fromkeys(("latlong", "equirectangular", "orthographic", "from_mitsuba"), True)
+REFUSED |= {"k6": 0.1, "skew": -0.5, "fisheye624_params": [0.0, 1.0]}
+
+
+@pytest.mark.parametrize(("key", "value"), REFUSED.items())
 @pytest.mark.parametrize("is_of_frame", [False, True])
 def test_keys_that_change_geometry_are_refused_by_name_where_they_are_set(tmp_path, key, value, is_of_frame):
     content = transforms(ring())
@@ -167,15 +152,12 @@ def test_focal_lengths_in_degrees_and_as_a_matrix(tmp_path):
     content = transforms(ring())
     for key in ("fl_x", "fl_y", "cx", "cy"):
         content.pop(key)
-    found = read(tmp_path, {**content, "x_fov": 60.0, "y_fov": 50.0})
-    lens = next(iter(found.cameras.values())).lens
-    assert lens is not None
+    lens = lens_of(read(tmp_path, {**content, "x_fov": 60.0, "y_fov": 50.0}))
     np.testing.assert_allclose(lens.focal_px, [320 / math.tan(math.pi / 6), 240 / math.tan(math.radians(25))])
     matrix = [[500, 0, 321, 0], [0, 510, 239, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     for frame in content["frames"]:
         frame["intrinsic_matrix"] = matrix
-    lens = next(iter(read(tmp_path, content).cameras.values())).lens
-    assert lens is not None
+    lens = lens_of(read(tmp_path, content))
     assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
     matrix[0][1] = 2
     with pytest.raises(CaptureError, match="skew 2; expected focal lengths above 0 and no skew"):
@@ -231,10 +213,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"ftheta_p0": 0.0, "fl_x": 300.0}, "'ftheta_p1' is 0; expected pixels per radian"),
         ({"ftheta_p0": "steep"}, "'ftheta_p0' to 'ftheta_p5' are .*expected numbers"),
         ({"camera_model": "FISHEYE624", "distortion_params": [0] * 6}, "has 6 numbers; FISHEYE624 has 12"),
-        (
-            {"applied_transform": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]},
-            "'applied_transform'.*a rotation",
-        ),
+        ({"applied_transform": np.diag([2, 1, 1, 1])[:3].tolist()}, "'applied_transform'.*a rotation"),
         ({"applied_scale": 0}, "'applied_scale' is 0"),
         ({"metres_per_unit": -1}, "'metres_per_unit' is -1; expected 1e-9 to 1e9"),
         ({"applied_scale": 2, "offset": [1, 2]}, "'offset' is a list of 2; expected 3"),
@@ -294,8 +273,7 @@ def test_axes_are_turned_and_names_are_those_of_the_pictures(tmp_path):
     for place in (path, tmp_path):
         found = read_poses(place)
         assert_same_poses(found, ring())
-    lens = found.cameras["images/view_0.png"].lens
-    assert lens is not None
+    lens = present(found.cameras["images/view_0.png"].lens)
     assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (640, 480, (500, 500), (320, 240))
 
 

@@ -88,7 +88,7 @@ def test_masks_that_are_too_wide_do_not_move_the_cameras():
 
     pictures, turns, masks, truth = turned(knobs())
     wide = {
-        name: binary_dilation(mask) if index % 3 else mask for index, (name, mask) in enumerate(masks.items())
+        name: binary_dilation(masks[name]) if index % 3 else masks[name] for index, name in enumerate(masks)
     }
     assert align_poses(poses_from_turntable(pictures, turns, wide), truth).rms_px < 0.6
 
@@ -130,7 +130,7 @@ def test_slack_moves_pairs_by_the_difference_of_their_angles():
 
 def test_views_that_are_all_alike_are_refused():
     with pytest.raises(
-        CaptureError, match=r"the axis can't be told, as all views are alike: silhouettes overlap by 100"
+        CaptureError, match="can't be told, as all views are alike: silhouettes overlap by 100"
     ):
         poses_from_turntable(*turned(vase())[:3])
     blank = {name: np.full((LENS.height, LENS.width), 128, np.uint8) for name in turned(vase())[0]}
@@ -149,9 +149,7 @@ def test_wrong_angles_are_refused():
 def test_a_place_of_the_camera_needs_three_views():
     pictures, turns, masks, _ = turned(knobs())
     turns["view_0_00"] = Turn(0.0, 1)
-    with pytest.raises(
-        CaptureError, match="1 views were taken from place 2 of the camera; expected 3 or more"
-    ):
+    with pytest.raises(CaptureError, match="1 views were taken from place 2 of the camera; expected 3"):
         poses_from_turntable(pictures, turns, masks)
 
 
@@ -168,30 +166,24 @@ def test_angles_are_ranges_one_for_each_place_or_a_table(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("0:360:10", "gives 36 angles .* for 4 views"),
+        ("0:360:10", "gives 36 angles .* for 3 views"),
+        ("0:360:1e-9", "gives 360000000000 angles"),  # which are counted and not listed
         ("0:360:0", "expected START:STOP:STEP"),
         ("ten", "expected START:STOP:STEP"),
         ("0:360:-90", "gives 0 angles"),
-    ],
-)
-def test_angles_that_do_not_fit_the_views_are_refused(text, said):
-    with pytest.raises(ConfigError, match=said):
-        parse_angles(text, ["a", "b", "c", "d"])
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
         ("view,angle\na,0\nb,10\n", "no angle for c"),
         ("view,angle\na,0\nb,10\nc,20\nd,30\n", "no view is called d"),
         ("view,angle\na,zero\n", "line 2: expected the columns view and angle"),
         ("name,turn\na,0\n", "line 2: expected the columns view and angle"),
+        ("view,angle\na,0\nb,10\na,20\n", "line 4: the view a has an angle already"),
     ],
 )
-def test_a_table_that_does_not_fit_the_views_is_refused(tmp_path, content, said):
-    (tmp_path / "angles.csv").write_text(content)
+def test_angles_that_do_not_fit_the_views_are_refused(tmp_path, text, said):
+    if "\n" in text:
+        (tmp_path / "angles.csv").write_text(text)
+        text = str(tmp_path / "angles.csv")
     with pytest.raises(ConfigError, match=said):
-        parse_angles(str(tmp_path / "angles.csv"), ["a", "b", "c"])
+        parse_angles(text, ["a", "b", "c"])
 
 
 @pytest.mark.slow
@@ -204,14 +196,3 @@ def test_matches_by_chance_do_not_move_the_cameras():
     disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)
     found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, sorted(pictures))
     assert align_poses(found, truth).rms_px < 0.5
-
-
-def test_a_view_with_two_angles_is_refused(tmp_path):
-    (tmp_path / "angles.csv").write_text("view,angle\na,0\nb,10\na,20\n")
-    with pytest.raises(ConfigError, match=r"line 4: the view a has an angle already"):
-        parse_angles(str(tmp_path / "angles.csv"), ["a", "b"])
-
-
-def test_a_range_of_endless_angles_is_counted_and_not_listed():
-    with pytest.raises(ConfigError, match=r"gives 360000000000 angles"):
-        parse_angles("0:360:1e-9", ["a", "b"])

@@ -11,7 +11,7 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from tests.captures.file_factory import centres_nm, widths_nm
+from tests.captures.file_factory import centres_nm, linear_values_of, widths_nm
 from unmix_plugin.captures.readers import matlab
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -276,18 +276,12 @@ def prisma(path, zeros=(0, 1)):
         group["VNIR_Cube"] = CUBE.transpose(0, 2, 1)
         group["SWIR_Cube"] = CUBE[..., :4].transpose(0, 2, 1)
         group["VNIR_PIXEL_L2_ERR"] = np.zeros((8, 5, 9), np.uint8)
-        file.attrs.update(
-            {
-                "List_Cw_Vnir": nm,
-                "List_Cw_Swir": np.array([2400, 1800, 1200, 1000], "f4"),
-                "List_Cw_Vnir_Flags": (nm > 0).astype("u1"),
-                "List_Fwhm_Vnir": np.where(nm > 0, 11, 0).astype("f4"),
-                "L2ScaleVnirMin": np.float32(-0.1),
-                "L2ScaleVnirMax": np.float32(0.9),
-                "ScaleFactor_Swir": np.float32(100),
-                "Offset_Swir": np.float32(2),
-            }
-        )
+        file.attrs["List_Cw_Vnir"] = nm
+        file.attrs["List_Cw_Swir"] = np.array([2400, 1800, 1200, 1000], "f4")
+        file.attrs["List_Cw_Vnir_Flags"] = (nm > 0).astype("u1")
+        file.attrs["List_Fwhm_Vnir"] = np.where(nm > 0, 11, 0).astype("f4")
+        numbers = {"L2ScaleVnirMin": -0.1, "L2ScaleVnirMax": 0.9, "ScaleFactor_Swir": 100, "Offset_Swir": 2}
+        file.attrs.update({name: np.float32(number) for name, number in numbers.items()})
     return path
 
 
@@ -298,13 +292,10 @@ def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_band
     np.testing.assert_array_equal(centres_nm(file)[2:], [700, 600, 500])
     np.testing.assert_array_equal(file.bands.bad, [True, True, False, False, False])
     np.testing.assert_array_equal(widths_nm(file), 11)
-    assert file.linear is not None
-    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE / 65535 - 0.1, atol=1e-6)
+    np.testing.assert_allclose(linear_values_of(file), CUBE / 65535 - 0.1, atol=1e-6)
     other = open_spectral_file(path, ReadOptions(dataset="SWIR_Cube"))
     np.testing.assert_array_equal(centres_nm(other), [2400, 1800, 1200, 1000])
-    assert other.linear is not None
-    values = other.linear.apply(other.read(), slice(None))
-    np.testing.assert_allclose(values, CUBE[..., :4] / 100 - 2, atol=1e-5)
+    np.testing.assert_allclose(linear_values_of(other), CUBE[..., :4] / 100 - 2, atol=1e-5)
     with pytest.raises(CaptureError, match="2 data sets could be the image"):  # none of them their errors
         open_spectral_file(path)
 

@@ -12,7 +12,14 @@ import pytest
 import spectral.io.envi as spy
 import tifffile
 
-from tests.captures.file_factory import centres_nm, header_text, widths_nm, write_envi
+from tests.captures.file_factory import (
+    centres_nm,
+    header_text,
+    linear_values_of,
+    present,
+    widths_nm,
+    write_envi,
+)
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.captures.spectral_file import (
@@ -65,10 +72,8 @@ def part(tmp_path, value, **metadata):
 
 
 def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
-    parts = [
-        part(tmp_path, 1, camera="a", exposure_s=0.1, scale=2.0),
-        part(tmp_path, 2, camera="a", exposure_s=0.2),
-    ]
+    parts = [part(tmp_path, 1, camera="a", exposure_s=0.1, scale=2.0)]
+    parts.append(part(tmp_path, 2, camera="a", exposure_s=0.2))
     stack = stack_bands(parts, tmp_path)
     assert stack.metadata == {
         "camera": "a",
@@ -143,13 +148,10 @@ def test_facts_of_an_image(header):
     assert facts["metadata"]["header"]["sensor type"] == "X"
 
 
-def test_facts_of_poses(poses):
+def test_facts_of_poses(poses, tmp_path):
     facts = inspect_file(poses)
     assert set(facts) == FACTS
     assert (facts["poses"], facts["shape"]) == (3, None)
-
-
-def test_poses_in_an_array(tmp_path):
     rows = np.zeros((5, 17))
     for distance, row in enumerate(rows):
         row[:15] = np.hstack([np.eye(3), [[distance], [0], [0]], [[480], [640], [500]]]).reshape(-1)
@@ -171,34 +173,25 @@ def test_numbers_that_are_not_there_are_found_out(tmp_path):
         inspect_file(tmp_path / "a.npz")
 
 
-def test_a_list_of_pixels_needs_its_size(tmp_path):
-    np.savez(tmp_path / "a.npz", Y=CUBE.reshape(-1, 3))
-    assert inspect_file(tmp_path / "a.npz", ReadOptions(dataset="Y", size=(4, 6)))["shape"] == [4, 6, 3]
-
-
 def test_one_json_object_a_file_and_status_2_if_one_is_refused(header, poses, tmp_path, capsys):
     assert inspect_command([str(header), str(poses), "--json"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [json.loads(line)["file"] for line in lines] == [str(header), str(poses)]
     assert inspect_command(["--json", str(tmp_path / "missing.hdr"), str(header)]) == 2
     refused, good = map(json.loads, capsys.readouterr().out.splitlines())
-    assert refused == {
-        "file": str(tmp_path / "missing.hdr"),
-        "error": f"{tmp_path / 'missing.hdr'}: no such file",
-    }
+    missing = str(tmp_path / "missing.hdr")
+    assert refused == {"file": missing, "error": f"{missing}: no such file"}
     assert good["reader"] == "envi"
 
 
-def test_the_command_of_captures_passes_it_on(header, tmp_path, capsys):
+def test_the_command_of_captures_passes_it_on_with_options(header, tmp_path, capsys):
     process(["inspect", "--json", str(header)])
     assert json.loads(capsys.readouterr().out)["shape"] == [4, 6, 3]
     with pytest.raises(SystemExit) as left:
         process(["inspect", "--json", str(tmp_path / "missing.hdr")])
     assert left.value.code == 2
-
-
-def test_options_reach_the_reader(tmp_path, capsys):
     np.savez(tmp_path / "a.npz", first=CUBE, second=CUBE[:2])
+    capsys.readouterr()
     assert inspect_command(["--json", str(tmp_path / "a.npz"), "--dataset", "second", "--axes", "bxy"]) == 0
     assert json.loads(capsys.readouterr().out)["shape"] == [3, 6, 2]
 
@@ -296,19 +289,11 @@ data ignore value = 65535
 @pytest.mark.parametrize(
     ("entries", "nm", "evidence"),
     [
-        (
-            "wavelength = {0.4, 0.5, 0.6, 2.5}",
-            [400, 500, 600, 2500],
-            "no unit: 0.4 to 2.5 taken as micrometres",
-        ),
+        ("wavelength = {0.4, 0.5, 0.6, 2.5}", [400, 500, 600, 2500], "0.4 to 2.5 taken as micrometres"),
         ("wavelength = {400, 500, 600, 700}", [400, 500, 600, 700], "no unit: 400 to 700 taken as nm"),
         ("wavelength = {400 500\n600\n700}", [400, 500, 600, 700], "no unit: 400 to 700 taken as nm"),
         ("wavelength units = Micrometers\nwavelength = {.4,.5,.6,.7}", [400, 500, 600, 700], "Micrometers"),
-        (
-            "band names = {a (450.5 nm), b (460 nm), c (470 nm), d (480 nm)}",
-            [450.5, 460, 470, 480],
-            "a (450.5 nm)",
-        ),
+        ("band names = {a (450.5 nm), b 460 nm, 470 nm, 480nm}", [450.5, 460, 470, 480], "a (450.5 nm)"),
         ("band names = {0.45 um, 0.46 um, 0.47 um, 0.48 um}", [450, 460, 470, 480], "unit um"),
         ("band names = {450.2, 460, 470, 480}", [450.2, 460, 470, 480], "increase and are taken as nm"),
     ],
@@ -325,10 +310,7 @@ def test_wavelengths_come_with_their_evidence(tmp_path, entries, nm, evidence):
         ("wavelength = {400, 500, 600}", "wavelengths are left out: 3 for 4 bands"),
         ("wavelength = {400, nan, 600, 700}", "that of band 1 (from 0) is nan"),
         ("wavelength = {400, x, 600, 700}", "are not a list of numbers"),
-        (
-            "wavelength units = Index\nwavelength = {1, 2, 3, 4}",
-            "with the unit 'Index' can't be brought to nm",
-        ),
+        ("wavelength units = Index\nwavelength = {1, 2, 3, 4}", "unit 'Index' can't be brought to nm"),
         ("wavelength units = Micrometers\nwavelength = {400, 500, 600, 700}", "can't be in Micrometers"),
         ("wavelength units = nm\nwavelength = {0.4, 0.5, 0.6, 0.7}", "can't be in nm"),
         ("wavelength = {1, 2, 3, 40}", "with no unit can't be brought to nm"),
@@ -344,9 +326,8 @@ def test_wavelengths_that_cannot_be_used_are_left_out_with_a_note(tmp_path, entr
     "names", ["Band 201, Band 202, Band 203, Band 204", "a, b, c, d", "450 nm, 460 nm, red, 480 nm"]
 )
 def test_names_without_wavelengths_give_none(tmp_path, names):
-    file = open_spectral_file(
-        write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", f"band names = {{{names}}}")
-    )
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", f"band names = {{{names}}}")
+    file = open_spectral_file(header)
     assert file.bands.wavelengths_nm is None
     assert file.bands.names == tuple(names.split(", "))
 
@@ -386,9 +367,7 @@ def test_headers_that_cannot_be_followed_are_refused(tmp_path, change, message):
 def test_files_that_are_no_pair_are_refused(tmp_path):
     header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
     header.with_suffix("").rename(tmp_path / "other.raw")
-    with pytest.raises(
-        CaptureError, match=r"no file of numbers beside this header; expected cube or cube.img"
-    ):
+    with pytest.raises(CaptureError, match="no file of numbers beside this header; expected cube or"):
         open_spectral_file(header)
     with pytest.raises(CaptureError, match="of no known kind"):
         open_spectral_file(tmp_path / "other.raw")
@@ -398,12 +377,9 @@ def test_files_that_are_no_pair_are_refused(tmp_path):
     header.write_bytes(bytes(range(256)))
     with pytest.raises(CaptureError, match="no ENVI header: its first line is not 'ENVI'"):
         open_spectral_file(header)
-
-
-def test_compressed_numbers_are_refused(tmp_path):
-    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
-    (tmp_path / "cube").write_bytes(b"\x1f\x8b\x08" + bytes(50))
-    with pytest.raises(CaptureError, match="cube: compressed with gzip; unpack it"):
+    header = write_envi(tmp_path / "packed.hdr", ENVI_CUBE, "bil")
+    (tmp_path / "packed").write_bytes(b"\x1f\x8b\x08" + bytes(50))
+    with pytest.raises(CaptureError, match="packed: compressed with gzip; unpack it"):
         open_spectral_file(header)
 
 
@@ -424,9 +400,8 @@ def test_a_header_named_after_the_whole_file_is_found(tmp_path):
 
 def test_text_that_is_not_utf8_is_read(tmp_path):
     header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bip")
-    header.write_bytes(
-        b"\xef\xbb\xbf" + header.read_bytes() + "band names = {rouge é, b, c, d}\n".encode("latin-1")
-    )
+    names = "band names = {rouge é, b, c, d}\n".encode("latin-1")
+    header.write_bytes(b"\xef\xbb\xbf" + header.read_bytes() + names)
     assert open_spectral_file(header).bands.names is not None
 
 
@@ -525,27 +500,20 @@ CALIBRATED = {
 
 @pytest.mark.parametrize("kind", CALIBRATED)
 def test_a_linear_calibration_is_known_by_whatever_name_a_format_has_for_it(tmp_path, kind):
-    file = open_spectral_file(CALIBRATED[kind](tmp_path))
-    assert file.linear is not None
-    wanted = np.array([2, 0])
-    np.testing.assert_allclose(
-        file.linear.apply(file.read(bands=wanted), wanted),
-        CUBE[..., wanted] * GAINS[wanted] + OFFSETS[wanted],
-    )
+    file, wanted = open_spectral_file(CALIBRATED[kind](tmp_path)), np.array([2, 0])
+    values = present(file.linear).apply(file.read(bands=wanted), wanted)
+    np.testing.assert_allclose(values, CUBE[..., wanted] * GAINS[wanted] + OFFSETS[wanted])
 
 
 def test_a_linear_calibration_of_the_whole_file(tmp_path):
     file = open_spectral_file(calibrated_envi(tmp_path, "data gain values = 0.25\ndata offset values = 2"))
-    assert file.linear is not None
-    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE * 0.25 + 2)
+    np.testing.assert_allclose(linear_values_of(file), CUBE * 0.25 + 2)
     assert file.scale is None
     assert open_spectral_file(calibrated_hdf5(tmp_path, {"Scale_Factor": 10000.0})).scale == 10000
-    assert (
-        open_spectral_file(calibrated_hdf5(tmp_path, {"scale_factor": 1.0, "add_offset": 0.0})).linear is None
-    )
-    multiplied = open_spectral_file(calibrated_hdf5(tmp_path, {"scale_factor": 2.0, "add_offset": 0.0}))
-    assert multiplied.linear is not None
-    np.testing.assert_allclose(multiplied.linear.apply(multiplied.read(), slice(None)), 2 * CUBE)
+    plain = calibrated_hdf5(tmp_path, {"scale_factor": 1.0, "add_offset": 0.0})
+    assert open_spectral_file(plain).linear is None
+    doubled = calibrated_hdf5(tmp_path, {"scale_factor": 2.0, "add_offset": 0.0})
+    np.testing.assert_allclose(linear_values_of(open_spectral_file(doubled)), 2 * CUBE)
 
 
 @pytest.mark.parametrize(
@@ -564,10 +532,8 @@ def test_a_calibration_that_cannot_be_applied_is_refused(tmp_path, more, message
 
 def test_the_header_beside_a_tiff_describes_it(tmp_path):
     tifffile.imwrite(tmp_path / "a.tif", CUBE, planarconfig="contig", photometric="minisblack")
-    more = (
-        "file type = TIFF\nbbl = {1, 0, 1}\nwavelength units = Micrometers\nwavelength = {0.45, 0.5, 0.6}\n"
-    )
-    more += "tint = 5\n"
+    more = "file type = TIFF\nbbl = {1, 0, 1}\ntint = 5\n"
+    more += "wavelength units = Micrometers\nwavelength = {0.45, 0.5, 0.6}\n"
     (tmp_path / "a.hdr").write_text(header_text(CUBE, "bip", {}) + more)
     for name in ("a.tif", "a.hdr"):
         file = open_spectral_file(tmp_path / name)
@@ -582,11 +548,8 @@ def test_the_header_beside_a_tiff_describes_it(tmp_path):
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
 def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding):
     header = write_envi(tmp_path / "a.hdr", CUBE, "bil")
-    text = (
-        header.read_text()
-        + "sensor = Größe [m\nwavelength_units = nm\nwavelength = [ 450.0 550.0\n   650.0]\nbbl = [1 0 1]\n"
-    )
-    header.write_bytes(text.encode(encoding))
+    more = "sensor = Größe [m\nwavelength_units = nm\nwavelength = [ 450.0 550.0\n   650.0]\nbbl = [1 0 1]\n"
+    header.write_bytes((header.read_text() + more).encode(encoding))
     file = open_spectral_file(header)
     np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
     np.testing.assert_array_equal(file.bands.bad, [False, True, False])
@@ -606,8 +569,7 @@ def test_the_metadata_of_enmap_describe_its_image(tmp_path):
     file = open_spectral_file(tmp_path / "ENMAP01-L2A-SPECTRAL_IMAGE.TIF")
     np.testing.assert_array_equal(centres_nm(file), [450, 550, 1650])
     np.testing.assert_array_equal(widths_nm(file), 7)
-    assert file.linear is not None
-    np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), CUBE * GAINS + OFFSETS)
+    np.testing.assert_allclose(linear_values_of(file), CUBE * GAINS + OFFSETS)
 
 
 def test_every_xml_beside_an_image_is_read(tmp_path):

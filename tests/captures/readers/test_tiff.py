@@ -105,32 +105,22 @@ def items(name, values, more=""):
     return "".join(f'<Item name="{name}" sample="{i}"{more}>{value}</Item>' for i, value in enumerate(values))
 
 
+NM, WIDE_NM = np.arange(400, 460, 10).tolist(), np.arange(400, 1000, 100).tolist()
+UM = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+
+
 @pytest.mark.parametrize(
     ("text", "nm"),
     [
-        (items("wavelength", [400, 410, 420, 430, 440, 450]), [400, 410, 420, 430, 440, 450]),
+        (items("wavelength", NM), NM),
+        (items("wavelength", UM) + items("wavelength_units", ["Micrometers"] * 6), WIDE_NM),
+        (items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"'), WIDE_NM),
+        (items("DESCRIPTION", [f"B{n % 7} ({n} nm)" for n in NM], ' role="description"'), NM),
         (
-            items("wavelength", [0.4, 0.5, 0.6, 0.7, 0.8, 0.9])
-            + items("wavelength_units", ["Micrometers"] * 6),
-            [400, 500, 600, 700, 800, 900],
+            "".join(f'<Item name="Band_{i + 1}">{n + 0.5} Nanometers</Item>' for i, n in enumerate(NM)),
+            np.add(NM, 0.5),
         ),
-        (
-            items("CENTRAL_WAVELENGTH_UM", [0.4, 0.5, 0.6, 0.7, 0.8, 0.9], ' domain="IMAGERY"'),
-            [400, 500, 600, 700, 800, 900],
-        ),
-        (
-            items(
-                "DESCRIPTION",
-                [f"B{i} ({nm} nm)" for i, nm in enumerate((443, 490, 560, 665, 705, 842))],
-                ' role="description"',
-            ),
-            [443, 490, 560, 665, 705, 842],
-        ),
-        (
-            "".join(f'<Item name="Band_{i + 1}">{400.5 + i} Nanometers</Item>' for i in range(6)),
-            [400.5, 401.5, 402.5, 403.5, 404.5, 405.5],
-        ),
-        ('<Item name="wavelength">{400, 410, 420, 430, 440, 450}</Item>', [400, 410, 420, 430, 440, 450]),
+        ('<Item name="wavelength">{400, 410, 420, 430, 440, 450}</Item>', NM),
     ],
 )
 def test_wavelengths_of_gdal(tmp_path, text, nm):
@@ -142,7 +132,7 @@ def test_wavelengths_of_gdal(tmp_path, text, nm):
 
 def test_scale_width_and_no_data_of_gdal(tmp_path):
     text = items("OFFSET", [0] * 6, ' role="offset"') + items("SCALE", [0.0001] * 6, ' role="scale"')
-    text += items("wavelength", [400, 410, 420, 430, 440, 450]) + items("fwhm", [5, 5, 5, 5, 5, 6])
+    text += items("wavelength", NM) + items("fwhm", [5, 5, 5, 5, 5, 6])
     tags = [(42112, "s", 0, GDAL.format(text), True), (42113, "s", 0, "65535", True)]
     file = written(tmp_path, CUBE, extratags=tags)
     assert file.scale == pytest.approx(10000)
@@ -153,7 +143,7 @@ def test_scale_width_and_no_data_of_gdal(tmp_path):
 @pytest.mark.parametrize(
     "description",
     [
-        json.dumps({"wavelengths_nm": [400, 410, 420, 430, 440, 450]}),
+        json.dumps({"wavelengths_nm": NM}),
         json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
         "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
         "wavelength = {400, 410, 420, 430, 440, 450}",
@@ -161,18 +151,14 @@ def test_scale_width_and_no_data_of_gdal(tmp_path):
 )
 def test_wavelengths_of_the_description(tmp_path, description):
     file = written(tmp_path, CUBE, description=description, metadata=None)
-    np.testing.assert_allclose(centres_nm(file), [400, 410, 420, 430, 440, 450])
+    np.testing.assert_allclose(centres_nm(file), NM)
     assert "image description" in file.bands.evidence
 
 
 def test_wavelengths_of_ome(tmp_path):
     channels = {"EmissionWavelength": [450, 550, 650], "EmissionWavelengthUnit": ["nm"] * 3}
-    tifffile.imwrite(
-        tmp_path / "a.ome.tif",
-        PLANES[:3],
-        photometric="minisblack",
-        metadata={"axes": "CYX", "Channel": channels},
-    )
+    metadata = {"axes": "CYX", "Channel": channels}
+    tifffile.imwrite(tmp_path / "a.ome.tif", PLANES[:3], photometric="minisblack", metadata=metadata)
     file = open_spectral_file(tmp_path / "a.ome.tif")
     np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
     np.testing.assert_array_equal(file.read(), CUBE[..., :3])
@@ -266,9 +252,8 @@ def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path)
     data = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as opened:
         page = opened.pages[0]
-        data[page.dataoffsets[2] : page.dataoffsets[2] + page.databytecounts[2]] = bytes(
-            page.databytecounts[2]
-        )
+        start, count = page.dataoffsets[2], page.databytecounts[2]
+        data[start : start + count] = bytes(count)
     path.write_bytes(data)
     np.testing.assert_array_equal(file.read(slice(0, 18)), CUBE[:18])
     with pytest.raises(CaptureError, match="can't be read"):
@@ -277,14 +262,8 @@ def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path)
 
 def test_a_file_of_many_gigabytes_opens_at_once(tmp_path):
     path = tmp_path / "big.tif"
-    tifffile.memmap(
-        path,
-        shape=(20000, 10000, 60),
-        dtype=np.uint16,
-        bigtiff=True,
-        photometric="minisblack",
-        planarconfig="contig",
-    )
+    options = {"bigtiff": True, "photometric": "minisblack", "planarconfig": "contig"}
+    tifffile.memmap(path, shape=(20000, 10000, 60), dtype=np.uint16, **options)
     file = open_spectral_file(path)
     assert file.shape == (20000, 10000, 60)
     assert file.read(slice(19999, 20000), slice(58, 60)).shape == (1, 10000, 2)

@@ -156,14 +156,9 @@ def test_a_scene_of_an_ftheta_lens_shows_its_views_in_a_lens_that_trains(tmp_pat
     assert scene["camera_model"] == "OPENCV"
     cube = np.load(output / "cubes" / "view_00.npy") / 65535.0
     assert cube.shape[:2] == (scene["h"], scene["w"])
-    lens = Lens(
-        scene["w"],
-        scene["h"],
-        (scene["fl_x"], scene["fl_y"]),
-        (scene["cx"], scene["cy"]),
-        (scene["k1"], scene["k2"], scene["p1"], scene["p2"]),
-        (scene["k3"], scene["k4"]),
-    )
+    keys = ("fl_x fl_y", "cx cy", "k1 k2 p1 p2", "k3 k4")
+    focal, center, bends, higher = (tuple(scene[key] for key in group.split()) for group in keys)
+    lens = Lens(scene["w"], scene["h"], focal, center, bends, higher)
     assert "interpolated" in (output / "report.txt").read_text()
     with Image.open(output / "masks" / "view_00.png") as mask:
         outside = np.asarray(mask.convert("L")) == 0

@@ -135,17 +135,20 @@ def panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], vi
         ConfigError: it leaves the image.
     """
     top, left, height, width = rectangle
-    rows, columns, _ = cube.shape
-    if min(top, left) < 0 or min(height, width) < 1 or top + height > rows or left + width > columns:
-        raise ConfigError(
-            f"--white-rectangle {view} {top} {left} {height} {width} (row, column, height, width) leaves the view of "
-            f"{rows} rows and {columns} columns"
-        )
+    _refuse_outside(f"--white-rectangle {view}", rectangle, cube.shape[:2])
     lines = slice(top, top + height)
     values = _linear(cube, cube.read(lines), lines)[:, left : left + width].astype(np.float64)
     mean = values.mean(axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
     return Reference(cube, "white reference", mean, False, how)
+
+
+def _refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    top, left, height, width = rectangle
+    is_empty = min(top, left) < 0 or min(height, width) < 1
+    if is_empty or top + height > size[0] or left + width > size[1]:
+        where = f"{what} {top} {left} {height} {width} (row, column, height, width)"
+        raise ConfigError(f"{where} leaves the image of {size[0]} rows and {size[1]} columns")
 
 
 def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], float]:
@@ -158,13 +161,10 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
         total += _linear(file, file.read(rows), rows).sum(axis=0, dtype=np.float64)
     mean = total / height
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
-    whole = slice(0, height)
-    patterns = [
-        _pattern(
-            _linear(file, file.read(whole, judged[[index]]), whole, judged[[index]])[..., 0] - mean[:, band]
-        )
-        for index, band in enumerate(judged)
-    ]
+    every, patterns = slice(0, height), []
+    for band in judged:
+        values = _linear(file, file.read(every, np.array([band])), every, np.array([band]))[..., 0]
+        patterns.append(_pattern(values - mean[:, band]))
     return mean[None].astype(np.float32), float(np.median(patterns))
 
 
@@ -250,12 +250,8 @@ class Raster:
     def of(height: int, width: int, crop: tuple[int, int, int, int] | None, binning: int) -> Raster:
         """The raster of images of this size, cropped (first row and column, height and width) and binned. Raises
         ConfigError: the rectangle leaves the image, or nothing is left."""
-        top, left, rows, columns = (0, 0, height, width) if crop is None else crop
-        if min(top, left) < 0 or min(rows, columns) < 1 or top + rows > height or left + columns > width:
-            raise ConfigError(
-                f"--crop {top} {left} {rows} {columns} (row, column, height, width) leaves the image of {height} rows "
-                f"and {width} columns"
-            )
+        top, left, rows, columns = crop or (0, 0, height, width)
+        _refuse_outside("--crop", (top, left, rows, columns), (height, width))
         if binning < 1 or min(rows, columns) // binning < 2:
             left = f"leaves fewer than 2 x 2 of {rows} x {columns} pixels"
             raise ConfigError(f"--bin-pixels {binning} {left}; give a smaller number")

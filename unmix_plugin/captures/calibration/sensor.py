@@ -85,12 +85,9 @@ class _BandChoice:
 
     def without_repeated(self) -> _BandChoice:
         """The choice without bands whose wavelength an earlier one that is kept has."""
-        left = np.array(
-            [index for index in range(len(self.wavelengths_nm)) if index not in self.dropped], int
-        )
-        repeated = np.zeros(len(self.wavelengths_nm), bool)
-        repeated[left] = True
-        repeated[left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]] = False
+        left = np.setdiff1d(np.arange(len(self.wavelengths_nm)), list(self.dropped))
+        first = left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]
+        repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(left, first))
         return self.without(repeated, "an earlier band has the same wavelength")
 
     def require(self, binning: int, where: str) -> None:
@@ -176,13 +173,11 @@ def prepare_sensor(
                 f"{used.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and above); take "
                 "it again with a shorter exposure"
             )
-        signal = used.signal(
-            next((its_dark for its_dark, its_white in own.values() if its_white is used), dark)
-        )
+        its_dark = next((own_dark for own_dark, own_white in own.values() if own_white is used), dark)
+        signal = used.signal(its_dark)
         lamp = signal / used.reflectance if lamp is None else lamp
-        choice = choice.without(
-            signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
-        )
+        is_dark = signal < _LEAST_WHITE * signal.max()
+        choice = choice.without(is_dark, "the white reference has no light there")
     choice.require(binning, str(first.path))
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
@@ -334,10 +329,8 @@ def _evidence(
         {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
         for band, reason in sorted(choice.dropped.items())
     ]
-    models = {view.name: radiometric_model(view.cube) for view in views}
-    light = {
-        name: model.irradiance for name, model in models.items() if model and model.irradiance is not None
-    }
+    models = [(view.name, radiometric_model(view.cube)) for view in views]
+    light = {name: model.irradiance for name, model in models if model and model.irradiance is not None}
     return found | ({"irradiance": light} if light else {})
 
 
@@ -459,8 +452,7 @@ def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B
 
     The residual of a band's regression on all others has variance 1 / (C^-1)_bb, with C the matrix of their second
     moments. Signal is the root mean square of the band.
-    Source:
-        Bioucas-Dias & Nascimento 2008, HySime, noise estimation.
+    Source: Bioucas-Dias & Nascimento 2008, HySime, noise estimation.
     """
     count, bands = values.shape
     if count < 4 * bands or bands < 8:

@@ -18,18 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.captures.poses import lens_models
 from unmix_plugin.captures.poses.lens import Lens, fit_lens
-from unmix_plugin.captures.poses.lens_models import (
-    Points,
-    bend_division,
-    bend_eucm,
-    bend_fisheye_624,
-    bend_fov,
-    bend_thin_prism,
-    project_equirectangular,
-    project_fisheye,
-    project_opencv,
-)
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -71,13 +61,13 @@ _MODELS = {
 _PARAMETER_COUNTS = dict(_MODELS.values())
 _FISHEYES = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"}
 _ONE_FOCAL = {name for name in _PARAMETER_COUNTS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
-_BENT: dict[str, Callable[[Points, Sequence[float]], Points]] = {
-    "FOV": lambda ideal, terms: bend_fov(ideal, *terms),
-    "THIN_PRISM_FISHEYE": bend_thin_prism,
-    "RAD_TAN_THIN_PRISM_FISHEYE": bend_fisheye_624,
-    "SIMPLE_DIVISION": lambda ideal, terms: bend_division(ideal, *terms),
-    "DIVISION": lambda ideal, terms: bend_division(ideal, *terms),
-    "EUCM": lambda ideal, terms: bend_eucm(ideal, *terms),
+_BENT: dict[str, Callable[[lens_models.Points, Sequence[float]], lens_models.Points]] = {
+    "FOV": lambda ideal, terms: lens_models.bend_fov(ideal, *terms),
+    "THIN_PRISM_FISHEYE": lens_models.bend_thin_prism,
+    "RAD_TAN_THIN_PRISM_FISHEYE": lens_models.bend_fisheye_624,
+    "SIMPLE_DIVISION": lambda ideal, terms: lens_models.bend_division(ideal, *terms),
+    "DIVISION": lambda ideal, terms: lens_models.bend_division(ideal, *terms),
+    "EUCM": lambda ideal, terms: lens_models.bend_eucm(ideal, *terms),
 }
 """Models that bend ideal points, which focal length and centre bring to pixels."""
 _CAMERA, _IMAGE, _POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
@@ -181,14 +171,16 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
         raise CaptureError(f"{where} is {width} x {height} with {parameters}; expected numbers above 0")
     if model == "EQUIRECTANGULAR":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        return fit_lens(lambda ideal: project_equirectangular(ideal, *parameters), start, model, where)
+        return fit_lens(
+            lambda ideal: lens_models.project_equirectangular(ideal, *parameters), start, model, where
+        )
     fx, fy, cx, cy, *terms = (parameters[0], *parameters) if model in _ONE_FOCAL else parameters
     if min(fx, fy) <= 0:
         raise CaptureError(f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0")
     focal, center = (fx, fy), (cx, cy)
     start = Lens(width, height, focal, center)
     if model in _FISHEYES:
-        fisheye = partial(project_fisheye, focal_px=focal, center_px=center, terms=tuple(terms))
+        fisheye = partial(lens_models.project_fisheye, focal_px=focal, center_px=center, terms=tuple(terms))
         return fit_lens(fisheye, start, model, where)
     if model in _BENT:
         bend = _BENT[model]
@@ -198,11 +190,11 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
     if not any(below):
         return lens, None
 
-    def full_opencv(ideal: Points) -> Points:
+    def full_opencv(ideal: lens_models.Points) -> lens_models.Points:
         squared = (ideal**2).sum(axis=1, keepdims=True)
         origin = (0.0, 0.0)
-        bent = project_opencv(ideal, (1.0, 1.0), origin, (k1, k2, k3))
-        slanted = project_opencv(ideal, (1.0, 1.0), origin, (), (p1, p2)) - ideal
+        bent = lens_models.project_opencv(ideal, (1.0, 1.0), origin, (k1, k2, k3))
+        slanted = lens_models.project_opencv(ideal, (1.0, 1.0), origin, (), (p1, p2)) - ideal
         divisor = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(below))
         return (bent / divisor + slanted) * focal + center
 

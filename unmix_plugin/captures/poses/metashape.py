@@ -17,13 +17,8 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.captures.poses import lens_models
 from unmix_plugin.captures.poses.lens import Lens, fit_lens
-from unmix_plugin.captures.poses.lens_models import (
-    Points,
-    bend_brown_fisheye,
-    project_equirectangular,
-    project_opencv,
-)
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -146,7 +141,7 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
     width, height = size
     if kind == "spherical":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        project = partial(project_equirectangular, width=width, height=height)
+        project = partial(lens_models.project_equirectangular, width=width, height=height)
         around, said = fit_lens(project, start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
     values = {
@@ -164,11 +159,11 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
         bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])
         return Lens(width, height, focal, center, *bends), []
 
-    def bent_and_skewed(ideal: Points) -> Points:
+    def bent_and_skewed(ideal: lens_models.Points) -> lens_models.Points:
         if kind == "fisheye":
-            bent = bend_brown_fisheye(ideal, radial, tangential)
+            bent = lens_models.bend_brown_fisheye(ideal, radial, tangential)
         else:
-            bent = project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
+            bent = lens_models.project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
         return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center
 
     model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"

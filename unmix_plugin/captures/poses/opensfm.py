@@ -12,14 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.captures.poses import lens_models
 from unmix_plugin.captures.poses.lens import Lens, fit_lens
-from unmix_plugin.captures.poses.lens_models import (
-    Points,
-    bend_dual,
-    bend_opensfm_624,
-    project_equirectangular,
-    project_fisheye,
-)
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.scenes.reading.faults import describe, read_number
@@ -126,13 +120,17 @@ def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
     keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
     terms, transition = [number(key) for key in keys], number("transition", 1.0)
 
-    def project(ideal: Points) -> Points:
+    def project(ideal: lens_models.Points) -> lens_models.Points:
         if kind in _FISHEYES:
-            return project_fisheye(ideal, focal, center, radial)
+            return lens_models.project_fisheye(ideal, focal, center, radial)
         if kind in _SPHERICAL:
             middle = np.array([(width - side) / 2, height / 2 - side / 4])
-            return project_equirectangular(ideal, side, side / 2) + middle
-        bent = bend_dual(ideal, transition, radial[:2]) if kind == "dual" else bend_opensfm_624(ideal, terms)
+            return lens_models.project_equirectangular(ideal, side, side / 2) + middle
+        bent = (
+            lens_models.bend_dual(ideal, transition, radial[:2])
+            if kind == "dual"
+            else lens_models.bend_opensfm_624(ideal, terms)
+        )
         return bent * focal + center
 
     return fit_lens(project, Lens(width, height, focal, center), kind, where)

@@ -13,15 +13,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.captures.poses import lens_models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
-from unmix_plugin.captures.poses.lens_models import (
-    Points,
-    bend_fisheye_624,
-    project_equirectangular,
-    project_fisheye,
-    project_ftheta,
-)
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
@@ -379,14 +373,16 @@ def _make_lens(
             f"{', '.join((*_PLAIN_MODELS, *_RESAMPLED_MODELS))}: undistort the images first"
         )
 
-    def project(ideal: Points) -> Points:
+    def project(ideal: lens_models.Points) -> lens_models.Points:
         if model == "ftheta":
-            return project_ftheta(ideal, center, terms, math.hypot(*size))
+            return lens_models.project_ftheta(ideal, center, terms, math.hypot(*size))
         if model == "EQUIRECTANGULAR":
-            return project_equirectangular(ideal, width, height)
+            return lens_models.project_equirectangular(ideal, width, height)
         if model == "FISHEYE624":
-            return bend_fisheye_624(ideal, terms) * focal + center
-        return project_fisheye(ideal, focal, center, (*given.distortion[:2], *given.higher_radial))
+            return lens_models.bend_fisheye_624(ideal, terms) * focal + center
+        return lens_models.project_fisheye(
+            ideal, focal, center, (*given.distortion[:2], *given.higher_radial)
+        )
 
     return fit_lens(project, Lens(*size, focal, center), model, where)
 

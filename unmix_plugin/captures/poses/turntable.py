@@ -227,12 +227,8 @@ def _touching(
     axes: Float64[np.ndarray, "Q 3 3"],
     towards: Float64[np.ndarray, "Q 3"],
 ) -> tuple[Int[np.ndarray, "Q 2"], Bool[np.ndarray, " Q"]]:
-    """Which corners of the views' hulls tangents from the epipoles touch, and whether these lie outside the hulls.
-
-    Args:
-        axes: Of the views.
-        towards: From them to the others.
-    """
+    """Which corners of the views' hulls tangents from the epipoles touch, and whether these lie outside the hulls; with
+    the axes of the views, and the way to the others."""
     epipole = (towards[:, None] @ axes)[:, 0]
     depth = np.where(np.abs(epipole[:, 2]) < 1e-6, 1e-6, epipole[:, 2])
     place = epipole[:, None, :2] / depth[:, None, None]
@@ -277,12 +273,8 @@ def _solve(
     bent: bool = False,
     slack: bool = False,
 ) -> _Numbers:
-    """Least squares over places of the camera, the first of which holds the world in place.
-
-    Args:
-        which: Places that are free.
-        zoom, bent, slack: Whether the focal length, k1 and the angles are free too.
-    """
+    """Least squares over some places of the camera, the first of which holds the world in place; and over the focal
+    length (zoom), k1 (bent) and the angles (slack) where asked."""
     from scipy.optimize import least_squares
 
     free = np.zeros(start.cameras.shape, bool)

@@ -136,10 +136,10 @@ def image_of_arrays(
     linear = _linear(path, image, of_image[2])
     exposure, exposure_warnings = _exposure(arrays, image)
 
-    dtype, no_data = _dtype_meant(image), _first_number(image.all_attributes, _NO_DATA)
+    dtype, no_data = image.dtype, _first_number(image.all_attributes, _NO_DATA)
     valid = _valid_range(image.all_attributes)
-    if dtype != image.dtype:  # attributes are written in the signed type
-        more = 256.0**dtype.itemsize
+    if dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true":
+        dtype, more = np.dtype(dtype.str.replace("i", "u")), 256.0**dtype.itemsize  # attributes are signed
         no_data = no_data + more if no_data is not None and no_data < 0 else no_data
         low, high = valid or (0.0, 0.0)
         valid = valid and (low + more * (low < 0), high + more * (high < 0))
@@ -162,12 +162,6 @@ def image_of_arrays(
         warnings=axis_warnings + band_warnings + exposure_warnings,
         metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )
-
-
-def _dtype_meant(image: FoundArray) -> np.dtype:
-    """The type of the numbers; unsigned where NetCDF says that a signed type holds such (`_Unsigned`)."""
-    is_unsigned = image.dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true"
-    return np.dtype(image.dtype.str.replace("i", "u")) if is_unsigned else image.dtype
 
 
 def _text(value: Any) -> str:

@@ -236,18 +236,18 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
         f"{scale['calibrated']:g} is written as 1: {scale['evidence']}; full scale of the cubes is {FULL_SCALE}"
     )
 
-    def total(what: str, noun: str = "pixel") -> str:
+    def total(what: str) -> str:
+        noun = what.rpartition("_")[2].removesuffix("s")
         return counted(sum(getattr(view, what) for view in views), noun)
 
     lines.append(
-        f"{total('saturated_pixels')} with saturated bands, which are written as 1; "
-        f"{total('clipped_values', 'value')} above 1, written as 1 too; "
-        f"{total('negative_values', 'value')} below 0, written as 0; "
-        f"{total('missing_pixels')} masked, as nothing was measured there"
+        f"{total('saturated_pixels')} with saturated bands, which are written as 1; {total('clipped_values')} above 1, "
+        f"written as 1 too; {total('negative_values')} below 0, written as 0; {total('missing_pixels')} masked, as "
+        "nothing was measured there"
     )
     share = f"{np.mean([view.matter_share for view in views]):.0%} of the pixels are matter"
     found = [recipe.background for recipe in plan.recipes.values() if isinstance(recipe.background, Backdrop)]
-    changed = f"{total('specks', 'speck')} removed, {total('holes', 'hole')} filled"
+    changed = f"{total('specks')} removed, {total('holes')} filled"
     if found:
         whole = sum(view.matter_share == 1.0 for view in views)
         lines.append(
