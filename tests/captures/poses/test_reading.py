@@ -103,7 +103,7 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "hints", [{}, {"scale": 0.5, "from_na": True}, {"applied_transform": np.eye(4).tolist()}]
+    "hints", [{}, {"scale": 0.5, "from_na": True}, {"applied_transform": np.eye(4).tolist(), "scale": 1}]
 )
 def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
     found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
