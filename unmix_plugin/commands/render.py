@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
     from unmix_plugin.products.render.files import FormattedOutput
     from unmix_plugin.products.render.pictures import Palette
+    from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.trained.open_run import LoadedRun
 
 
@@ -31,8 +32,9 @@ class RenderOptions:
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
     cameras: str = "dataset-eval"
-    """dataset-eval, dataset-train, orbit (around the scene), interpolate (through the evaluation cameras), or a file:
-    nerfstudio's camera_path.json, or poses as in transforms.json."""
+    """dataset-eval, dataset-train, orbit (around the scene), interpolate (through the evaluation cameras), map (from
+    above without perspective, north up; map:bottom, map:east, map:north, map:west, map:south or map:X,Y,Z: from there),
+    or a file: nerfstudio's camera_path.json, or poses as in transforms.json."""
     view: tuple[str, ...] = ()
     """Only these of the cameras, by name or by number from 0."""
     outputs: tuple[str, ...] = ()
@@ -43,13 +45,16 @@ class RenderOptions:
     absorption:centre:650-700, absorption:area:650-700); or all (but those with a colon). None given: spectral rgb
     abundances segmentation depth for single views, rgb for a path."""
     formats: tuple[str, ...] = ()
-    """envi, exr, npy, png, mp4; each output is written in those that suit it. None given: what suits each best. mp4 of
-    spectra goes through the bands."""
+    """envi, exr, npy, png, mp4, tif (GeoTIFF of maps); each output is written in those that suit it. None given:
+    what suits each best. mp4 of spectra goes through the bands."""
     size: str | None = None
     """Width and height in pixels, as in 640x480; the vertical field of view stays. None: the dataset's or the file's;
     orbit and interpolate have at least 512 rows."""
     downscale: float | None = None
     """Divide width and height by this."""
+    pixel_size: float | None = None
+    """Of maps: edge of a pixel in metres, or in units of the world where the run has no scale; None: about that of the
+    scene's views."""
     frames: int | None = None
     """Number of cameras of orbit or interpolate; None: 120."""
     fps: float | None = None
@@ -112,7 +117,7 @@ def _render_run(options: RenderOptions, request: CameraRequest, processes: Proce
         with working(console, f"reading {path}"):
             loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
             loaded = _relit(loaded, options)
-            cameras = choose_cameras(loaded.scene, request)
+            cameras = choose_cameras(loaded.scene, request, loaded.scale)
         for line in loaded.scene.notes:
             say(console, line)
         outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
@@ -129,7 +134,15 @@ def _camera_request(options: RenderOptions) -> CameraRequest:
         if match is None:
             raise ConfigError(f"--size {options.size}: expected width and height in pixels, as in 640x480")
         size = (int(match[1]), int(match[2]))
-    return CameraRequest(options.cameras, options.view, size, options.downscale, options.frames, options.fps)
+    return CameraRequest(
+        options.cameras,
+        options.view,
+        size,
+        options.downscale,
+        options.frames,
+        options.fps,
+        options.pixel_size,
+    )
 
 
 def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
@@ -163,7 +176,6 @@ def _render(
     from unmix_plugin.products.render.files import file_name, needs_legend
     from unmix_plugin.products.render.job import RenderJob, Survey, needs_survey, output_paths, take_survey
     from unmix_plugin.products.render.pictures import draw_legend, legend_csv
-    from unmix_plugin.trained.camera_files import camera_file_bytes
 
     scene, asked = loaded.scene, dict.fromkeys(one.output for one in outputs)
     folder = (options.output or loaded.folder.exports / "render").resolve()
@@ -173,18 +185,16 @@ def _render(
         if needs_legend(one, scene)
     }
     tables = {folder / f"{file_name(output)}_legend.csv": output for output in asked if output.classes}
-    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
-    camera_path = folder / f"cameras-{Path(options.cameras).stem}.json"
-    camera_bytes = camera_file_bytes(cameras.views, frames_per_second, scene.frame)
+    camera_files = _camera_files(folder, options, cameras, scene.frame)
     paths = [path for one in outputs for path in output_paths(folder, one, cameras)]
     paths += [*legends, *tables]
-    if not camera_path.is_file() or camera_path.read_bytes() != camera_bytes:
-        paths.append(camera_path)
+    paths += [path for path, data in camera_files.items() if not path.is_file() or path.read_bytes() != data]
     with processes.together():
         if processes.is_first:
             refuse_to_overwrite(paths, options.overwrite)
             # First, so that a folder that can't be written is noticed early.
-            write_file(camera_path, camera_bytes)
+            for path, data in camera_files.items():
+                write_file(path, data)
     names, (width, height) = dict.fromkeys(output.name for output in asked), cameras.size
     say(
         console,
@@ -208,7 +218,21 @@ def _render(
     _list(folder, outputs, cameras, job.palette)
     for path in (*legends, *tables):
         print(f"{path}  what the colours mean")
-    print(f"{camera_path}  the cameras, to be given to --cameras again")
+    for path in camera_files:
+        print(f"{path}  the cameras, to be given to --cameras again")
+
+
+def _camera_files(
+    folder: Path, options: RenderOptions, cameras: RenderCameras, frame: Normalisation
+) -> dict[Path, bytes]:
+    """The file of the cameras; none of a map, which no camera file can hold."""
+    from unmix_plugin.trained.camera_files import camera_file_bytes
+
+    if cameras.map_info is not None:
+        return {}
+    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
+    data = camera_file_bytes(cameras.views, frames_per_second, frame)
+    return {folder / f"cameras-{Path(options.cameras).stem}.json": data}
 
 
 def _list(

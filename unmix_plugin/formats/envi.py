@@ -300,8 +300,10 @@ def envi_cube_rows(
     wavelengths: Bands | None,
     names: Sequence[str] | None,
     description: str,
+    more: Mapping[str, HeaderValue] | None = None,
 ) -> Iterator[RowSink]:
-    """Context that gives a sink for the rows of a cube of `shape` (H, W, C); the rest is as in `write_envi_cube`."""
+    """Context that gives a sink for the rows of a cube of `shape` (H, W, C); `more` are further entries of its header,
+    the rest is as in `write_envi_cube`."""
     for what, given in (("wavelengths", wavelengths), ("names", names)):
         if given is not None and len(given) != shape[2]:
             raise ValueError(f"{len(given)} {what} for {shape[2]} bands")
@@ -313,7 +315,7 @@ def envi_cube_rows(
         entries["band names"] = list(names)
     if wavelengths is not None and all(map(wavelengths.contains, _SHOWN_NM)):
         entries["default bands"] = [str(wavelengths.nearest(wavelength) + 1) for wavelength in _SHOWN_NM]
-    with _rows(envi_cube_paths(path_without_suffix), shape, entries) as add:
+    with _rows(envi_cube_paths(path_without_suffix), shape, {**entries, **(more or {})}) as add:
         yield add
 
 

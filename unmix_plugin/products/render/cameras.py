@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unmix_plugin.engine.geometry.camera_paths import interpolated, orbit
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, did_you_mean
+from unmix_plugin.products.render.maps import MapInfo, map_camera
 from unmix_plugin.trained.camera_files import check_frames_per_second, check_size, read_camera_file
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import RunView, cameras_of, find_view, resized_views, views_of
 
@@ -40,6 +43,8 @@ class CameraRequest:
     """Of a path that is made here."""
     frames_per_second: float | int | None = None
     """Of videos; None: as in the file, or a default for each kind of video."""
+    pixel_size: float | None = None
+    """Of a map: edge of a pixel, metres or units of the world; None: that of the scene's views."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,8 @@ class RenderCameras:
     """Whether one view follows the other, as the frames of a video do."""
     frames_per_second: float | None
     """Of videos, where it is given."""
+    map_info: MapInfo | None = None
+    """Where the one view lies, if it is a map."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,12 +66,21 @@ class RenderCameras:
         return self.views[0].camera.width, self.views[0].camera.height
 
 
-def choose_cameras(scene: RenderableScene, request: CameraRequest) -> RenderCameras:
-    """The cameras asked for.
+def choose_cameras(
+    scene: RenderableScene, request: CameraRequest, scale: Scale | None = None
+) -> RenderCameras:
+    """The cameras asked for; `scale` is that of the world, for maps.
 
     Raises:
         ConfigError: an unknown choice, a bad file, an impossible size, or options that contradict each other.
     """
+    kind, _, direction = request.source.partition(":")
+    if kind == "map":
+        return _map(scene, request, scale, direction or "top")
+    if request.pixel_size is not None:
+        raise ConfigError(
+            f"--pixel-size is for --cameras map; --cameras {request.source} has pixels of its own"
+        )
     chosen = _from_source(scene, request)
     if request.only:
         names = {find_view(chosen.views, one).name for one in request.only}
@@ -96,12 +112,25 @@ def _from_source(scene: RenderableScene, request: CameraRequest) -> RenderCamera
     if not source.endswith(".json") and not Path(source).is_file():
         hint = did_you_mean(source, _CAMERA_CHOICES, likeness=0.5, form=" ({})")
         raise ConfigError(
-            f"unknown cameras {source!r}{hint}; known are {', '.join(_CAMERA_CHOICES)}, and "
+            f"unknown cameras {source!r}{hint}; known are {', '.join(_CAMERA_CHOICES)}, map, and "
             "the path of a camera file (.json)"
         )
     found = read_camera_file(Path(source), scene.frame)
     is_path = found.frames_per_second is not None
     return RenderCameras(found.views, is_path, found.frames_per_second)
+
+
+def _map(
+    scene: RenderableScene, request: CameraRequest, scale: Scale | None, direction: str
+) -> RenderCameras:
+    given = (request.size, request.downscale, request.num_frames, request.frames_per_second)
+    if any(one is not None for one in given) or request.only:
+        raise ConfigError(
+            "--cameras map has one view of the size that --pixel-size gives; leave out other options of views"
+        )
+    camera, info = map_camera(scene, scale, direction, request.pixel_size)
+    name = re.sub(r"[^\w-]+", "_", f"map_{direction}")
+    return RenderCameras((RunView(name, camera),), False, None, info)
 
 
 def _path(name: str, cameras: Cameras) -> RenderCameras:

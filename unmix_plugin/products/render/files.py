@@ -6,12 +6,15 @@ Notation: `h x W` pixels, some rows of a view; `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import hashlib
+import importlib
+import io
+import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr
 from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, write_file
 from unmix_plugin.formats.video import FrameSink, video_frames
+from unmix_plugin.products.render.maps import MapInfo
 from unmix_plugin.products.render.pictures import (
     LIGHT_KINDS,
     Palette,
@@ -36,8 +40,8 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-_Format = Literal["envi", "exr", "npy", "png", "mp4"]
-_FORMATS: tuple[_Format, ...] = ("envi", "exr", "npy", "png", "mp4")
+_Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]
+_FORMATS: tuple[_Format, ...] = ("envi", "exr", "npy", "png", "mp4", "tif")
 _EVERY_OUTPUT = "all"
 """Stands for every output that takes no argument."""
 
@@ -140,6 +144,8 @@ def choose_formats(
     names = dict.fromkeys(one for name in outputs for one in (known if name == _EVERY_OUTPUT else [name]))
     chosen = [scene.output(name) for name in names]
     wanted: list[_Format] = [_format(name) for name in dict.fromkeys(formats)]
+    if "tif" in wanted:
+        require_tifffile()
     owners: dict[str, str] = {}
     for output in chosen:
         name = file_name(output)
@@ -153,12 +159,13 @@ def choose_formats(
         # Linear light is for other programs, but a composite of bands is for people.
         is_composite = output.kind == "linear" and ":" in output.name
         possible = _COMPOSITE if is_composite else _BY_KIND[output.kind]
-        suited: tuple[_Format, ...] = tuple(one for one in wanted if one in possible.suited)
+        able = (*possible.suited, "tif")  # numbers of any kind
+        suited: tuple[_Format, ...] = tuple(one for one in wanted if one in able)
         if wanted and not suited:
             reason = _REASONS.get((output.kind, wanted[0]), "the format does not suit it")
             raise ConfigError(
                 f"{output.name} can't be written as {' or '.join(wanted)}: {reason}. "
-                f"Formats for {output.name}: {', '.join(possible.suited)}"
+                f"Formats for {output.name}: {', '.join(able)}"
             )
         found += [
             FormattedOutput(output, one)
@@ -169,6 +176,18 @@ def choose_formats(
             asked = " or ".join(output.name for output in chosen)
             raise ConfigError(f"--formats {one} suits none of the outputs asked for: {asked}")
     return tuple(found)
+
+
+def require_tifffile() -> Any:
+    """tifffile, which only captures need otherwise.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        return importlib.import_module("tifffile")
+    except ImportError as error:
+        raise ConfigError("--formats tif needs tifffile: pip install tifffile imagecodecs") from error
 
 
 def _format(name: str) -> _Format:
@@ -219,6 +238,8 @@ class RenderSetting:
     """Names of the channels of each output that has several."""
     frames_per_second: float | None
     """Of sweeps; None: so that they take about six seconds."""
+    map_info: MapInfo | None = None
+    """Where a map lies."""
 
 
 def still_paths(folder: Path, formatted: FormattedOutput, view_name: str) -> list[Path]:
@@ -252,7 +273,9 @@ def still_at(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> 
     Raises:
         RunError: the disk is full or refuses.
     """
-    open_file = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep}[formatted.format]
+    open_file = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep, "tif": _tif}[
+        formatted.format
+    ]
     with open_file(formatted.output, path, setting) as sink:
         yield sink
 
@@ -313,8 +336,35 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     shape = (height, width, len(names))
     bands = setting.bands if output.kind in ("channels", "spectra") else None
     description = f"{output.name}: {output.what}"
-    with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description) as add:
+    more = None if setting.map_info is None else setting.map_info.envi
+    with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description, more) as add:
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
+
+
+@contextmanager
+def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
+    """Numbers as TIFF, a band after the other; of a map as GeoTIFF."""
+    width, height = setting.size
+    names = setting.channels.get(output.name, (output.name,))
+    planes = np.zeros((len(names), height, width), dtype=np.uint8 if output.kind == "labels" else np.float32)
+
+    def add(rows: Rows) -> None:
+        values = rows.values[output.name].reshape(-1, width, len(names))
+        planes[:, rows.first : rows.first + len(values)] = np.moveaxis(values, -1, 0)
+
+    yield add
+    buffer, info = io.BytesIO(), setting.map_info
+    with require_tifffile().TiffWriter(buffer) as writer:
+        writer.write(
+            planes,
+            photometric="minisblack",
+            planarconfig="separate" if len(names) > 1 else None,
+            compression="zlib",
+            description=json.dumps({"output": output.name, "what": output.what, "bands": list(names)}),
+            metadata=None,
+            extratags=[] if info is None else info.geotiff,
+        )
+    write_file(path, buffer.getvalue())
 
 
 @contextmanager

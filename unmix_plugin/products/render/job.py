@@ -202,6 +202,7 @@ class RenderJob:
             _scene_bands(scene),
             channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
             cameras.frames_per_second,
+            cameras.map_info,
         )
         self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
         self._still = [one for one in outputs if one not in self._moving]

@@ -1,0 +1,98 @@
+"""Maps: an independent reader finds a known place within a pixel, in metres, from above and from the side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import spectral.io.envi as envi
+import tifffile
+from spectral.io.bipfile import BipFile
+
+from tests.products.ball_model import RADIUS, ball_scene
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
+from unmix_plugin.products.render.files import choose_formats
+from unmix_plugin.products.render.job import RenderJob, Survey
+from unmix_plugin.products.render.maps import map_camera
+from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.measures import Scale
+
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+PLACE = np.array([500_010.0, 5_400_020.0, 300.0])
+"""Where the ball lies in its world, as geo-referenced ones do."""
+SCENE = replace(ball_scene(), frame=Normalisation(TURN, np.zeros(3), 0.25, PLACE))
+SCALE = Scale(1.0, "test")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("maps")
+    for source in ("map", "map:east"):
+        cameras = choose_cameras(SCENE, CameraRequest(source, pixel_size=0.2), SCALE)
+        outputs = choose_formats(["accumulation", "spectral"], ["tif", "envi"], SCENE, False)
+        with RenderJob(SCENE, cameras, outputs, Survey(), folder) as job:
+            for block in job.blocks():
+                job.render(block)
+    return folder
+
+
+def outline(opacity, left, top, pixel):
+    """Least and greatest x and y of what is opaque."""
+    rows, columns = np.nonzero(opacity > 0.5)
+    x = left + pixel * np.array([columns.min(), columns.max() + 1])
+    y = top - pixel * np.array([rows.min(), rows.max() + 1])
+    return np.array([*x, *y])
+
+
+@pytest.mark.parametrize(("view", "axes"), [("map_top", (0, 1)), ("map_east", (1, 2))])
+def test_a_geotiff_has_the_ball_where_it_is(folder, view, axes):
+    with tifffile.TiffFile(folder / "accumulation" / f"{view}.tif") as file:
+        tags, opacity = file.pages.first.tags, file.asarray()
+        pixel, tie = tags[33550].value, tags[33922].value
+        keys = np.array(tags[34735].value).reshape(-1, 4)
+    assert pixel == (0.2, 0.2, 0.0)
+    assert tie[:3] == (0.0, 0.0, 0.0)
+    reach = RADIUS / 0.25
+    middle = PLACE[list(axes)]
+    expected = [middle[0] - reach, middle[0] + reach, middle[1] + reach, middle[1] - reach]
+    np.testing.assert_allclose(outline(opacity, tie[3], tie[4], 0.2), expected, atol=0.2)
+    assert {tuple(key) for key in keys[1:]} >= {(1024, 0, 1, 1), (1025, 0, 1, 1), (3076, 0, 1, 9001)}
+    assert len(keys) == keys[0, 3] + 1
+
+
+def test_an_envi_header_says_the_same(folder):
+    image = envi.open(folder / "spectral" / "map_top.hdr")
+    assert isinstance(image, BipFile)
+    kind, column, row, left, top, x, y, units = image.metadata["map info"]
+    assert (kind, float(column), float(row), float(x), float(y)) == ("Arbitrary", 1, 1, 0.2, 0.2)
+    assert units == "units=Meters"
+    with tifffile.TiffFile(folder / "spectral" / "map_top.tif") as file:
+        tie = file.pages.first.tags[33922].value
+        np.testing.assert_array_equal(np.moveaxis(file.asarray(), 0, -1), image.open_memmap())
+    assert (float(left), float(top)) == tie[3:5]
+
+
+def test_without_a_scale_units_are_those_of_the_world():
+    _, info = map_camera(SCENE, None, "top", 0.2)
+    assert info.envi["map info"][-1] == "units=Unknown"
+    _, millimetres = map_camera(SCENE, Scale(0.001, "test"), "top", 0.0002)
+    assert millimetres.left == pytest.approx(info.left / 1000)
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (CameraRequest("map", pixel_size=0.0), "--pixel-size is 0; it must be greater than 0"),
+        (CameraRequest("map", pixel_size=1e-7), "--pixel-size 1e-07: .* expected whole numbers"),
+        (CameraRequest("map:up"), "--cameras map:up: expected top, bottom"),
+        (CameraRequest("map:0,0,0"), "--cameras map:0,0,0: expected top"),
+        (
+            CameraRequest("map", size=(10, 10)),
+            "--cameras map has one view of the size that --pixel-size gives",
+        ),
+        (CameraRequest("orbit", pixel_size=0.1), "--pixel-size is for --cameras map"),
+    ],
+)
+def test_what_makes_no_map_is_refused(request_, message):
+    with pytest.raises(ConfigError, match=message):
+        choose_cameras(SCENE, request_, SCALE)

@@ -1,0 +1,177 @@
+"""Orthographic views of a scene as maps: from above with north up, or square to any direction; and their map info.
+
+Map coordinates are metres where the scene's scale is known, otherwise units of its world. From above, x is the world's
+x (east) and y its y (north); so maps of geo-referenced scenes have the coordinates of their frame. Seen from the side,
+up is the world's z and x goes to the right.
+
+Source: GeoTIFF 1.1, OGC 19-008r4 (tags and keys); ENVI header format (map info).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64, Int
+from torch import Tensor
+
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.space import RayBundle
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.camera_files import check_size
+from unmix_plugin.trained.measures import Scale
+from unmix_plugin.trained.protocol import RenderableScene
+from unmix_plugin.trained.trained_scene import TrainedScene
+
+_DIRECTIONS = {
+    "top": (0.0, 0.0, 1.0),
+    "bottom": (0.0, 0.0, -1.0),
+    "east": (1.0, 0.0, 0.0),
+    "west": (-1.0, 0.0, 0.0),
+    "north": (0.0, 1.0, 0.0),
+    "south": (0.0, -1.0, 0.0),
+}
+"""From where one looks, in the world; the first is what `map` alone means."""
+_USUAL_PIXELS = 512
+"""Along the longest side, where nothing says how large pixels are."""
+_OUTSIDE = 1.01
+"""Where rays start, in half diagonals of the scene box from its middle."""
+
+
+class OrthographicCameras(Cameras):
+    """Cameras whose rays are parallel to their axis; `focal_px` is pixels in a unit of length."""
+
+    def generate_rays(
+        self, camera_indices: Int[Tensor, " R"], pixel_coords: Float[Tensor, "R 2"]
+    ) -> RayBundle:
+        """Rays through points of the images."""
+        offsets = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
+        poses = self.camera_to_world[camera_indices]
+        origins = poses[:, :, 3] + offsets[:, :1] * poses[:, :, 0] - offsets[:, 1:] * poses[:, :, 1]
+        backward = poses[:, :, 2]
+        return RayBundle(origins, (-backward).contiguous(), camera_indices, -backward, pixel_coords)
+
+    def project(
+        self, points: Float[Tensor, "P 3"], index: int
+    ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
+        """Pixel coordinates and depths of points."""
+        pose = self.camera_to_world[index]
+        local = (points - pose[:, 3]) @ pose[:, :3]
+        coords = torch.stack([local[:, 0], -local[:, 1]], dim=-1)
+        return coords * self.focal_px[index] + self.center_px[index], -local[:, 2]
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same part of the map with another number of pixels."""
+        factors = torch.tensor([[width / self.width, height / self.height]])
+        parts = (self.focal_px * factors.to(self.focal_px), self.center_px * factors.to(self.center_px))
+        return OrthographicCameras(self.camera_to_world, *parts, self.distortion, width, height)
+
+
+@dataclass(frozen=True)
+class MapInfo:
+    """Where a map lies."""
+
+    left: float
+    """x of the left edge of the first column, map coordinates."""
+    top: float
+    """y of the upper edge of the first row."""
+    pixel: float
+    """Edge of a pixel."""
+    is_metric: bool
+    """Whether coordinates are metres."""
+
+    @property
+    def envi(self) -> dict[str, Any]:
+        """Entries of an ENVI header; pixels are counted from 1, whose corner (1, 1) is that of the first pixel."""
+        units = f"units={'Meters' if self.is_metric else 'Unknown'}"
+        return {"map info": ["Arbitrary", 1.0, 1.0, self.left, self.top, self.pixel, self.pixel, units]}
+
+    @property
+    def geotiff(self) -> list[tuple[int, int, int, Any, bool]]:
+        """Tags of a GeoTIFF as tifffile takes them: pixel scale, tie point, keys."""
+        citation = (
+            "unmix-nerf map, local metres|" if self.is_metric else "unmix-nerf map, units of the scene|"
+        )
+        keys = [
+            (1024, 0, 1, 1 if self.is_metric else 32767),  # GTModelType: projected, or user-defined
+            (1025, 0, 1, 1),  # GTRasterType: a pixel is an area
+            (1026, 34737, len(citation), 0),  # GTCitation
+        ]
+        if self.is_metric:
+            keys += [(3072, 0, 1, 32767), (3074, 0, 1, 32767), (3076, 0, 1, 9001)]  # user-defined, metres
+        directory = [1, 1, 1, len(keys), *(number for key in keys for number in key)]
+        return [
+            (33550, 12, 3, (self.pixel, self.pixel, 0.0), True),
+            (33922, 12, 6, (0.0, 0.0, 0.0, self.left, self.top, 0.0), True),
+            (34735, 3, len(directory), tuple(directory), True),
+            (34737, 2, len(citation) + 1, citation, True),
+        ]
+
+
+def map_camera(
+    scene: RenderableScene, scale: Scale | None, direction: str, pixel_size: float | None
+) -> tuple[Cameras, MapInfo]:
+    """An orthographic camera that has all of the scene box in its image, and where its map lies.
+
+    Args:
+        scene: Of any method.
+        scale: Of its world.
+        direction: From where one looks: one of `_DIRECTIONS`, or x,y,z of the world.
+        pixel_size: Edge of a pixel, metres or units of the world; None: that of the scene's own views.
+    Raises:
+        ConfigError: an unknown direction, or a size that is not above 0 or makes too many pixels.
+    """
+    axes, frame = _axes(direction), scene.frame
+    metres = 1.0 if scale is None else scale.metres_per_unit
+    corners = np.stack(np.meshgrid(*scene.scene_box.aabb.T.cpu().double().numpy()), -1).reshape(-1, 3)
+    flat = frame.to_world(corners) @ axes.T * metres
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    if pixel_size is None:
+        own = scene.pixel_size * metres / frame.scale if isinstance(scene, TrainedScene) else None
+        pixel_size = own or float((high - low)[:2].max()) / _USUAL_PIXELS
+        pixel_size = float(f"{pixel_size:.2g}")
+    if not 0 < pixel_size < math.inf:
+        raise ConfigError(f"--pixel-size is {pixel_size:g}; it must be greater than 0")
+    width, height = (max(1, math.ceil(side / pixel_size - 1e-6)) for side in (high - low)[:2])
+    check_size(width, height, f"--pixel-size {pixel_size:g}")
+    info = MapInfo(float(low[0]), float(high[1]), pixel_size, scale is not None)
+    middle = np.array(
+        [low[0] + width * pixel_size / 2, high[1] - height * pixel_size / 2, (low[2] + high[2]) / 2]
+    )
+    middle[2] += _OUTSIDE * float(np.linalg.norm(high - low)) / 2
+    place = frame.to_model(middle / metres @ axes)
+    pose = np.column_stack([frame.rotation @ axes.T, place])
+    camera = OrthographicCameras(
+        torch.from_numpy(pose).float()[None],
+        torch.full((1, 2), metres / (pixel_size * frame.scale)),
+        torch.tensor([[width / 2, height / 2]]),
+        torch.zeros(1, 4),
+        width,
+        height,
+    )
+    return camera, info
+
+
+def _axes(direction: str) -> Float64[np.ndarray, "3 3"]:
+    """Rows: right, up and towards the viewer, unit vectors of the world."""
+    if direction in _DIRECTIONS:
+        back = np.array(_DIRECTIONS[direction])
+    else:
+        try:
+            back = np.array([float(part) for part in direction.split(",")])
+        except ValueError:
+            back = np.zeros(0)
+        length = float(np.linalg.norm(back))
+        if len(back) != 3 or not 0 < length < math.inf:
+            raise ConfigError(
+                f"--cameras map:{direction}: expected {', '.join(_DIRECTIONS)}, or a direction x,y,z of the world to "
+                "look from"
+            )
+        back = back / length
+    up = np.array([0.0, 1.0, 0.0]) if abs(back[2]) > 1 - 1e-6 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
