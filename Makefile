@@ -10,7 +10,7 @@ BENCHMARKS := $(filter-out benchmarks/fuzz_guided.py,$(sort $(wildcard benchmark
 MINIMUM := .venv-minimum
 MINIMUM_TESTS := tests/engine tests/spectral tests/editing tests/formats tests/scenes tests/figures tests/viewer/test_server.py tests/captures/readers
 
-.PHONY: demo test test-all test-minimum test-portable wheel platforms audit lint format bench site clean help
+.PHONY: demo test test-all test-minimum test-portable wheel platforms audit lint format bench notebooks site clean help
 
 help:
 	@echo "make demo    train on the built-in scene, evaluate, export abundance maps and a page to share"
@@ -25,6 +25,7 @@ help:
 	@echo "make format  rewrite the code in the one format"
 	@echo "make bench   run every benchmark, results into benchmarks/results"
 	@echo "make site    build the site from docs/ into build/site/html, and check its links"
+	@echo "make notebooks   run the tutorials"
 	@echo "make clean   remove the virtual environment and caches"
 
 $(BIN)/python:
@@ -95,6 +96,9 @@ format: $(VENV)/.installed-dev
 
 bench: $(VENV)/.installed-dev
 	@set -e; for benchmark in $(BENCHMARKS); do echo "== $$benchmark"; $(BIN)/python $$benchmark; done
+
+notebooks: $(VENV)/.installed-dev
+	$(BIN)/python scripts/run_notebooks.py
 
 site: $(VENV)/.installed-dev
 	PYTHON=$(BIN)/python scripts/build_site.sh

@@ -12,7 +12,7 @@ import re
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from unittest import mock
@@ -24,6 +24,7 @@ from unmix_plugin import engine, errors
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = {
+    "unmix-demo": ("demo", "demo", ("",)),
     "unmix-process": ("process", "process", ("", "inspect")),
     "unmix-train": ("train", "train", ("unmix-nerf", "unmix-nerf-published", "neumatex")),
     "unmix-eval": ("eval", "evaluate", ("",)),
@@ -185,28 +186,28 @@ def _autodoc(name: str, thing: object, with_members: bool) -> list[str]:
 class _Found(BaseException):
     """Ends a command where it would read its arguments."""
 
-    def __init__(self, parser: argparse.ArgumentParser) -> None:
-        self.parser = parser
+    def __init__(self, parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+        self.parser, self.words = parser, list(words)
 
 
-def _parser(command: str, words: list[str]) -> argparse.ArgumentParser:
-    """The parser that a command makes after `words`."""
+def parser_of(command: str, words: list[str]) -> tuple[argparse.ArgumentParser, list[str]]:
+    """The parser that a command makes for `words`, and those of them that it would parse."""
     module, function, _ = COMMANDS[command]
     read = tyro.cli
 
     def cli(kind: object, **options: object) -> object:
         if options.pop("return_unknown_args", False):
             return read(kind, **options, return_unknown_args=True)
-        del options["args"]
+        words = options.pop("args")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)
-            raise _Found(tyro.extras.get_parser(kind, **options))
+            raise _Found(tyro.extras.get_parser(kind, **options), words)
 
     with mock.patch("tyro.cli", cli):
         try:
             getattr(import_module(f"unmix_plugin.commands.{module}"), function)(words)
         except _Found as found:
-            return found.parser
+            return found.parser, found.words
     raise RuntimeError(f"{command} {' '.join(words)} reads no arguments")
 
 
@@ -217,7 +218,7 @@ def _write_command(folder: Path, command: str) -> tuple[str, str]:
     for start in starts:
         asked = ["--help-all"] if command == "unmix-train" else []
         words = [start, *asked] if start else []
-        parser = _parser(command, words)
+        parser, _ = parser_of(command, words)
         if start:
             parts += [f"## {command} {start}", ""]
         parts += list(_description(parser))
@@ -228,7 +229,7 @@ def _write_command(folder: Path, command: str) -> tuple[str, str]:
                 for name, product in action.choices.items():
                     parts += [f"## {command} {name}", "", *_description(product), *_flags(product)]
     _write(folder / f"{command}.md", "\n".join(parts) + "\n")
-    return command, first
+    return command, "Train a method on a scene, or go on with a run." if command == "unmix-train" else first
 
 
 def _description(parser: argparse.ArgumentParser) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """The site: it builds without a warning, its links lead somewhere, and it loads nothing from elsewhere."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,9 +9,15 @@ from pathlib import Path
 import pytest
 
 from scripts.check_site import faults_of
-from tests.docs.pages import ROOT
+from scripts.stage_site import COMMANDS
+from tests.docs.pages import ROOT, text_of
 
 PAGE = "<html><head><script src='{load}'></script></head><body><article><a href='{link}'>x</a></article></body></html>"
+
+
+def test_every_command_has_a_page():
+    section = text_of("pyproject.toml").split("[project.scripts]")[1].split("\n\n")[0]
+    assert sorted(COMMANDS) == sorted(re.findall(r"^(unmix-[a-z-]+) =", section, re.MULTILINE))
 
 
 @pytest.mark.slow
