@@ -147,7 +147,7 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
 
 def report_text(title: str, checked: _Checked, done: Sequence[str]) -> str:
     """One page of text: what looks wrong, what was measured, what was done."""
-    wrong, parts = checked[0] or ["nothing that these checks can see"], [title, ""]
+    wrong, parts = checked[0] or ["none of the checks found a fault"], [title, ""]
     headings = ("What looks wrong", "What was measured", "What was done")
     for heading, lines in zip(headings, (wrong, checked[1], done), strict=True):
         parts.append(heading)

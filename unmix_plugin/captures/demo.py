@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -97,6 +97,7 @@ def make_demo_capture(
     illuminant: str | Path = RAW_LAMP,
     place: Place | None = None,
     backdrop: Backdrop | None = None,
+    follow: Callable[[str, Sequence[int]], Iterable[int]] = lambda _, items: items,
 ) -> None:
     """Write the demo capture, in place of an older one. It is built beside the folder and moved in when complete.
 
@@ -106,6 +107,7 @@ def make_demo_capture(
         illuminant: The lamp: the name of a known light, or a CSV file (wavelength,power).
         place: What there is to see, and from where; None is the table with speckles on every surface.
         backdrop: What is behind all things; None is nothing.
+        follow: Gives the items, while it shows how many are done.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
@@ -131,7 +133,7 @@ def make_demo_capture(
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
         write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
         instrument = _demo_line_camera(size, sampling.centers_nm, lamp)
-        _write_images(staging, cameras, place.things, spectra, instrument, sampling, backdrop)
+        _write_images(staging, cameras, place.things, spectra, instrument, sampling, backdrop, follow)
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
@@ -179,7 +181,8 @@ def _write_images(
     spectra: Float[np.ndarray, "K B"],
     camera: _LineCamera,
     bands: Bands,
-    backdrop: Backdrop | None = None,
+    backdrop: Backdrop | None,
+    follow: Callable[[str, Sequence[int]], Iterable[int]],
 ) -> None:
     """Dark, white, every view, and the labels of each."""
     from PIL import Image
@@ -188,7 +191,7 @@ def _write_images(
     shape = (_REFERENCE_LINES, len(camera.dark_counts), len(bands))
     for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
         _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
-    for index in range(len(cameras)):
+    for index in follow("rendering views", range(len(cameras))):
         view, name = render_view(cameras, index, things=things), f"view_{index:03d}"
         light = reflected(view, spectra)
         if backdrop is not None:

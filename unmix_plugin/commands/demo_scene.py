@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -104,6 +105,7 @@ def _write_capture(options: DemoSceneOptions) -> None:
         make_demo_capture,
         marked_place,
     )
+    from unmix_plugin.commands.reporting import CommandConsole, follow
     from unmix_plugin.spectral.colour.conversion import parse_light
 
     folder = options.directory
@@ -111,7 +113,8 @@ def _write_capture(options: DemoSceneOptions) -> None:
     light = parse_light(options.illuminant or RAW_LAMP)
     started = time.perf_counter()
     place = marked_place() if options.markers else None
-    make_demo_capture(folder, size, bands, views, options.overwrite, light, place)
+    shown = partial(follow, CommandConsole())
+    make_demo_capture(folder, size, bands, views, options.overwrite, light, place, follow=shown)
     seconds = time.perf_counter() - started
     print(
         f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in {seconds:.1f} s"

@@ -220,11 +220,18 @@ def _show(console: Console, figures: dict[str, Any], title: str, of: str) -> Non
         is_common = "bands" in figures or name in ("views", "train_seconds")
         what = DEFINITIONS.get(name, "") if is_common else ""
         if value is not None:
-            table.add_row(name, f"{value:.4g}", what)
+            table.add_row(name, f"{value:.4g}{_unit(name)}", what)
     console.print(table)
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
         print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
+
+
+def _unit(name: str) -> str:
+    return next((unit for word, unit in _UNITS.items() if word in name.split("_")), "")
+
+
+_UNITS = {"psnr": " dB", "sam": " rad", "angle": " rad", "seconds": " s"}
 
 
 def main() -> None:

@@ -44,9 +44,9 @@ def test_evaluation_finds_colour_and_light_again_also_under_a_light_never_seen(t
     assert figures["base_colour_psnr_scaled"] >= figures["base_colour_psnr"]
     names = [image["name"] for image in figures["per_image"]]
     assert names == ["000", "dim-000", "dim-001"]
-    assert picture_size(trained / "eval" / "rgb" / "000.png") == (48, 24)
-    assert picture_size(trained / "eval" / "relit_rgb" / "dim-001.png") == (48, 24)
-    assert picture_size(trained / "eval" / "base_colour" / "000.png") == (48, 24)
+    assert picture_size(trained / "eval" / "rgb" / "000.png") == (1058, 546)
+    assert picture_size(trained / "eval" / "relit_rgb" / "dim-001.png") == (1058, 546)
+    assert picture_size(trained / "eval" / "base_colour" / "000.png") == (1058, 546)
 
 
 def test_a_run_renders_from_its_folder_alone(trained):

@@ -9,6 +9,8 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.product import Job, RunProduct
 
 _SIZES = (16, 8192)
+_FAR_OFF = 0.05
+"""Share of the reflected light from which the difference of the glTF material shows."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,12 @@ class MaterialProduct(RunProduct):
             )
         job.say(
             f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
+            + (
+                ": its base colour, roughness and metallicity can't express it. Where that shows, draw it with "
+                "decoder.glsl, or with unmix-render, which traces the trained one"
+                if error > _FAR_OFF
+                else ""
+            )
         )
         return written
 

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine import Cameras
+from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 SUBPIXELS = 2
 """Places of a pixel along each edge through which rays pass."""
+_PICTURE_PX = 512
+"""Longer side of a picture, at least."""
 _COLOUR_TRUTHS = ("base_colour_psnr", "base_colour_psnr_scaled")
 _SPECTRAL_TRUTHS = ("base_colour_psnr", "reflectance_angle", "abundance_rmse", "endmember_angle")
 
@@ -126,8 +129,13 @@ def _material_metrics(
 
 def _side_by_side(
     shown: Bool[Tensor, "H W"], true: Float[Tensor, "M 3"], predicted: Float[Tensor, "M 3"]
-) -> Float[Tensor, "H W2 3"]:
-    """Two pictures, black where nothing counts."""
-    pictures = torch.zeros(2, *shown.shape, 3, dtype=true.dtype, device=true.device)
-    pictures[:, shown] = torch.stack([true, predicted]).clamp(0, 1)
-    return torch.cat(list(pictures), dim=1)
+) -> Float[Tensor, "H2 W2 3"]:
+    """Two pictures, black where nothing counts, below their titles and so large that they can be looked at."""
+    pictures = torch.zeros(2, *shown.shape, 3, dtype=true.dtype)
+    pictures[:, shown.cpu()] = torch.stack([true, predicted]).clamp(0, 1).cpu()
+    times = max(1, -(-_PICTURE_PX // max(shown.shape)))
+    tiles = (pictures * 255 + 0.5).byte().repeat_interleave(times, dim=1).repeat_interleave(times, dim=2)
+    titles = ("true", "predicted")
+    canvas = Canvas(CanvasLayout.of((tiles.shape[2], tiles.shape[1]), titles), 3, titles)
+    canvas.put(0, tiles.permute(1, 2, 0, 3).numpy())
+    return torch.from_numpy(canvas.pixels).to(true) / 255
