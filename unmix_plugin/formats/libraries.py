@@ -237,7 +237,7 @@ def _read_text(path: Path) -> _Table:
     is_usgs = record is not None or any("USGS" in line for line in words[:3])
     if record is not None and len(numbers[0]) == 1:
         values = np.array([row[0] for row in numbers])
-        return [_plain(record[2])], _usgs_wavelengths(path, len(values)), values[None]
+        return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None]
     rows = np.array([row[:2] for row in numbers if 2 <= len(row) <= 3])
     if not len(rows):
         raise SpectrumError("no lines with a wavelength and a value")
@@ -254,7 +254,11 @@ def _read_text(path: Path) -> _Table:
         raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
     # The second line from the last before the numbers of splib06 is the title.
     title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
-    return [_plain(title)], wavelengths * factor, values[None] / (100.0 if "percent" in quantity else 1.0)
+    return (
+        [" ".join(title.split())],
+        wavelengths * factor,
+        values[None] / (100.0 if "percent" in quantity else 1.0),
+    )
 
 
 def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
@@ -290,7 +294,3 @@ def _usgs_wavelengths(path: Path, count: int) -> Float64[np.ndarray, " B"]:
 
 def _column(path: Path) -> list[float]:
     return [row[0] for row in _words_and_numbers(path)[1] if len(row) == 1]
-
-
-def _plain(name: str) -> str:
-    return " ".join(name.split())

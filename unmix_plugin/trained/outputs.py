@@ -171,33 +171,29 @@ _TABLE = (
         "view-dependent part of the radiance, 1 = full scale",
         compute=lambda view: view.materials.specular(view.coefficients),
     ),
-    MaterialOutput(
-        "reflectance",
-        "spectra",
-        "reflectance",
-        "radiance over the scene's light, 1 = as bright as white, shading included; NaN where nothing is",
-        compute=_reflectance,
-    ),
-    MaterialOutput(
-        "continuum",
-        "spectra",
-        "continuum removed",
-        "reflectance over its continuum, the upper convex hull, at most 1; NaN where nothing is",
-        compute=_continuum_removed,
-    ),
-    MaterialOutput(
-        "derivative",
-        "spectra",
-        "derivative",
-        "derivative of the reflectance by wavelength, 1/nm; NaN where nothing is",
-        compute=_derivative(1),
-    ),
-    MaterialOutput(
-        "second_derivative",
-        "spectra",
-        "second derivative",
-        "second derivative of the reflectance by wavelength, 1/nm^2; NaN where nothing is",
-        compute=_derivative(2),
+    *(
+        MaterialOutput(name, "spectra", title, f"{what}; NaN where nothing is", compute=compute)
+        for name, title, what, compute in (
+            (
+                "reflectance",
+                "reflectance",
+                "radiance over the scene's light, 1 = as bright as white, shading included",
+                _reflectance,
+            ),
+            (
+                "continuum",
+                "continuum removed",
+                "reflectance over its continuum, the upper convex hull, at most 1",
+                _continuum_removed,
+            ),
+            ("derivative", "derivative", "derivative of the reflectance by wavelength, 1/nm", _derivative(1)),
+            (
+                "second_derivative",
+                "second derivative",
+                "second derivative of the reflectance by wavelength, 1/nm^2",
+                _derivative(2),
+            ),
+        )
     ),
     MaterialOutput(
         "abundances",
@@ -288,17 +284,16 @@ class _Family:
     SpectrumError where the bands don't cover it."""
 
 
+def _made(name: str, what: str, compute: Callable[[MaterialView], Tensor]) -> MaterialOutput:
+    family = FAMILIES[name.partition(":")[0]]
+    return MaterialOutput(name, family.kind, family.title, what, compute=compute)
+
+
 def _band(name: str, argument: str, materials: Materials) -> MaterialOutput:
     band = materials.bands.nearest(_wavelength_nm(argument, name))
     column = torch.eye(len(materials.bands))[:, band : band + 1]
     what = f"{materials.quantity} of one band on black, 1 = full scale: {argument}"
-    return MaterialOutput(
-        name,
-        "grey",
-        FAMILIES["band"].title,
-        what,
-        compute=lambda view: view.materials.through(view.coefficients, column)[..., 0],
-    )
+    return _made(name, what, lambda view: view.materials.through(view.coefficients, column)[..., 0])
 
 
 def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOutput:
@@ -309,13 +304,7 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
         )
     matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
     what = f"three bands as red, green and blue, {materials.quantity} on black: {argument}"
-    return MaterialOutput(
-        name,
-        "linear",
-        FAMILIES["false-colour"].title,
-        what,
-        compute=lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1),
-    )
+    return _made(name, what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1))
 
 
 def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:

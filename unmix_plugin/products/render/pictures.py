@@ -166,8 +166,8 @@ def _eight_bits(values: np.ndarray) -> np.ndarray:
 
 _WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
 """Inches."""
-_NAMES_A_ROW = 3
-_LONGEST_NAME = 24
+_NAMES_A_ROW, _LONG_NAMES_A_ROW = 3, 2
+_SHORT_NAME, _LONGEST_NAME = 18, 30
 _FONT_PT = 9
 
 
@@ -188,7 +188,9 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
     has_names = output.kind in ("labels", "shares")
     names = palette.entries(output) if has_names else []
     bar = 0.0 if scale is None else _BAR_ROW
-    height = 2 * _MARGIN + bar + -(-len(names) // _NAMES_A_ROW) * _NAME_ROW
+    is_long = max((len(name) for name, _ in names), default=0) > _SHORT_NAME
+    columns = _LONG_NAMES_A_ROW if is_long else _NAMES_A_ROW
+    height = 2 * _MARGIN + bar + -(-len(names) // columns) * _NAME_ROW
     figure = Figure(figsize=(_WIDTH, height), facecolor="white")
     top = height - _MARGIN - bar
     if scale is not None:
@@ -198,8 +200,8 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
         drawn.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
         drawn.ax.set_title(f"{output.name}: {scale.label}", fontsize=_FONT_PT, loc="left", pad=3)
     for index, (name, colour) in enumerate(names):
-        row, column = divmod(index, _NAMES_A_ROW)
-        left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / _NAMES_A_ROW
+        row, column = divmod(index, columns)
+        left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / columns
         bottom = top - (row + 1) * _NAME_ROW
         draw_swatch(figure, colour, (left, bottom + 0.05))
         place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
