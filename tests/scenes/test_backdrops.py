@@ -34,6 +34,9 @@ BACKDROPS: dict[str, Light] = {
     "white": grey(0.95),
     "a gradient": lambda *_: (0.2 + 0.5 * ROWS / HEIGHT)[..., None] * COLOUR,
     "stripes of the sensor": lambda *_: np.broadcast_to(0.1 + STRIPES, (HEIGHT, WIDTH, BANDS)),
+    "a wall that is darker towards the sides": lambda *_: (
+        0.9 * (1 - 0.3 * (2 * COLUMNS / WIDTH - 1.2) ** 2)[..., None] * COLOUR
+    ),
     "a shaded wall and floor": shaded_with_a_seam,
 }
 

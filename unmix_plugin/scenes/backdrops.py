@@ -392,8 +392,21 @@ def _stripes(features: Sequence[Float32[np.ndarray, "h W k"]]) -> Float32[np.nda
 
     width = max(1, round(_BORDER_SHARE * len(features[0])))
     lines = [side.mean(axis=0) for image in features for side in (image[:width], image[-width:])]
-    narrow = [line - ndimage.median_filter(line, (_STRIPE_WINDOW, 1), mode="mirror") for line in lines]
+    # Less what is smooth: mirrored at the ends of a line, a slope would look like stripes there.
+    rests = [line - _smooth_part(line) for line in lines]
+    narrow = [rest - ndimage.median_filter(rest, (_STRIPE_WINDOW, 1), mode="mirror") for rest in rests]
     return np.median(narrow, axis=0).astype(np.float32)
+
+
+def _smooth_part(line: Float32[np.ndarray, "W k"]) -> Float32[np.ndarray, "W k"]:
+    """A cubic through most of a line, whatever the rest is."""
+    terms = np.vander(np.linspace(-1, 1, len(line)), 4).astype(np.float32)
+    smooth = np.broadcast_to(np.median(line, axis=0), line.shape)
+    for _ in range(_TURNS):
+        away = _norm(line - smooth)
+        near = away <= 2 * np.median(away)
+        smooth = terms @ np.linalg.lstsq(terms[near], line[near], rcond=None)[0]
+    return smooth
 
 
 def _fit(
