@@ -601,7 +601,7 @@
   // ---- lengths ------------------------------------------------------------------------------------------------------
   const unitText = (length, power = 1) => {
     const square = power === 2 ? "²" : "";
-    if (metresPerUnit === null) return `${shownNumber(length ** power)} world units${square}`;
+    if (metresPerUnit === null) return `${shownNumber(length ** power)} world ${length === 1 ? "unit" : "units"}${square}`;
     const metres = length * metresPerUnit;
     const [factor, unit] = metres >= 1 ? [1, "m"] : metres >= 0.01 ? [100, "cm"] : [1000, "mm"];
     return `${shownNumber((metres * factor) ** power)} ${unit}${square}`;
