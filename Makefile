@@ -80,9 +80,10 @@ wheel: | $(BIN)/python
 	$(INSTALL) build twine
 	$(BIN)/python scripts/check_wheel.py $(WHEEL_OPTIONS)
 
+# Strict: what could not be looked up has not been audited.
 audit: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check pip-audit
-	$(BIN)/python -m pip_audit --no-deps --disable-pip --requirement constraints.txt
+	$(BIN)/python -m pip_audit --strict --no-deps --disable-pip --requirement constraints.txt
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff format --check .
