@@ -24,6 +24,7 @@ OF_OTHERS = {
     "--constraint",
     "--help-all",
     "--index-url",
+    "--logdir",
     "--pipeline",
     "--pipeline.model.resolution",
     "--rows",
