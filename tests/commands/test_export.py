@@ -214,7 +214,9 @@ def test_help_imports_neither_torch_nor_what_writes_products():
         "        heavy = {'torch', 'warp', 'scipy', 'skimage', 'matplotlib', 'PIL'}\n"
         "        print('end:', stop.code, sorted(heavy & set(sys.modules)))\n"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, errors="replace", check=True
+    )
     assert ended.stdout.count("end: 0 []\n") == 2, ended.stdout
 
 
