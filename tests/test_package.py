@@ -91,7 +91,9 @@ def test_a_wheel_carries_licence_readme_and_dependency_ranges(wheel):
 def lines_printed_by(code):
     """Standard output of a fresh interpreter that runs the code."""
     command = [sys.executable, "-c", code]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    finished = subprocess.run(
+        command, capture_output=True, text=True, errors="replace", check=False, cwd=ROOT
+    )
     assert finished.returncode == 0, finished.stderr
     return finished.stdout.splitlines()
 

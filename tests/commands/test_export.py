@@ -518,7 +518,7 @@ def test_removed_matter_leaves_the_surface(solid, tmp_path):
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["spectrum"], "give a pixel with --view and --pixel, or a point with --point"),
+        (["spectrum"], "give a pixel with --view and --pixel, a point with --point, or a region"),
         (["spectrum", "--view", "1", "--point", "1,2,3"], "give a pixel with --view and --pixel"),
         (["spectrum", "--view", "eval_003", "--pixel", "1,1"], "no view 'eval_003' (did you mean"),
         (["spectrum", "--view", "2", "--pixel", "1,1"], "a number from 0 to 1"),
