@@ -9,6 +9,7 @@ out="${1:-build/site/html}"
 source="$(mktemp -d)"
 trap 'rm -rf "$source"' EXIT
 
+[ ! -e "$out/objects.inv" ] || rm -rf "$out" # an older site, with pages that are gone
 "$python" scripts/stage_site.py "$source"
 "$python" -m sphinx -W --keep-going --quiet --fresh-env --doctree-dir "$source/.doctrees" "$source" "$out"
 touch "$out/.nojekyll" # GitHub Pages leaves out folders such as _static without it

@@ -112,6 +112,7 @@ def _front_page(text: str) -> str:
             ("changelog", "changelog", "what each release brings"),
         ],
     }
+    text = re.sub(r"The \[README\]\(index\.md\) [^.]*\. ", "", text)  # which is this page
     trees = []
     for section in re.split(r"^(?=## )", text, flags=re.MULTILINE)[1:]:
         title = section.splitlines()[0].removeprefix("## ").split(":")[0]
