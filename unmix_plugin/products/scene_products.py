@@ -238,7 +238,7 @@ class Regions(Product):
 @dataclass(frozen=True)
 class Report(Product):
     """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
-    known ones, abundances, segmentation, figures of merit, errors, training, settings. Measured images and labels are
+    known ones, abundances, segmentation, figures of merit, errors, settings. Measured images and labels are
     shown where the scene folder is found."""
 
     name = "report"
