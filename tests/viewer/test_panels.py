@@ -197,7 +197,7 @@ CHANGES = (
     ("colour of gloss", (255, 200, 0), "gloss"),
     ("colour", (120, 110, 100), "retint"),
     ("name", "clay", "name: clay"),
-    ("replace by the known material", True, "library: ColorChecker/"),
+    ("replace by the known material", True, "library: ColorChecker/red"),
     ("swap with the other", True, "swap: [0, 2]"),
     ("light", "FL2", "illuminant: FL2"),
 )
@@ -207,6 +207,8 @@ CHANGES = (
 def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
     with opened(viewer) as page:
         recipe = page.controls[page.control("recipe")]
+        assert page.controls[page.control("known material")]["value"] == "choose one"
+        page.set("known material", "ColorChecker/red")
         for label, value, written in CHANGES:
             page.set(label, value)
             page.wait_until(lambda written=written: written in recipe["value"])
