@@ -23,8 +23,8 @@ from nbclient.exceptions import CellExecutionError
 from PIL import Image
 
 TUTORIALS = Path(__file__).resolve().parents[1] / "docs/tutorials"
-_PROGRESS = re.compile(r"\s*[\u2800-\u28ff\u2501\u2578]")
-"""What a line of a spinner or a progress bar starts with."""
+_PROGRESS = re.compile(r"\s*[\u2800-\u28ff]|.*(\u2501\u2501|-:--:--| left$)|\s*starting$")
+"""What a line of a spinner, a progress bar or a table's rule looks like."""
 _LONGEST_OUTPUT = 24
 """Lines that are kept of what a cell prints."""
 
