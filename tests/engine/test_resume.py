@@ -14,7 +14,7 @@ from tests.engine.stopped_runs import call_after_step, finished, newest, quiet_t
 from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.load_run import load_config, load_model
-from unmix_plugin.engine.runs.run_folder import checkpoint_steps
+from unmix_plugin.engine.runs.run_folder import RunLock, checkpoint_steps
 from unmix_plugin.engine.training.training_control import Interrupted
 from unmix_plugin.errors import RunError
 
@@ -162,6 +162,19 @@ def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
         assert (run / "metrics.jsonl").read_bytes() == before
         other.communicate("")
     assert quiet_trainer(load_config(run)).train().steps == 12
+
+
+def test_a_lock_that_is_let_go_twice_leaves_that_of_another_holder(tmp_path: Path):
+    first, second = RunLock(tmp_path / "lock"), RunLock(tmp_path / "lock")
+    first.release()
+    first.release()
+    del first
+    taking = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock; "
+    taking += "RunLock(Path(sys.argv[1]))"
+    words = [sys.executable, "-c", taking, str(tmp_path / "lock")]
+    assert b"another training writes to" in subprocess.run(words, capture_output=True, check=False).stderr
+    second.release()
+    assert subprocess.run(words, capture_output=True, check=False).returncode == 0
 
 
 def test_a_ctrl_c_before_any_checkpoint_says_there_is_none(short_config: TrainerConfig):

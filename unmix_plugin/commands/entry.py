@@ -139,7 +139,7 @@ def _is_output_closed(error: OSError) -> bool:
     """Whether standard output is a pipe whose reader has gone; what is left in it is then thrown away."""
     try:
         output = sys.stdout.fileno()
-    except OSError:
+    except (OSError, ValueError, AttributeError):  # no file, closed, or none at all
         return False
     is_of_pipe = isinstance(error, BrokenPipeError)
     if hasattr(select, "poll"):

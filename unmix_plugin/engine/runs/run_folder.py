@@ -152,8 +152,10 @@ class RunLock:
             RunError: another process has it, or the file can't be made.
         """
         self._lock = FileLock(path, timeout=0, is_singleton=True, thread_local=False)
+        self._is_held = False
         try:
             self._lock.acquire()
+            self._is_held = True
         except Timeout as error:
             raise RunError(
                 f"another {holder} writes to {path.parent}; stop it first, or wait for its end"
@@ -165,7 +167,9 @@ class RunLock:
                 raise RunError(f"can't write {path}: {error.strerror or error}") from error
 
     def release(self) -> None:
-        """Let others train the run."""
-        self._lock.release()
+        """Let others train the run. The process may hold the lock more than once, so each gives back its own only."""
+        if self._is_held:
+            self._is_held = False
+            self._lock.release()
 
     __del__ = release
