@@ -89,6 +89,23 @@ def test_endmembers_are_the_runs_through_the_sensor(solid, camera, tmp_path):
     np.testing.assert_allclose(seen[:, 1:], expected.matrix.T @ whole[:, 1:], atol=1e-5)
 
 
+def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_path):
+    words = ["--run", solid.run, "--device", "cpu", "--output", tmp_path / "out", "--sensor", camera]
+    ended = run(export, "endmembers", *words)
+    assert "without angles.csv: known spectra are compared in the run's own bands" in " ".join(
+        ended.out.split()
+    )
+    assert (tmp_path / "out" / "endmembers.csv").is_file()
+    assert not (tmp_path / "out" / "angles.csv").exists()
+    refused = run(export, "endmembers", *words, "--overwrite", "--library", "+builtin")
+    assert (refused.status, "leave out --library or --sensor" in refused.err) == (2, True)
+    refused = run(render, *words, "--overwrite", "--outputs", "library:+builtin")
+    assert refused.status == 2
+    assert "library:+builtin compares with spectra known in the run's own bands" in " ".join(
+        refused.err.split()
+    )
+
+
 @pytest.mark.parametrize(
     "words",
     [

@@ -131,6 +131,27 @@ def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what
     np.testing.assert_allclose(ash.reflectance, [0.3, 0.1, NAN, NAN, 0.2])
 
 
+@pytest.mark.parametrize("marker", ["-999", "-9999", "-1.23e34"])
+def test_marks_for_what_is_missing_count_as_they_are_stored(tmp_path, marker):
+    text = f"wavelength,leaf (%)\n400,5\n500,{marker}\n600,30\n"
+    [leaf] = read_library(written(tmp_path, "leaf.csv", text))
+    np.testing.assert_allclose(leaf.reflectance, [0.05, NAN, 0.3])
+    [maple] = read_library(written(tmp_path, "maple.txt", ECOSTRESS.replace("12.5", marker)))
+    np.testing.assert_allclose(maple.reflectance, [0.05, 0.08, NAN, 0.44])
+
+
+def test_in_ten_thousandths_marks_are_gaps_noise_is_0_and_other_negative_values_are_refused(tmp_path):
+    path, _ = written_by_spectral(tmp_path, data_type=2, reflectance_scale_factor=10000)
+    stored = np.array([[-9999, 5000, 7000], [-150, -999, 9000]])
+    path.with_suffix(".sli").write_bytes(stored.astype("<i2").tobytes())
+    oak, fir = read_library(path)
+    np.testing.assert_allclose(oak.reflectance, [0.5, 0.7])
+    np.testing.assert_allclose(fir.reflectance, [0, NAN, 0.9])
+    path.with_suffix(".sli").write_bytes(np.where(stored == -150, -500, stored).astype("<i2").tobytes())
+    with pytest.raises(SpectrumError, match=r"must not be negative; found -0\.05 in 'fir tree' at 400\.5 nm"):
+        read_library(path)
+
+
 ECOSTRESS = """Name: Acer  rubrum
 Type: vegetation
 Class: tree

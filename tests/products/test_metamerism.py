@@ -3,6 +3,7 @@
 import csv
 import io
 from typing import Literal
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from unmix_plugin.products.metamerism import (
     _find_metamers,
     _metamerism_paths,
     _write_metamerism,
+    export_metamerism,
 )
+from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
@@ -94,6 +97,20 @@ def test_bands_that_no_eye_sees_play_no_part():
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
         _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, *BOTH)
+
+
+def test_a_library_of_the_visible_range_serves_a_run_that_goes_far_beyond(tmp_path):
+    """Of which it covers less than half of the bands."""
+    paints = tmp_path / "paints.csv"
+    paints.write_text("wavelength,red,Red\n380,0.1,0.2\n580,0.3,0.2\n780,0.8,0.7\n")
+    wide = Bands.of(np.linspace(400, 2500, 106))
+    materials = Materials(wide, torch.full((1, 106), 0.4), torch.zeros(0, 106), names=("slate",))
+    job = MagicMock(
+        spec=Job, materials=materials, folder=tmp_path / "out", working=MagicMock(), say=MagicMock()
+    )
+    job.scene.light_power = None
+    export_metamerism(job, *BOTH, [paints])
+    assert job.say.call_args.args[0].startswith("0 pairs of 3 materials, seen in D65, A over 20 bands")
 
 
 def test_the_table_names_materials_lights_and_differences(tmp_path):

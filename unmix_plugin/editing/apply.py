@@ -180,6 +180,7 @@ def with_sensor(scene: TrainedScene, sensor: Sensor) -> TrainedScene:
         endmembers=_through(materials.endmembers, seen.matrix),
         specular_spectra=_through(materials.specular_spectra, seen.matrix),
         light=None if materials.light is None else _through(materials.light, seen.matrix),
+        sensor=sensor.name,
     )
     return replace(scene, materials=through, notes=(*scene.notes, seen.description, *seen.notes))
 

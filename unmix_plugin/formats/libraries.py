@@ -36,8 +36,10 @@ BUILT_IN = "+builtin"
 """Stands among a user's files for the spectra that come with the program."""
 
 LIBRARY_SUFFIXES = ("csv", "sli", "hdr", "txt", "asc")
-_HIGHEST_MARKER = -99.0
-"""Numbers from here downwards stand for what was not measured."""
+_MARKERS = (-999.0, -9999.0)
+_HIGHEST_MARKER, _LEAST_REFLECTANCE = -99.0, -0.99
+"""Stored numbers that stand for what was not measured: `_MARKERS`, and what is at most both of these, as it is stored
+and as a reflectance. Noise stored as ten-thousandths reaches the first alone."""
 _NOISE = 0.02
 """Part of its greatest value by which noise may take a spectrum below 0."""
 _LARGEST_UM = 100.0
@@ -89,8 +91,10 @@ def read_library(path: Path) -> list[LibraryMaterial]:
             f"ECOSTRESS and USGS have them; {BUILT_IN} adds the built-in spectra"
         )
     try:
-        names, wavelengths_nm, spectra = reader(path)
-        return _materials(names, wavelengths_nm, spectra, path)
+        names, wavelengths_nm, stored, scale = reader(path)
+        spectra = stored / scale
+        is_marker = (stored <= _HIGHEST_MARKER) & (spectra <= _LEAST_REFLECTANCE) | np.isin(stored, _MARKERS)
+        return _materials(names, wavelengths_nm, np.where(is_marker, np.nan, spectra), path)
     except OSError as error:
         raise SpectrumError(f"{error.filename or path}: can't read: {error.strerror or error}") from error
     except (SpectrumError, ValueError) as error:
@@ -122,8 +126,10 @@ def _named(materials: Sequence[LibraryMaterial]) -> list[LibraryMaterial]:
     return list(taken.values())
 
 
-_Table = tuple[Sequence[str], Float64[np.ndarray, " B"], Float64[np.ndarray, "K B"]]
-"""Names, wavelengths in nm in any order, spectra."""
+_Table = tuple[
+    Sequence[str], Float64[np.ndarray, " B"], Float64[np.ndarray, "K B"], float | Float64[np.ndarray, "K 1"]
+]
+"""Names, wavelengths in nm in any order, spectra as they are stored, and what they are to be divided by."""
 
 
 def _materials(
@@ -134,7 +140,7 @@ def _materials(
     centers, places = np.unique(wavelengths_nm, return_inverse=True)
     bands, found = Bands(centers), []
     for name, row in zip(names, spectra, strict=True):
-        measured = np.isfinite(row) & (row > _HIGHEST_MARKER)
+        measured = np.isfinite(row)
         counts = np.bincount(places[measured], minlength=len(centers))
         if not counts.any():
             raise SpectrumError(f"'{name}' has no value that was measured")
@@ -172,7 +178,7 @@ def _read_csv(path: Path) -> _Table:
     percent = [name != given for name, given in zip(names, header[1:], strict=True)]
     if not all(names) or len(set(names)) < len(names):
         raise SpectrumError(f"each spectrum needs a name of its own; found {names}")
-    return names, values[:, 0] * factor, values[:, 1:].T / np.where(percent, 100.0, 1.0)[:, None]
+    return names, values[:, 0] * factor, values[:, 1:].T, np.where(percent, 100.0, 1.0)[:, None]
 
 
 def _read_envi(path: Path) -> _Table:
@@ -204,7 +210,7 @@ def _read_envi(path: Path) -> _Table:
     scale = _number(header, "reflectance scale factor", "1")
     if not _SMALLEST_SCALE <= scale <= 1.0 / _SMALLEST_SCALE:
         raise ValueError(f"'reflectance scale factor' is {scale:g}; expected a number above 0, such as 10000")
-    return names, _wavelengths(header, num_bands) * factor, values / scale
+    return names, _wavelengths(header, num_bands) * factor, values, scale
 
 
 def _wavelengths(header: Mapping[str, str], num_bands: int) -> np.ndarray:
@@ -237,7 +243,7 @@ def _read_text(path: Path) -> _Table:
     is_usgs = record is not None or any("USGS" in line for line in words[:3])
     if record is not None and len(numbers[0]) == 1:
         values = np.array([row[0] for row in numbers])
-        return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None]
+        return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None], 1.0
     rows = np.array([row[:2] for row in numbers if 2 <= len(row) <= 3])
     if not len(rows):
         raise SpectrumError("no lines with a wavelength and a value")
@@ -254,11 +260,8 @@ def _read_text(path: Path) -> _Table:
         raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
     # The second line from the last before the numbers of splib06 is the title.
     title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
-    return (
-        [" ".join(title.split())],
-        wavelengths * factor,
-        values[None] / (100.0 if "percent" in quantity else 1.0),
-    )
+    scale = 100.0 if "percent" in quantity else 1.0
+    return [" ".join(title.split())], wavelengths * factor, values[None], scale
 
 
 def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:

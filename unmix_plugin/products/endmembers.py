@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
 
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
@@ -24,14 +25,24 @@ _LEGEND_ROWS = 16
 
 
 def export_endmembers(job: Job, library: Sequence[Path], comparison: Comparison) -> list[Path]:
-    """Write table, library and plot, and the angles to all spectra of a library.
+    """Write table, library and plot, and in the run's own bands the angles to all spectra of a library.
 
     Args:
         job: The run and where to write.
         library: Files of known spectra; none: the built-in ones.
         comparison: How spectra are compared.
+    Raises:
+        ConfigError: a library to compare with what another sensor sees.
     """
     materials, angles = job.materials, job.folder / "angles.csv"
+    if materials.sensor is not None:
+        if library:
+            raise ConfigError(
+                "--library is compared with in the run's own bands; leave out --library or --sensor"
+            )
+        job.claim(_endmember_paths(job.folder))
+        job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
+        return _write_endmembers(job.folder, materials)
     known = library_of(library, materials.bands)
     job.claim([*_endmember_paths(job.folder), angles])
     if job.scene.light_power is None:

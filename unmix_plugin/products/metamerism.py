@@ -50,7 +50,7 @@ def export_metamerism(
     """Compare all pairs in all lights; `alike` and `different` are bounds of CIEDE2000."""
     job.claim(_metamerism_paths(job.folder))
     with job.working("comparing colours"):
-        known = library_of(library, job.materials.bands)
+        known = library_of(library, _visible(job.materials.bands))
         found = _find_metamers(
             job.materials, job.scene.light_power, known, surfaces, lights, alike, different
         )
@@ -75,6 +75,13 @@ class _Metamers:
     pairs: list[MetamericPair]
 
 
+def _visible(bands: Bands) -> Bands:
+    """The visible ones."""
+    if not bands.visible_mask.any():
+        raise SpectrumError(f"{bands} hold no visible light, so nothing is known of metamerism")
+    return Bands.of(bands.centers_nm[bands.visible_mask])
+
+
 def _metamerism_paths(folder: Path) -> list[Path]:
     """Files that `_write_metamerism` makes."""
     return [folder / "metamerism.csv", folder / "metamerism.png"]
@@ -90,10 +97,7 @@ def _find_metamers(
     different: float,
 ) -> _Metamers:
     """Look at all pairs of surfaces in all lights."""
-    is_visible = materials.bands.visible_mask
-    if not is_visible.any():
-        raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")
-    bands = Bands.of(materials.bands.centers_nm[is_visible])
+    bands = _visible(materials.bands)
     lights = [parse_light(word) for word in light_names]
     powers = (
         np.stack([illuminant_power(light, bands) for light in lights])

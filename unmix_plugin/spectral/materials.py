@@ -161,6 +161,8 @@ class Materials:
     """Relative power of the light that the spectra are seen in; None where it is unknown."""
     margin_error: Float[Tensor, ""] | None = None
     """Standard error of the margin of the largest abundance over the second; None where it is unknown."""
+    sensor: str | None = None
+    """Name of another camera whose channels the bands are; None: they are the run's own."""
 
     def __post_init__(self) -> None:
         """Give names where there are none.

@@ -308,6 +308,11 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
 
 
 def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
+    if materials.sensor is not None and name.startswith("library:"):
+        raise ConfigError(
+            f"{name} compares with spectra known in the run's own bands and can't be seen through the sensor "
+            f"{materials.sensor}; leave out --sensor"
+        )
     asked = parse_reflectance_map(name, materials.bands)
     caveat = _OF_RADIANCE if materials.light is None else ""
     undefined = "; NaN where undefined" if asked.kind == "map" else ""

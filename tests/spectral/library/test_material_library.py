@@ -114,6 +114,14 @@ def test_a_material_is_found_by_its_full_or_its_short_name_in_any_case():
         library.find("red")
 
 
+def test_of_names_that_differ_in_case_alone_the_exact_one_is_found():
+    flat = [LibraryMaterial(name, VISIBLE, np.ones(31), "") for name in ("Leaf", "leaf", "x/LEAF")]
+    library = MaterialLibrary(tuple(flat))
+    assert [library.find(name).name for name in ("Leaf", "leaf")] == ["Leaf", "leaf"]
+    with pytest.raises(SpectrumError, match="'LEAF' may be any of Leaf, leaf; give the full name"):
+        library.find("LEAF")
+
+
 def test_an_unknown_name_is_answered_with_the_nearest():
     with pytest.raises(SpectrumError, match="the library has no 'carot'; nearest: memory colours/carrot"):
         measured_library().find("carot")

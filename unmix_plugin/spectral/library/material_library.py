@@ -123,12 +123,14 @@ class MaterialLibrary:
         return tuple(material.name for material in self.materials)
 
     def find(self, name: str) -> LibraryMaterial:
-        """The material of a name: in full (`ColorChecker/blue`), or its last part where only one has it;
-        in any case.
+        """The material of exactly this name; or else in any case, in full (`ColorChecker/blue`), or its last part
+        where only one has it.
 
         Raises:
             SpectrumError: no material or several of that name; the message has the nearest names.
         """
+        if name in self.names:
+            return self.materials[self.names.index(name)]
         wanted = name.strip().casefold()
         for key in (str.casefold, _last_part):
             found = [material for material in self.materials if key(material.name) == wanted]
