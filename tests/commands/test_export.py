@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -438,7 +439,7 @@ def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):
     assert (ended.status, "report.json is damaged" in ended.err) == (2, True)
 
 
-def test_a_report_quotes_the_figures_that_eval_found(solid_copy):
+def test_a_report_quotes_the_figures_that_eval_found(solid_copy, tmp_path, monkeypatch):
     (solid_copy / "eval").mkdir()
     (solid_copy / "eval" / "metrics.json").write_text(
         json.dumps({"psnr": 12.34, "miou": None, "definitions": {}})
@@ -448,11 +449,18 @@ def test_a_report_quotes_the_figures_that_eval_found(solid_copy):
     assert "in 3-D" not in page
     (solid_copy / "exports" / "page").mkdir()
     (solid_copy / "exports" / "page" / "page.html").touch()
-    assert run(export, *words("report", "--run", solid_copy, "--overwrite")).status == 0
-    page = (solid_copy / "exports" / "report" / "report.html").read_text()
-    assert '<a href="../page/page.html">in 3-D</a>' in page
+    moved, out = solid_copy.rename(tmp_path / "50 % #1"), ["--output", tmp_path / "out", "--overwrite"]
+    assert run(export, *words("report", "--run", moved, *out)).status == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert '<a href="../50%20%25%20%231/exports/page/page.html">in 3-D</a>' in page
     assert "eval/metrics.json" in page
     assert "12.34" in page
+    # On Windows, there is no relative path to another drive.
+    monkeypatch.setattr(
+        "os.path.relpath", Mock(side_effect=ValueError("path is on mount 'C:', start on 'D:'"))
+    )
+    assert run(export, *words("report", "--run", moved, *out)).status == 0
+    assert "in 3-D" not in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("mesh", "point-cloud")])

@@ -68,6 +68,25 @@ def test_runs_that_share_part_of_bands_and_views_are_compared_on_that_part_and_s
     assert "of what they share alone, 1 view and 2 bands" in found.remarks[-1]
 
 
+def test_views_without_a_shared_band_or_a_valid_pixel_are_left_out_and_said(tmp_path):
+    whole, blank = view([0.01, 0.01, 0.01]), BandErrors(NM, np.full(3, np.nan), np.full(3, np.nan), 0)
+    infrared = view([1.0, 1.0, 1.0], NM + 500)
+    first = compared(tmp_path, "a", 30.0, {"v0": whole, "v1": whole, "v2": blank})
+    again = compared(tmp_path, "b", 31.0, {"v0": whole, "v1": whole, "v2": blank})
+    found = compare_runs([first, again], tmp_path / "out")
+    assert (found.rows, found.remarks) == (
+        [("psnr", [30.0, 31.0])],
+        ["left out: 1 view without a valid pixel"],
+    )
+    other = compared(tmp_path, "c", 31.0, {"v0": whole, "v1": infrared, "v2": whole})
+    found = compare_runs([first, other], tmp_path / "out")
+    assert dict(found.rows) == {"psnr": pytest.approx([20.0, 20.0]), "rmse": pytest.approx([0.1, 0.1])}
+    assert "left out: 1 view without a shared band" in found.remarks
+    assert found.remarks[-1].endswith("1 view and 3 bands")
+    with pytest.raises(ConfigError, match="b: no evaluation view has a valid pixel"):
+        compare_runs([first, compared(tmp_path, "b", 31.0, {"v0": blank})], tmp_path / "out")
+
+
 def test_runs_that_share_nothing_are_refused(tmp_path):
     first = compared(tmp_path, "a", 30.0, {"v0": view([0.01, 0.01, 0.01])})
     brighter = compared(tmp_path, "b", 30.0, {"v0": view([0.01, 0.01, 0.01], mean=(0.2, 0.4, 0.6))})

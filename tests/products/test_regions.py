@@ -1,6 +1,7 @@
 """Regions of a surface that is known exactly: their size, what is in them, what is kept of them and what is refused."""
 
 import json
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -61,33 +62,53 @@ def test_a_material_is_where_it_prevails(surface):
 
 
 def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
-    seen = surface.measure(InView(CAMERA, np.ones((40, 40), bool)), "seen")
+    seen = surface.measure(InView.of_mask(CAMERA, np.ones((40, 40), bool)), "seen")
     # A camera at a distance of 3 sees the cap above radius / 3; the last pixel before the outline is much of its area.
     assert seen.area == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - RADIUS / 3), rel=0.12)
     middle = [(16.0, 16.0), (24.0, 16.0), (24.0, 24.0), (16.0, 24.0)]
-    patch = surface.measure(InView(CAMERA, polygon_mask(middle, (40, 40))), "patch")
+    patch = surface.measure(InView.of_mask(CAMERA, polygon_mask(middle, (40, 40))), "patch")
     pixel = (3 - RADIUS) / float(CAMERA.focal_px[0, 0]) / FRAME.scale
     assert patch.area == pytest.approx((8 * pixel) ** 2, rel=0.05)
     with pytest.raises(ConfigError, match="has nothing of the surface"):
         surface.measure(
-            InView(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40))), "corner"
+            InView.of_mask(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40))), "corner"
         )
 
 
 def test_regions_come_back_as_they_were_kept(tmp_path):
     run, mask = RunFolder(tmp_path), np.random.default_rng(0).random((40, 40)) > 0.5
-    kept = {"a b": Box((0.0, 1.0, 2.0), (1.0, 2.0, 3.0)), "m": OfMaterial(2), "v": InView(CAMERA, mask)}
+    kept = {
+        "a b": Box((0.0, 1.0, 2.0), (1.0, 2.0, 3.0)),
+        "m": OfMaterial(2),
+        "v": InView.of_mask(CAMERA, mask),
+    }
     for name, region in kept.items():
         keep_region(run, name, region)
     found = read_measures(run).regions
     assert (found["a b"], found["m"], list(found)) == (kept["a b"], kept["m"], list(kept))
     view = found["v"]
     assert isinstance(view, InView)
-    np.testing.assert_array_equal(view.mask, mask)
+    np.testing.assert_array_equal(view.mask(), mask)
     keep_region(run, "m", None)
     assert list(read_measures(run).regions) == ["a b", "v"]
     with pytest.raises(ConfigError, match="no region 'm'"):
         keep_region(run, "m", None)
+
+
+def test_many_regions_of_large_views_take_little_memory_until_they_are_measured(tmp_path):
+    large = {"kind": "view", "camera": CAMERA.resized(8192, 8192).to_json(), "runs": [8192**2]}
+    regions = {str(number): large for number in range(8)}
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "regions": regions}))
+    tracemalloc.start()
+    read_measures(RunFolder(tmp_path))
+    kept = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert kept < 1e7
+
+
+def test_names_of_areas_of_materials_are_refused():
+    with pytest.raises(ConfigError, match="'material leaf' can't be the name of a region: exports"):
+        check_name("material leaf")
 
 
 @pytest.mark.parametrize("name", ["", " ", "../x", "a/b", ".x", "a\nb", "x" * 65])

@@ -9,7 +9,7 @@ Notation: `V` evaluation views, `S` bands that a view has in all runs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,12 +69,14 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
         ConfigError: methods that measure differently, or nothing that the runs share.
         RunError: the disk is full or refuses.
     """
-    first, labels = runs[0], _labels([run.path for run in runs])
-    names, remarks = _shared_views(runs)
+    labels, remarks = _labels([run.path for run in runs]), []
+    blank = {name for run in runs for name, errors in run.bands.items() if not errors.num_pixels}
+    if blank:
+        remarks.append(f"left out: {counted(len(blank), 'view')} without a valid pixel")
+        runs = [_without_blank(run) for run in runs]
+    first, names = runs[0], _shared_views(runs, remarks)
     bands = {name: _shared_bands([run.bands[name] for run in runs]) for name in names if first.bands}
     num_bands = [len(nm) for nm, _ in bands.values()]
-    if num_bands and not max(num_bands):
-        raise ConfigError("the runs share no band: all their wavelengths differ")
     squared = {
         name: np.stack([run.bands[name].mse[rows] for run, rows in zip(runs, at, strict=True)], axis=1)
         for name, (_, at) in bands.items()
@@ -164,13 +166,21 @@ def _labels(paths: Sequence[Path]) -> list[str]:
     return [str(path) for path in paths]
 
 
-def _shared_views(runs: Sequence[ComparedRun]) -> tuple[list[str], list[str]]:
-    """Names of the views that show the same in all runs, and what is said of the others.
+def _without_blank(run: ComparedRun) -> ComparedRun:
+    """The run without views of no valid pixel, which have no errors and no part in its figures."""
+    bands = {name: errors for name, errors in run.bands.items() if errors.num_pixels}
+    if not bands:
+        raise ConfigError(f"{run.path}: no evaluation view has a valid pixel")
+    return replace(run, views={name: run.views[name] for name in bands}, bands=bands)
+
+
+def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
+    """Names of the views that show the same in all runs; what is said of the others goes to the remarks.
 
     Raises:
-        ConfigError: methods that measure differently, or no such view.
+        ConfigError: methods that measure differently, no shared band, or no such view.
     """
-    first, remarks = runs[0], []
+    first = runs[0]
     for other in runs[1:]:
         if bool(other.bands) != bool(first.bands):
             raise ConfigError(
@@ -182,6 +192,12 @@ def _shared_views(runs: Sequence[ComparedRun]) -> tuple[list[str], list[str]]:
     if others:
         remarks.append(f"left out: {counted(others, 'view')} that not all runs have")
     if first.bands:
+        banded = [name for name in names if len(_shared_bands([run.bands[name] for run in runs])[0])]
+        if names and not banded:
+            raise ConfigError("the runs share no band: all their wavelengths differ")
+        if len(banded) < len(names):
+            remarks.append(f"left out: {counted(len(names) - len(banded), 'view')} without a shared band")
+        names = banded
         same = [name for name in names if _is_same([run.bands[name] for run in runs])]
     else:
         alike = [
@@ -198,7 +214,7 @@ def _shared_views(runs: Sequence[ComparedRun]) -> tuple[list[str], list[str]]:
             f"{' and '.join(str(run.path) for run in runs)} are runs of different scenes: no evaluation view shows the "
             "same in all of them"
         )
-    return same, remarks
+    return same
 
 
 def _shared_bands(views: Sequence[BandErrors]) -> tuple[Float[np.ndarray, " S"], list[Int[np.ndarray, " S"]]]:

@@ -132,10 +132,11 @@ def points_in(
         return np.all((world >= region.low) & (world <= region.high), axis=1, keepdims=False)
     camera = region.camera.to("cpu")
     coords, depths = camera.project(positions, 0)
-    height, width = region.mask.shape
+    mask = region.mask()
+    height, width = mask.shape
     inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < torch.tensor([width, height])).all(dim=-1)
     columns, rows = coords[inside].long().numpy().T
-    inside[inside.clone()] = torch.from_numpy(region.mask[rows, columns])
+    inside[inside.clone()] = torch.from_numpy(mask[rows, columns])
     if bool(inside.any()):
         seen = SeenSurface(scene, width * height, [camera])
         seen.look(camera)
@@ -243,9 +244,9 @@ def _requested(job: Job, asked: RegionRequest) -> Region:
     view = find_view(job.views("eval"), asked.view, job.views("train"))
     size = view.camera.size(0)
     if asked.polygon is not None:
-        return InView(view.camera, polygon_mask(_corners(asked.polygon), size))
+        return InView.of_mask(view.camera, polygon_mask(_corners(asked.polygon), size))
     assert asked.mask is not None
-    return InView(view.camera, _read_mask(asked.mask, size))
+    return InView.of_mask(view.camera, _read_mask(asked.mask, size))
 
 
 def _corners(text: str) -> list[tuple[float, float]]:

@@ -50,7 +50,21 @@ class InView:
 
     camera: Cameras
     """One camera, model space."""
-    mask: Bool[np.ndarray, "H W"]
+    runs: Sequence[int]
+    """Of pixels outside and inside in turn, row after row, the first outside; in all as many as the view has."""
+
+    @classmethod
+    def of_mask(cls, camera: Cameras, mask: Bool[np.ndarray, "H W"]) -> InView:
+        """Where a mask of the camera's size is true."""
+        flat = mask.reshape(-1)
+        ends = np.flatnonzero(np.diff(flat)) + 1
+        lengths = np.diff(np.concatenate([[0], ends, [flat.size]]))
+        return cls(camera, [*([0] if flat[0] else []), *lengths.tolist()])
+
+    def mask(self) -> Bool[np.ndarray, "H W"]:
+        """Which pixels; made anew at each call, as many regions of large views would not fit into memory."""
+        inside = np.arange(len(self.runs)) % 2 == 1
+        return np.repeat(inside, self.runs).reshape(self.camera.height, self.camera.width)
 
 
 Region: TypeAlias = Box | OfMaterial | InView
@@ -72,6 +86,11 @@ def check_name(name: str) -> str:
         raise ConfigError(
             f"{name[:80]!r} can't be the name of a region; expected 1 to {_LONGEST_NAME} letters, digits, "
             "spaces, - or _"
+        )
+    if name.startswith("material "):
+        raise ConfigError(
+            f"{name!r} can't be the name of a region: exports name areas of materials so; choose one that does not "
+            "begin with 'material '"
         )
     return name
 
@@ -102,12 +121,7 @@ def region_to_json(region: Region) -> dict[str, Any]:
         return {"kind": "box", "low": list(region.low), "high": list(region.high)}
     if isinstance(region, OfMaterial):
         return {"kind": "material", "material": region.material}
-    flat = region.mask.reshape(-1)
-    ends = np.flatnonzero(np.diff(flat)) + 1
-    lengths = np.diff(np.concatenate([[0], ends, [flat.size]]))
-    # Runs of pixels outside and inside in turn, row after row, the first outside.
-    runs = [*([0] if flat[0] else []), *lengths.tolist()]
-    return {"kind": "view", "camera": region.camera.to_json(), "runs": runs}
+    return {"kind": "view", "camera": region.camera.to_json(), "runs": list(region.runs)}
 
 
 def region_from_json(values: Any) -> Region:
@@ -134,5 +148,4 @@ def region_from_json(values: Any) -> Region:
         raise ValueError("a view without one camera and runs of pixels")
     if sum(runs) != pixels:
         raise ValueError(f"runs of {sum(runs)} pixels in a view of {pixels}")
-    mask = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
-    return InView(camera, mask.reshape(camera.height, camera.width))
+    return InView(camera, runs)

@@ -10,10 +10,12 @@ from spectral.io.bipfile import BipFile
 
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render import files
 from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey
 from unmix_plugin.products.render.maps import map_camera
+from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale
 
@@ -70,6 +72,19 @@ def test_an_envi_header_says_the_same(folder):
         tie = file.pages.first.tags[33922].value
         np.testing.assert_array_equal(np.moveaxis(file.asarray(), 0, -1), image.open_memmap())
     assert (float(left), float(top)) == tie[3:5]
+
+
+def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
+    setting = files.RenderSetting(tmp_path, (4, 3), Palette.of(None, {}), None, {}, None)
+    [depth] = choose_formats(["depth"], ["tif"], SCENE, False)
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    for limit, is_big in ((48, False), (47, True)):
+        monkeypatch.setattr(files, "_LARGEST_TIFF", limit)
+        with files.still(depth, "v", setting) as sink:
+            sink(files.Rows(0, {"depth": values}))
+        with tifffile.TiffFile(tmp_path / "depth" / "v.tif") as file:
+            assert file.is_bigtiff == is_big
+            np.testing.assert_array_equal(file.asarray(), values)
 
 
 def test_without_a_scale_units_are_those_of_the_world():

@@ -46,6 +46,8 @@ _EVERY_OUTPUT = "all"
 """Stands for every output that takes no argument."""
 
 _LONGEST_FILE_NAME = 100
+_LARGEST_TIFF = 1 << 31
+"""Bytes; of more numbers BigTIFF is written, as addresses in a TIFF end at 4 GiB."""
 _DEFAULT_STILLS = ("spectral", "rgb", "abundances", "segmentation", "depth")
 
 
@@ -354,7 +356,7 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
 
     yield add
     buffer, info = io.BytesIO(), setting.map_info
-    with require_tifffile().TiffWriter(buffer) as writer:
+    with require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
             planes,
             photometric="minisblack",

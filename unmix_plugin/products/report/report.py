@@ -14,6 +14,7 @@ from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -188,9 +189,12 @@ def _view_values(views: ReportViews) -> dict[str, Any]:
 
 
 def _page_link(folder: Path, loaded: LoadedRun) -> str | None:
-    """The exported 3-D page from the report's folder, where there is one."""
+    """The exported 3-D page from the report's folder as a URL, where there is one on the same drive."""
     page = loaded.folder.exports / "page" / "page.html"
-    return Path(os.path.relpath(page, folder)).as_posix() if page.is_file() else None
+    try:
+        return quote(Path(os.path.relpath(page, folder)).as_posix()) if page.is_file() else None
+    except ValueError:  # Windows has no way from one drive to another
+        return None
 
 
 def _true_materials(loaded: LoadedRun, light: np.ndarray | None) -> TrueMaterials | None:
