@@ -2,6 +2,7 @@
 
 import html
 import math
+import re
 import threading
 
 import numpy as np
@@ -12,17 +13,18 @@ from PIL import Image
 from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import make_model
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
-from tests.viewer.view_factory import BOX, ring, source_of_model
+from tests.viewer.view_factory import BOX, make_source, ring, source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare
+from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.camera_files import read_camera_file
+from unmix_plugin.trained.measures import read_measures
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.rendering.painting import BACKGROUNDS
@@ -156,6 +158,45 @@ def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(vie
         ]
         page.set("forget all", True)
         page.wait_until(lambda: page.controls[page.control("probe")]["options"] == ["none yet"])
+
+
+def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
+    run = viewer.services.source.run
+    with opened(viewer) as page:
+        probing = page.controls[page.control("probe where I click")]
+        page.set("set scale", True)
+        page.wait_until(lambda: any("click two points of the object first" in text for _, text in page.notices))
+        page.set("measure where I click", True)
+        page.wait_until(lambda: probing["value"] is False)
+        page.click(0.5, 0.5)
+        page.wait_until(lambda: "Click a second point" in page.texts)
+        page.click(0.4, 0.5)
+        page.wait_until(lambda: " units</td>" in page.texts)
+        assert page.controls[page.control("probe")]["options"] == ["none yet"]
+        units = float(re.findall(r"([0-9.]+) units</td>", page.texts)[-1])
+        page.set("set scale", True)
+        page.wait_until(lambda: any("the distance is 0 m" in text for _, text in page.notices))
+        assert not (run.path / "measures.json").exists()
+        page.set("distance (m)", 0.05)
+        in_the_way = run.path / ".measures.json.tmp"
+        in_the_way.mkdir()
+        page.set("set scale", True)
+        page.wait_until(lambda: any("can't write" in text for _, text in page.notices))
+        in_the_way.rmdir()
+        page.set("set scale", True)
+        page.wait_until(lambda: "5 cm</td>" in page.texts and "1 unit is" in page.texts)
+        scale = read_measures(run).scale
+        assert scale is not None
+        assert scale.metres_per_unit == pytest.approx(0.05 / units, rel=1e-3)
+        page.set("probe where I click", True)
+        page.wait_until(lambda: page.controls[page.control("measure where I click")]["value"] is False)
+    (run.path / "measures.json").unlink()
+
+
+def test_no_scale_is_set_before_training_has_ended(tmp_path):
+    with serving(make_source(tmp_path, TrainingControl())) as (viewer, _), opened(viewer) as page:
+        page.set("set scale", True)
+        page.wait_until(lambda: any("when training has ended" in text for _, text in page.notices))
 
 
 def test_depth_comes_with_objects_and_goes_with_them(viewer):
@@ -424,6 +465,10 @@ def test_all_that_another_method_names_is_shown_by_its_kind_as_its_scene_renders
         torch.testing.assert_close(view.frame["direction"], scene.look(view.frame.camera)["direction"])
         page.click(0.5, 0.5)
         page.wait_until(lambda: "direction" in page.texts and "rgb" in page.texts)
+        page.set("measure where I click", True)
+        page.wait_until(lambda: page.controls[page.control("probe where I click")]["value"] is False)
+        page.click(0.5, 0.5)
+        page.wait_until(lambda: "Click a second point" in page.texts or bool(page.notices))
         page.set("width", 32)
         page.set("height", 24)
         page.set("save a screenshot (PNG)", True)

@@ -10,6 +10,7 @@ import torch
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.viewer.panels.probe import _abundances_csv, _probe_through, _spectra_csv
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
@@ -82,8 +83,10 @@ def test_the_files_of_probes_hold_every_number(taken):
     np.testing.assert_allclose(values[:, 0], taken.materials.bands.centers_nm)
     np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken, measured]).decode())))
-    assert rows[0][:6] == ["probe", "x", "y", "z", "material", "measured_in"]
-    assert rows[0][6:] == list(taken.materials.names)
-    assert rows[2][5] == "train_003"
-    np.testing.assert_allclose([float(value) for value in rows[1][6:]], taken.abundances, atol=1e-5)
+    assert rows[0][:7] == ["probe", "x", "y", "z", "metres_per_unit", "material", "measured_in"]
+    assert rows[0][7:] == list(taken.materials.names)
+    assert [rows[2][4], rows[2][6]] == ["", "train_003"]
+    np.testing.assert_allclose([float(value) for value in rows[1][7:]], taken.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
+    rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
+    assert rows[1][4] == "0.25"

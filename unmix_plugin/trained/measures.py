@@ -229,7 +229,7 @@ def require_on_surface(scene: RenderableScene, point: Sequence[float]) -> None:
         "no view shows anything there" if math.isinf(nearest) else f"the nearest is {nearest:.0f} pixels off"
     )
     raise ConfigError(
-        f"the point {_text(world)} is not on the object: {seen}; give a point as probes give it"
+        f"the point {_text(world)} is not on the object: {seen}; choose a point that views show"
     )
 
 

@@ -287,6 +287,8 @@ class Session:
         """Called when materials or light have changed."""
         self.on_close: list[Callable[[], None]] = []
         """Called when the client has gone."""
+        self.click_switches: list[viser.GuiCheckboxHandle] = []
+        """Of the panels that take clicks; at most one of them is on."""
         self.value_range_shown: tuple[float, float] | None = None
         """Ends of the colour map of the picture shown; None where it has none."""
         self._legend: viser.GuiHtmlHandle | None = None

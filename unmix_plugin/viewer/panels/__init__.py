@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from unmix_plugin.viewer.panels.capture import CapturePanel
 from unmix_plugin.viewer.panels.materials import MaterialsPanel
+from unmix_plugin.viewer.panels.measure import MeasurePanel
 from unmix_plugin.viewer.panels.probe import ProbePanel, ValuesPanel
 from unmix_plugin.viewer.panels.training import TrainingPanel
 from unmix_plugin.viewer.panels.view import LayerPanel, LightPanel, ScenePanel
@@ -19,6 +20,7 @@ def panels_of(services: Services) -> list[tuple[str, Callable[[Session], object]
         ("light", LightPanel, bool(services.lights)),
         ("scene", ScenePanel, True),
         ("probe", ProbePanel if services.has_materials else ValuesPanel, True),
+        ("measure", MeasurePanel, True),
         ("materials", MaterialsPanel, services.has_materials),
         ("capture", CapturePanel, True),
         ("training", TrainingPanel, services.source.control is not None),

@@ -16,7 +16,9 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import csv_bytes, write_file
+from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
@@ -107,13 +109,16 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
     return csv_bytes([header, *([f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1))])
 
 
-def _abundances_csv(probes: Sequence[_ProbedPoint]) -> bytes:
-    """One row a probe: number, position in the world, material, the training view measured in, abundances."""
-    header = ["probe", "x", "y", "z", "material", "measured_in", *probes[0].materials.names]
+def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
+    """One row a probe: number, position in the world, metres in a unit of it (empty where unknown), material, the
+    training view measured in, abundances."""
+    metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
+    header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", *probes[0].materials.names]
     rows = [
         [
             str(one.number),
             *(f"{value:.9g}" for value in one.world),
+            metres,
             one.name,
             one.measured_in,
             *(f"{value:.6g}" for value in one.abundances),
@@ -152,7 +157,7 @@ class ProbePanel:
         self._markers: dict[int, viser.IcosphereHandle] = {}
         self._taken = 0
         gui = session.client.gui
-        self._is_on = gui.add_checkbox("probe where I click", True)
+        add_click_switch(session, "probe where I click", self._take)
         self._chosen = gui.add_dropdown("probe", _NO_PROBES)
         self._chosen.on_update(session.guarded(self._show_chosen))
         self._text = gui.add_html(paragraph(_INVITATION))
@@ -161,11 +166,8 @@ class ProbePanel:
         self._comparison = Chart(gui, "all probes")
         session.add_button("save as CSV", self._save)
         session.add_button("forget all", self._forget, is_minor=True)
-        _on_click(session, self._take)
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        if self._is_on.value is not True:
-            return
         session, services = self._session, self._session.services
         taken = _take_probe(services.maker, session.view.edit, camera, place, self._taken + 1)
         self._taken += 1
@@ -215,7 +217,7 @@ class ProbePanel:
         folder = self._session.services.folder
         for name, content in (
             ("probes", _spectra_csv(self._probes)),
-            ("probe-abundances", _abundances_csv(self._probes)),
+            ("probe-abundances", _abundances_csv(self._probes, self._session.services.source.scale)),
         ):
             path = write_file(new_file(folder, name, ".csv", name), content)
             self._session.client.send_file_download(path.name, content)
@@ -235,14 +237,26 @@ class ProbePanel:
         self._markers.pop(one.number).remove()
 
 
-def _on_click(session: Session, work: Callable[[Cameras, tuple[float, float]], None]) -> None:
-    """Do something at each click, with the camera of the canvas and the column and row that were clicked."""
+def add_click_switch(
+    session: Session, label: str, work: Callable[[Cameras, tuple[float, float]], None], is_on: bool = True
+) -> None:
+    """A box that, while ticked, has something done at each click, with the camera of the canvas and the column and row
+    that were clicked; ticking it unticks those of other panels."""
+    switch = session.client.gui.add_checkbox(label, is_on)
+    session.click_switches.append(switch)
+
+    def untick_others() -> None:
+        for other in session.click_switches if switch.value is True else ():
+            other.value = other is switch
 
     def clicked(*place: Any) -> None:
+        if switch.value is not True:
+            return
         camera = camera_of(session.pose(), _PROBED_ROWS)
         x, y = (number(value, 0.0, 1.0, fallback=0.5) for value in place)
         work(camera, (min(x * camera.width, camera.width - 1), min(y * camera.height, camera.height - 1)))
 
+    switch.on_update(session.guarded(untick_others))
     session.client.scene.on_click()(lambda event: session.guarded(lambda: clicked(*event.screen_pos))())
 
 
@@ -262,8 +276,8 @@ class ValuesPanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
+        add_click_switch(session, "probe where I click", self._take)
         self._text = session.client.gui.add_html(paragraph(_INVITATION))
-        _on_click(session, self._take)
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         column, row = place

@@ -314,14 +314,19 @@ class PictureMaker:
     @contextmanager
     def edit_turn(self, edit: Edit) -> Iterator[tuple[TrainedScene, TrainedScene]]:
         """Context with the scene before and after an edit, and the device; an UnmixError if the edit does not fit."""
+        with self.shown_turn(edit) as (scene, shown):
+            yield require_materials(scene, "of this run"), require_materials(shown, "of this run")
+
+    @contextmanager
+    def shown_turn(self, edit: Edit) -> Iterator[tuple[RenderableScene, RenderableScene]]:
+        """The same for the scene of any method."""
         self._ask(1)
         with ExitStack() as stack:
             try:
-                scene = stack.enter_context(self.source.borrowed_materials())
+                scene = stack.enter_context(self.source.borrowed())
             finally:
                 self._ask(-1)
-            shown = edit.apply(scene, self.source.version, self.aids.see)
-            yield scene, require_materials(shown, "of this run")
+            yield scene, edit.apply(scene, self.source.version, self.aids.see)
 
     def _ask(self, change: int) -> None:
         """Note that a page waits for the device, or no longer: otherwise the render loop would take turn after turn."""

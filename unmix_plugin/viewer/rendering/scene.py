@@ -25,6 +25,7 @@ from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
+from unmix_plugin.trained.measures import Scale, read_measures, recorded_scale
 from unmix_plugin.trained.model_scene import LightChoice, relit
 from unmix_plugin.trained.open_run import LoadedRun, require_materials, snapshot
 from unmix_plugin.trained.outputs import MaterialView
@@ -76,6 +77,15 @@ class SceneSource:
         """
         with self.borrowed() as scene:
             yield require_materials(scene, "of this run")
+
+    @property
+    def scale(self) -> Scale | None:
+        """How long a unit of the world is, as kept with the run by now or as its scene says; None where unknown.
+
+        Raises:
+            RunError: what is kept is damaged.
+        """
+        return read_measures(self.run).scale or recorded_scale(self.record.summary)
 
     @property
     def version(self) -> int:
