@@ -165,7 +165,9 @@ def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
     with opened(viewer) as page:
         probing = page.controls[page.control("probe where I click")]
         page.set("set scale", True)
-        page.wait_until(lambda: any("click two points of the object first" in text for _, text in page.notices))
+        page.wait_until(
+            lambda: any("click two points of the object first" in text for _, text in page.notices)
+        )
         page.set("measure where I click", True)
         page.wait_until(lambda: probing["value"] is False)
         page.click(0.5, 0.5)

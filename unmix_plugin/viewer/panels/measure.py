@@ -70,7 +70,9 @@ class MeasurePanel:
         session.show_objects("measure", bool(self._places))
         if len(self._points) < 2:
             self._text.content = paragraph(
-                "Click a second point." if self._points else "Switch it on, and click two points of the object."
+                "Click a second point."
+                if self._points
+                else "Switch it on, and click two points of the object."
             )
             return
         units = float(np.linalg.norm(self._points[1] - self._points[0]))
