@@ -29,7 +29,7 @@ class MeasurePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._places: list[tuple[float, ...]] = []
+        self._places: list[Float64[np.ndarray, "3"]] = []
         """Where markers are: model space."""
         self._points: list[Float64[np.ndarray, "3"]] = []
         """The same in the world."""
@@ -51,7 +51,7 @@ class MeasurePanel:
             raise ConfigError("nothing is there to measure: less than half of the light ends on something")
         if len(self._points) == 2:
             self._places, self._points = [], []
-        self._places.append(tuple(found.position.tolist()))
+        self._places.append(found.position)
         self._points.append(found.world_position)
         self._show()
 
@@ -72,7 +72,7 @@ class MeasurePanel:
             self._text.content = paragraph(
                 "Click a second point."
                 if self._points
-                else "Switch it on, and click two points of the object."
+                else "Tick the box, and click two points of the object."
             )
             return
         units = float(np.linalg.norm(self._points[1] - self._points[0]))
@@ -81,7 +81,7 @@ class MeasurePanel:
         if scale is not None:
             rows.append(("in the scene", describe_length(units, None)))
         self._text.content = table(rows)
-        ends = np.array([self._places])
+        ends = np.stack(self._places)[None]
         scene.add_line_segments(f"{_NODE}/line", ends, _COLOUR, thickness=3.0, thickness_units="screen")
         scene.add_label(f"{_NODE}/length", length, position=ends[0].mean(axis=0), anchor="bottom-center")
 
