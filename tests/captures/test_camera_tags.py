@@ -65,6 +65,17 @@ def test_a_band_has_its_centre_and_width(tags, centre, width):
     assert next(iter(tags)).rpartition(":")[2] in table.evidence
 
 
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "0"},
+        {"drone-dji:BandFreq": "730(+/-0) nm"},
+    ],
+)
+def test_a_width_of_0_is_unknown(tags):
+    assert present(band_of(tags)).fwhm_nm is None
+
+
 @pytest.mark.parametrize("centre", ["0.717", "none", ""])
 def test_no_wavelength_is_made_up(centre):
     assert band_of({"Camera:CentralWavelength": centre, "Camera:BandName": "Red edge"}) is None

@@ -163,7 +163,7 @@ def tag_text(tags: XmpTags, *names: str) -> str | None:
 def band_of(tags: XmpTags) -> BandTable | None:
     """Centre and width of the bands of a multispectral camera's file; None where no tag tells them.
 
-    DJI writes `560(+/-16)nm`: half a width, which is doubled here.
+    DJI writes `560(+/-16)nm`: half a width, which is doubled here. Widths of 0 stand for unknown ones.
     """
     for name in ("Camera:CentralWavelength", "BandFreq"):
         value = tag_value(tags, name) or []
@@ -176,7 +176,7 @@ def band_of(tags: XmpTags) -> BandTable | None:
         widths = tag_numbers(tags, "Camera:WavelengthFWHM") or []
         if all(halves):
             widths = [2.0 * float(half[1]) for half in halves if half]
-        fwhm_nm = np.array(widths) if len(widths) == len(centres) else None
+        fwhm_nm = np.array(widths) if len(widths) == len(centres) and min(widths) > 0 else None
         return BandTable(np.array(centres, dtype=np.float64), f"XMP tag {name}, nm", fwhm_nm)
     return None
 

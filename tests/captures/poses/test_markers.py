@@ -165,6 +165,29 @@ def test_wrong_sightings_are_left_out_and_views_without_markers_named():
     assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
 
 
+def test_views_of_a_sensor_without_markers_are_named():
+    sightings = seen(cameras(), board())
+    sensor_of = dict.fromkeys(sightings, "rgb") | {"nir_0": "nir", "nir_1": "nir"}
+    sightings |= {"nir_0": {}, "nir_1": {}}
+    found = solved(sightings, sensor_of=sensor_of, lenses={"rgb": LENS})
+    assert "poses of 8 of 10 views" in found.notes[0]
+    assert "views without enough markers: nir_0, nir_1" in found.notes
+    assert not any("focal length" in note for note in found.notes)
+
+
+def test_sightings_where_a_lens_folds_its_picture_over_are_left_out():
+    lens = replace(LENS, distortion=(-0.5, 0.0, 0.0, 0.0))
+    truth, corners = cameras(lens=lens), board()
+    in_the_corner = np.array([[300.0, 220.0], [318.0, 220.0], [318.0, 238.0], [300.0, 238.0]])
+    sightings = seen(truth, corners)
+    sightings["view_1"][3] = in_the_corner
+    found = solved(sightings, lenses={"": lens})
+    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+    assert "1 sighting of markers left out where a lens folds its picture over" in found.notes
+    with pytest.raises(CaptureError, match="at 8 sightings of markers, which leaves 0 of 8 views: calibrate"):
+        solved({name: {3: in_the_corner} for name in truth.cameras}, lenses={"": lens})
+
+
 def test_a_board_in_one_view_only_is_refused():
     truth = cameras()
     sightings: dict[str, dict] = {name: {} for name in truth.cameras}

@@ -588,6 +588,49 @@ def test_every_xml_beside_an_image_is_read(tmp_path):
     np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
 
 
+@pytest.mark.parametrize("width", ["0", "-7", "inf"])
+def test_widths_in_an_xml_that_no_band_has_are_unknown(tmp_path, width):
+    tifffile.imwrite(tmp_path / "a-SPECTRAL_IMAGE.TIF", CUBE, planarconfig="contig", photometric="minisblack")
+    bands = "".join(
+        f'<bandID number="{i}"><wavelengthCenterOfBand>{nm}</wavelengthCenterOfBand>'
+        f"<FWHMOfBand>{width if i == 1 else 7}</FWHMOfBand></bandID>"
+        for i, nm in enumerate((450, 550, 650), start=1)
+    )
+    (tmp_path / "a-METADATA.XML").write_text(
+        f"<x><y><bandCharacterisation>{bands}</bandCharacterisation></y></x>"
+    )
+    file = open_spectral_file(tmp_path / "a-SPECTRAL_IMAGE.TIF")
+    np.testing.assert_array_equal(centres_nm(file), [450, 550, 650])
+    assert file.bands.fwhm_nm is None
+
+
+def test_gains_beside_a_file_that_has_its_own_are_not_looked_at(tmp_path):
+    unusable = '<PAMDataset><PAMRasterBand band="1"><Scale>0</Scale></PAMRasterBand></PAMDataset>'
+    file = open_spectral_file(calibrated_tiff(tmp_path, gdal_items(scale=GAINS, offset=OFFSETS), unusable))
+    np.testing.assert_allclose(linear_values_of(file), CUBE * GAINS + OFFSETS)
+    with pytest.raises(CaptureError, match="gains from 0 to 1; expected finite numbers above 0"):
+        open_spectral_file(calibrated_tiff(tmp_path, [], unusable))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("data type = ", "data type = 6;", "'data type' is 6"),
+        ("data type = ", "kind = ", "'data type' is missing"),
+    ],
+)
+def test_a_faulty_header_of_numbers_is_refused_and_not_read_as_that_of_a_quick_look(tmp_path, old, new, said):
+    header = write_envi(tmp_path / "x.hdr", CUBE, "bil", BANDS)
+    (tmp_path / "x").rename(tmp_path / "x.img")
+    tifffile.imwrite(tmp_path / "x.tif", CUBE[..., 0])
+    header.write_text(header.read_text().replace(old, new))
+    with pytest.raises(CaptureError, match=said):
+        open_spectral_file(header)
+    assert open_spectral_file(tmp_path / "x.tif").shape == (*CUBE.shape[:2], 1)
+    with pytest.raises(CaptureError, match="would both be the view 'x'"):
+        find_cubes(tmp_path, ReadOptions())
+
+
 @pytest.mark.parametrize("other", [".mat", ".tif", ".npy"])
 def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, other):
     header = write_envi(tmp_path / "s.hdr", CUBE, "bil", BANDS)

@@ -78,19 +78,39 @@ def poses_from_markers(
     require_opencv()
     sensor_of, lenses = sensor_of or {}, lenses or {}
     sensors = sorted({sensor_of.get(name, "") for name in sightings})
-    seen = _gather(sightings, {name: sensors.index(sensor_of.get(name, "")) for name in sightings})
+    followed, folded = _followed(sightings, {name: lenses.get(sensor_of.get(name, "")) for name in sightings})
+    seen = _gather(followed, {name: sensors.index(sensor_of.get(name, "")) for name in sightings})
     first = []
     for sensor in sensors:
         width, height = next(size for name, size in sizes_px.items() if sensor_of.get(name, "") == sensor)
         first.append(lenses.get(sensor) or Lens(width, height, (0.0, 0.0), (width / 2, height / 2)))
-    free = np.array([sensor not in lenses for sensor in sensors])
+    free = np.array([sensor not in lenses and index in seen.sensor for index, sensor in enumerate(sensors)])
     found, kept = _adjust(_begin(seen, first, free), seen, free)
     _refuse_several_sizes(found, seen, kept)
     found = replace(found, sizes=np.ones(len(found.sizes)))
     found, kept = _adjust(found, seen, free, same_size=True)
     _refuse_moved(found, seen, kept)
     found = _with_distortion(found, seen.part(kept), free)
-    return _pose_set(found, seen, kept, sightings, marker_size, free)
+    poses = _pose_set(found, seen, kept, sightings, marker_size, free)
+    said = f"{counted(folded, 'sighting')} of markers left out where a lens folds its picture over"
+    return replace(poses, notes=(*poses.notes, said)) if folded else poses
+
+
+def _followed(sightings: Sightings, lens_of: Mapping[str, Lens | None]) -> tuple[Sightings, int]:
+    """Sightings whose corners known lenses can follow, and the number of the others."""
+    followed = {
+        name: {
+            number: corners
+            for number, corners in markers.items()
+            if (lens := lens_of[name]) is None or lens.ideal_of(corners) is not None
+        }
+        for name, markers in sightings.items()
+    }
+    lost = sum(len(markers) - len(followed[name]) for name, markers in sightings.items())
+    if lost and (left := sum(map(bool, followed.values()))) < LEAST_VIEWS:
+        where = f"{counted(lost, 'sighting')} of markers, which leaves {left} of {len(followed)} views"
+        raise CaptureError(f"a lens folds its picture over at {where}: calibrate it again")
+    return followed, lost
 
 
 def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
@@ -162,11 +182,10 @@ class _Chain:
         self._seen, self._lenses = seen, lenses
         self._focal = np.array([lens.focal_px[0] for lens in lenses])[seen.sensor][seen.view]
         self._ideal = np.empty_like(seen.corners)
-        for index, lens in enumerate(lenses):
+        for index in np.unique(seen.sensor[seen.view]).tolist():
             own = seen.sensor[seen.view] == index
-            ideal = lens.ideal_of(seen.corners[own].reshape(-1, 2))
-            if ideal is None:
-                raise CaptureError("a lens folds its picture over: calibrate it again")
+            ideal = lenses[index].ideal_of(seen.corners[own].reshape(-1, 2))
+            assert ideal is not None  # `_followed` leaves out what a lens can't follow
             self._ideal[own] = ideal.reshape(-1, 4, 2)
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""

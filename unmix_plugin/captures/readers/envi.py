@@ -110,7 +110,10 @@ def described_image(header_path: Path) -> Path | None:
     with suppress(ValueError, OSError):
         header = read_header(header_path)
         if "tif" not in header.get("file type", "").lower():
-            numbers = data_beside(header_path, read_layout(header).num_bytes)
+            needed_bytes = 0  # of a faulty header, whose reader says what is wrong
+            with suppress(ValueError):
+                needed_bytes = read_layout(header).num_bytes
+            numbers = data_beside(header_path, needed_bytes)
             return None if numbers not in others else others[0]
     return others[0]
 

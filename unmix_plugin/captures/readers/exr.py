@@ -103,9 +103,10 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     for index, own in windows.items():
         low, high = np.maximum(own[0], frame[0]), np.minimum(own[1], frame[1])
         if (high <= low).any():
+            has, whole = ((window - [[0], [1]]).tolist() for window in (own, frame))
             raise CaptureError(
-                f"{path}: its data window {own.tolist()} lies outside of the picture {frame.tolist()} (left and top, "
-                "right and bottom); expected a part of it: render it again"
+                f"{path}: its data window {has} lies outside of the picture {whole} (left and top, right and bottom); "
+                "expected a part of it: render it again"
             )
         is_partial |= bool((low > frame[0]).any() or (high < frame[1]).any())
         # The library decodes all channels of a part; what is taken is put on the picture.

@@ -159,12 +159,12 @@ def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
     if bands.wavelengths_nm is None and np.isfinite(centres).all():
         bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
         widths = columns["FWHMOfBand"]
-        bands = replace(bands, fwhm_nm=widths if np.isfinite(widths).all() else bands.fwhm_nm)
-    linear = linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name)
+        bands = replace(bands, fwhm_nm=widths if ((widths > 0) & (widths < np.inf)).all() else bands.fwhm_nm)
     return replace(
         file,
         bands=bands,
-        linear=file.linear or linear,
+        linear=file.linear
+        or linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name),
         no_data=float(no_data) if file.no_data is None and not np.isnan(no_data) else file.no_data,
         sources=(*file.sources, found),
     )
