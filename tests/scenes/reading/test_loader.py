@@ -8,7 +8,18 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WAVELENGTHS, WIDTH, make_scene, ring_poses
+from tests.scenes.scene_factory import (
+    FOCAL,
+    HEIGHT,
+    SPECTRUM,
+    WAVELENGTHS,
+    WIDTH,
+    fault_of,
+    look_at,
+    make_scene,
+    ring_poses,
+    set_frame,
+)
 from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading import loader
 from unmix_plugin.scenes.reading.faults import find_named
@@ -341,6 +352,33 @@ def test_a_view_that_is_far_off_is_left_out_and_named(tmp_path, away):
     assert (4 in scene.train_indices) == (away < 100)
     is_said = ["view_4.npy" in said and "its pose must be wrong" in said for said in scene.warnings]
     assert any(is_said) == (away > 100)
+
+
+@pytest.mark.parametrize("lenses", [1, 5])
+def test_far_off_is_told_among_ten_places_or_more(tmp_path, lenses):
+    """Five lenses 2 cm apart, or views of one lens, and one 2 m away."""
+    target = np.zeros(3)
+    poses = [
+        look_at(np.array([3.0 + 0.02 * (index % lenses), 0.05 * (index // lenses), 0.5]), target)
+        for index in range(9 if lenses == 1 else 15)
+    ]
+    folder = make_scene(tmp_path / "scene", poses=[*poses, look_at(np.array([3.0, 20.0, 0.5]), target)])
+    for index in range(len(poses) if lenses > 1 else 0):
+        folder.edit(set_frame(index, capture=f"shot_{index // lenses}"))
+    scene = load_scene(folder.root)
+    assert scene.train_indices == tuple(range(1, len(poses) + 1))
+    assert not any("left out" in said for said in scene.warnings)
+
+
+def test_bands_that_only_a_view_far_off_sees_are_refused(tmp_path):
+    poses = ring_poses(16)
+    poses[4][:3, 3] += 200.0
+    folder = make_scene(tmp_path / "scene", alpha=False, poses=poses)
+    for index in set(range(16)) - {4}:
+        folder.edit_cube(index, lambda cube: cube[..., :3]).edit(set_frame(index, bands=[0, 1, 2]))
+    fault = fault_of(folder)
+    assert "no training frame sees the bands at 680 nm" in fault
+    assert "left out of training: view_4.npy" in fault
 
 
 def test_a_scene_of_nothing_but_sky_is_said_to_be_one(tmp_path):

@@ -223,5 +223,16 @@ def test_widths_of_bands_are_read_and_must_be_one_a_band(folder):
     count = len(load_scene(folder.root).wavelengths_nm)
     folder.edit(lambda c: c.update(fwhm=[7.5] * count))
     np.testing.assert_array_equal(load_scene(folder.root).fwhm_nm, np.full(count, 7.5))
-    folder.edit(lambda c: c.update(fwhm=[7.5, -1]))
-    assert "'fwhm' must have a width in nm above 0 for each of the wavelengths" in fault_of(folder)
+    for faulty in ([7.5, -1], [7.5] * (count - 1), [-7.5] * count, ["7.5"] * count, 7.5):
+        folder.edit(lambda c, faulty=faulty: c.update(fwhm=faulty))
+        assert "'fwhm' must have a width in nm above 0 for each of the wavelengths" in fault_of(folder)
+
+
+@pytest.mark.parametrize("unknown", [None, 0, 0.0])
+def test_widths_are_unknown_where_one_is_null_or_0(folder, unknown):
+    known = [7.5] * (len(load_scene(folder.root).wavelengths_nm) - 1)
+    scene = load_scene(folder.edit(lambda c: c.update(fwhm=[*known, unknown])).root)
+    assert scene.fwhm_nm is None
+    assert [said for said in scene.warnings if "'fwhm' has 0 or null for 1 of" in said] == [
+        scene.warnings[-1]
+    ]

@@ -48,6 +48,8 @@ from unmix_plugin.spectral.sensor import SceneSensor
 _FAR_OFF, _MOST_FAR_OFF = 20.0, 0.1
 """Distance of a camera from the others' middle, in the distance within which most others are, from which on its pose is
 taken for wrong; and the largest share of the views that this may hold for."""
+_LEAST_PLACES = 10
+"""Of cameras; among fewer none is called far off."""
 _NOTHING_TO_SEE = (
     "the training views show nothing but a plain backdrop or sky: there is no shape that could be learnt"
 )
@@ -85,9 +87,13 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
             if fault is not None:
                 faults.add(frame.where, fault)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
+    train, warnings = split.train, ()
     if checked is not None and split.train and entry.wavelengths_nm is not None:
-        used = {checked.sensor_indices[index] for index in split.train}
+        train, warnings = _without_far_off(entry, located, split.train)
+        used, noted = {checked.sensor_indices[index] for index in train}, faults.noted
         check_coverage(checked.sensors, used, entry.wavelengths_nm, faults)
+        if warnings and faults.noted > noted:
+            faults.add(FILE_NAME, warnings[0])
     if options.world == "unbounded" and checked is not None and checked.foreground is not None:
         faults.add(
             "world",
@@ -96,7 +102,10 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         )
     faults.raise_if_any()
     assert checked is not None
-    return _assemble(root, entry, located, checked, truth, split, options)
+    if entry.fwhm_nm is not None and (unknown := int(np.isnan(entry.fwhm_nm).sum())):
+        said = f"'fwhm' has 0 or null for {unknown} of {len(entry.fwhm_nm)} bands: the widths of all count as unknown"
+        entry, warnings = replace(entry, fwhm_nm=None), (*warnings, said)
+    return _assemble(root, entry, located, checked, truth, Split(train, split.evaluation), warnings, options)
 
 
 @dataclass(frozen=True)
@@ -137,11 +146,11 @@ def _assemble(
     checked: _CheckedFiles,
     truth: _Truth,
     split: Split,
+    warnings: tuple[str, ...],
     options: SceneOptions,
 ) -> Scene:
     assert entry.wavelengths_nm is not None
-    train, warnings = _without_far_off(entry, located, split.train)
-    space = _find_model_space(root, entry, checked, train, options)
+    space = _find_model_space(root, entry, checked, split.train, options)
     normalisation, scene_box, is_unbounded, before, world_reason = space
     if before is not None and not before.shows_matter:
         before, warnings = None, (*warnings, _NOTHING_TO_SEE)
@@ -158,7 +167,7 @@ def _assemble(
         sensors=checked.sensors,
         frames=_name_frames(entry, located, checked.sensor_indices),
         cameras=make_cameras(entry, checked.sizes, normalisation),
-        train_indices=train,
+        train_indices=split.train,
         eval_indices=split.evaluation,
         scene_box=scene_box,
         normalisation=normalisation.after(entry.placement),
@@ -397,9 +406,16 @@ def _without_far_off(
     entry: SceneEntry, located: tuple[dict[str, Path], ...], train: tuple[int, ...]
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Training views without those whose cameras are so far off that only a wrong pose explains it, and what to say."""
+    if any(frame.pose is None for frame in entry.frames):
+        return train, ()
     positions = _world_poses(entry)[list(train), :, 3]
-    distances = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    usual = float(np.quantile(distances, 1 - _MOST_FAR_OFF, method="lower"))
+    shots = [entry.frames[view].shot or place.tobytes() for view, place in zip(train, positions, strict=True)]
+    places = np.stack(list(dict(zip(shots, positions, strict=True)).values()))  # a rig's lenses share one
+    if len(places) < _LEAST_PLACES:
+        return train, ()
+    middle = np.median(places, axis=0)
+    usual = float(np.quantile(np.linalg.norm(places - middle, axis=1), 1 - _MOST_FAR_OFF, method="lower"))
+    distances = np.linalg.norm(positions - middle, axis=1)
     is_off = (distances > _FAR_OFF * usual) & (usual > 0)
     if not is_off.any():
         return train, ()

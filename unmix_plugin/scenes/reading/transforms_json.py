@@ -386,6 +386,8 @@ class FrameEntry:
     """What it was taken with."""
     line_poses: _LinePoses | None = None
     """Poses by row, where it was taken by a line camera."""
+    shot: str | None = None
+    """Name of the shot; the lenses of a rig take one together."""
 
     def name_of(self, key: str) -> str:
         """One of its files, for messages."""
@@ -409,7 +411,7 @@ class SceneEntry:
     metres_per_unit: float | None = None
     """Metres in a unit of the world that the poses come from."""
     fwhm_nm: Float64[np.ndarray, " B"] | None = None
-    """Widths of the instrument's bands."""
+    """Widths of the instrument's bands, NaN where one is unknown."""
 
 
 def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:
@@ -484,7 +486,8 @@ def _read_frame(
     pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
     lens, sensor = read_intrinsics(content, frame, where, faults), _read_sensor_entry(frame, where, faults)
     named = {key: path for key, path in paths.items() if path is not None}
-    return FrameEntry(where, named, pose if lines is None else lines.middle, lens, sensor, lines)
+    shot = frame["capture"] if isinstance(frame.get("capture"), str) else None
+    return FrameEntry(where, named, pose if lines is None else lines.middle, lens, sensor, lines, shot)
 
 
 def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) -> str | None:
@@ -501,14 +504,13 @@ def _read_widths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray,
     values, centers = content.get("fwhm"), content.get("wavelengths")
     if values is None or not isinstance(centers, list):
         return None
-    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
-    known = [number for number in numbers if number is not None and number > 0]
-    if len(known) != len(centers) or len(numbers) != len(centers):
-        faults.add(
-            FILE_NAME, "'fwhm' must have a width in nm above 0 for each of the wavelengths, or be left out"
-        )
+    values = [0.0 if value is None else value for value in values] if isinstance(values, list) else []
+    numbers = [number for value in values if (number := read_number(value)) is not None and number >= 0]
+    if len(numbers) != len(centers) or len(values) != len(centers):
+        expected = "a width in nm above 0 for each of the wavelengths (0 or null where it is unknown)"
+        faults.add(FILE_NAME, f"'fwhm' must have {expected}, or be left out")
         return None
-    return np.array(known)
+    return np.array([number or np.nan for number in numbers])
 
 
 def _read_wavelengths(
