@@ -160,6 +160,7 @@ def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(vie
         page.wait_until(lambda: page.controls[page.control("probe")]["options"] == ["none yet"])
 
 
+@pytest.mark.slow
 def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
     run = viewer.services.source.run
     with opened(viewer) as page:
