@@ -32,6 +32,12 @@ class ProcessOptions:
     """Side of a printed marker, metres: gives scale and upright to poses that are found in the images."""
     marker_family: str | None = None
     """OpenCV's name of the markers, such as DICT_4X4_50 or DICT_APRILTAG_36H11; without it, the one that is found."""
+    known_distance: Annotated[
+        tuple[str, str, str, str, float] | None,
+        tyro.conf.arg(metavar="VIEW:C,R VIEW:C,R VIEW:C,R VIEW:C,R METRES"),
+    ] = None
+    """Gives the scale: two points, each by its pixels in two views (VIEW:column,row in the files, from 0), and the
+    metres between them."""
     angles: Annotated[str | None, tyro.conf.arg(metavar="SPEC")] = None
     """By which the object was turned in each view, for `--poses turntable`: START:STOP:STEP in degrees (0:360:10), one
     for each place of the camera, with commas between; or a CSV file with the columns view, angle and, if there were

@@ -48,8 +48,8 @@ class Plan:
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
-        ours = ("output_dir", "overwrite", "poses", "marker_size", "marker_family", "angles")
-        asked = {key: value for key, value in plain_options(options).items() if key not in ours}
+        own = ["output_dir", "overwrite", "poses", "marker_size", "marker_family", "known_distance", "angles"]
+        asked = {key: value for key, value in plain_options(options).items() if key not in own}
         files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
         return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps(files)}
 

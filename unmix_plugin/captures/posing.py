@@ -20,12 +20,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.captures.camera_tags import tag_numbers
+from unmix_plugin.captures.known_distance import KnownDistance, metres_per_unit
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, match_poses
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import Capture, CaptureView
 from unmix_plugin.engine.geometry.camera_paths import focus_point, meeting_point
-from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.errors import CaptureError, ConfigError, counted, name_some
 from unmix_plugin.scenes.placement import METRES_KEY, Placement
 
 FROM_PICTURES = ESTIMATE, MARKERS, TURNTABLE = "estimate", "markers", "turntable"
@@ -56,8 +57,8 @@ class PosedViews:
     findings: tuple[str, ...]
     """What looks wrong, one sentence each."""
     keys: dict[str, Any]
-    """What transforms.json records of the way from the source's world to the scene's; nothing where the poses were
-    estimated: the scene's world, which stands upright, is then the one that exports return to."""
+    """What transforms.json records of the way from the source's world to the scene's, and of metres. Where the poses
+    were estimated, exports return to the scene's world, which stands upright: there is no way, or only a scale."""
     notes: tuple[str, ...]
 
 
@@ -78,9 +79,12 @@ def given_poses(capture: Capture, where: str | None) -> PoseSet:
     return read_poses(path, {view.name: (view.cube.shape[1], view.cube.shape[0]) for view in capture.views})
 
 
-def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
+def pose_views(
+    views: Sequence[CaptureView], poses: PoseSet, known: KnownDistance | None = None
+) -> PosedViews:
     """Give each view its camera, lenses of a rig that of others of their release; views without one are left out.
-    Raises CaptureError: fewer than two views have a camera, or a lens does not fit its view."""
+    Poses that don't tell metres get them from a distance that is known. Raises CaptureError: fewer than two views have
+    a camera, or a lens does not fit its view. Raises ConfigError: the distance does not go with the poses."""
     files = [
         (view.name, [*view.cube.files, *([] if view.picture is None else [view.picture])]) for view in views
     ]
@@ -108,6 +112,15 @@ def pose_views(views: Sequence[CaptureView], poses: PoseSet) -> PosedViews:
     keys = way.to_json() if poses.has_world else {}
     if poses.has_world and poses.metres_per_unit is not None:
         keys[METRES_KEY] = poses.metres_per_unit
+    if known is not None:
+        if poses.metres_per_unit is not None:
+            raise ConfigError(f"--known-distance: {poses.source} gives metres already; leave it out")
+        metres, said = metres_per_unit(known, fitted if poses.has_world else placed.cameras)
+        if poses.has_world:
+            keys[METRES_KEY] = metres
+        else:  # exports return to the scene's upright world, in metres
+            keys = Placement(scale=1.0 / metres).to_json() | {METRES_KEY: 1.0}
+        how = (*how, said)
     notes = (*poses.notes, *matched, *completed, *resampled, *how)
     findings = [*_unposed(views, posed, poses.source), *_other_sizes(posed, cameras)]
     return PosedViews(posed, placed, tuple(findings), keys, notes)

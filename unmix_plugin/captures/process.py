@@ -10,6 +10,7 @@ import numpy as np
 
 from unmix_plugin.captures.calibration.sensor import References
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
+from unmix_plugin.captures.known_distance import asked_distance
 from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.plan import Plan, input_files, make_plan
@@ -48,16 +49,17 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture)
+    known = asked_distance(options, capture.views)
     posed = None
     if options.poses not in FROM_PICTURES:
-        posed = pose_views(capture.views, given_poses(capture, options.poses))
+        posed = pose_views(capture.views, given_poses(capture, options.poses), known)
     views = capture.views if posed is None else posed.views
     plan = make_plan(capture, views, options, _open_references(options))
     for note in plan.notes:
         say(f"note: {note}")
     if options.poses == MARKERS:
         say("looking for markers ...")
-        posed = pose_views(plan.views, marked_poses(plan, options))
+        posed = pose_views(plan.views, marked_poses(plan, options), known)
     folder = WorkFolder(options.output_dir)
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
     if folder.begin({**plan.fingerprint(options), "lenses": sorted(map(_numbers_of, resampled.values()))}):
@@ -80,7 +82,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if posed is None:
         say("estimating poses ...")
         found = poses_of_written_views(plan, records, folder.path, folder.poses, options)
-        posed = pose_views(plan.views, found)
+        posed = pose_views(plan.views, found, known)
         _refuse_late(_resampled_lenses(plan, posed))
     for note in posed.notes:
         say(f"poses: {note}")

@@ -75,6 +75,13 @@ class Lens:
         """The inverse of `pixels_of`; None where the distortion folds."""
         return _invert(self.pixels_of, pixels, self)
 
+    def from_file(self, pixels: Points) -> Points | None:
+        """Pixels of the file in the picture that this lens has; None where the file's lens folds."""
+        if self.resampled_from is None:
+            return pixels
+        ideal = _invert(self.resampled_from.project, pixels, self)
+        return None if ideal is None else self.pixels_of(ideal)
+
     def file_pixels(self) -> Float64[np.ndarray, "H W 2"]:
         """Where the middle of each pixel lies in the file; NaN where the file's lens does not see it."""
         columns, rows = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)

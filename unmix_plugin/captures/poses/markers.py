@@ -31,7 +31,7 @@ from unmix_plugin.captures.poses.marker_map import (
     solve,
     transformed,
 )
-from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet
+from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, where_rays_meet
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.scenes.placement import Placement
 
@@ -392,7 +392,7 @@ def _pose_set(
 
 def _how_large(marker_size: float | None) -> str:
     if marker_size is None:
-        return "there is no scale: give --marker-size for exports in metres"
+        return "there is no scale: give --marker-size or --known-distance for exports in metres"
     return f"the scale is that of markers with sides of {marker_size:g} m"
 
 
@@ -451,20 +451,10 @@ def _located(
 ) -> Float64[np.ndarray, "4 3"] | None:
     """Corners where rays of cameras meet, None where they don't; cameras that disagree are left out."""
     left = list(seen)
-    while len(left) > 1:
-        table, wanted = np.zeros((4, 3, 3)), np.zeros((4, 3))
-        for camera, pixels in left:
-            assert camera.lens is not None
-            pose, ideal = camera.camera_to_world, camera.lens.ideal_of(pixels)
-            if ideal is None:
-                return None
-            rays = np.column_stack([ideal, np.ones(4)]) @ FLIP @ pose[:, :3].T
-            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            across = np.eye(3) - rays[:, :, None] * rays[:, None]
-            table, wanted = table + across, wanted + across @ pose[:, 3]
-        points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
-        misses = [rms((camera.pixels_of(points) - pixels)[None])[0] for camera, pixels in left]
-        if max(misses) < 2.0 * _OUTLIER_PX:
+    while len(left) > 1 and (met := where_rays_meet(left)) is not None:
+        points, away = met
+        misses = np.sqrt((away**2).mean(axis=1))
+        if np.max(misses) < 2.0 * _OUTLIER_PX:
             return points
         left.pop(int(np.argmax(np.nan_to_num(misses, nan=np.inf))))
     return None

@@ -60,6 +60,15 @@ class PosedCamera:
         depth = np.where(z > 1e-9, z, np.nan)
         return self.lens.pixels_of(np.column_stack([x / depth, y / depth]))
 
+    def rays_of(self, pixels: Float64[np.ndarray, "P 2"]) -> Float64[np.ndarray, "P 3"] | None:
+        """Unit directions into which pixels look; None where the lens folds its picture there."""
+        assert self.lens is not None
+        ideal = self.lens.ideal_of(pixels)
+        if ideal is None:
+            return None
+        rays = np.column_stack([ideal, np.ones(len(ideal))]) @ FLIP @ self.camera_to_world[:, :3].T
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
     def moved(self, way: Placement) -> PosedCamera:
         """The camera in the world that a similarity leads to."""
         pose = self.camera_to_world
@@ -98,6 +107,23 @@ class PoseSet:
         return replace(
             self, cameras=cameras, points=None if self.points is None else way.to_scene(self.points)
         )
+
+
+def where_rays_meet(
+    seen: Sequence[tuple[PosedCamera, Float64[np.ndarray, "P 2"]]],
+) -> tuple[Float64[np.ndarray, "P 3"], Float64[np.ndarray, "N P"]] | None:
+    """The points nearest to the rays of cameras through the pixels that show them, and by how many pixels each camera
+    misses them, NaN where they are behind it; None where a lens folds its picture."""
+    table, wanted = np.zeros((3, 3)), np.zeros(3)
+    for camera, pixels in seen:
+        rays = camera.rays_of(pixels)
+        if rays is None:
+            return None
+        across = np.eye(3) - rays[:, :, None] * rays[:, None]
+        table, wanted = table + across, wanted + across @ camera.camera_to_world[:, 3]
+    points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
+    misses = [np.linalg.norm(camera.pixels_of(points) - pixels, axis=1) for camera, pixels in seen]
+    return points, np.stack(misses)
 
 
 def path_text(text: str) -> str:
