@@ -126,11 +126,11 @@ def test_certain_abundances_cost_less_and_less(has_alpha):
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
     model = make_model(has_alpha=has_alpha)
     begin_step, found = model.get_training_callbacks()[0].func, []
-    for progress in (0.0, 0.5, 1.0):
+    for progress in (0.0, 0.25, 0.5, 1.0):
         begin_step(1, progress)
         losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), certainty=3.0)
         found.append(float(losses.get("certainty", 0.0)))
-    assert found == pytest.approx([0.03, 0.0075, 0.0])
+    assert found == pytest.approx([0.03, 0.0075, 0.0, 0.0])
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():

@@ -44,10 +44,11 @@ _NO_OUTLIER = 1e6
 _SPARSITY_PART = 0.25
 """Part of the training in which sparsity is asked for: later it would thin out surfaces."""
 _CERTAINTY_WEIGHT = 1e-2
-"""Weight, at the start of training, of the certainty of abundances; it fades to the end. Before surfaces stand, most of
-what a ray sees is haze of the commonest materials. Where the softmax grows sure of those, it has no gradient left, and
-a rare material is never learnt. Source: Pereyra et al. 2017, Regularizing Neural Networks by Penalizing Confident
-Output Distributions."""
+"""Weight, at the start of training, of the certainty of abundances. Before surfaces stand, most of what a ray sees is
+haze of the commonest materials. Where the softmax grows sure of those, it has no gradient left, and a rare material is
+never learnt. Source: Pereyra et al. 2017, Regularizing Neural Networks by Penalizing Confident Output Distributions."""
+_CERTAINTY_PART = 0.5
+"""Part of the training in which certainty costs something: later pure materials may be pure."""
 _SURFACE_PART = 0.5
 """Part of the training in which known surfaces guide it: later they would hold back what is finer."""
 _NORMALS_WEIGHT = 0.01
@@ -69,7 +70,7 @@ def loss_weights(
         "sparsity": preset.sparsity_loss_weight * _fading(progress, _SPARSITY_PART),
         "surface": preset.surface_loss_weight * _fading(progress, _SURFACE_PART),
         "normals": _NORMALS_WEIGHT * _fading(progress, 1.0),
-        "certainty": _CERTAINTY_WEIGHT * _fading(progress, 1.0),
+        "certainty": _CERTAINTY_WEIGHT * _fading(progress, _CERTAINTY_PART),
         "abundances": config.abundances * _FINAL_ABUNDANCES**progress,
     }
     unknown_then = ("opacity", "sparsity", "surface", "certainty") if as_published else ()
