@@ -99,11 +99,12 @@ def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_p
     assert not (tmp_path / "out" / "angles.csv").exists()
     refused = run(export, "endmembers", *words, "--overwrite", "--library", "+builtin")
     assert (refused.status, "leave out --library or --sensor" in refused.err) == (2, True)
-    refused = run(render, *words, "--overwrite", "--outputs", "library:+builtin")
-    assert refused.status == 2
-    assert "library:+builtin compares with spectra known in the run's own bands" in " ".join(
-        refused.err.split()
-    )
+    for command in ([render], [export, "point-cloud"]):
+        refused = run(*command, *words, "--overwrite", "--outputs", "library:+builtin")
+        assert refused.status == 2
+        assert "library:+builtin compares with spectra known in the run's own bands" in " ".join(
+            refused.err.split()
+        )
 
 
 @pytest.mark.parametrize(

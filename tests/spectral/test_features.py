@@ -89,6 +89,16 @@ def test_an_absorption_is_found_at_its_place_on_any_slope_and_at_any_brightness(
     assert absorption(none, w, "centre").isnan()
 
 
+@pytest.mark.parametrize("end", [0.0, -0.001])
+def test_a_spectrum_that_begins_and_ends_at_0_has_absorptions_all_the_same(end):
+    w = np.array([400.0, 450, 500, 550, 600])
+    spectrum = torch.tensor([end, 0.5, 0.2, 0.5, end], dtype=torch.float64)
+    assert continuum_removed(spectrum, w).tolist() == pytest.approx([1, 1, 0.4, 1, 1])
+    assert float(absorption(spectrum, w, "depth")) == pytest.approx(0.6)
+    assert float(absorption(spectrum, w, "area")) == pytest.approx(0.6 * 50)
+    assert continuum_removed(spectrum.clamp(max=0), w).isnan().all()
+
+
 def test_derivatives_allow_for_uneven_steps_and_refuse_too_few_bands():
     w = np.array([400.0, 410, 425, 470, 480, 500, 580])
     parabola = 3e-5 * (w - 450) ** 2 + 0.1

@@ -15,6 +15,8 @@ from tests.trained.camera_scenes import BOX, FRAME, around, record
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.render.job import needs_survey, take_survey
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
 from unmix_plugin.trained.model_scene import model_scene
 from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView, _output_names
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
@@ -95,6 +97,38 @@ def test_bands_that_are_not_there_are_refused_before_anything_is_rendered(monkey
     monkeypatch.setattr(type(SCENE), "look", None)
     with pytest.raises(SpectrumError, match="nm"):
         SCENE.render(CAMERA, [name])
+
+
+@pytest.mark.parametrize(
+    ("name", "function"),
+    [
+        ("continuum", continuum_removed),
+        ("derivative", lambda values, w: values @ torch.from_numpy(derivative_matrix(w)).float()),
+        ("second_derivative", lambda values, w: values @ torch.from_numpy(derivative_matrix(w, 2)).float()),
+    ],
+)
+@pytest.mark.parametrize("dark", [0.0, 1e-5])
+def test_features_are_those_of_the_bands_with_light_and_undefined_in_the_dark_ones(name, function, dark):
+    w = np.linspace(450.0, 700.0, 7)
+    materials = replace(
+        SCENE.materials,
+        bands=Bands.of(w),
+        endmembers=torch.rand(3, 7, generator=torch.Generator().manual_seed(0)),
+        specular_spectra=torch.zeros(len(SCENE.materials.specular_spectra), 7),
+        light=torch.tensor([0.5, 0.7, 1.0, 0.9, 0.6, 0.5, dark]),
+    )
+    scene = replace(SCENE, materials=materials)
+    view = scene.look(CAMERA)
+    seen = view.opacity >= 0.5
+    assert view[name][..., 6].isnan().all()
+    expected = function(view["reflectance"][seen][:, :6], w[:6]).float()
+    assert expected.isfinite().all()
+    assert_close(view[name][seen][:, :6], expected)
+    light = torch.tensor([1.0, 1, 1, 1, dark, dark, dark])
+    few = replace(scene, materials=replace(materials, light=light))
+    if "derivative" in name:
+        with pytest.raises(SpectrumError, match="a derivative takes 5 bands or more; found 4"):
+            few.output(name)
 
 
 def test_depth_distance_and_normals_are_those_of_the_world():

@@ -9,6 +9,7 @@ from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
 from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import seen_reflectance
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
@@ -42,6 +43,21 @@ def test_where_the_light_is_unknown_radiance_stands_for_reflectance():
 def test_a_band_that_the_light_leaves_dark_has_no_reflectance():
     found = seen_reflectance(torch.tensor([[0.0, 0.4]]), torch.ones(1), torch.tensor([0.0, 1.0]), 0.5)
     assert found[0].isnan().tolist() == [True, False]
+
+
+@pytest.mark.parametrize("dark", [0.0, 1e-4])
+def test_a_library_map_leaves_out_the_bands_that_other_comparisons_leave_out(library, dark):
+    bands, light = Bands.of(WAVELENGTHS_NM), np.array([dark, 0.8, 1.0, 0.9, 0.6])
+    radiance = light * np.array([5e4, *WAVELENGTHS_NM[1:]]) / 1000  # noise, where there is hardly any light
+    known = library_of([library], bands)
+    [match] = known.nearest(radiance[None], bands, light, 1)[0]
+    reflectance = seen_reflectance(
+        torch.from_numpy(radiance)[None], torch.ones(1), torch.from_numpy(light), 0.5
+    )
+    asked = parse_reflectance_map(f"library:angle:{library}", bands, torch.from_numpy(light > 1e-3))
+    [angle] = asked.fit(torch.zeros(0, len(bands)))(reflectance)
+    assert float(angle) == pytest.approx(match.angle_rad, abs=1e-7)
+    assert match.num_bands == 4
 
 
 def test_an_index_of_a_view_is_that_of_its_reflectance():

@@ -25,6 +25,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.materials import Materials, seen_reflectance
 from unmix_plugin.trained.measures import Scale
+from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.trained.reflectance_maps import ReflectanceMap, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
@@ -130,7 +131,9 @@ class _PointScore:
         return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
 
 
-def _require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointScore]:
+def _require_point_scores(
+    outputs: Sequence[str], bands: Bands, lit: Bool[Tensor, "B"] | None = None
+) -> list[_PointScore]:
     """Numbers to add to points; an output asked for twice is given once."""
     scores: list[_PointScore] = []
     for output in dict.fromkeys(_plain(output) for output in outputs):
@@ -141,7 +144,7 @@ def _require_point_scores(outputs: Sequence[str], bands: Bands) -> list[_PointSc
                 "colour, material and abundances are in every cloud"
             )
         name = _property_name(output, [score.property for score in scores])
-        scores.append(_PointScore(output, name, parse_reflectance_map(output, bands)))
+        scores.append(_PointScore(output, name, parse_reflectance_map(output, bands, lit)))
     return scores
 
 
@@ -171,7 +174,9 @@ _COUNT_BOUNDS = (1, 10_000_000)
 def export_point_cloud(job: Job, num_points: int, outputs: Sequence[str]) -> list[Path]:
     """Look through all cameras of the run, clean and thin what they see."""
     count, materials = _require_count(num_points), job.materials
-    scores = _require_point_scores(outputs, materials.bands)
+    scores = _require_point_scores(outputs, materials.bands, materials.is_lit)
+    for score in scores:
+        find_output(score.output, materials)  # which refuses libraries through another sensor
     job.claim([_point_cloud_path(job.folder)])
     surface = job.surface(_RAYS_PER_POINT * count)
     with job.working("cleaning and thinning the points"):

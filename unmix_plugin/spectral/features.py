@@ -67,9 +67,12 @@ def continuum(
 def continuum_removed(
     spectra: Float[Tensor, "*N B"], wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Float64[Tensor, "*N B"]:
-    """Spectra over their `continuum`: at most 1, and 1 where nothing absorbs; NaN where the continuum is 0 or less."""
+    """Spectra over their `continuum`: at most 1, and 1 where nothing absorbs, nor can where the continuum is 0 or less,
+    as at an outermost band of 0; NaN for spectra that have no value above 0.
+    """
     hull = continuum(spectra, wavelengths_nm)
-    return torch.where(hull > 0, spectra.double() / hull, torch.nan)
+    beside = torch.where(hull.amax(dim=-1, keepdim=True) > 0, 1.0, torch.nan)
+    return torch.where(hull > 0, spectra.double() / hull, beside)
 
 
 def absorption(

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.library.material_library import DARK_LIGHT
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
@@ -181,6 +182,12 @@ class Materials:
         """What the spectra are: reflectance where the light is flat, as after a white reference; radiance otherwise."""
         is_flat = self.light is not None and bool((self.light >= _FLAT * self.light.max()).all())
         return "reflectance" if is_flat else "radiance"
+
+    @property
+    def is_lit(self) -> Bool[Tensor, "B"]:
+        """Bands with light enough, `DARK_LIGHT`, to compare reflectances in; all where the light is unknown."""
+        light = self.endmembers.new_ones(len(self.bands)) if self.light is None else self.light
+        return light > DARK_LIGHT * light.max()
 
     def table(self) -> SpectraTable:
         """The endmembers with their names: spectra under the scene's light, [0, 1]."""

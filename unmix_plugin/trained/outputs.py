@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -117,17 +118,25 @@ def _reflectance(view: MaterialView) -> Tensor:
     return view.materials.reflectance(view.coefficients)
 
 
-def _continuum_removed(view: MaterialView) -> Tensor:
-    return continuum_removed(_reflectance(view), view.materials.bands.centers_nm).float()
+def _of_lit_bands(function: Callable[[Tensor, np.ndarray], Tensor]) -> Callable[[MaterialView], Tensor]:
+    """A function of reflectances and their wavelengths, over the bands with light; NaN in the others."""
+
+    def compute(view: MaterialView) -> Tensor:
+        reflectance, lit = _reflectance(view), view.materials.is_lit.cpu()
+        found = torch.full_like(reflectance, torch.nan)
+        centers_nm = view.materials.bands.centers_nm[lit.numpy()]
+        found[..., lit] = function(reflectance[..., lit], centers_nm).to(found)
+        return found
+
+    return compute
 
 
 def _derivative(order: Literal[1, 2]) -> Callable[[MaterialView], Tensor]:
-    def compute(view: MaterialView) -> Tensor:
-        reflectance = _reflectance(view)
-        matrix = derivative_matrix(view.materials.bands.centers_nm, order)
-        return (reflectance.double() @ torch.from_numpy(matrix).to(reflectance.device)).float()
+    def derivative(reflectance: Tensor, wavelengths_nm: np.ndarray) -> Tensor:
+        matrix = torch.from_numpy(derivative_matrix(wavelengths_nm, order))
+        return reflectance.double() @ matrix.to(reflectance.device)
 
-    return compute
+    return _of_lit_bands(derivative)
 
 
 def _scores(view: MaterialView) -> Tensor:
@@ -184,7 +193,7 @@ _TABLE = (
                 "continuum",
                 "continuum removed",
                 "reflectance over its continuum, the upper convex hull, at most 1",
-                _continuum_removed,
+                _of_lit_bands(continuum_removed),
             ),
             ("derivative", "derivative", "derivative of the reflectance by wavelength, 1/nm", _derivative(1)),
             (
@@ -313,7 +322,7 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
             f"{name} compares with spectra known in the run's own bands and can't be seen through the sensor "
             f"{materials.sensor}; leave out --sensor"
         )
-    asked = parse_reflectance_map(name, materials.bands)
+    asked = parse_reflectance_map(name, materials.bands, materials.is_lit)
     caveat = _OF_RADIANCE if materials.light is None else ""
     undefined = "; NaN where undefined" if asked.kind == "map" else ""
 
@@ -385,5 +394,7 @@ def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
             "or name the light as illuminant_path in transforms.json"
         )
     if output.name.endswith("derivative"):
-        derivative_matrix(materials.bands.centers_nm)  # which refuses too few bands
+        derivative_matrix(
+            materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
+        )  # which refuses too few bands
     return replace(output, what=output.what + (_OF_RADIANCE if materials.light is None else ""))

@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine.registry import OutputKind
@@ -59,16 +59,25 @@ def is_reflectance_map(name: str) -> bool:
     return name.partition(":")[0] in _PARSERS
 
 
-def parse_reflectance_map(name: str, bands: Bands) -> ReflectanceMap:
+def parse_reflectance_map(name: str, bands: Bands, lit: Bool[Tensor, "B"] | None = None) -> ReflectanceMap:
     """What an output such as `index:ndvi`, `target:ace:paint.csv>0.5`, `library:mine.csv<0.1` or
     `absorption:centre:650-700` is.
 
+    Args:
+        name, bands: Of the output, and of what it is made of.
+        lit: Bands that spectra of a library are compared in; None: all.
     Raises:
         ConfigError: an unknown index, or a formula, a threshold or wavelengths that can't be read.
         SpectrumError: the bands do not cover what it needs, or a file that can't be read.
     """
     kind, _, argument = name.partition(":")
-    return _PARSERS[kind](argument, bands)
+    asked = _PARSERS[kind](argument, bands)
+    if kind != "library" or lit is None:
+        return asked
+    dark, score = ~lit.cpu(), asked.fit(torch.zeros(0, len(bands)))
+    return replace(
+        asked, fit=lambda _: lambda spectra: score(spectra.masked_fill(dark.to(spectra.device), torch.nan))
+    )
 
 
 def _index(argument: str, bands: Bands) -> ReflectanceMap:

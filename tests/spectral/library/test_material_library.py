@@ -114,6 +114,13 @@ def test_a_material_is_found_by_its_full_or_its_short_name_in_any_case():
         library.find("red")
 
 
+def test_absorptions_are_compared_of_materials_that_begin_at_0_too():
+    black_at_400 = LibraryMaterial("edge", VISIBLE, np.linspace(0, 0.8, 31) ** 2, "")
+    spectrum = black_at_400.reflectance[None] / 2
+    [match] = MaterialLibrary((black_at_400,)).nearest(spectrum, VISIBLE, comparison="continuum")[0]
+    assert match.angle_rad == pytest.approx(0, abs=1e-6)
+
+
 def test_of_names_that_differ_in_case_alone_the_exact_one_is_found():
     flat = [LibraryMaterial(name, VISIBLE, np.ones(31), "") for name in ("Leaf", "leaf", "x/LEAF")]
     library = MaterialLibrary(tuple(flat))

@@ -85,9 +85,8 @@ def take_survey(scene: RenderableScene, views: Sequence[RunView], outputs: Colle
     if not is_mixed or not spectra:
         return Survey(scales)
     reflectance = scene.materials.reflectance_of(seen["spectral"], seen["accumulation"])
-    scores = {
-        output.name: parse_reflectance_map(output.name, scene.bands).fit(reflectance) for output in maps
-    }
+    bands, lit = scene.bands, scene.materials.is_lit
+    scores = {output.name: parse_reflectance_map(output.name, bands, lit).fit(reflectance) for output in maps}
     for output in maps:
         if output.value_range is None and output.kind == "map":
             scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
