@@ -10,6 +10,7 @@ import trimesh
 
 from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
 from tests.trained.camera_scenes import FRAME
+from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.mesh import TriangleMesh
@@ -98,7 +99,7 @@ def test_regions_come_back_as_they_were_kept(tmp_path):
 def test_many_regions_of_large_views_take_little_memory_until_they_are_measured(tmp_path):
     large = {"kind": "view", "camera": CAMERA.resized(8192, 8192).to_json(), "runs": [8192**2]}
     regions = {str(number): large for number in range(8)}
-    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "regions": regions}))
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": RUN_FORMAT, "regions": regions}))
     tracemalloc.start()
     read_measures(RunFolder(tmp_path))
     kept = tracemalloc.get_traced_memory()[0]
@@ -133,6 +134,6 @@ def test_names_that_no_file_can_have_are_refused(name):
     ],
 )
 def test_damaged_regions_are_refused(regions, tmp_path):
-    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "regions": regions}))
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": RUN_FORMAT, "regions": regions}))
     with pytest.raises(RunError, match=r"measures\.json is damaged"):
         read_measures(RunFolder(tmp_path))

@@ -8,6 +8,7 @@ import pytest
 
 from tests.products.ball_model import RADIUS, ball_scene, cameras_around
 from tests.trained.camera_scenes import FRAME
+from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.trained.measures import (
@@ -74,7 +75,7 @@ def test_points_count_on_the_surface_that_views_show():
     ],
 )
 def test_a_damaged_file_is_refused(scale, tmp_path):
-    (tmp_path / "measures.json").write_text(json.dumps({"format_version": 4, "scale": scale}))
+    (tmp_path / "measures.json").write_text(json.dumps({"format_version": RUN_FORMAT, "scale": scale}))
     with pytest.raises(RunError, match=r"measures\.json is damaged"):
         read_measures(RunFolder(tmp_path))
 
