@@ -27,6 +27,8 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
+from unmix_plugin.products.mesh import TriangleMesh
+from unmix_plugin.products.page.page import material_areas
 from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -337,6 +339,11 @@ def test_a_page_holds_the_surface_and_escapes_its_title(exported):
     how = facts["arrays"]["faces"]
     corners = np.cumsum(np.frombuffer(arrays, "<i4", how["count"], how["start"]))
     np.testing.assert_array_equal(corners.reshape(-1, 3), mesh.faces)
+    how = facts["arrays"]["materials"]
+    materials = np.frombuffer(arrays, "u1", how["count"], how["start"])
+    sheet = TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    expected = material_areas(sheet.areas(), sheet.faces, materials, len(facts["names"]))
+    np.testing.assert_allclose(facts["areas"], expected, rtol=0.01)
     how = facts["arrays"]["abundances"]
     roots = np.frombuffer(arrays, "u1", how["count"], how["start"]).reshape(-1, 6) / 1.0
     np.testing.assert_allclose((how["scale"] * roots**2).sum(axis=1), 1, atol=0.03)

@@ -108,6 +108,12 @@ def test_all_layers_differ(opened):
     opened.evaluate("unmixPage.state.formula = 'r650/r550'")
     shown = [picture(opened, layer) for layer in layers]
     assert len(layers) == 7
+    opened.evaluate("unmixPage.choose('materials')")
+    areas = opened.evaluate("unmixPage.facts.areas")
+    texts = [
+        float(text.split(": ")[1].split()[0]) for text in opened.locator("#legend .key").all_inner_texts()
+    ]
+    assert texts == pytest.approx([area for area in areas if area > 0], rel=1e-3)
     for index, one in enumerate(shown):
         assert all(np.abs(one - other).mean() > 0.004 for other in shown[:index]), layers[index]
 

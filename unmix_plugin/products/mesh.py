@@ -53,6 +53,9 @@ _MOST_MOVED = 3.0
 _RINGS = 3
 """Neighbours over which the way that vertices are moved is smoothed."""
 
+_AREA_RINGS = 4
+"""The same of normals, along which areas are taken."""
+
 _HEALED_RINGS = 3
 """Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
 
@@ -95,6 +98,15 @@ class TriangleMesh:
             np.add.at(sums, corner, across)
         lengths = np.linalg.norm(sums, axis=1, keepdims=True)
         return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1.0), [0.0, 0.0, 1.0])
+
+    def areas(self) -> Float64[np.ndarray, " F"]:
+        """Of the faces, as large as they are seen along the smoothed normal: rough surfaces of short trainings have
+        more area than what they stand for."""
+        smooth = np.stack([self.smoothed(axis, _AREA_RINGS) for axis in self.normals.T], axis=1)
+        along = smooth[self.faces].sum(axis=1)
+        along /= np.linalg.norm(along, axis=1, keepdims=True).clip(min=1e-12)
+        a, b, c = self.vertices[self.faces].swapaxes(0, 1)
+        return np.maximum((np.cross(b - a, c - a) * along).sum(axis=1) / 2, 0.0)
 
 
 def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:

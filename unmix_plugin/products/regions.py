@@ -1,7 +1,6 @@
 """Regions of a run's surface: how large they are, their mean spectrum with its spread, and what they are made of.
 
-All is weighted by area, on the surface that `mesh` exports. Rough surfaces of short trainings have more area than what
-they stand for, so triangles are counted as large as they are seen along the smoothed normal.
+All is weighted by area (`TriangleMesh.areas`), on the surface that `mesh` exports.
 
 Notation: `V` vertices, `F` faces, `P` points, `B` bands, `K` endmembers.
 """
@@ -34,8 +33,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _CELLS_PER_PIXEL, _RESOLUTIONS = 2, (48, 256)
 """Along the longest edge of the scene box, and the least and most cells there."""
-_RINGS = 4
-"""Neighbours over which normals are smoothed."""
 _PARTS = ((2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4))
 """Points of a triangle that tell how much of it is in a region, by their shares of its corners, in sixths."""
 
@@ -77,12 +74,7 @@ class MeasuredSurface:
     @cached_property
     def areas(self) -> Float64[np.ndarray, " F"]:
         """Of the triangles, square units of the world."""
-        faces, normals = self.mesh.faces, self.mesh.normals
-        smooth = np.stack([self.mesh.smoothed(axis, _RINGS) for axis in normals.T], axis=1)[faces].sum(axis=1)
-        smooth /= np.linalg.norm(smooth, axis=1, keepdims=True).clip(min=1e-12)
-        a, b, c = self.mesh.vertices[faces].swapaxes(0, 1)
-        facing = (np.cross(b - a, c - a) * smooth).sum(axis=1) / 2
-        return np.maximum(facing, 0.0) / self._scene.frame.scale**2
+        return self.mesh.areas() / self._scene.frame.scale**2
 
     def shares(self, region: Region) -> Float64[np.ndarray, "F 3"]:
         """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""

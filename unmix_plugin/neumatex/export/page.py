@@ -25,7 +25,7 @@ from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.products.page.page import PageContent, colour_map, rounded, spectral_facts
+from unmix_plugin.products.page.page import PageContent, colour_map, material_areas, rounded, spectral_facts
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
@@ -61,7 +61,10 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         none = torch.zeros(0, len(scene.bands))
         facts = spectral_facts(Materials(scene.bands, family.endmembers, none, light=flat))
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
-        arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
+        materials = arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
+        a, b, c = mesh.corners().double().unbind(dim=1)
+        areas = torch.linalg.cross(b - a, c - a).norm(dim=1).numpy() / 2 / scene.frame.scale**2
+        facts["areas"] = material_areas(areas, mesh.faces.numpy(), materials, shares.shape[1])
         family = InColours(family, scene.bands)
     fit = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
     if not isinstance(family, PbrFamily):

@@ -362,20 +362,7 @@
   const swatch = (k) => {
     const dot = make("span", { className: "dot" });
     dot.style.background = css(colours[k]);
-    return make("div", { className: "key" }, dot, `${names[k]}: ${unitText(Math.sqrt(areas()[k]), 2)}`);
-  };
-  // Of each material, a third of the triangles at each of its vertices; world units squared.
-  let knownAreas = null;
-  const areas = () => {
-    if (knownAreas) return knownAreas;
-    knownAreas = new Float64Array(256);
-    const [a, b, c] = [new Kit.Vector3(), new Kit.Vector3(), new Kit.Vector3()];
-    for (let f = 0; f < faces.length; f += 3) {
-      [a, b, c].forEach((corner, i) => corner.fromArray(positions, 3 * faces[f + i]));
-      const third = b.sub(a).cross(c.sub(a)).length() / 6;
-      for (let i = 0; i < 3; i++) knownAreas[materials[faces[f + i]]] += third;
-    }
-    return knownAreas;
+    return make("div", { className: "key" }, dot, `${names[k]}: ${unitText(Math.sqrt(facts.areas[k]), 2)}`);
   };
 
   const painters = {

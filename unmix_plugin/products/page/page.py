@@ -69,7 +69,8 @@ class PageContent:
     arrays: dict[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]]
     """`positions` (V, 3) in the world and `faces` (F, 3); of each vertex or of anything else, numbers by name."""
     facts: dict[str, Any]
-    """As `spectral_facts` gives them, and more; `notes` are sentences to be said."""
+    """As `spectral_facts` gives them, and more; `notes` are sentences to be said, `areas` are `material_areas`
+    where there are materials."""
     pictures: dict[str, bytes]
     """PNG by caption, for browsers that can't draw in 3-D."""
 
@@ -139,6 +140,8 @@ def _mixture_content(job: Job, resolution: int) -> PageContent:
     mesh = find_surface(job, resolution)[0]
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
+    areas = mesh.areas() / job.frame.scale**2
+    facts = {"areas": material_areas(areas, mesh.faces, arrays["materials"], len(job.materials.names))}
     view = [*job.views("eval"), *job.views("all")][0]
     enlarged = _PICTURE_PX / max(view.camera.width, view.camera.height)
     size = [max(1, round(enlarged * side)) for side in (view.camera.width, view.camera.height)]
@@ -147,7 +150,17 @@ def _mixture_content(job: Job, resolution: int) -> PageContent:
         f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
-    return PageContent(arrays, {**spectral_facts(job.materials), "notes": []}, pictures)
+    return PageContent(arrays, {**spectral_facts(job.materials), **facts, "notes": []}, pictures)
+
+
+def material_areas(
+    areas: Float[np.ndarray, " F"],
+    faces: Int[np.ndarray, "F 3"],
+    materials: UInt8[np.ndarray, " V"],
+    count: int,
+) -> list[float]:
+    """Of each material, a third of the areas of the triangles at each of its vertices."""
+    return rounded(np.bincount(materials[faces].ravel(), np.repeat(areas / 3, 3), count)[:count])
 
 
 def spectral_facts(materials: Materials) -> dict[str, Any]:
