@@ -137,7 +137,8 @@ def look(program: str, place: Path, variables: dict[str, str]) -> None:
                 sys.exit(f"the viewer did not start: {said}")
         finally:
             viewer.terminate()
-            viewer.stdout and viewer.stdout.read()
+            if viewer.stdout is not None:
+                viewer.stdout.read()
     print(f"viewer: {time.monotonic() - started:.1f} s", flush=True)
 
 

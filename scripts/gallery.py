@@ -23,6 +23,7 @@ mpl.use("agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.optimize import linear_sum_assignment
 
@@ -194,7 +195,7 @@ def panels(
     save(figure, path)
 
 
-def _legend(figure: plt.Figure, legend: Sequence[tuple[str, Sequence[float]]], base: float) -> None:
+def _legend(figure: Figure, legend: Sequence[tuple[str, Sequence[float]]], base: float) -> None:
     place = 0.012
     for name, shade in legend:
         figure.text(place, base, "■", color=tuple(shade), fontsize=15, va="baseline")
@@ -202,7 +203,7 @@ def _legend(figure: plt.Figure, legend: Sequence[tuple[str, Sequence[float]]], b
         place = text.get_window_extent().x1 / figure.bbox.width + 0.025
 
 
-def save(figure: plt.Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
     """A figure as a PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110, facecolor="white")
@@ -415,7 +416,7 @@ MAKERS: dict[str, Callable[[Studio], None]] = {
 
 def main() -> None:
     """Console entry."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*MAKERS, []], help="pictures to make; all by default")
     parser.add_argument("--scenes", type=Path, required=True, help="folder of the scenes")
     parser.add_argument("--work", type=Path, default=Path("outputs/gallery"), help="where runs are kept")

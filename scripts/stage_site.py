@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import tyro
@@ -187,7 +188,7 @@ def _autodoc(name: str, thing: object, with_members: bool) -> list[str]:
 class _Found(BaseException):
     """Ends a command where it would read its arguments."""
 
-    def __init__(self, parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+    def __init__(self, parser: Any, words: Sequence[str]) -> None:
         self.parser, self.words = parser, list(words)
 
 
@@ -196,7 +197,7 @@ def parser_of(command: str, words: list[str]) -> tuple[argparse.ArgumentParser, 
     module, function, _ = COMMANDS[command]
     read = tyro.cli
 
-    def cli(kind: object, **options: object) -> object:
+    def cli(kind: Any, **options: Any) -> Any:
         if options.pop("return_unknown_args", False):
             return read(kind, **options, return_unknown_args=True)
         words = options.pop("args")
@@ -242,7 +243,7 @@ def _description(parser: argparse.ArgumentParser) -> Iterator[str]:
     yield ""
 
 
-def _flags(parser: argparse.ArgumentParser) -> Iterator[str]:
+def _flags(parser: Any) -> Iterator[str]:
     """The arguments of a parser as a list of definitions, group by group."""
     group = ""
     for action in parser._actions:
@@ -259,9 +260,9 @@ def _flags(parser: argparse.ArgumentParser) -> Iterator[str]:
 def _flag(action: argparse.Action) -> Iterator[str]:
     names = [name for name in action.option_strings if name.startswith("--")]
     value = _value(action.metavar)
-    help_text, default = re.fullmatch(
-        r"(.*?)\s*(?:\(default: ?(.*)\)|\(required\))?", action.help or "", re.S
-    ).groups()
+    said = re.fullmatch(r"(.*?)\s*(?:\(default: ?(.*)\)|\(required\))?", action.help or "", re.S)
+    assert said is not None  # it takes any text
+    help_text, default = said.groups()
     required = (action.help or "").rstrip().endswith("(required)")
     head = f"`{names[0]} {value}`".replace(" `", "`") if names else f"`{value}`"
     ending = "required" if required else "" if default in (None, "", "None") else f"default `{default}`"
@@ -274,7 +275,7 @@ def _flag(action: argparse.Action) -> Iterator[str]:
     yield ""
 
 
-def _value(metavar: object) -> str:
+def _value(metavar: str | tuple[str, ...] | None) -> str:
     if metavar is None:
         return ""
     text = metavar if isinstance(metavar, str) else " ".join(metavar)
