@@ -7,6 +7,7 @@ from pathlib import Path
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.product import Job
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.measures import (
     Scale,
     describe_scale,
@@ -71,7 +72,7 @@ def _seen_point(job: Job, text: str) -> tuple[float, float, float]:
         )
     view = find_view(job.views("eval"), match[1], job.views("train"))
     found = job.loaded.scene.probe(view.camera, int(match[2]), int(match[3]))
-    if found.world_position is None or found.opacity < 0.5:
+    if found.world_position is None or found.opacity < OCCUPIED_ACCUMULATION:
         raise ConfigError(f"{text}: the view shows nothing there; choose a pixel on the object")
     x, y, z = found.world_position.tolist()
     return x, y, z
