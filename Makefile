@@ -58,7 +58,7 @@ test-all: $(VENV)/.installed-dev $(VENV)/.system-packages
 
 # As on Windows: without the modules, functions and signals that only POSIX has, and with a narrow console.
 test-portable: $(VENV)/.installed-dev
-	PYTHONPATH=tests/without_posix $(BIN)/python -m pytest --numprocesses 2 -m "not slow"
+	PYTHONPATH=scripts/without_posix $(BIN)/python -m pytest --numprocesses 2 -m "not slow"
 
 # Deprecations that old releases warn of are no failures here, and old checkers of shapes are left out.
 test-minimum:
