@@ -227,7 +227,7 @@ def _write_command(folder: Path, command: str) -> tuple[str, str]:
         first = first or parts[-2].split("\n")[0]
         parts += list(_flags(parser))
         for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
+            if isinstance(action.choices, dict):  # those of a subcommand, whichever argparse tyro builds on
                 for name, product in action.choices.items():
                     parts += [f"## {command} {name}", "", *_description(product), *_flags(product)]
     _write(folder / f"{command}.md", "\n".join(parts) + "\n")
@@ -247,7 +247,7 @@ def _flags(parser: Any) -> Iterator[str]:
     """The arguments of a parser as a list of definitions, group by group."""
     group = ""
     for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction) or "--help" in action.option_strings:
+        if isinstance(action.choices, dict) or "--help" in action.option_strings:
             continue
         title = getattr(action.container, "title", "") or ""
         if title != group and title not in ("options", "positional arguments"):
