@@ -94,6 +94,53 @@ def test_a_target_threshold_gives_zeros_and_ones(target):
     assert 0 < found.nanmean() < 1
 
 
+@pytest.mark.parametrize("method", ["angle", "mf", "ace"])
+@pytest.mark.parametrize("dark", [0.0, 1e-4])
+def test_a_target_is_looked_for_in_the_bands_with_light(target, method, dark):
+    spectra = torch.rand((20, 5), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    bands, light = Bands.of(WAVELENGTHS_NM), torch.tensor([0.5, dark, 1.0, 0.9, 0.6], dtype=torch.float64)
+    reflectance = seen_reflectance(spectra * light, torch.ones(20), light, 0.5)
+    asked = parse_reflectance_map(f"target:{method}:{target}", bands, light > 1e-3)
+    others = Bands(bands.centers_nm[[0, 2, 3, 4]])
+    expected = parse_reflectance_map(f"target:{method}:{target}", others)
+    found = asked.fit(reflectance)(reflectance)
+    assert found.isfinite().all()
+    assert_close(found, expected.fit(spectra[:, [0, 2, 3, 4]])(spectra[:, [0, 2, 3, 4]]))
+    assert asked.what == f"{expected.what}; 1 of 5 bands left out: no light"
+
+
+def test_an_absorption_is_that_of_the_bands_with_light():
+    bands = Bands.of([400.0, 450.0, 500.0, 550.0, 600.0, 650.0])
+    light = torch.tensor([0.0, 1.0, 1.0, 0.0, 1.0, 1.0])
+    reflectance = seen_reflectance(
+        light * torch.tensor([[0.5, 0.5, 0.3, 0.9, 0.4, 0.5]]), torch.ones(1), light, 0.5
+    )
+    asked = parse_reflectance_map("absorption:area:450-650", bands, light > 0)
+    [area] = asked.fit(torch.zeros(0, 6))(reflectance)
+    assert float(area) == pytest.approx(25 * 0.4 + 50 * (0.4 + 0.2) + 25 * 0.2)
+    assert asked.what.endswith("450 to 650 nm; 1 of 5 bands left out: no light")
+
+
+def test_too_few_bands_with_light_are_refused(target):
+    bands, light = Bands.of(WAVELENGTHS_NM), torch.tensor([False, True, False, False, False])
+    for name, said in (
+        (f"target:{target}", "two bands or more; found 1 band"),
+        ("absorption:450-650", "three bands or more with light from 450 to 650 nm, .* found 1 of"),
+    ):
+        with pytest.raises(SpectrumError, match=said):
+            parse_reflectance_map(name, bands, light)
+    with pytest.raises(SpectrumError, match="no power in any of the 5 bands"):
+        parse_reflectance_map(f"target:mf:{target}", bands, torch.zeros(5, dtype=torch.bool))
+
+
+def test_a_target_is_seen_in_a_light_that_leaves_a_band_dark(target):
+    scene = make_scene(light=[0.0, 0.8, 1.0, 0.9, 0.6])
+    found = scene.render(CAMERA, [f"target:{target}", "absorption:450-650"])
+    seen = scene.look(CAMERA).opacity > 0.5
+    for name, values in found.items():
+        assert values[seen].isfinite().all(), name
+
+
 def test_what_a_map_is_names_the_index_or_the_target(target):
     bands = Bands.of(WAVELENGTHS_NM)
     assert "r650" in parse_reflectance_map(INDEX, bands).what

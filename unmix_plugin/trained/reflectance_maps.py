@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.engine.registry import OutputKind
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError, counted
 from unmix_plugin.figures.plotting import distinct_colours, own_colours
 from unmix_plugin.formats.libraries import library_of, read_library
 from unmix_plugin.spectral.bands import Bands
@@ -65,29 +65,39 @@ def parse_reflectance_map(name: str, bands: Bands, lit: Bool[Tensor, "B"] | None
 
     Args:
         name, bands: Of the output, and of what it is made of.
-        lit: Bands that spectra of a library are compared in; None: all.
+        lit: Bands with light; targets, libraries and absorptions are made of these alone, and say so. None: all.
     Raises:
         ConfigError: an unknown index, or a formula, a threshold or wavelengths that can't be read.
-        SpectrumError: the bands do not cover what it needs, or a file that can't be read.
+        SpectrumError: the bands, or those with light, do not cover what it needs, or a file that can't be read.
     """
     kind, _, argument = name.partition(":")
-    asked = _PARSERS[kind](argument, bands)
-    if kind != "library" or lit is None:
-        return asked
-    dark, score = ~lit.cpu(), asked.fit(torch.zeros(0, len(bands)))
-    return replace(
-        asked, fit=lambda _: lambda spectra: score(spectra.masked_fill(dark.to(spectra.device), torch.nan))
-    )
+    is_lit = np.ones(len(bands), dtype=np.bool_) if lit is None else lit.cpu().numpy()
+    if kind != "index" and not is_lit.any():
+        raise SpectrumError(f"{name}: the light has no power in any of the {bands}")
+    return _PARSERS[kind](argument, bands, is_lit)
 
 
-def _index(argument: str, bands: Bands) -> ReflectanceMap:
+def _left_out(lit: Bool[np.ndarray, " some"]) -> str:
+    """What a description says of bands that are left out for lack of light."""
+    dark = len(lit) - int(lit.sum())
+    return f"; {dark} of {counted(len(lit), 'band')} left out: no light" if dark else ""
+
+
+def _index(argument: str, bands: Bands, _: Bool[np.ndarray, " B"]) -> ReflectanceMap:
     index = parse_index(argument, bands)
     return ReflectanceMap(index.what, index.usual_range, lambda _: index)
 
 
-def _target(argument: str, bands: Bands) -> ReflectanceMap:
-    target = parse_target(argument, bands, read_library)
-    return ReflectanceMap(target.what, target.usual_range, target.fit)
+def _target(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> ReflectanceMap:
+    """`[METHOD:]FILE[#NAME][<VALUE or >VALUE]`."""
+    chosen = np.flatnonzero(lit)
+    target = parse_target(argument, Bands(bands.centers_nm[chosen]), read_library)
+
+    def fit(background: Float[Tensor, "N B"]) -> Score:
+        score = target.fit(background[:, chosen])
+        return lambda spectra: score(spectra[..., chosen])
+
+    return ReflectanceMap(target.what + _left_out(lit), target.usual_range, fit)
 
 
 _LIBRARY = re.compile(r"(?P<angle>angle:)?(?P<file>.+?)\s*(<\s*(?P<limit>\d+\.?\d*|\.\d+)\s*)?", re.DOTALL)
@@ -95,7 +105,7 @@ _LARGEST_ANGLE_RAD = 0.1
 """Beyond it nothing counts as alike if no other threshold is asked for; the usual one of spectral angle mappers."""
 
 
-def _library(argument: str, bands: Bands) -> ReflectanceMap:
+def _library(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> ReflectanceMap:
     """`[angle:]FILE[<LIMIT]`: which spectrum of a library is nearest, or the angle to it."""
     match = _LIBRARY.fullmatch(argument)
     if match is None:
@@ -112,8 +122,9 @@ def _library(argument: str, bands: Bands) -> ReflectanceMap:
                 f"library:{argument}: the angle itself takes no threshold; leave out <{match['limit']}"
             )
         what = f"spectral angle in radians to the nearest spectrum of {name}: 0 = the same but for brightness"
+        what += _left_out(lit)
         return ReflectanceMap(
-            what, (0.0, 0.5), lambda _: lambda spectra: _nearest(library, bands, spectra)[0]
+            what, (0.0, 0.5), lambda _: lambda spectra: _nearest(library, bands, lit, spectra)[0]
         )
     if not 0 < limit <= np.pi:
         raise ConfigError(f"library:{argument}: the largest angle must lie between 0 and {np.pi:.4g} rad")
@@ -123,7 +134,7 @@ def _library(argument: str, bands: Bands) -> ReflectanceMap:
         )
 
     def ids(spectra: Float[Tensor, "*rays B"]) -> Tensor:
-        angles, nearest = _nearest(library, bands, spectra)
+        angles, nearest = _nearest(library, bands, lit, spectra)
         return torch.where(angles <= limit, nearest, NOTHING_ID).to(torch.uint8)
 
     looks = torch.from_numpy(np.nan_to_num(library.resampled(bands)))
@@ -131,16 +142,19 @@ def _library(argument: str, bands: Bands) -> ReflectanceMap:
     classes = tuple(
         (name, tuple(colour)) for name, colour in zip(library.names, colours.tolist(), strict=True)
     )
-    what = f"nearest spectrum of {name} by its number, {NOTHING_ID} where none is within {limit:g} rad"
+    what = f"nearest spectrum of {name} by its number, {NOTHING_ID} where none is within {limit:g} rad{_left_out(lit)}"
     return ReflectanceMap(what, None, lambda _: ids, "labels", classes)
 
 
 def _nearest(
-    library: MaterialLibrary, bands: Bands, spectra: Float[Tensor, "*rays B"]
+    library: MaterialLibrary,
+    bands: Bands,
+    lit: Bool[np.ndarray, " B"],
+    spectra: Float[Tensor, "*rays B"],
 ) -> tuple[Float[Tensor, "*rays"], Tensor]:
     """Angle to the nearest spectrum of a library, NaN where there is none, and its number."""
     rows = spectra.reshape(-1, len(bands)).double().cpu().numpy()
-    lit = np.asarray(np.isfinite(rows).any(axis=0))  # bands that the light leaves dark are NaN everywhere
+    lit = lit & np.isfinite(rows).any(axis=0)
     angles, _ = library.angles(np.where(lit, rows, 0.0), bands, lit.astype(np.float64))
     least = torch.from_numpy(np.nan_to_num(angles, nan=np.inf)).min(dim=1)
     values = torch.where(least.values.isfinite(), least.values, torch.nan)
@@ -159,7 +173,7 @@ _MEASURES: dict[str, tuple[AbsorptionMeasure, str]] = {
 }
 
 
-def _absorption(argument: str, bands: Bands) -> ReflectanceMap:
+def _absorption(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> ReflectanceMap:
     """`[depth|centre|area:]LOW-HIGH`, wavelengths in nm."""
     match = _ABSORPTION.fullmatch(argument.strip())
     if match is None:
@@ -168,11 +182,13 @@ def _absorption(argument: str, bands: Bands) -> ReflectanceMap:
             "absorption:centre:2150-2250"
         )
     low, high = float(match["low"]), float(match["high"])
-    chosen = np.flatnonzero((bands.centers_nm >= low) & (bands.centers_nm <= high))
+    within = (bands.centers_nm >= low) & (bands.centers_nm <= high)
+    chosen = np.flatnonzero(within & lit)
     if low >= high or not (bands.contains(low) and bands.contains(high)) or len(chosen) < 3:
+        with_light = "" if lit[within].all() else " with light"
         raise SpectrumError(
-            f"absorption:{argument} needs three bands or more from {low:g} to {high:g} nm, all of it covered; "
-            f"found {len(chosen)} of {bands}"
+            f"absorption:{argument} needs three bands or more{with_light} from {low:g} to {high:g} nm, all of it "
+            f"covered; found {len(chosen)} of {bands}"
         )
     measure, what = _MEASURES[match["measure"] or "depth"]
     window = bands.centers_nm[chosen]
@@ -181,10 +197,11 @@ def _absorption(argument: str, bands: Bands) -> ReflectanceMap:
     def score(spectra: Float[Tensor, "*rays B"]) -> Tensor:
         return absorption(spectra[..., chosen], window, measure).to(spectra.dtype)
 
-    return ReflectanceMap(f"{what}, {low:g} to {high:g} nm", usual, lambda _: score)
+    what = f"{what}, {low:g} to {high:g} nm{_left_out(lit[within])}"
+    return ReflectanceMap(what, usual, lambda _: score)
 
 
-_PARSERS: dict[str, Callable[[str, Bands], ReflectanceMap]] = {
+_PARSERS: dict[str, Callable[[str, Bands, Bool[np.ndarray, " B"]], ReflectanceMap]] = {
     "index": _index,
     "target": _target,
     "library": _library,

@@ -436,7 +436,8 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
         )
     # Of the outputs with an argument only these: others read files, which a page must not name.
     is_absorption = settings.index.startswith("absorption:")
-    asked = parse_reflectance_map(settings.index if is_absorption else f"index:{settings.index}", bands)
+    name = settings.index if is_absorption else f"index:{settings.index}"
+    asked = parse_reflectance_map(name, bands, materials.is_lit)
     index, rows = asked.fit(torch.empty(0, len(bands))), frame.coefficients.flatten()
     # Chunk by chunk: the spectra of a whole picture may not fit into memory.
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
