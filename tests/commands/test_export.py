@@ -300,6 +300,9 @@ def test_points_and_mesh_lie_where_the_scene_is(solid, exported):
     for kind in ("ply", "obj", "glb"):
         mesh = loaded_mesh(exported[0] / "mesh" / f"mesh.{kind}")
         assert ((mesh.vertices >= low - 0.2) & (mesh.vertices <= high + 0.2)).all()
+    for name, file in (("mesh", "mesh.glb"), ("splats", "splats.glb")):
+        said = " ".join(exported[1][name].split())
+        assert f"lengths in {file} are in units of the scene, of unknown size" in said
 
 
 def test_splats_are_flat_upright_and_as_dense_as_the_surface(exported):

@@ -19,7 +19,7 @@ def opened(path):
 
 def wavelength_of(name):
     """What the layout's own expression reads in a channel's name."""
-    found = re.fullmatch(r"S0\.(\d+(?:,\d+)?)nm", name)
+    found = re.fullmatch(r"(?:S0|T)\.(\d+(?:,\d+)?)nm", name)
     return float(found[1].replace(",", ".")) if found else 0.0
 
 
@@ -58,6 +58,16 @@ def test_the_header_says_which_layout_it_is_and_loses_nothing_by_compression(tmp
     assert header["emissiveUnits"] == "W.m^-2.sr^-1"
     assert header["comments"] == "of a test"
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
+
+
+def test_reflectance_is_in_reflective_channels_and_has_no_unit_of_light(tmp_path):
+    cube = random_cube()
+    path = write_spectral_exr(tmp_path / "v.exr", cube, BANDS, None, quantity="reflectance")
+    header, channels = opened(path)
+    assert "emissiveUnits" not in header
+    assert all(name.startswith("T.") for name in channels)
+    spectral = sorted(channels, key=wavelength_of)
+    np.testing.assert_array_equal(np.stack([channels[name] for name in spectral], axis=-1), cube)
 
 
 def test_channels_of_any_name_keep_their_type(tmp_path):

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,6 +34,7 @@ from unmix_plugin.products.mesh import (
     _without_stray_pieces,
     _write_mesh,
 )
+from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import world_up
 from unmix_plugin.trained.surface import GridPoints, sample_slice
 
@@ -181,6 +183,17 @@ def test_other_readers_get_the_mesh_in_the_world_of_the_scene(files, outside, ki
     distances = np.linalg.norm(mesh.vertices - FRAME.to_world(np.zeros(3)), axis=1)
     np.testing.assert_allclose(distances, RADIUS / FRAME.scale, atol=0.05 / FRAME.scale)
     assert mesh.volume > 0
+
+
+def test_gltf_is_in_metres_where_the_scene_has_a_scale(files, outside, tmp_path):
+    scaled = replace(SCENE, scale=Scale(0.025, "as measured"))
+    _write_mesh(tmp_path, ("glb", "ply"), outside, scaled, FRAME, up="z")
+    metres, units = loaded_mesh(tmp_path / "mesh.glb"), loaded_mesh(files[".glb"])
+    np.testing.assert_allclose(metres.vertices, 0.025 * units.vertices, atol=1e-6)
+    assert metres.volume > 0
+    assert (tmp_path / "mesh.ply").stat().st_size > 0
+    vertices = PlyData.read(tmp_path / "mesh.ply")["vertex"]
+    np.testing.assert_array_equal(vertices["x"], PlyData.read(files[".ply"])["vertex"]["x"])
 
 
 def test_numbers_in_ply_and_glb_are_the_same_floats(files, outside):

@@ -46,6 +46,15 @@ def test_every_format_of_a_cube_holds_the_same_float32_spectra(written_cubes):
     np.testing.assert_array_equal(channels["A"].pixels, VIEW.accumulation.numpy())
 
 
+def test_images_of_reflectance_are_called_so_and_hold_it_in_reflective_channels(tmp_path):
+    flat = replace(MATERIALS, light=torch.ones(len(MATERIALS.bands)))
+    cubes._write_view(("exr",), tmp_path, NAME, VIEW, flat)
+    file = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True)
+    assert file.header()["comments"] == f"{NAME}: reflectance on black, 1 = full scale"
+    assert "emissiveUnits" not in file.header()
+    np.testing.assert_array_equal(file.channels()["T.500,000000nm"].pixels, VIEW.spectra.numpy()[..., 1])
+
+
 def test_every_format_of_abundances_holds_the_same_float32_shares(tmp_path):
     formats = ("npy", "png", "envi", "exr")
     abundances._write_view(formats, tmp_path, NAME, VIEW, MATERIALS)

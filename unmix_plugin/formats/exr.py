@@ -1,7 +1,8 @@
 """OpenEXR images: named channels of one size, losslessly compressed, with attributes; and spectra as channels.
 
-Source: Fichet et al. 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3). Channels are emissive and unpolarised:
-`S0.<wavelength>nm` with a decimal comma, since a dot parts layers.
+Source: Fichet et al. 2021, An OpenEXR Layout for Spectral Images, JCGT 10(3). Radiance is in emissive, unpolarised
+channels, `S0.<wavelength>nm`, reflectance in reflective ones, `T.<wavelength>nm`; with a decimal comma, since a dot
+parts layers.
 
 Notation: `H x W` pixels, `B` bands.
 """
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -43,13 +45,13 @@ def layer_names(layer: str, channels: Sequence[str]) -> list[str]:
     return [f"{layer}.{channel.replace('.', '_')}" for channel in channels]
 
 
-def _channel_name(wavelength_nm: float) -> str:
+def _channel_name(layer: str, wavelength_nm: float) -> str:
     """Channel of a band.
 
-    >>> _channel_name(450.0)
+    >>> _channel_name("S0", 450.0)
     'S0.450,000000nm'
     """
-    return f"S0.{wavelength_nm:.6f}nm".replace(".", ",").replace(",", ".", 1)
+    return f"{layer}.{wavelength_nm:.6f}nm".replace(".", ",").replace(",", ".", 1)
 
 
 def write_spectral_exr(
@@ -59,28 +61,33 @@ def write_spectral_exr(
     rgb: Float32[np.ndarray, "H W 3"] | None,
     alpha: Float32[np.ndarray, "H W"] | None = None,
     comments: str = "",
+    quantity: Literal["reflectance", "radiance"] = "radiance",
 ) -> Path:
     """Write spectra with their wavelengths, float32.
 
     Args:
         path: File; its folder is made.
-        spectra: Radiance on black, bands last.
+        spectra: On black, bands last.
         bands: Their wavelengths.
         rgb: Preview for viewers that know no spectra, linear light in sRGB primaries.
         alpha: Opacity, [0, 1]; spectra and preview are multiplied by it already, as OpenEXR wants it.
         comments: What the numbers are.
+        quantity: What the spectra are, as `Materials.quantity` has it.
     Raises:
         ValueError: another number of wavelengths than of bands.
     """
     if spectra.shape[2] != len(bands):
         raise ValueError(f"{len(bands)} wavelengths for spectra of shape {spectra.shape}")
-    channels = {_channel_name(nm): spectra[..., i] for i, nm in enumerate(bands.centers_nm.tolist())}
+    layer = "T" if quantity == "reflectance" else "S0"
+    channels = {_channel_name(layer, nm): spectra[..., i] for i, nm in enumerate(bands.centers_nm.tolist())}
     if rgb is not None:
         channels.update({name: rgb[..., i] for i, name in enumerate("RGB")})
     if alpha is not None:
         channels["A"] = alpha
-    # The unit is the layout's for emissive images; what 1 means depends on the sensor.
-    attributes = {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}
+    attributes = {"spectralLayoutVersion": "1.0"}
+    if quantity == "radiance":
+        # The layout's unit; what 1 means depends on the sensor.
+        attributes["emissiveUnits"] = "W.m^-2.sr^-1"
     if comments:
         attributes["comments"] = comments
     return write_exr(path, channels, attributes)

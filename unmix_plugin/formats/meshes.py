@@ -214,7 +214,8 @@ def write_glb(
         linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
-        extras: What else the file says of the mesh, as JSON has it.
+        extras: What else the file says of the mesh, as JSON has it. Where its `metres_per_unit` is known, the node
+            scales by it, since lengths of glTF are metres.
         up: The unit vector that is up; its node turns it to +y, as glTF prescribes.
         uv: Texture coordinates: u to the right, v downwards.
         pictures: PNG by name; the first is shown in place of the colours, the others are variants, shown unlit.
@@ -277,7 +278,7 @@ def write_splats_glb(
         path: File; its folder is made.
         splats: What to write.
         numbers: More of each Gaussian, (P,) float32, by a name that starts with `_`.
-        extras: What else the file says, as JSON has it.
+        extras: As those of `write_glb`.
         up: The unit vector that is up; the node turns it to +y.
     Source:
         Khronos Group, KHR_gaussian_splatting.
@@ -321,7 +322,7 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
     Args:
         path: File; its folder is made.
         mesh: What to write.
-        extras: What else the file says of the mesh, as JSON has it.
+        extras: As those of `write_glb`.
     Raises:
         RunError: the disk is full or refuses.
     """
@@ -395,11 +396,13 @@ def _write_glb(
         "images": images,
     }
     said = {name: value for name, value in (used or {}).items() if value}
+    metres = extras.get("metres_per_unit")
+    node = {"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist()}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist()}],
+        "nodes": [node if metres is None else {**node, "scale": 3 * [metres]}],
         "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
         **({"materials": list(materials)} if materials else {}),
         **({"extensionsUsed": list(used)} if used else {}),

@@ -38,4 +38,5 @@ def _write_view(
             write_envi_cube(folder / view, spectra, bands, names, about)
         else:
             preview = (rendered.spectra.float().clamp(0, 1) @ rgb_matrix(bands)).clamp(0, 1).numpy()
-            write_spectral_exr(path, spectra, bands, preview, rendered.coverage.float().numpy(), about)
+            alpha = rendered.coverage.float().numpy()
+            write_spectral_exr(path, spectra, bands, preview, alpha, about, materials.quantity)

@@ -264,7 +264,16 @@ def export_mesh(
         f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
         f"at a density of {threshold * job.frame.scale:.4g} per world unit"
     )
+    if "glb" in formats:
+        say_units(job, "mesh.glb")
     return written
+
+
+def say_units(job: Job, file: str) -> None:
+    """Say what lengths in a glTF file are: metres, as it prescribes, only where the run has a scale."""
+    scale = job.loaded.scale
+    unknown = "in units of the scene, of unknown size, where glTF has metres: unmix-export scale sets one"
+    job.say(f"lengths in {file} are {unknown if scale is None else f'in metres: {scale.said}'}")
 
 
 def find_surface(
@@ -415,8 +424,8 @@ def _write_mesh(
 
     PLY carries all of it; glTF positions, normals, colours (linear), `_MATERIAL` and abundances; OBJ positions,
     normals, colours (sRGB) and the material of each face. Textures, if any, replace the colours of glTF and lie beside
-    an OBJ. Large coordinates are float64 in PLY and OBJ; glTF has them
-    less `offset` in the extras of its mesh.
+    an OBJ. Large coordinates are float64 in PLY and OBJ; glTF has them less `offset` in the extras of its mesh, in the
+    world's units; its node makes them metres where the scene has a scale.
     """
     normals = mesh.normals
     positions = torch.from_numpy(mesh.vertices).float()

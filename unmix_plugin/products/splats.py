@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Float64
 
 from unmix_plugin.formats.meshes import Splats, least_turns, write_splats_glb, write_splats_ply
-from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content
+from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content, say_units
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
@@ -75,6 +75,8 @@ def export_splats(
             comments.append("turned so that -y is up; --up z keeps the axes of the world")
         written.append(write_splats_ply(paths["ply"], splats, own, comments))
     job.say(f"{len(positions)} Gaussians")
+    if "glb" in paths:
+        say_units(job, "splats.glb")
     return written
 
 

@@ -51,6 +51,12 @@ def exr(path):
     return np.stack([channels[name] for name in "RGB"], axis=-1)
 
 
+def test_the_gltf_is_in_metres_where_the_scale_is_known(written, tmp_path):
+    write_material(tmp_path, knot(), PBR, FRAME, 256, metres_per_unit=0.001)
+    units, metres = (loaded_mesh(folder / "material.glb").vertices for folder in (written, tmp_path))
+    np.testing.assert_allclose(metres, 0.001 * units, atol=1e-7)
+
+
 def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
     loaded = loaded_mesh(written / "material.glb")
     model = FRAME.to_model(np.asarray(loaded.vertices, dtype=np.float64))

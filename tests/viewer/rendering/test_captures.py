@@ -5,6 +5,7 @@ import threading
 from dataclasses import replace
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 import tyro
@@ -75,6 +76,18 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
     frame = make_frame(source, camera)
     np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
     np.testing.assert_allclose(canvas.coverage, frame.coverage.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize(("light", "quantity"), [(None, "radiance"), (torch.ones(5), "reflectance")])
+def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_path, light, quantity):
+    frame = make_frame(source, sized_camera(some_pose(), 17, 13))
+    scene = replace(frame.scene, materials=replace(frame.materials, light=light))
+    canvas = SpectraCanvas(frame.camera, 5)
+    canvas.take(0, replace(frame, scene=scene))
+    file = OpenEXR.File(str(canvas.write(tmp_path / "view.exr")), separate_channels=True)
+    assert file.header()["comments"] == f"{quantity} on black, 1 = full scale"
+    layer = "T" if quantity == "reflectance" else "S0"
+    assert sum(name.startswith(f"{layer}.") for name in file.channels()) == 5
 
 
 def test_a_strip_that_cannot_be_taken_ends_the_capture(services, caplog):

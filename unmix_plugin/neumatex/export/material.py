@@ -105,6 +105,7 @@ def write_material(
     texture_size: int,
     seed: int = 0,
     bands: Bands | None = None,
+    metres_per_unit: float | None = None,
 ) -> tuple[list[Path], float]:
     """Write a material on a mesh.
 
@@ -116,6 +117,7 @@ def write_material(
         texture_size: Width and height of the textures, texels.
         seed: Of the fit of the glTF material.
         bands: Of a spectral material.
+        metres_per_unit: Of the world, to which glTF is scaled; None: unknown.
     Returns:
         The files, and the mean error of the glTF material as a part of the reflected light.
     Raises:
@@ -138,7 +140,10 @@ def write_material(
     about = "parameters of the material, 0 to 1, linear"
     written.append(_write_channels(folder / "parameters.exr", baked, baked.parameters, names, about))
     shown = (pictures["gltf_base_colour"], pictures["gltf_metallic_roughness"])
-    written.append(_write_glb(folder / "material.glb", mesh, baked, frame, shown))
+    extras: dict[str, Any] = {"about": "metallic-roughness approximation of a neumatex run"}
+    if metres_per_unit is not None:
+        extras["metres_per_unit"] = metres_per_unit
+    written.append(_write_glb(folder / "material.glb", mesh, baked, frame, shown, extras))
     report = _report_bytes(baked, type(family).__name__, names, fit, textures)
     written.append(write_file(folder / "material.json", report))
     if isinstance(family, NeuralFamily):
@@ -197,14 +202,18 @@ def _write_channels(
 
 
 def _write_glb(
-    path: Path, mesh: Mesh, baked: BakedMaterial, frame: Normalisation, pictures: tuple[bytes, bytes]
+    path: Path,
+    mesh: Mesh,
+    baked: BakedMaterial,
+    frame: Normalisation,
+    pictures: tuple[bytes, bytes],
+    extras: dict[str, Any],
 ) -> Path:
     """Write the mesh in world coordinates with base colour (sRGB) and metallic-roughness pictures."""
     chosen = baked.atlas.vertices
     world = positions_for_files(frame.to_world(mesh.vertices.cpu().double().numpy()))[chosen]
-    extras: dict[str, Any] = {"about": "metallic-roughness approximation of a neumatex run"}
     if world.dtype == np.float64:  # glTF has float32 only
-        extras["offset"] = np.round(world.mean(axis=0)).tolist()
+        extras = {**extras, "offset": np.round(world.mean(axis=0)).tolist()}
         world = world - extras["offset"]
     normals = directions_to_world(frame, mesh.normals.cpu().double().numpy())[chosen]
     geometry = (world.astype(np.float32), normals.astype(np.float32), baked.atlas.uv, baked.atlas.faces)

@@ -28,6 +28,7 @@ class MaterialProduct(RunProduct):
         """Unwrap, bake, fit, write."""
         from unmix_plugin.neumatex.export.material import material_paths, write_material
         from unmix_plugin.neumatex.fit.trained_object import TrainedObject
+        from unmix_plugin.products.mesh import say_units
 
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
@@ -35,7 +36,13 @@ class MaterialProduct(RunProduct):
         job.claim(material_paths(job.folder, scene.surface.family))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
-                job.folder, scene.mesh, scene.surface, scene.frame, self.texture_size, bands=scene.bands
+                job.folder,
+                scene.mesh,
+                scene.surface,
+                scene.frame,
+                self.texture_size,
+                bands=scene.bands,
+                metres_per_unit=None if job.loaded.scale is None else job.loaded.scale.metres_per_unit,
             )
         job.say(
             f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
@@ -46,6 +53,7 @@ class MaterialProduct(RunProduct):
                 else ""
             )
         )
+        say_units(job, "material.glb")
         return written
 
 

@@ -392,7 +392,8 @@ def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     comments = f"{output.name}: {output.what}"
     if bands is not None:
         spectra, rgb = np.moveaxis(planes, 0, -1), np.moveaxis(preview, 0, -1)
-        write_spectral_exr(path, spectra, bands, rgb, opacity, comments)
+        quantity = "reflectance" if "reflectance" in output.what else "radiance"
+        write_spectral_exr(path, spectra, bands, rgb, opacity, comments, quantity)
         return
     pixels = dict(zip(names, planes, strict=True))
     write_exr(path, {**pixels, "A": opacity} if output.kind == "linear" else pixels, {"comments": comments})

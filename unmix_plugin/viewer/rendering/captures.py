@@ -24,6 +24,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.video import OWN_GROUP
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
@@ -63,15 +64,16 @@ class SpectraCanvas:
         self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
         self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
         self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
-        self._bands = None
+        self._materials: Materials | None = None
 
     def take(self, first_row: int, frame: RenderedView) -> None:
         """Put a strip in its place."""
         assert isinstance(frame, MaterialView)
         rows, materials = slice(first_row, first_row + frame.camera.height), frame.materials
-        self._bands = materials.bands
+        self._materials = materials
         self.spectra[rows] = frame["spectral"].cpu().numpy()
-        self.linear_rgb[rows] = materials.through(frame.coefficients, rgb_matrix(self._bands)).cpu().numpy()
+        to_rgb = rgb_matrix(materials.bands)
+        self.linear_rgb[rows] = materials.through(frame.coefficients, to_rgb).cpu().numpy()
         self.coverage[rows] = frame.coverage.cpu().numpy()
 
     def write(self, path: Path) -> Path:
@@ -80,9 +82,10 @@ class SpectraCanvas:
         Raises:
             RunError: the disk is full or refuses.
         """
-        assert self._bands is not None
-        what = "radiance on black, 1 = full scale"
-        return write_spectral_exr(path, self.spectra, self._bands, self.linear_rgb, self.coverage, what)
+        assert self._materials is not None
+        bands, quantity = self._materials.bands, self._materials.quantity
+        about = f"{quantity} on black, 1 = full scale"
+        return write_spectral_exr(path, self.spectra, bands, self.linear_rgb, self.coverage, about, quantity)
 
 
 _LAUNCH = "from unmix_plugin.commands.render import main; main()"
