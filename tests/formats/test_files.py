@@ -7,20 +7,37 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from tests.formats.cubes import full_disk, random_cube
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.formats.files import (
+    NOT_PLAIN,
+    NOT_PORTABLE,
     array_bytes,
     indexed_png_bytes,
     make_folder,
     npy_rows,
     refuse_to_overwrite,
     rgba_png_bytes,
+    safe_name,
     write_file,
 )
+
+DEVICES = {
+    "con",
+    "prn",
+    "aux",
+    "nul",
+    *(f"{port}{digit}" for port in ("com", "lpt") for digit in "123456789"),
+}
+NASTY = st.sampled_from(
+    ["con", "NUL", "aux.txt", "com1", ".", " ", ":", "\\", "/", "\0", "a", "\u00e9", "e\u0301", "-"]
+)
+NAMES = st.one_of(st.text(max_size=400), st.lists(NASTY, max_size=6).map("".join))
 
 
 def test_a_file_is_written_into_a_folder_made_for_it(tmp_path):
@@ -151,3 +168,55 @@ def test_a_picture_of_ids_is_ids_and_colours_in_one(tmp_path):
         rgba = np.asarray(picture.convert("RGBA"))
     np.testing.assert_array_equal(rgba[..., :3], np.round(palette[ids] * 255))
     np.testing.assert_array_equal(rgba[..., 3] == 0, ids == 255)
+
+
+@given(NAMES, st.sampled_from([NOT_PLAIN, NOT_PORTABLE]))
+def test_a_safe_name_is_one_on_every_system_and_safe_names_stay(name, unfit):
+    safe = safe_name(name, unfit)
+    assert safe.isprintable()
+    assert not set(safe) & set('<>:"/\\|?*')
+    assert safe == safe.strip(". ") != ""
+    assert safe.partition(".")[0].rstrip().lower() not in DEVICES
+    assert len(safe.encode()) <= 110
+    assert safe_name(safe, unfit) == safe
+
+
+@pytest.mark.parametrize(
+    ("name", "safe"),
+    [
+        ("CON", "_CON"),
+        ("aux.txt", "_aux.txt"),
+        ("com\u00b9", "_com\u00b9"),
+        ("console", "console"),
+        ("C:leaf", "C_leaf"),
+        ("leaf. . ", "leaf"),
+        ("Bl\u00e4tter", "Bl\u00e4tter"),
+        (" . ", "unnamed"),
+    ],
+)
+def test_devices_streams_and_trailing_dots_of_windows_are_no_names(name, safe):
+    assert safe_name(name) == safe
+
+
+def test_long_names_that_differ_at_their_end_stay_different():
+    assert safe_name("\u6e2f" * 90 + "a") != safe_name("\u6e2f" * 90 + "b")
+
+
+@pytest.mark.parametrize(
+    "writes", [lambda path: write_file(path, b""), lambda path: make_folder(path / "more")]
+)
+def test_a_path_too_long_for_windows_is_said_to_be_that(tmp_path, monkeypatch, writes):
+    """Its own words are that there is no such file or folder."""
+    (tmp_path / "file").touch()
+    with pytest.raises(RunError, match="choose"):
+        writes(tmp_path / "file" / "name")
+    monkeypatch.setattr(atomic_files, "_LONGEST_PATH", 12)
+    with pytest.raises(
+        RunError, match="more than 12 letters: choose a shorter folder, or turn on long paths"
+    ):
+        writes(tmp_path / "file" / "name")
+
+
+def test_a_name_too_long_is_to_be_shortened(tmp_path):
+    with pytest.raises(RunError, match="File name too long; choose a shorter name"):
+        write_file(tmp_path / ("a" * 256), b"")

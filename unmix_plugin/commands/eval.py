@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -125,6 +124,7 @@ def _evaluate_run(
     from unmix_plugin.engine.processes import flat_settings
     from unmix_plugin.engine.runs.config_json import config_to_json
     from unmix_plugin.engine.runs.load_run import load_pipeline
+    from unmix_plugin.formats.files import safe_name
     from unmix_plugin.products.comparison import ComparedRun
     from unmix_plugin.products.evaluation import evaluate_images, evaluate_scene
 
@@ -139,7 +139,7 @@ def _evaluate_run(
             for note in scene.notes:
                 print(note)
             words = ["eval", *(Path(given).stem for given in (options.edits, options.illuminant) if given)]
-            folder = loaded.run.exports / re.sub(r"[^\w.-]+", "_", "-".join(words))
+            folder = loaded.run.exports / safe_name("-".join(words))
     measured = spectral_scene(loaded.pipeline.datamanager)
     shown = partial(follow, console)
     if scene is not None and measured is not None:

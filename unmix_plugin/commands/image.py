@@ -68,7 +68,7 @@ def image(argv: list[str]) -> None:
 
     from unmix_plugin.captures.calibration.calibration import find_missing
     from unmix_plugin.captures.readers.opening import open_spectral_file
-    from unmix_plugin.formats.files import refuse_to_overwrite
+    from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
     from unmix_plugin.products.unmixed_image import (
         BandAxis,
         unmixed_image_paths,
@@ -76,7 +76,7 @@ def image(argv: list[str]) -> None:
     )
     from unmix_plugin.spectral.unmixing.image import unmix_image
 
-    folder = options.output_dir / (options.file.resolve().stem or "image")
+    folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
     refuse_to_overwrite(paths, options.overwrite)
     opened = open_spectral_file(options.file, _reading(options))

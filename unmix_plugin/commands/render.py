@@ -226,13 +226,14 @@ def _camera_files(
     folder: Path, options: RenderOptions, cameras: RenderCameras, frame: Normalisation
 ) -> dict[Path, bytes]:
     """The file of the cameras; none of a map, which no camera file can hold."""
+    from unmix_plugin.formats.files import safe_name
     from unmix_plugin.trained.camera_files import camera_file_bytes
 
     if cameras.map_info is not None:
         return {}
     frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
     data = camera_file_bytes(cameras.views, frames_per_second, frame)
-    return {folder / f"cameras-{Path(options.cameras).stem}.json": data}
+    return {folder / f"{safe_name(f'cameras-{Path(options.cameras).stem}')}.json": data}
 
 
 def _list(

@@ -17,7 +17,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from unmix_plugin.engine.runs.atomic_files import (
+    NOT_PLAIN,
+    NOT_PORTABLE,
     make_folder,
+    safe_name,
     whole_file,
     write_all,
     write_errors_as,
@@ -30,6 +33,8 @@ if TYPE_CHECKING:
 
 
 __all__ = [
+    "NOT_PLAIN",
+    "NOT_PORTABLE",
     "RowSink",
     "array_bytes",
     "csv_bytes",
@@ -40,6 +45,7 @@ __all__ = [
     "raw_rows",
     "refuse_to_overwrite",
     "rgba_png_bytes",
+    "safe_name",
     "write_file",
 ]
 

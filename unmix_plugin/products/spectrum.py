@@ -18,7 +18,7 @@ from jaxtyping import Float
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.figures.plotting import figure_bytes, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
-from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.files import NOT_PORTABLE, make_folder, safe_name, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measured_surface
@@ -62,7 +62,7 @@ def export_spectrum(
     measured = spread = None
     others = (view_name, pixel_text, point_text)
     if region is not None and others == (None, None, None):
-        title, name = f"region {region}", f"region_{region}"
+        title, name = f"region {region}", safe_name(f"region_{region}", NOT_PORTABLE)
         kept = job.loaded.measures.region(region)
         job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
         found = measured_surface(job).measure(kept, region)

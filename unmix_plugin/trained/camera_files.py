@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from jaxtyping import Float64
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.formats.files import safe_name
 from unmix_plugin.scenes.placement import read_placement
 from unmix_plugin.scenes.reading.faults import (
     Faults,
@@ -271,9 +271,9 @@ def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
         if not all(isinstance(value, str) and value for value in values):
             continue
         stems = [str(value) if key == "name" else Path(str(value)).stem for value in values]
-        names = [re.sub(r"[^\w.+-]", "_", stem).strip(".") for stem in stems]
-        if all(names) and len({name.casefold() for name in names}) == len(names):
+        names = [safe_name(stem) for stem in stems]
+        if len({name.casefold() for name in names}) == len(names):
             return names
         if key == "name":
-            raise ConfigError(f"{path}: two frames have one name, or a name that no file can have")
+            raise ConfigError(f"{path}: two frames have one name")
     return numbers

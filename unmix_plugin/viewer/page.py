@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -19,13 +18,14 @@ from jaxtyping import Float
 
 from unmix_plugin.errors import ConfigError, UnmixError
 from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.formats.files import safe_name
 
 if TYPE_CHECKING:
     import viser
 
 
-_LONGEST_TEXT, _LONGEST_NAME = 100_000, 64
-"""Letters of a text and of a file's name that are looked at."""
+_LONGEST_TEXT = 100_000
+"""Letters of a text that are looked at."""
 
 _LOG = logging.getLogger("unmix_plugin.viewer")
 _ChoiceT = TypeVar("_ChoiceT")
@@ -71,14 +71,13 @@ def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
 
     Args:
         folder: Where; it need not exist.
-        name: What was typed. Anything but letters, digits, `_`, `-` and inner dots becomes `_`.
+        name: What was typed. Anything but letters, digits, `_`, `+`, `-` and inner dots becomes `_`.
         suffix: Ending, with its dot.
         fallback: Used where nothing is left of the name.
     Raises:
         ConfigError: there are too many files of that name.
     """
-    cleaned = re.sub(r"[^A-Za-z0-9_.-]", "_", text(name)[:_LONGEST_NAME].strip()).strip("._")
-    stem = cleaned.removesuffix(suffix).strip("._") or fallback
+    stem = safe_name(text(name).strip().removesuffix(suffix).strip("._/\\"), fallback=fallback)
     for count in range(1, 10_000):
         path = folder / f"{stem if count == 1 else f'{stem}-{count}'}{suffix}"
         if not path.exists():

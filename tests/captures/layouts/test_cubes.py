@@ -12,6 +12,7 @@ from tests.captures.layouts.data_sets import PLAIN
 from unmix_plugin.captures.calibration import sensor
 from unmix_plugin.captures.calibration.calibration import open_reference
 from unmix_plugin.captures.layouts.cubes import find_cubes
+from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
@@ -144,6 +145,11 @@ def test_references_above_a_tree_are_named(tmp_path):
     write_cube(tmp_path, "white", counts(3000))
     assert list(stems(tmp_path)) == NAMES
     assert any("references: white.hdr;" in note for note in find_cubes(tmp_path, PLAIN).notes)
+
+
+def test_views_are_named_so_that_every_system_has_a_file_for_each():
+    names = view_names(["aux.hdr", "leaf (1).hdr", "_x: .hdr"], "here")
+    assert names == ["_aux", "leaf_1", "x"]
 
 
 @pytest.mark.parametrize("twin", ["capture/213.npy", "results/REFLECTANCE_213.npy"])

@@ -53,9 +53,10 @@ def test_runs_started_in_the_same_second_get_folders_of_their_own(tmp_path: Path
 
 
 def test_a_scene_name_that_is_no_file_name_stays_inside_the_output_folder(tmp_path: Path):
-    for name in ("..", "a/b", "", ".", "x y\n"):
+    for name in ("..", "a/b", "", ".", "x y\n", "nul", "plant."):
         run = create_run_folder(tmp_path, name, "m", NOON)
         assert run.path.parents[2] == tmp_path
+        assert run.path.parents[1].name in ("scene", "a_b", "x_y_", "_nul", "plant")
 
 
 def test_the_newest_run_is_the_one_started_or_resumed_last_whatever_its_name(tmp_path: Path):
@@ -181,7 +182,7 @@ def test_a_run_finds_its_scene_from_any_working_directory(
 
 
 @pytest.mark.parametrize(
-    "name", ["/tmp/x", "../../x", "a/b", "..", ".", "", "a\nb", "a\0b", "\ud800", 3, None]
+    "name", ["/tmp/x", "../../x", "a/b", "..", ".", "", "a\nb", "a\0b", "\ud800", 3, None, "nul", "a:b", "a."]
 )
 def test_a_view_whose_name_is_no_plain_file_name_is_refused(trained: RunFolder, name: object):
     rewrite(trained.scene_path, lambda scene: scene["summary"].update(frames=["a", name]))

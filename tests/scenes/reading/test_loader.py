@@ -297,6 +297,20 @@ def test_names_take_the_folder_in_where_stems_repeat(tmp_path):
     assert names[:3] == ["cubes_view_0", "other_view_0", "cubes_view_2"]
 
 
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (["CON.npy", "aux.x.npy"], ["_CON", "_aux.x"]),
+        (["a:b.npy", "c. .npy"], ["a_b", "c"]),
+        (["Leaf.npy", "leaf.npy"], ["0_Leaf", "1_leaf"]),
+        (["x/nul.npy", "y/nul.npy"], ["x_nul", "y_nul"]),
+        (["leaf (1).npy", "leaf (2).npy"], ["leaf (1)", "leaf (2)"]),
+    ],
+)
+def test_names_are_those_of_different_files_on_every_system(files, expected):
+    assert loader.distinct_names(files) == expected
+
+
 def test_every_file_read_has_its_hash_and_a_changed_file_another(tmp_path):
     folder = make_scene(tmp_path / "scene")
     scene = load_scene(folder.root)

@@ -26,6 +26,7 @@ from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.formats.files import safe_name
 
 _CUBE_SUFFIXES = frozenset(
     {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4", ".pt"}
@@ -255,4 +256,4 @@ def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
 def _name(path: Path) -> str:
     """The stem, with only what is fit for any file system."""
     stem = path.name if path.is_dir() else path.stem
-    return re.sub(r"[^\w.+-]+", "_", stem).strip(".") or "view"
+    return safe_name(stem, fallback="view")

@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from unmix_plugin.captures.spectral_file import Capture, ReadOptions
 from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.formats.files import NOT_PLAIN, safe_name
 from unmix_plugin.scenes.reading.faults import find_named
 
 _FindViews: TypeAlias = Callable[[Path, ReadOptions], Capture]
@@ -88,7 +89,7 @@ def view_names(texts: Sequence[str], where: str) -> list[str]:
     stems = [path.name if path.suffix[1:].isdecimal() else path.stem for path in paths]
     if len(set(stems)) < len(stems):
         stems = ["_".join([*path.parent.parts, stem]) for path, stem in zip(paths, stems, strict=True)]
-    names = [re.sub(r"[^\w.+-]+", "_", stem).strip("._") or "view" for stem in stems]
+    names = [safe_name(re.sub(NOT_PLAIN, "_", stem).strip("._"), fallback="view") for stem in stems]
     seen: dict[str, str] = {}
     for name, text in zip(names, texts, strict=True):
         other = seen.setdefault(name.casefold(), text)

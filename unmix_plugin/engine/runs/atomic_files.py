@@ -5,9 +5,12 @@ The JSON files of a run have one format version for all of them, and nothing is 
 
 import contextlib
 import errno
+import hashlib
 import json
 import os
+import re
 import time
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +25,9 @@ _CHUNK_BYTES = 1 << 26
 _READERS_S = (0.02, 0.1, 0.5, 1.0) if os.name == "nt" else ()
 """Waits for readers of a file to be replaced: Windows lets nobody replace one that is open, as by a virus scanner."""
 
+_LONGEST_PATH = 259 if os.name == "nt" else None
+"""Letters of a path, where Windows has not been told to take long ones; its error is that of a missing folder."""
+
 _MAKE_ROOM, _ELSEWHERE = "; make room or choose another folder", "; choose a folder that you may write to"
 _RAISE_LIMIT = "; raise the limit of a file's size (ulimit -f), or choose a folder on another file system"
 _ADVICE = {
@@ -30,9 +36,42 @@ _ADVICE = {
         (_MAKE_ROOM, (errno.ENOSPC, errno.EDQUOT)),
         (_RAISE_LIMIT, (errno.EFBIG,)),
         (_ELSEWHERE, (errno.EACCES, errno.EPERM, errno.EROFS)),
+        ("; choose a shorter name", (errno.ENAMETOOLONG,)),
     )
     for number in numbers
 }
+
+NOT_PLAIN, NOT_PORTABLE = r"[^\w.+-]+", r'[\\/:*?"<>|]'
+"""What a name needn't have, and what some system refuses in one."""
+
+_DEVICES = re.compile(
+    r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\u00b9\u00b2\u00b3]) *(\..*)?", re.IGNORECASE
+)
+"""Names that are devices in every folder on Windows, whatever suffix follows."""
+
+_LONGEST_NAME_BYTES = 110
+"""Bytes of a name, of which encrypted file systems take 143, with the suffixes and marks that ours get."""
+
+
+def safe_name(name: str, unfit: str = NOT_PLAIN, fallback: str = "unnamed") -> str:
+    """A user's name as one that every system takes for a file or a folder, with any suffix of ours behind it.
+
+    No dot or space begins or ends it, it is no device of Windows, and a long one ends with letters of its hash.
+
+    Args:
+        unfit: Pattern of what becomes `_`, beside what can't be printed; NOT_PORTABLE leaves spaces and brackets.
+        fallback: Used where nothing is left of the name.
+
+    >>> safe_name("aux.txt"), safe_name("leaf: 3. "), safe_name("leaf (3)", NOT_PORTABLE)
+    ('_aux.txt', 'leaf_3', 'leaf (3)')
+    """
+    shown = "".join(one if one.isprintable() else "_" for one in unicodedata.normalize("NFC", name))
+    plain = re.sub(unfit, "_", shown.strip(" .")).strip(" .") or fallback
+    plain = f"_{plain}" if _DEVICES.fullmatch(plain) else plain
+    if len(plain.encode()) <= _LONGEST_NAME_BYTES:
+        return plain
+    ending = hashlib.sha256(plain.encode()).hexdigest()[:8]
+    return f"{plain.encode()[: _LONGEST_NAME_BYTES - 9].decode(errors='ignore')}-{ending}"
 
 
 @contextmanager
@@ -93,7 +132,7 @@ def make_folder(path: Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(
-            f"can't make the folder {path}: {error.strerror or error}; choose another one"
+            f"can't make the folder {path}: {error.strerror or error}{_too_long(path) or '; choose another one'}"
         ) from error
     return path
 
@@ -115,7 +154,14 @@ def write_errors_as(path: Path) -> Iterator[None]:
 
 def cannot_write(path: Path, reason: str) -> RunError:
     """The error of a file that can't be written, with advice where the reason calls for some."""
-    return RunError(f"can't write {path}: {reason}{_ADVICE.get(reason, '')}")
+    return RunError(f"can't write {path}: {reason}{_too_long(path) or _ADVICE.get(reason, '')}")
+
+
+def _too_long(path: Path) -> str:
+    """What to do about a path that is too long for Windows; empty for others."""
+    if _LONGEST_PATH is None or len(str(path.absolute())) <= _LONGEST_PATH:
+        return ""
+    return f"; the path has more than {_LONGEST_PATH} letters: choose a shorter folder, or turn on long paths"
 
 
 def remove_stale_temporaries(folder: Path) -> None:

@@ -2,13 +2,13 @@
 
 import errno
 import os
-import re
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from unmix_plugin.engine.runs.atomic_files import safe_name
 from unmix_plugin.errors import RunError
 
 
@@ -64,7 +64,7 @@ def create_run_folder(
         RunError: it can't be made.
     """
     stamp = (started or datetime.now(timezone.utc).astimezone()).strftime("%Y-%m-%d_%H%M%S")
-    parent = output_dir.resolve() / (_file_name(scene_name) or "scene") / _file_name(method_name)
+    parent = output_dir.resolve() / safe_name(scene_name, fallback="scene") / safe_name(method_name)
     try:
         parent.mkdir(parents=True, exist_ok=True)
         for number in range(1, 10_000):
@@ -135,11 +135,6 @@ def _refuse_links_out(root: Path) -> None:
                     f"{path} is a link that leads out of the run folder, to {path.resolve()}; "
                     "put what it leads to in its place, or remove it"
                 )
-
-
-def _file_name(name: str) -> str:
-    """`name` with whatever a folder name had better not have replaced by `_`."""
-    return re.sub(r"[^\w.+-]", "_", name).strip(".")
 
 
 class RunLock:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import torch
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import DataManager
-from unmix_plugin.engine.runs.atomic_files import read_run_json
+from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, read_run_json, safe_name
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
 
@@ -124,10 +123,8 @@ def _check_frames(record: SceneRecord) -> None:
 
 
 def _is_plain_name(name: Any) -> bool:
-    """Whether `name` is text that names a file in a folder, and never one elsewhere."""
-    if not isinstance(name, str) or name in ("", ".", ".."):
-        return False
-    return PurePath(name).name == name and name.isprintable()
+    """Whether `name` is text that names a file in a folder on any system, and never one elsewhere."""
+    return isinstance(name, str) and name == safe_name(name, NOT_PORTABLE)
 
 
 _RELATIVE_TOLERANCE = 1e-4

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -20,7 +20,7 @@ from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import FORMATS, UnreadableImageError, read_colour, read_mask
-from unmix_plugin.scenes.reading.loader import make_cameras
+from unmix_plugin.scenes.reading.loader import distinct_names, make_cameras
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import Normalisation
 
@@ -213,7 +213,9 @@ def read_posed_pictures(
     """
     located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
     faults.raise_if_any()
-    names = _names([files.colours.relative_to(root).as_posix() for files in located if files is not None])
+    names = distinct_names(
+        [files.colours.relative_to(root).as_posix() for files in located if files is not None]
+    )
     named = [
         replace(files, name=name) for name, files in zip(names, located, strict=True) if files is not None
     ]
@@ -251,14 +253,6 @@ def _check(root: Path, named: list[_PictureFiles], faults: Faults) -> tuple[list
         sizes.append((shape[0], shape[1]))
         colours.add(shape[2])
     return sizes, colours
-
-
-def _names(paths: list[str]) -> list[str]:
-    """The shortest names that differ: stems, with folders before them, or with numbers."""
-    plain = [PurePosixPath(path).with_suffix("") for path in paths]
-    candidates = ([path.name for path in plain], ["_".join(path.parts) for path in plain])
-    numbered = [f"{path.name}_{index}" for index, path in enumerate(plain)]
-    return next((names for names in candidates if len(set(names)) == len(names)), numbered)
 
 
 def has_alpha(picture: Picture) -> bool:

@@ -23,7 +23,7 @@ from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.formats.envi import envi_cube_paths, envi_cube_rows
 from unmix_plugin.formats.exr import layer_names, write_exr, write_spectral_exr
-from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, write_file
+from unmix_plugin.formats.files import indexed_png_bytes, npy_rows, rgba_png_bytes, safe_name, write_file
 from unmix_plugin.formats.video import FrameSink, video_frames
 from unmix_plugin.products.render.maps import MapInfo
 from unmix_plugin.products.render.pictures import (
@@ -45,7 +45,6 @@ _FORMATS: tuple[_Format, ...] = ("envi", "exr", "npy", "png", "mp4", "tif")
 _EVERY_OUTPUT = "all"
 """Stands for every output that takes no argument."""
 
-_LONGEST_FILE_NAME = 100
 _LARGEST_TIFF = 1 << 31
 """Bytes; of more numbers BigTIFF is written, as addresses in a TIFF end at 4 GiB."""
 _DEFAULT_STILLS = ("spectral", "rgb", "abundances", "segmentation", "depth")
@@ -113,9 +112,8 @@ def file_name(output: Output) -> str:
     )
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
     is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES
-    if len(plain) <= _LONGEST_FILE_NAME and not is_formula:
-        return plain
-    return f"{plain[:_LONGEST_FILE_NAME]}-{hashlib.sha256(output.name.encode()).hexdigest()[:8]}"
+    ending = f"-{hashlib.sha256(output.name.encode()).hexdigest()[:8]}" if is_formula else ""
+    return safe_name(plain + ending)
 
 
 def needs_legend(formatted: FormattedOutput, scene: RenderableScene) -> bool:

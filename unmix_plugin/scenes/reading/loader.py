@@ -6,6 +6,7 @@ time. Model space is found last: which box the training views show, and whether 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -17,6 +18,7 @@ from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, safe_name
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
 from unmix_plugin.scenes.geometry.bounds import find_bounds
@@ -195,23 +197,33 @@ def _readable(name: str) -> str:
     >>> _readable("@SUM(A1)"), _readable("leaf\\u202e_1")
     ('_SUM(A1)', 'leaf__1')
     """
-    shown = "".join(character if character.isprintable() else "_" for character in name)
+    shown = safe_name(name, NOT_PORTABLE, "view")
     return f"_{shown[1:]}" if shown[:1] in ("=", "+", "-", "@") else shown
+
+
+def distinct_names(files: Sequence[str]) -> list[str]:
+    """The shortest names of views that differ and that files can have on every system.
+
+    Args:
+        files: Path of a file of each, with slashes: its stem, its folder before it, its whole path, or a number.
+    """
+    paths = [PurePosixPath(file).with_suffix("") for file in files]
+    candidates = (
+        [path.name for path in paths],
+        [f"{path.parent.name}_{path.name}" for path in paths],
+        ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths],
+    )
+    for candidate in candidates:
+        names = [_readable(name) for name in candidate]
+        if len({name.casefold() for name in names}) == len(names):
+            return names
+    return [_readable(f"{index}_{path.name}") for index, path in enumerate(paths)]
 
 
 def _name_frames(
     entry: SceneEntry, located: tuple[dict[str, Path], ...], sensors: tuple[int, ...]
 ) -> tuple[Frame, ...]:
-    """Frames with the shortest names that differ: the stem of the cube, its folder before it, or its whole path."""
-    paths = [PurePosixPath(frame.paths["hyperspectral_file_path"]).with_suffix("") for frame in entry.frames]
-    candidates = (
-        [path.name for path in paths],
-        [f"{path.parent.name}_{path.name}" for path in paths],
-        ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths],
-        [f"{path.name}_{index}" for index, path in enumerate(paths)],
-    )
-    candidates = [[_readable(name) for name in names] for names in candidates]
-    names = next((names for names in candidates if len(set(names)) == len(names)), candidates[-1])
+    names = distinct_names([frame.paths["hyperspectral_file_path"] for frame in entry.frames])
     return tuple(
         Frame(
             name=name,
