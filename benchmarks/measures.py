@@ -20,13 +20,13 @@ import _machine
 import numpy as np
 import tyro
 
-from unmix_plugin.products.mesh import surface_of
-from unmix_plugin.products.regions import MeasuredSurface
 from unmix_plugin.scenes.demo.shading import THINGS
 from unmix_plugin.scenes.demo.shapes import first_hits
+from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import scale_between
 from unmix_plugin.trained.open_run import open_run
 from unmix_plugin.trained.regions import Box
+from unmix_plugin.trained.surface_mesh import surface_of
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 METRES = 0.1

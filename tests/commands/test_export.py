@@ -27,13 +27,13 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
-from unmix_plugin.products.mesh import TriangleMesh
 from unmix_plugin.products.page.page import material_areas
 from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.open_run import load_run, open_run
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SMALL = {
     "cubes": ["--formats", "envi", "exr", "npy"],

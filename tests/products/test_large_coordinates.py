@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from tests.products.ball_model import ALL_ROUND, ball_scene, seen_surface
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME, around
-from unmix_plugin.products.mesh import TriangleMesh, _write_mesh
+from unmix_plugin.products.mesh import _write_mesh
 from unmix_plugin.products.point_cloud import _write_point_cloud
 from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView, positions_for_files
 from unmix_plugin.trained.surface import GridPoints
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SCENE = ball_scene()
 MIDDLE = np.array([-2_499_366.0, -4_256_836.0, 4_029_217.0])

@@ -21,22 +21,19 @@ from tests.products.ball_model import (
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.mesh import (
-    TriangleMesh,
-    _extract_mesh,
-    _filled,
-    _mesh_paths,
-    _not_empty,
-    _require_sound,
-    _surface_density,
-    _textures,
-    _trim_unseen,
-    _without_stray_pieces,
-    _write_mesh,
-)
+from unmix_plugin.products.mesh import _mesh_paths, _require_sound, _textures, _write_mesh
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import world_up
 from unmix_plugin.trained.surface import GridPoints, sample_slice
+from unmix_plugin.trained.surface_mesh import (
+    TriangleMesh,
+    _extract_mesh,
+    _filled,
+    _not_empty,
+    _surface_density,
+    _trim_unseen,
+    _without_stray_pieces,
+)
 
 SCENE = ball_scene()
 PIXEL = SCENE.pixel_size

@@ -17,11 +17,12 @@ import torch
 from jaxtyping import Float, Float64
 
 from unmix_plugin.formats.meshes import Splats, least_turns, write_splats_glb, write_splats_ply
-from unmix_plugin.products.mesh import TriangleMesh, find_surface, gltf_content, say_units
+from unmix_plugin.products.mesh import find_surface, gltf_content, say_units
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_at
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 _WIDTH = 0.75
 """Standard deviation along the surface, relative to the square root of the vertex's area."""

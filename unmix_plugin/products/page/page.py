@@ -31,7 +31,7 @@ from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.products.abundances import draw_abundances
-from unmix_plugin.products.mesh import TriangleMesh, find_surface
+from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.segmentation import draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
@@ -42,6 +42,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 MOST_BYTES = 20_000_000

@@ -1,0 +1,162 @@
+"""Regions measured on the surface of a scene: how large they are, their mean spectrum with its spread, and what they
+are made of.
+
+All is weighted by area (`TriangleMesh.areas`), on the surface that `unmix-export mesh` exports.
+
+Notation: `V` vertices, `F` faces, `P` points, `B` bands, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, UInt8
+from torch import Tensor
+
+from unmix_plugin.errors import ConfigError
+from unmix_plugin.trained.measures import Scale, describe_area
+from unmix_plugin.trained.regions import Box, InView, OfMaterial, Region
+from unmix_plugin.trained.surface import SeenSurface, SurfaceAppearance, look_from_above
+from unmix_plugin.trained.surface_mesh import Follow, TriangleMesh, Working, surface_of
+from unmix_plugin.trained.trained_scene import TrainedScene
+
+_CELLS_PER_PIXEL, _RESOLUTIONS = 2, (48, 256)
+"""Along the longest edge of the scene box, and the least and most cells there."""
+_PARTS = ((2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4))
+"""Points of a triangle that tell how much of it is in a region, by their shares of its corners, in sixths."""
+
+
+@dataclass(frozen=True)
+class MeasuredRegion:
+    """What a part of a surface is."""
+
+    area: float
+    """Square units of the world."""
+    mean: Float64[np.ndarray, " B"]
+    """Spectrum without the view-dependent part."""
+    spread: Float64[np.ndarray, " B"]
+    """Standard deviation over the area."""
+    abundances: Float64[np.ndarray, " K"]
+    """Summing to 1."""
+
+    faces: Bool[np.ndarray, " F"]
+    """Triangles of which more than half is in it."""
+
+    def said(self, names: Sequence[str], scale: Scale | None) -> str:
+        """Area and largest shares for people."""
+        largest = np.argsort(-self.abundances)[:3]
+        shares = ", ".join(f"{names[index]} {self.abundances[index]:.2f}" for index in largest)
+        return f"{describe_area(self.area, scale)}: {shares}"
+
+
+class MeasuredSurface:
+    """The surface of a scene, in which any region can be measured."""
+
+    def __init__(self, scene: TrainedScene, mesh: TriangleMesh) -> None:
+        """
+        Args:
+            scene: Unedited or edited.
+            mesh: Its surface, model space.
+        """
+        self._scene, self.mesh = scene, mesh
+        positions, normals = (torch.from_numpy(values).float() for values in (mesh.vertices, mesh.normals))
+        self._abundances, self._diffuse = look_from_above(scene, positions, normals)
+        self._materials = SurfaceAppearance(scene.materials, self._abundances, self._diffuse).material_ids
+
+    @classmethod
+    def of(
+        cls,
+        scene: TrainedScene,
+        follow: Follow = lambda _doing, items: items,
+        working: Working = lambda _doing: nullcontext(),
+    ) -> MeasuredSurface:
+        """The surface that `mesh` exports, with cells half as large as a pixel; `follow` and `working` as `surface_of`
+        takes them.
+
+        Raises:
+            RunError: no camera of the run sees a surface.
+        """
+        cells = _CELLS_PER_PIXEL * float(scene.scene_box.size.max()) / scene.pixel_size
+        resolution = round(min(max(cells, _RESOLUTIONS[0]), _RESOLUTIONS[1]))
+        mesh, _ = surface_of(scene, resolution, follow=follow, working=working)
+        with working("looking at the surface's points"):
+            return cls(scene, mesh)
+
+    @cached_property
+    def areas(self) -> Float64[np.ndarray, " F"]:
+        """Of the triangles, square units of the world."""
+        return self.mesh.areas() / self._scene.frame.scale**2
+
+    def shares(self, region: Region) -> Float64[np.ndarray, "F 3"]:
+        """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""
+        faces = self.mesh.faces
+        if isinstance(region, OfMaterial):
+            return _in_material(self._scene, region, self._materials)[faces].astype(np.float64)
+        corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
+        points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
+        inside = points_in(self._scene, region, torch.from_numpy(points).float())
+        return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
+
+    def measure(self, region: Region, name: str) -> MeasuredRegion:
+        """What a region is.
+
+        Raises:
+            ConfigError: nothing of the surface is in it, or the scene has no such material.
+        """
+        shares = self.shares(region)
+        weights = shares * (self.areas / 3)[:, None]
+        area = float(weights.sum())
+        if area <= 0:
+            low, high = (self._scene.frame.to_world(self.mesh.vertices).round(3) for _ in range(2))
+            raise ConfigError(
+                f"the region {name} has nothing of the surface in it, which lies between "
+                f"{' '.join(f'{x:g}' for x in low.min(axis=0))} and {' '.join(f'{x:g}' for x in high.max(axis=0))} "
+                "of the world"
+            )
+        share = (
+            np.bincount(self.mesh.faces.ravel(), weights=weights.ravel(), minlength=len(self.mesh.vertices))
+            / area
+        )
+        spectra = self._diffuse.double().numpy()
+        mean = share @ spectra
+        spread = np.sqrt(share @ (spectra - mean) ** 2)
+        abundances = share @ self._abundances.double().numpy()
+        return MeasuredRegion(area, mean, spread, abundances, shares.mean(axis=1) > 0.5)
+
+
+def points_in(
+    scene: TrainedScene, region: Box | InView, positions: Float[Tensor, "P 3"]
+) -> Bool[np.ndarray, " P"]:
+    """Which points of a scene's surface are in a box or in a part of a view.
+
+    Args:
+        positions: Model space, on the CPU.
+    """
+    if isinstance(region, Box):
+        world = scene.frame.to_world(positions.double().numpy())
+        return np.all((world >= region.low) & (world <= region.high), axis=1, keepdims=False)
+    camera = region.camera.to("cpu")
+    coords, depths = camera.project(positions, 0)
+    mask = region.mask()
+    height, width = mask.shape
+    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < torch.tensor([width, height])).all(dim=-1)
+    columns, rows = coords[inside].long().numpy().T
+    inside[inside.clone()] = torch.from_numpy(mask[rows, columns])
+    if bool(inside.any()):
+        seen = SeenSurface(scene, width * height, [camera])
+        seen.look(camera)
+        inside[inside.clone()] = seen.shows(positions[inside])
+    return inside.numpy()
+
+
+def _in_material(
+    scene: TrainedScene, region: OfMaterial, materials: UInt8[np.ndarray, " V"]
+) -> Bool[np.ndarray, " V"]:
+    if region.material >= len(scene.materials.names):
+        raise ConfigError(f"the scene has no material {region.material}; it has {len(scene.materials.names)}")
+    return np.asarray(materials == region.material)
