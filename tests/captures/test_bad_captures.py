@@ -28,6 +28,7 @@ from unmix_plugin.errors import UnmixError
 Spoil = Callable[[Path], Any]
 COUNTS = np.full((HEIGHT, WIDTH, BANDS), 500, np.uint16)
 MOVED = ", ".join(f"{value + 3:g}" for value in WAVELENGTHS_NM)
+BACKWARDS = ", ".join(f"{value:g}" for value in WAVELENGTHS_NM[::-1])
 REFERENCES = {"white": "white.hdr", "dark": "dark.hdr"}
 
 
@@ -116,6 +117,16 @@ SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
     ),
     (_cube("view_01", wavelength=f"{{{MOVED}}}"), {}, r"view_01\.hdr has 453 nm at band 0; expected 450 nm"),
     (_cube("view_01", COUNTS.astype(np.float32)), {}, "holds float32; expected uint16"),
+    (
+        _cube("view_01", COUNTS, **{"reflectance scale factor": 10000}),
+        {},
+        r"view_00\.hdr has no gains or scale, .*view_01\.hdr has \(header field 'reflectance scale factor'\)",
+    ),
+    (
+        _cube("white", wavelength=f"{{{BACKWARDS}}}"),
+        REFERENCES,
+        r"white\.hdr has 850 nm at band 0; expected 450 nm",
+    ),
     (_cut, {}, r"view_01\.raw: cut short: 1000 bytes; view_01\.hdr promises 13824"),
     (_pointer, {}, r"view_09\.tif: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'"),
     (

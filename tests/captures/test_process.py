@@ -132,6 +132,43 @@ def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_pat
     assert record["stored"]["value_scale"] == FULL_SCALE
 
 
+def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_differ(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture", views=2)
+    counts = np.fromfile(capture.root / "view_01.raw", "<u2").reshape(HEIGHT, -1, WIDTH).transpose(0, 2, 1)
+    marks = "{" + ", ".join("0" if band == 3 else "1" for band in range(counts.shape[2])) + "}"
+    write_cube(capture.root, "view_01", counts.astype(">u2"), header={"byte order": 1, "bbl": marks})
+    process(capture.root, tmp_path / "scene", scale=4095.0)
+    scene = load_scene(tmp_path / "scene")
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
+    np.testing.assert_allclose(scene.cube(1), np.delete(counts, 3, axis=2) / 4095, atol=1e-4)
+
+
+def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    white = np.fromfile(capture.root / "white.raw", "<u2").reshape(-1, len(WAVELENGTHS_NM), WIDTH)
+    white[:, 2] = 4095  # which no view reaches
+    white.tofile(capture.root / "white.raw")
+    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
+    findings = process(capture.root, tmp_path / "scene", **references)
+    assert findings[0].startswith("white.hdr: the white is saturated in 550 nm: these bands are left out")
+    scene = load_scene(tmp_path / "scene")
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 2))
+    np.testing.assert_allclose(
+        scene.cube(0), np.delete(capture.reflectance["view_00"], 2, axis=2), atol=1.0 / 1000
+    )
+
+
+def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
+    findings = process(capture.root, tmp_path / "scene", **references, white_reflectance="0.02")
+    scale = json.loads((tmp_path / "scene" / "process.json").read_text())["decisions"]["scale"]["calibrated"]
+    assert scale != 1
+    assert findings[0].startswith(f"values are reflectance divided by {scale:g}, as ")
+    kept = process(capture.root, tmp_path / "kept", **references, white_reflectance="0.02", scale=1.0)
+    assert not any("divided by" in finding for finding in kept)
+
+
 def test_views_without_a_pose_are_left_out(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     write_poses(capture.root / "transforms.json", ["view_00", "view_02", "view_03"])

@@ -108,6 +108,11 @@ def make_plan(
     said += [*_notes_on_pictures([view.cube for view in views]), *views[0].cube.notes]
     opened = [file for file in (references.dark, references.white) if file is not None]
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
+    if scale != 1.0 and options.scale is None and all(sensor.is_absolute for sensor in sensors.values()):
+        warned.append(
+            f"values are {next(iter(sensors.values())).unit} divided by {scale:g}, as too many are above 1 or all are "
+            f"small: multiply what is exported by {scale:g}, or keep them with --scale 1"
+        )
     each = [(view.name, file) for view in views for file in (view.cube, view.dark, view.white)]
     each += [(file.path.name, file) for file in opened]
     return Plan(
@@ -169,10 +174,10 @@ def _notes_on_pictures(files: Sequence[SpectralFile]) -> list[str]:
                 f"{green} nm for green, {blue} nm for blue. If this is wrong, give --wavelengths {blue},{green},{red}"
             )
             break
-    turned = sum(file.metadata.get("orientation", 1) != 1 for file in pictures)
+    turned = sum(file.metadata.get("orientation", 1) != 1 for file in files)
     if turned:
         notes.append(
-            f"EXIF's orientation of {turned} of {len(pictures)} pictures is ignored, as poses and lenses refer to the "
+            f"EXIF's orientation of {turned} of {len(files)} pictures is ignored, as poses and lenses refer to the "
             "stored pixels; if yours were made from turned pictures, store these turned"
         )
     return notes

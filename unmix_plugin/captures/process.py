@@ -17,7 +17,13 @@ from unmix_plugin.captures.plan import Plan, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.posing import FROM_PICTURES, MARKERS, PosedViews, given_poses, pose_views
 from unmix_plugin.captures.readers.opening import open_spectral_file
-from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
+from unmix_plugin.captures.spectral_file import (
+    Capture,
+    CaptureView,
+    ReadOptions,
+    SpectralFile,
+    require_comparable,
+)
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import write_scene_files
@@ -28,8 +34,6 @@ _Say = Callable[[str], None]
 """Tells the user something, one line."""
 _Follow = Callable[[str, Sequence[CaptureView]], Iterable[CaptureView]]
 """Goes through views and shows how far it is."""
-_LARGEST_DIFFERENCE_NM = 0.1
-"""Between the same bands of views of one sensor."""
 
 
 def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list[str]:
@@ -181,24 +185,17 @@ def _open_references(options: ProcessOptions) -> References:
 
 
 def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
-    """Views of one sensor have the same size, bands and type of numbers."""
+    """Views of one sensor have the same size, bands, unit and type of numbers."""
     if cube.shape != first.shape:
         found, expected = (" x ".join(map(str, file.shape)) for file in (cube, first))
         raise CaptureError(
             f"{cube.path} has {found} rows, columns and bands; expected {expected}, as {first.path} has: crop it, or "
             "remove it"
         )
-    wavelengths, expected_nm = cube.bands.wavelengths_nm, first.bands.wavelengths_nm
-    if (wavelengths is None) != (expected_nm is None):
+    if (cube.bands.wavelengths_nm is None) != (first.bands.wavelengths_nm is None):
         raise CaptureError(f"only one of {cube.path} and {first.path} gives wavelengths; give --wavelengths")
-    if wavelengths is not None and expected_nm is not None:
-        band = int(np.argmax(np.abs(wavelengths - expected_nm)))
-        if abs(wavelengths[band] - expected_nm[band]) > _LARGEST_DIFFERENCE_NM:
-            raise CaptureError(
-                f"{cube.path} has {wavelengths[band]:g} nm at band {band}; expected {expected_nm[band]:g} nm, as "
-                f"{first.path} has"
-            )
-    if cube.dtype != first.dtype:
+    require_comparable(cube, first)
+    if cube.dtype.newbyteorder("=") != first.dtype.newbyteorder("="):
         raise CaptureError(
             f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds"
         )

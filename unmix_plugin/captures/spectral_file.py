@@ -30,9 +30,18 @@ BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 _ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
 
+COLOURS_AS_STORED = (
+    "red, green and blue are taken as light, as stored; if they are a picture's for people (sRGB), save it as PNG of "
+    "8 bits"
+)
+"""Warning of colours that no header says to be linear."""
 _WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
 MOST_WIDTH = 0.25
 """Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
+GIVEN = "given by the user"
+"""Evidence of wavelengths that files do not state, or state wrongly."""
+_LARGEST_DIFFERENCE_NM = 0.1
+"""Between the same bands of files of one capture."""
 _PARTLY_KNOWN = "only some of the files give wavelengths"
 _KEPT_BYTES = 2**28
 _kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
@@ -200,6 +209,30 @@ class SpectralFile:
     def files(self) -> tuple[Path, ...]:
         """Every file that `read` depends on, `path` first."""
         return (self.path, *(source for source in self.sources if source != self.path))
+
+
+def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
+    """Refuse a file whose bands are other ones than those of another file of the capture, or whose numbers are of
+    another unit: gains in one alone. Raises CaptureError."""
+    found, expected = file.bands.wavelengths_nm, other.bands.wavelengths_nm
+    if (
+        found is not None
+        and expected is not None
+        and GIVEN not in (file.bands.evidence, other.bands.evidence)
+    ):
+        band = int(np.argmax(np.abs(found - expected)))
+        if abs(found[band] - expected[band]) > _LARGEST_DIFFERENCE_NM:
+            raise CaptureError(
+                f"{file.path} has {found[band]:g} nm at band {band}; expected {expected[band]:g} nm, as "
+                f"{other.path} has"
+            )
+    if (file.linear is None) != (other.linear is None):
+        has, lacks = (file, other) if other.linear is None else (other, file)
+        stated = "" if has.linear is None else has.linear.evidence
+        raise CaptureError(
+            f"{lacks.path} has no gains or scale, {has.path} has ({stated}); expected both or neither, as numbers of "
+            "one can't be compared with those of the other"
+        )
 
 
 def unreadable(path: Path, error: Exception) -> CaptureError:

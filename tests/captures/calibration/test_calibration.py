@@ -171,3 +171,35 @@ def test_the_lens_of_the_file_comes_back_from_that_of_the_result(
     np.testing.assert_allclose(back.focal_px, lens.focal_px)
     np.testing.assert_allclose(back.center_px, lens.center_px, atol=1e-9)
     assert (back.width, back.height, back.distortion) == (40, 30, lens.distortion)
+
+
+@pytest.mark.parametrize("is_image", [False, True])
+def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image: bool):
+    light = np.full((LINES, SAMPLES, NUM), 3000, np.uint16)
+    if is_image:  # of which each pixel counts
+        light[LINES // 2 :] = 1000
+    truth = light.astype(np.float64)
+    light[:4, 5] = 65535
+    white = open_reference(file_of(light, no_data=65535.0), "white reference", file_of(light))
+    assert white.is_per_pixel == is_image
+    assert is_image or (white.mean == 3000).all()
+    counts = np.random.default_rng(0).integers(100, 4000, light.shape).astype(np.uint16)
+    raster, every = Raster.of(LINES, SAMPLES, None, 1), np.arange(NUM)
+    known = replace(white, reflectance=np.ones(NUM))
+    found = Calibration(raster, every, white=known).rows(file_of(counts), 0, LINES)
+    measured = ~found.missing
+    assert measured[4:].all()
+    assert (~measured[:4, 5]).all() == is_image
+    np.testing.assert_allclose(found.values[measured], (counts / truth)[measured], rtol=1e-5)
+    light[:, 5] = 65535
+    with pytest.raises(CaptureError, match="has columns without a measurement"):
+        open_reference(file_of(light, no_data=65535.0), "white reference", file_of(light))
+
+
+def test_a_panel_is_what_was_measured_of_its_rectangle():
+    counts, _ = _cube()
+    counts[2:4, 3] = 65535
+    panel = panel_reference(file_of(counts, no_data=65535.0), (2, 3, 2, 3), "a view")
+    np.testing.assert_allclose(panel.mean[0, 0], counts[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
+    with pytest.raises(CaptureError, match="no pixel of --white-rectangle holds a measurement"):
+        panel_reference(file_of(counts, no_data=65535.0), (2, 3, 2, 1), "a view")

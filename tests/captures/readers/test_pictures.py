@@ -30,7 +30,9 @@ def test_colours_are_three_bands_of_unknown_wavelength(tmp_path):
 def test_numbers_of_sixteen_bits_keep_them(tmp_path):
     (tmp_path / "rgb.png").write_bytes(imagecodecs.png_encode(DEEP))
     (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(DEEP[..., 0].copy()))
-    np.testing.assert_array_equal(open_spectral_file(tmp_path / "rgb.png").read(), DEEP)
+    colours = open_spectral_file(tmp_path / "rgb.png")
+    np.testing.assert_array_equal(colours.read(), DEEP)
+    assert "red, green and blue are taken as light, as stored" in colours.warnings[0]
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "grey.png").read(), DEEP[..., :1])
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float32, Float64
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.exposure import exposure_of
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile
+from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile, require_comparable
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
@@ -37,10 +37,14 @@ def is_srgb(file: SpectralFile) -> bool:
     return file.metadata.get("encoding") == "sRGB"
 
 
-def _linear(
+def stated_values(
     file: SpectralFile, stored: np.ndarray, rows: slice, bands: BandIndex = slice(None)
 ) -> Float32[np.ndarray, "h W b"]:
-    """Numbers of some whole rows: pictures decoded, and the calibration applied that the file carries itself."""
+    """Values of some whole rows: pictures decoded, and the calibration applied that the file carries itself.
+
+    Args:
+        stored: Numbers (h, W, b) that were read of these rows and bands.
+    """
     if is_srgb(file):  # IEC 61966-2-1:1999
         top = np.iinfo(stored.dtype).max
         levels = np.arange(top + 1) / top
@@ -50,6 +54,16 @@ def _linear(
     if model is not None:
         return model.apply(stored.astype(np.float32), rows)
     return stored.astype(np.float32) if file.linear is None else file.linear.apply(stored, bands)
+
+
+def _measured(
+    file: SpectralFile, rows: slice, bands: BandIndex = slice(None)
+) -> Float32[np.ndarray, "h W b"]:
+    """Values of some rows, NaN where nothing was measured."""
+    stored = file.read(rows, bands)
+    values = stated_values(file, stored, rows, bands)
+    values[find_missing(stored, file)] = np.nan
+    return values
 
 
 @dataclass(frozen=True)
@@ -67,6 +81,8 @@ class Reference:
     """How it is used, for people."""
     reflectance: Float64[np.ndarray, " B"] | None = None
     """Of a white panel at every band of the file, above 0."""
+    is_view: bool = False
+    """Whether the file is a view that shows it."""
 
     @property
     def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
@@ -79,7 +95,7 @@ class Reference:
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
         if self.is_per_pixel:
-            return _linear(self.file, self.file.read(rows, bands), rows, bands)[:, columns]
+            return _measured(self.file, rows, bands)[:, columns]
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
@@ -93,24 +109,21 @@ def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Referen
     """A reference for the cubes of one sensor.
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
-    camera that takes whole images), and by the mean of its lines otherwise (a line camera). Raises CaptureError:
-    another number of bands than the cubes, other units, or a value that is not finite.
+    camera that takes whole images), and by the mean of its lines otherwise (a line camera). Pixels without a
+    measurement are left out of it. Raises CaptureError: other bands than the cubes, other units, or a column without
+    a measurement.
     """
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(
             f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected as many"
         )
-    if (file.linear is None) != (cube.linear is None):
-        has, lacks = (file, cube) if cube.linear is None else (cube, file)
-        stated = "" if has.linear is None else has.linear.evidence
-        raise CaptureError(
-            f"{lacks.path} has no gains or scale, {has.path} has ({stated}); expected both or neither, as numbers of "
-            "one can't be compared with those of the other"
-        )
+    require_comparable(file, cube)
     mean, pattern = _column_means(file)
     if not np.isfinite(mean).all():
-        raise CaptureError(f"{file.path}: the {what} holds NaN or infinite values; take it again")
+        raise CaptureError(
+            f"{file.path}: the {what} has columns without a measurement (NaN, infinite or no-data); take it again"
+        )
     if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
         return Reference(file, what, mean, True, how)
@@ -132,15 +145,18 @@ def panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], vi
     Args:
         rectangle: First row and column, height and width.
     Raises:
+        CaptureError: nothing was measured there.
         ConfigError: it leaves the image.
     """
     top, left, height, width = rectangle
     _refuse_outside(f"--white-rectangle {view}", rectangle, cube.shape[:2])
     lines = slice(top, top + height)
-    values = _linear(cube, cube.read(lines), lines)[:, left : left + width].astype(np.float64)
-    mean = values.mean(axis=(0, 1), keepdims=True).astype(np.float32)
+    values = _measured(cube, lines)[:, left : left + width].astype(np.float64)
+    if np.isnan(values[..., 0]).all():
+        raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
+    mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
-    return Reference(cube, "white reference", mean, False, how)
+    return Reference(cube, "white reference", mean, False, how, is_view=True)
 
 
 def _refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:
@@ -154,17 +170,18 @@ def _refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple
 def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], float]:
     """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
     height, width, bands = file.shape
-    total = np.zeros((width, bands))
+    total, count = np.zeros((width, bands)), np.zeros((width, bands))
     step = max(1, _BLOCK_VALUES // (width * bands))
     for first in range(0, height, step):
-        rows = slice(first, min(first + step, height))
-        total += _linear(file, file.read(rows), rows).sum(axis=0, dtype=np.float64)
-    mean = total / height
+        values = _measured(file, slice(first, min(first + step, height)))
+        total += np.nansum(values, axis=0, dtype=np.float64)
+        count += np.isfinite(values).sum(axis=0)
+    mean = total / np.where(count > 0, count, np.nan)
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
     every, patterns = slice(0, height), []
     for band in judged:
-        values = _linear(file, file.read(every, np.array([band])), every, np.array([band]))[..., 0]
-        patterns.append(_pattern(values - mean[:, band]))
+        values = _measured(file, every, np.array([band]))[..., 0]
+        patterns.append(_pattern(np.nan_to_num(values - mean[:, band])))
     return mean[None].astype(np.float32), float(np.median(patterns))
 
 
@@ -354,7 +371,7 @@ class Calibration:
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
-        values = _linear(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
+        values = stated_values(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
         own_dark, white = self.own.get(file.path, (self.dark, self.white))
         dark = None if own_dark is None else own_dark.rows(rows, columns, bands)
         factor = self._exposure_factor(file, white)

@@ -48,6 +48,9 @@ _MOST_NOISY = 0.5
 """Share of bands that may be left out for their noise."""
 _MOST_SATURATED_WHITE = 0.5
 """Share of a white reference's values at the detector's top at which it can't serve."""
+_NEAR_TOP, _MOST_CLIPPED = 0.99, 0.05
+"""Share of the detector's end that means of lines reach where some are above it; share of a white reference's values at
+that end from which a band is left out."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 _BRIGHT_PERCENTILE = 99.9
@@ -154,7 +157,7 @@ def prepare_sensor(
     files = [view.cube for view in views]
     first, binning = files[0], options.bin_bands
     model = radiometric_model(first)
-    choice, notes = _stated_bands(first, options), []
+    choice, notes, warnings = _stated_bands(files, options), [], []
     dark, white = _references(views, choice, options, references)
     own = _own_references(views, choice, options, dark, white)
     whites = [one for one in (white, *(of_view for _, of_view in own.values())) if one is not None]
@@ -167,17 +170,11 @@ def prepare_sensor(
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
     for used in whites:
-        share = 0.0 if saturation is None else float((used.stored_mean >= saturation).mean())
-        if share > _MOST_SATURATED_WHITE:
-            raise CaptureError(
-                f"{used.file.path}: {share:.0%} of the white reference is saturated ({saturation:g} and above); take "
-                "it again with a shorter exposure"
-            )
         its_dark = next((own_dark for own_dark, own_white in own.values() if own_white is used), dark)
         signal = used.signal(its_dark)
         lamp = signal / used.reflectance if lamp is None else lamp
-        is_dark = signal < _LEAST_WHITE * signal.max()
-        choice = choice.without(is_dark, "the white reference has no light there")
+        choice, said = _lit_bands(choice, used, signal, saturation)
+        warnings += said
     choice.require(binning, str(first.path))
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
@@ -212,11 +209,13 @@ def prepare_sensor(
         evidence,
         lamp,
         tuple(notes),
-        exposures.warnings,
+        (*warnings, *exposures.warnings),
     )
 
 
-def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
+def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
+    """Bands that no file marks as bad, by the wavelengths of the first."""
+    file = files[0]
     wavelengths = file.bands.wavelengths_nm
     if wavelengths is None:
         raise CaptureError(
@@ -224,8 +223,9 @@ def _stated_bands(file: SpectralFile, options: ProcessOptions) -> _BandChoice:
             "with --wavelengths"
         )
     choice = _BandChoice(wavelengths, {})
-    if file.bands.bad is not None:
-        choice = choice.without(file.bands.bad, "marked as bad in the file")
+    marks = [one.bands.bad for one in files if one.bands.bad is not None]
+    if marks:
+        choice = choice.without(np.any(marks, axis=0), "marked as bad in the file")
     if file.bands.fwhm_nm is not None:
         broad = file.bands.is_broad
         choice = choice.without(broad, f"wider than {MOST_WIDTH:.0%} of its wavelength: too broad for one")
@@ -394,6 +394,39 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
         return float(number), f"{at_top} sampled values are {number}, none is greater"
     limit = float(np.iinfo(dtype).max)
     return limit, f"no plateau below the end of {dtype.name}; the greatest sampled value is {number}"
+
+
+def _lit_bands(
+    choice: _BandChoice, white: Reference, signal: Float64[np.ndarray, " B"], saturation: float | None
+) -> tuple[_BandChoice, list[str]]:
+    """The choice without bands in which a white reference is saturated or has no light, and warnings."""
+    clipped, warnings, path = _clipped_bands(white, saturation), [], white.file.path
+    advice = "take it again with a shorter exposure"
+    if clipped.mean() > _MOST_SATURATED_WHITE:
+        raise CaptureError(f"{path}: {clipped.mean():.0%} of the white reference is saturated; {advice}")
+    if clipped.any():
+        listed = name_some([f"{nm:g} nm" for nm in choice.wavelengths_nm[clipped]])
+        warnings = [f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"]
+    choice = choice.without(clipped, "the white reference is saturated there")
+    return choice.without(
+        signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
+    ), warnings
+
+
+def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarray, " B"]:
+    """Bands in which a white reference is at the end of the detector, where reflectances would come out too high.
+
+    A file of its own may reach that end where no view does, and then shows it by many values that are exactly there.
+    """
+    if saturation is None:
+        return np.zeros(white.file.shape[2], bool)
+    is_clipped = (white.stored_mean >= _NEAR_TOP * saturation).mean(axis=(0, 1)) > _MOST_CLIPPED
+    if white.is_view or white.file.dtype.kind not in "iu":
+        return is_clipped
+    rows = [white.file.read(slice(row, row + 1))[0] for row in sampled_rows(white.file.shape[0])]
+    stored = np.concatenate(rows)
+    ends = [2**bits - 1 for bits in _DETECTOR_BITS if 2**bits - 1 == stored.max()]
+    return is_clipped | (np.isin(stored, ends).mean(axis=0) > _MOST_CLIPPED)
 
 
 _Sample: TypeAlias = tuple[Float32[np.ndarray, "N B"], Bool[np.ndarray, "N B"]]

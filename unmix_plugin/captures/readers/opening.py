@@ -27,6 +27,7 @@ from unmix_plugin.captures.readers.matlab import open_matlab
 from unmix_plugin.captures.readers.pictures import open_band_folder, open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
 from unmix_plugin.captures.spectral_file import (
+    GIVEN,
     BandTable,
     ReadOptions,
     SpectralFile,
@@ -98,12 +99,14 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         size = f"{height} rows x {width} columns x {num_bands} bands"
         if 0 in opened.shape:
             raise CaptureError(f"{path}: the image has no pixels: {size}")
+        if opened.dtype.kind not in "iuf":
+            raise CaptureError(f"{path}: the image holds {opened.dtype.name}; expected real numbers")
         given = options.wavelengths_nm
         if given is None:
             return opened
         if len(given) != num_bands:
             raise CaptureError(f"{opened.path}: {len(given)} wavelengths were given for {size}")
-        bands = replace(opened.bands, wavelengths_nm=given, evidence="given by the user")
+        bands = replace(opened.bands, wavelengths_nm=given, evidence=GIVEN)
         return replace(opened, bands=bands)
     except CaptureError:
         raise

@@ -16,6 +16,7 @@ import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, parse_xmp
 from unmix_plugin.captures.spectral_file import (
+    COLOURS_AS_STORED,
     BandTable,
     ReadOptions,
     SpectralFile,
@@ -78,6 +79,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
+        warnings=(COLOURS_AS_STORED,) if is_deep and bands.wavelengths_nm is None else (),
         metadata=metadata,
     )
 
