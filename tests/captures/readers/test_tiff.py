@@ -267,3 +267,63 @@ def test_a_file_of_many_gigabytes_opens_at_once(tmp_path):
     file = open_spectral_file(path)
     assert file.shape == (20000, 10000, 60)
     assert file.read(slice(19999, 20000), slice(58, 60)).shape == (1, 10000, 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"photometric": "miniswhite"}, "whose numbers grow with darkness"),
+        (
+            {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)},
+            "places in a table of colours",
+        ),
+        ({"photometric": "cfa", "extratags": [(33421, "H", 2, (2, 2)), (33422, "B", 4, b"\0\1\1\2")]}, "CFA"),
+    ],
+)
+def test_pages_whose_numbers_are_no_light_are_refused(tmp_path, options, message):
+    with pytest.raises(CaptureError, match=message):
+        written(tmp_path, CUBE[..., 0].astype(np.uint8), planarconfig=None, **options)
+    with pytest.raises(CaptureError, match="colour space of the eye"):
+        written(tmp_path, CUBE[..., :3].astype(np.uint8), photometric="cielab")
+
+
+def test_colours_that_may_be_a_pictures_are_questioned_unless_they_have_wavelengths(tmp_path):
+    colours = CUBE[..., :3].astype(np.uint8)
+    assert (
+        "red, green and blue are taken as light, as stored"
+        in written(tmp_path, colours, photometric="rgb").warnings[0]
+    )
+    tag = (42112, "s", 0, GDAL.format(items("wavelength", NM[:3])), True)
+    assert not written(tmp_path, colours, photometric="rgb", extratags=[tag]).warnings
+
+
+def test_lists_of_gdal_for_the_whole_file(tmp_path):
+    entries = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
+    text = "".join(
+        f'<Item name="{name}">{{{", ".join(map(str, own))}}}</Item>' for name, own in entries.items()
+    )
+    file = written(tmp_path, CUBE, extratags=[(42112, "s", 0, GDAL.format(text), True)])
+    np.testing.assert_array_equal(centres_nm(file), NM)
+    np.testing.assert_array_equal(widths_nm(file), entries["fwhm"])
+    assert file.bands.bad is not None
+    assert file.bands.bad.tolist() == [False, False, True, False, False, False]
+
+
+def test_labels_of_imagej_and_names_of_pages_are_wavelengths(tmp_path):
+    labels = [f"{nm} nm" for nm in NM]
+    tifffile.imwrite(tmp_path / "a.tif", PLANES, imagej=True, metadata={"axes": "CYX", "Labels": labels})
+    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "a.tif")), NM)
+    with tifffile.TiffWriter(tmp_path / "b.tif") as file:
+        for plane, label in zip(PLANES, labels, strict=True):
+            file.write(plane, metadata=None, extratags=[(285, "s", 0, f"filter {label}", True)])
+    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "b.tif")), NM)
+
+
+def test_the_orientation_of_a_page_is_told(tmp_path):
+    assert written(tmp_path, CUBE, extratags=[(274, "H", 1, 6, True)]).metadata["orientation"] == 6
+    assert "orientation" not in written(tmp_path, CUBE, extratags=[(274, "H", 1, 1, True)]).metadata
+
+
+def test_numbers_that_are_not_real_are_refused(tmp_path):
+    with pytest.raises(CaptureError, match="the image holds complex64; expected real numbers"):
+        written(tmp_path, CUBE.astype(np.complex64))

@@ -25,6 +25,7 @@ import numpy as np
 from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
 from unmix_plugin.captures.exposure import exposure_facts
 from unmix_plugin.captures.spectral_file import (
+    COLOURS_AS_STORED,
     Axes,
     BandIndex,
     BandTable,
@@ -45,6 +46,16 @@ from unmix_plugin.spectral.bands import nm_per_unit
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
+_COLOURS = (2, 6)
+"""RGB and YCbCr."""
+_NO_NUMBERS = {
+    0: "whose numbers grow with darkness (MinIsWhite)",
+    3: "whose numbers are places in a table of colours (palette)",
+    4: "which is a mask",
+    **dict.fromkeys((8, 9, 10), "in a colour space of the eye (Lab)"),
+    32803: "in which neighbouring pixels see different colours (CFA)",
+}
+"""Kinds of pages (PhotometricInterpretation) whose numbers are not light."""
 _OPACITY = (1, 2)
 """Kinds of extra numbers of a pixel. Programs give it to fourth bands that are none, so that nothing is dropped."""
 _GDAL_METADATA, _GDAL_NODATA, _DESCRIPTION, _PAGE_NAME = 42112, 42113, 270, 285
@@ -103,7 +114,8 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         top: Any = file.pages.first
         items = _gdal_items(first) or _gdal_items(top)
         stated = _from_gdal(items) or _from_description(first) or _from_description(top)
-    stated = stated or _from_pages(stack.pages)
+        stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
+        no_data = _number(str(first.tags.valueof(_GDAL_NODATA) or ""))
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
     axes, axis_warnings = "yxb", ()
@@ -124,11 +136,28 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
         linear=_linear(path, items, shape[2]),
-        no_data=_number(str(first.tags.valueof(_GDAL_NODATA) or "")),
-        notes=tuple(messages[:3]),
-        warnings=stack.warnings + axis_warnings + band_warnings + exposure_warnings,
-        metadata={name: value for name, value in tags.items() if value} | exposure,
+        no_data=no_data,
+        notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
+        warnings=stack.warnings
+        + axis_warnings
+        + band_warnings
+        + exposure_warnings
+        + _not_decoded(first, bands),
+        metadata={name: value for name, value in tags.items() if value} | exposure | _orientation(tags),
     )
+
+
+def _not_decoded(page: TiffPage, bands: BandTable) -> tuple[str, ...]:
+    """A warning of colours that may be a picture's, which is as bright as its numbers to the eye only."""
+    is_colour = (
+        page.photometric in _COLOURS and bands.wavelengths_nm is None and page.dtype in (np.uint8, np.uint16)
+    )
+    return (COLOURS_AS_STORED,) if is_colour else ()
+
+
+def _orientation(tags: dict[str, Any]) -> dict[str, int]:
+    found = tags["exif"].get("Orientation")
+    return {"orientation": found} if found in range(2, 9) else {}
 
 
 def _check_directories(path: Path) -> None:
@@ -237,10 +266,14 @@ def _size_of_group(pages: list[TiffPage]) -> tuple[int, int]:
 
 
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
-    """Refuse a page that is empty, deep, of an unknown type, or promises more than the file holds."""
+    """Refuse a page that is empty, deep, of an unknown type, no light, or promises more than the file holds."""
     where = f"{path}: page {page.index}"
     if 0 in page.shaped or page.dtype is None:
         raise CaptureError(f"{where}: has the shape {page.shape} of {page.dtype or 'an unknown type'}")
+    if page.photometric in _NO_NUMBERS:
+        raise CaptureError(
+            f"{where}: a page {_NO_NUMBERS[page.photometric]}; save it as numbers that grow with light"
+        )
     if page.imagedepth > 1:
         raise CaptureError(f"{where}: is {page.imagedepth} images deep; expected one image a page")
     segments, needed = min(len(page.dataoffsets), len(page.databytecounts)), math.prod(page.chunked)
@@ -362,13 +395,16 @@ def _linear(path: Path, items: list[_GdalItem], num_bands: int) -> Linear | None
 
 def _from_gdal(items: list[_GdalItem]) -> StatedBands | None:
     def of_samples(*names: str, role: str | None = None) -> list[str]:
-        """Values of one entry for each band, in the order of bands."""
+        """Values of one entry for each band in the order of bands, or the list in one for the whole file."""
         found = {
             item.sample: item.value
             for item in items
             if item.sample is not None and (item.name in names or (role and item.role == role))
         }
-        return [found[sample] for sample in sorted(found)]
+        if found:
+            return [found[sample] for sample in sorted(found)]
+        whole = [item.value for item in items if item.sample is None and item.name in names]
+        return re.findall(r"[^\s,{}]+", whole[0]) if whole else []
 
     names = of_samples(role="description") or of_samples("band_name", "bandname")
     names = names or [item.value for item in items if re.fullmatch(r"band_\d+", item.name)]
@@ -377,9 +413,6 @@ def _from_gdal(items: list[_GdalItem]) -> StatedBands | None:
     if not centres:
         centres, fwhm = of_samples("central_wavelength_um"), of_samples("fwhm_um")
         units = ["Micrometers"] if centres else units
-    if not centres:
-        whole = [item.value for item in items if item.sample is None and item.name in _CENTRES]
-        centres = re.findall(r"[^\s,{}]+", whole[0]) if whole else []
     if not centres and not names:
         return None
     good, unit = of_samples("bbl") or None, units[0] if units else None
@@ -413,10 +446,12 @@ def _from_description(page: TiffPage) -> StatedBands | None:
     return StatedBands("image description", centres, unit)
 
 
-def _from_pages(pages: list[TiffPage]) -> StatedBands:
-    """Names of pages, where each is a band and has its own."""
+def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
+    """Names of pages, where each is a band and has its own: ImageJ's labels, or in the pages themselves."""
     if pages[0].shaped[0] * pages[0].shaped[-1] > 1:
         return StatedBands("the file")
+    if labels := imagej.get("Labels"):
+        return StatedBands("labels of ImageJ", names=[str(label) for label in labels])
     for tag, what in ((_PAGE_NAME, "names of pages"), (_DESCRIPTION, "descriptions of pages")):
         names = [" ".join(str(page.tags.valueof(tag) or "").split()) for page in pages]
         if all(0 < len(name) < 200 for name in names) and len(set(names)) == len(names):
