@@ -32,6 +32,8 @@ _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
 _PLAUSIBLE_NM = (100.0, 30_000.0)
 """Range of cameras, from the far ultraviolet to the thermal infrared."""
+_LEAST_WIDTH_NM = 0.05
+"""Widths below this are in another unit than the wavelengths, as are those wider than these."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
 _ASK = "give the wavelengths yourself (--wavelengths)"
 
@@ -84,6 +86,10 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
     fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes)
     if fwhm is not None and factor is not None and (fwhm[~unused] > 0).all():
         fwhm = np.where(unused, fwhm[~unused].mean(), fwhm) * factor
+        if centres is not None and ((fwhm > centres) | (fwhm < _LEAST_WIDTH_NM)).any():
+            unit = f"{fwhm.min():g} to {fwhm.max():g} nm, as they have the unit of the wavelengths"
+            notes.append(f"FWHM are left out: they would be {unit}")
+            fwhm = None
     else:
         fwhm = None
     good = _numbers("marks of bad bands", stated.good, num_bands, notes)

@@ -17,6 +17,9 @@ from unmix_plugin.errors import CaptureError, ConfigError, counted
 if TYPE_CHECKING:
     from rich.table import Table
 
+_SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evidence", "map")
+"""Metadata that have lines of their own."""
+
 
 @dataclass(frozen=True)
 class InspectOptions:
@@ -97,7 +100,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
             ("poses", f"{counted(report['poses'], 'camera')} ({report['metadata'].get('source', '')})")
         )
     rows += [("note", note) for note in report["notes"]]
-    others = [name for name in report["metadata"] if name not in ("axes", "source")]
+    others = [name for name in report["metadata"] if name not in _SHOWN]
     return rows + ([("also holds", ", ".join(others))] if others else [])
 
 
@@ -110,10 +113,28 @@ def _image_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     named = report["band_names"]
     if named and report["wavelengths_nm"] is None:
         rows.append(("bands", ", ".join(named[:8]) + (", ..." if len(named) > 8 else "")))
-    for key, what in (("bad_bands", "bad bands"), ("scale", "stored for 1"), ("no_data", "no data")):
-        if report[key] not in (None, []):
-            rows.append((what, str(report[key]).strip("[]")))
+    if report["bad_bands"]:
+        nm = report["wavelengths_nm"]
+        marked = [f"{band}{f' ({nm[band]:g} nm)' if nm else ''}" for band in report["bad_bands"]]
+        rows.append(("bad bands", f"{', '.join(marked)}, counted from 0"))
+    if report["gains"] and report["scale"] is None:
+        rows += [(key, _range_text(report[key])) for key in ("gains", "offsets")]
+    for key, what in (("scale", "stored for 1"), ("no_data", "no data")):
+        if report[key] is not None:
+            rows.append((what, f"{report[key]:g}" if isinstance(report[key], float) else str(report[key])))
+    found = report["metadata"]
+    if "exposure_s" in found:
+        rows.append(("exposure", f"{_range_text(found['exposure_s'])} s ({found['exposure_evidence']})"))
+    if "gain" in found:
+        rows.append(("gain", _range_text(found["gain"])))
+    rows += [(key, found["map"][key]) for key in ("map info",) if key in found.get("map", {})]
     return rows
+
+
+def _range_text(numbers: float | list[float]) -> str:
+    """One number, or the least and greatest of one a band."""
+    low, high = (numbers, numbers) if isinstance(numbers, float | int) else (min(numbers), max(numbers))
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
 def _wavelength_text(report: dict[str, Any]) -> str:

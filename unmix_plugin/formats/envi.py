@@ -33,6 +33,12 @@ _FLOAT32 = 4
 _COMPLEX_TYPES = (6, 9)
 _AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
+_SAID_ONCE = re.compile(
+    r"samples|lines|bands|header offset|data type|interleave|byte order|wavelength.*|fwhm|bbl|data .*|reflectance.*"
+)
+"""Keys by which numbers and bands are read."""
+MAP_KEYS = ("map info", "projection info", "coordinate system string")
+"""Where on the Earth an image lies."""
 _OTHER_HEADERS = {
     "#?R": "a Radiance picture",
     "BYTEORDER": "an ESRI (ArcGIS) band file",
@@ -98,6 +104,8 @@ def read_header(path: Path) -> dict[str, str]:
         return _parse_header(text)
     except ValueError as error:
         begin = text.lstrip().upper()
+        if begin.startswith("ENVI"):
+            raise
         other = next((kind for word, kind in _OTHER_HEADERS.items() if begin.startswith(word)), None)
         found = f"it is the header of {other}" if other else str(error)
         raise ValueError(
@@ -151,6 +159,8 @@ def _parse_header(text: str) -> dict[str, str]:
             close = -1 if "=" in body[opening.end() : close] else close
         if opening is not None and close >= 0:
             value, position = body[opening.end() : close], body.index("\n", close) + 1
+        if _SAID_ONCE.fullmatch(key) and header.get(key, value.strip()) != value.strip():
+            raise ValueError(f"'{key}' is there twice, with different values")
         header[key] = value.strip()
     return header
 
@@ -241,14 +251,14 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     Args:
         header_path: Of the header.
         needed_bytes: Least size.
-        first: Suffix that is preferred.
+        first: Suffix that is preferred: of several files of that size it tells which one is meant.
     Raises:
-        ValueError: there is none.
+        ValueError: there is none, or several could be it.
     """
     base = header_path.with_suffix("")
     suffixes = [either for suffix in (first, *_DATA_SUFFIXES) for either in (suffix, suffix.upper())]
     candidates = dict.fromkeys(base.with_name(base.name + suffix) for suffix in suffixes)
-    if first == "" and base.suffix:  # x.raw.hdr beside x.RAW
+    if base.suffix:  # x.raw.hdr beside x.RAW
         candidates |= {base.with_suffix(base.suffix.upper()): None}
     found = [path for path in candidates if path.is_file() and path != header_path]
     # Any other file of this name will do if it has just the size.
@@ -257,12 +267,19 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     )
     found += [path for path in others if path.is_file() and path.stat().st_size == needed_bytes]
     if not found:
-        usual = f"{base.name}{first}" if first else f"{base.name} or {base.name}.img"
+        usual = f"{base.name}{first}" if first == ".sli" else f"{base.name} or {base.name}.img"
         raise ValueError(
             f"no file of numbers beside this header; expected {usual} (.dat, .raw, .bil, .bip, .bsq, ...) in the same "
             "folder"
         )
-    return next((path for path in found if path.stat().st_size >= needed_bytes), found[0])
+    chosen = next((path for path in found if path.stat().st_size >= needed_bytes), found[0])
+    alike = [path.name for path in found if path.stat().st_size == needed_bytes > 0]
+    if len(alike) > 1 and chosen.suffix.lower() != first:
+        raise ValueError(
+            f"{' and '.join(alike)} could each be what it describes; name the one that is meant, or move the "
+            "others away"
+        )
+    return chosen
 
 
 def envi_cube_paths(path_without_suffix: Path) -> list[Path]:
@@ -276,6 +293,7 @@ def write_envi_cube(
     wavelengths: Bands | None,
     names: Sequence[str] | None,
     description: str,
+    more: Mapping[str, HeaderValue] | None = None,
 ) -> list[Path]:
     """Write a cube as NAME.hdr and NAME.img, float32, band-interleaved by pixel.
 
@@ -285,10 +303,11 @@ def write_envi_cube(
         wavelengths: Centres of the bands, if they are bands of a spectrum.
         names: Of the bands; commas in them become `-`, as the format has no other way.
         description: What the numbers are, with their unit.
+        more: Further entries of the header.
     Raises:
         ValueError: another number of wavelengths or names than of bands.
     """
-    with envi_cube_rows(path_without_suffix, cube.shape, wavelengths, names, description) as add:
+    with envi_cube_rows(path_without_suffix, cube.shape, wavelengths, names, description, more) as add:
         add(cube)
     return envi_cube_paths(path_without_suffix)
 
@@ -414,7 +433,7 @@ def header_bytes(values: Mapping[str, HeaderValue]) -> bytes:
     lines = ["ENVI"]
     for key, value in values.items():
         if isinstance(value, str):
-            text = f"{{ {plain(value)} }}" if key == "description" else plain(value)
+            text = f"{{ {plain(value)} }}" if key in ("description", *MAP_KEYS) else plain(value)
         else:
             text = str(value) if isinstance(value, int) else f"{{ {', '.join(map(element, value))} }}"
         lines.append(f"{key} = {text}")

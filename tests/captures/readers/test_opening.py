@@ -202,9 +202,21 @@ def test_the_table_for_people(header, poses, tmp_path, capsys):
     out = " ".join(capsys.readouterr().out.split())
     assert "4 rows x 6 columns x 3 bands, uint16, bil, read as envi" in out
     assert "450 to 650.5 nm, FWHM 5 to 6 nm (header field 'wavelength', nm)" in out
-    assert "bad bands 1" in out
+    assert "bad bands 1 (550 nm), counted from 0" in out
     assert "3 cameras" in out
     assert "of no known kind" in out
+
+
+def test_the_table_has_every_number_that_values_depend_on(tmp_path, capsys):
+    more = "data gain values = {1, 1, 2, 4}\ndata offset values = {0, 0, 0, -3}\ntint = 20\n"
+    more += "map info = {UTM, 1, 1, 500000, 4500000, 2, 2, 33, North, WGS-84}\n"
+    assert inspect_command([str(write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", more))]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert (
+        "gains 1 to 4 offsets -3 to 0 exposure 0.02 s (header field 'tint', no unit: taken as milliseconds)"
+        in out
+    )
+    assert "map info UTM, 1, 1, 500000, 4500000, 2, 2, 33, North, WGS-84" in out
 
 
 def test_no_file_is_an_error():
@@ -388,6 +400,43 @@ def test_of_several_files_of_numbers_the_one_that_is_large_enough_is_taken(tmp_p
     (tmp_path / "cube").rename(tmp_path / "cube.RAW")
     (tmp_path / "cube.dat").write_bytes(b"notes")
     assert open_spectral_file(header).sources == (tmp_path / "cube.RAW",)
+
+
+def test_of_two_files_of_the_right_size_the_one_named_after_the_interleave_is_meant(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq")
+    (tmp_path / "cube").rename(tmp_path / "cube.bsq")
+    (tmp_path / "cube.bil").write_bytes(bytes(ENVI_CUBE.nbytes))
+    np.testing.assert_array_equal(open_spectral_file(header).read(), ENVI_CUBE)
+    (tmp_path / "cube.bsq").rename(tmp_path / "cube.img")
+    with pytest.raises(CaptureError, match=r"cube\.img and cube\.bil could each be what it describes"):
+        open_spectral_file(header)
+    np.testing.assert_array_equal(open_spectral_file(tmp_path / "cube.img").read(), ENVI_CUBE)
+
+
+def test_a_key_that_says_two_things_is_refused(tmp_path):
+    bands = "wavelength = {400, 500, 600, 700}\n"
+    write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", bands + "sensor type = a\nsensor type = b\n" + bands)
+    assert centres_nm(open_spectral_file(tmp_path / "cube.hdr"))[0] == 400
+    write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", bands + bands.replace("400", "410"))
+    with pytest.raises(CaptureError, match=r"cube\.hdr: 'wavelength' is there twice, with different values"):
+        open_spectral_file(tmp_path / "cube.hdr")
+
+
+def test_a_no_data_value_is_read_before_a_comment_or_said_to_be_none(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", "data ignore value = -9999 ; none measured")
+    assert open_spectral_file(header).no_data == -9999
+    write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", "data ignore value = unset")
+    assert "'data ignore value' is unset, no number: not used" in open_spectral_file(header).warnings
+
+
+@pytest.mark.parametrize(("nm", "unit", "fwhm"), [(500, "Micrometers", 5.5), (500, "nm", 0.0055)])
+def test_widths_in_another_unit_than_the_wavelengths_are_left_out_and_said(tmp_path, nm, unit, fwhm):
+    numbers = [nm + 10 * band if unit == "nm" else (nm + 10 * band) / 1000 for band in range(4)]
+    more = f"wavelength = {{{', '.join(map(str, numbers))}}}\nwavelength units = {unit}\nfwhm = {{{fwhm}"
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", more + f", {fwhm}" * 3 + "}")
+    file = open_spectral_file(header)
+    assert file.bands.fwhm_nm is None
+    assert "FWHM are left out: they would be" in file.warnings[0]
 
 
 def test_a_header_named_after_the_whole_file_is_found(tmp_path):

@@ -21,6 +21,7 @@ from unmix_plugin.captures.spectral_file import (
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
+    MAP_KEYS,
     EnviLayout,
     data_beside,
     header_begins,
@@ -61,7 +62,9 @@ def open_envi(path: Path, _: ReadOptions) -> SpectralFile:
     try:
         header = read_header(header_path)
         layout = read_layout(header)
-        data_path = path if path != header_path else data_beside(header_path, layout.num_bytes)
+        data_path = path
+        if path == header_path:
+            data_path = data_beside(header_path, layout.num_bytes, f".{layout.interleave}")
     except ValueError as error:
         raise CaptureError(f"{header_path}: {error}") from error
     size_warnings = _check_size(header_path, data_path, layout)
@@ -133,16 +136,19 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     linear, linear_warnings = _linear(header_path, header, num_bands)
     exposure, exposure_warnings = exposure_facts(header, "header field")
     own, no_data = file.bands, _number(header, "data ignore value")
+    if no_data is None and header.get("data ignore value"):
+        linear_warnings += (f"'data ignore value' is {header['data ignore value']}, no number: not used",)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
+    on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
     return replace(
         file,
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
         no_data=file.no_data if no_data is None else no_data,
         warnings=file.warnings + band_warnings + linear_warnings + exposure_warnings,
-        metadata=file.metadata | exposure | {"header": shown},
+        metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
     )
 
 
@@ -211,7 +217,8 @@ def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple
 
 
 def _number(header: dict[str, str], key: str) -> float | None:
+    """A number; a comment behind it is cut off."""
     try:
-        return float(header[key])
+        return float(header[key].partition(";")[0])
     except (KeyError, ValueError):
         return None
