@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.io import savemat
 
 from tests.commands.running import picture_size, run
@@ -98,3 +99,34 @@ def test_what_cannot_be_unmixed_ends_with_one_message(change, words, message, cu
     assert ended.status == 2
     assert message in ended.err
     assert len(ended.err.strip().splitlines()) == 1
+
+
+def test_the_place_on_the_earth_is_kept_and_a_repeated_wavelength_left_out(cube, tmp_path):
+    nm = np.linspace(450, 900, cube.shape[2])
+    on_map = {
+        "map info": "UTM, 1, 1, 5e5, 4.5e6, 2, 2, 33, North",
+        "coordinate system string": 'PROJCS["x", 1]',
+    }
+    write_envi_cube(tmp_path / "field", cube, Bands.of(nm), None, "a field", on_map)
+    header = (tmp_path / "field.hdr").read_text()
+    (tmp_path / "field.hdr").write_text(header.replace(f"{float(nm[3])!r},", f"{float(nm[2])!r},"))
+    ended = run(
+        image, tmp_path / "field.hdr", "--endmembers", 3, "--mnf", 2, "--output-dir", tmp_path / "out"
+    )
+    assert ended.status == 0, ended.err
+    assert "1 band left out: marked as bad in the file, or of a wavelength that is there twice" in ended.out
+    for name in ("abundances", "confidence", "mnf"):
+        assert open_spectral_file(tmp_path / "out" / "field" / f"{name}.hdr").metadata["map"] == on_map
+
+
+def test_a_picture_is_unmixed_in_linear_light(tmp_path):
+    materials = np.array([[0.9, 0.1, 0.05], [0.05, 0.1, 0.8]])
+    share = np.linspace(0, 1, 64)[:, None]
+    light = (share * materials[0] + (1 - share) * materials[1]).repeat(16, axis=0).reshape(32, 32, 3)
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    Image.fromarray(np.rint(255 * coded).astype(np.uint8)).save(tmp_path / "a.png")
+    ended = run(image, tmp_path / "a.png", "--endmembers", 2, "--output-dir", tmp_path)
+    assert ended.status == 0, ended.err
+    assert "the picture is taken as sRGB and brought to linear light" in ended.out
+    misfit = open_spectral_file(tmp_path / "a" / "confidence.hdr").read()[..., 1]
+    assert misfit.mean() < 0.01

@@ -66,7 +66,7 @@ def image(argv: list[str]) -> None:
     """
     options = tyro.cli(ImageOptions, prog="unmix-image", args=argv)
 
-    from unmix_plugin.captures.calibration.calibration import find_missing
+    from unmix_plugin.captures.calibration.calibration import find_missing, is_srgb, stated_values
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
     from unmix_plugin.products.unmixed_image import (
@@ -81,10 +81,9 @@ def image(argv: list[str]) -> None:
     refuse_to_overwrite(paths, options.overwrite)
     opened = open_spectral_file(options.file, _reading(options))
     bands, wavelengths = _good_bands(opened)
-    cube = opened.read(bands=bands)
-    mask = ~find_missing(cube, opened)
-    if opened.linear is not None:
-        cube = opened.linear.apply(cube, bands)
+    stored = opened.read(bands=bands)
+    mask = ~find_missing(stored, opened)
+    cube = stated_values(opened, stored, slice(0, opened.shape[0]), bands)
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
     height, width, num_bands = cube.shape
@@ -92,11 +91,17 @@ def image(argv: list[str]) -> None:
     print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
+    if is_srgb(opened):
+        print("the picture is taken as sRGB and brought to linear light")
+    if left_out := opened.shape[2] - num_bands:
+        print(
+            f"{counted(left_out, 'band')} left out: marked as bad in the file, or of a wavelength that is there twice"
+        )
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
-    axis = BandAxis(wavelengths, bands + 1)
+    axis = BandAxis(wavelengths, bands + 1, opened.metadata.get("map"))
     names = write_unmixed_image(folder, found, axis, library, fractions)
     _say(found, mask, names)
     for path in paths:
@@ -146,7 +151,8 @@ def _reading(options: ImageOptions) -> ReadOptions:
 
 
 def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """Indices of the bands that the file does not mark as bad, by wavelength where that is known; and wavelengths."""
+    """Indices of the bands that the file does not mark as bad, by wavelength where that is known, each wavelength once;
+    and wavelengths."""
     import numpy as np
 
     table = opened.bands
@@ -155,8 +161,8 @@ def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
         raise CaptureError(f"{opened.path}: the file marks all of its bands as bad")
     if table.wavelengths_nm is None:
         return kept, None
-    kept = kept[np.argsort(table.wavelengths_nm[kept], kind="stable")]
-    return kept, table.wavelengths_nm[kept]
+    wavelengths, first = np.unique(table.wavelengths_nm[kept], return_index=True)
+    return kept[first], wavelengths
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ Notation: `H x W` pixels, `B` bands, `K` materials.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,12 +31,14 @@ _FIRST_COLOURS = np.array(
 
 @dataclass(frozen=True)
 class BandAxis:
-    """What a file says of its bands."""
+    """What a file says of its bands and its place."""
 
     wavelengths_nm: Float64[np.ndarray, " B"] | None
     """Strictly increasing; None where they are not known."""
     numbers: Int[np.ndarray, " B"]
     """Of the bands in the file, from 1."""
+    on_map: Mapping[str, str] | None = None
+    """Where the image lies, as entries of an ENVI header."""
 
 
 def unmixed_image_paths(folder: Path, has_library: bool = False, has_fractions: bool = False) -> list[Path]:
@@ -76,25 +79,25 @@ def write_unmixed_image(
     write_file(plot, draw_spectra(spectra, x, names, colours, (x_label, "value in the image's unit")))
     write_file(maps, _maps(found, names, colours))
     about = f"abundances: shares of {found.shares}, 0 to 1"
-    write_envi_cube(folder / "abundances", found.abundances, None, names, about)
+    write_envi_cube(folder / "abundances", found.abundances, None, names, about, axis.on_map)
     trust = np.stack([found.confidence, found.misfit], axis=-1)
     about = (
         "probability that the largest abundance is the largest in truth; angle between pixel and mixture, rad"
     )
-    write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about)
+    write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about, axis.on_map)
     if library is not None and bands is not None:
         write_file(folder / "angles.csv", angles_csv(library, names, spectra, bands, None))
     if fractions is not None:
-        _write_fractions(folder, fractions)
+        _write_fractions(folder, fractions, axis.on_map)
     return names
 
 
-def _write_fractions(folder: Path, found: NoiseFractions) -> None:
+def _write_fractions(folder: Path, found: NoiseFractions, on_map: Mapping[str, str] | None) -> None:
     """Minimum noise fractions as a cube, and the ratio of signal to noise of all of them as a table."""
     cube = found.components.numpy().astype(np.float32)
     names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
     about = "minimum noise fractions: noise 1; 0 where nothing was measured"
-    write_envi_cube(folder / "mnf", cube, None, names, about)
+    write_envi_cube(folder / "mnf", cube, None, names, about, on_map)
     rows = [(number, f"{ratio:.9g}") for number, ratio in enumerate(found.signal_to_noise.tolist(), 1)]
     write_file(folder / "mnf.csv", csv_bytes([("component", "signal to noise"), *rows]))
 
