@@ -26,6 +26,7 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.writing.view_files import ViewRecord
 from unmix_plugin.engine.geometry.camera_paths import meeting_point
 from unmix_plugin.errors import counted, name_some
+from unmix_plugin.spectral.colour.srgb import decode_srgb
 
 _FEW_VIEWS = 15
 _NARROW_DEG = 12.0
@@ -90,9 +91,7 @@ class SeenView:
 
         with Image.open(self.picture) as picture:
             pixels = np.asarray(picture.convert("RGBA"))
-        levels = np.arange(256) / 255.0
-        linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-        light = linear[pixels[..., :3]] @ np.array([0.2126, 0.7152, 0.0722])
+        light = decode_srgb(np.arange(256) / 255.0)[pixels[..., :3]] @ np.array([0.2126, 0.7152, 0.0722])
         smooth = ndimage.uniform_filter(light, 3)
         return np.where(pixels[..., 3] > 127, smooth, np.nan).astype(np.float32)
 

@@ -62,10 +62,9 @@ from unmix_plugin.spectral.colour.conversion import (
     brightness,
     covered_bands,
     illuminant_power,
-    linear_to_srgb,
     rgb_matrix,
-    srgb_to_linear,
 )
+from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.library.material_library import DARK_LIGHT, MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.spectral.sensor import Sensor
@@ -247,8 +246,8 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
     surface = _LitReflectance(state.bands, reflectance, light)
     if seen is None:
-        changed = _retinted(surface, _linear(edit.colour))
-        reached = _srgb(changed @ surface.to_linear_rgb)
+        changed = _retinted(surface, decode_srgb(np.array(edit.colour)))
+        reached = encode_srgb(np.clip(changed @ surface.to_linear_rgb, 0, 1))
     else:
         changed = _retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
         reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
@@ -307,9 +306,10 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
         flat = np.ones(len(state.bands))
         white = _LitReflectance(state.bands, flat, flat)
-        mirror = _retinted(white, _linear(edit.colour))
+        mirror = _retinted(white, decode_srgb(np.array(edit.colour)))
         state.mirror_reflectances[edit.colour] = mirror
-        _note_nearest(state, f"{where}: highlights", edit.colour, _srgb(mirror @ white.to_linear_rgb))
+        reached = encode_srgb(np.clip(mirror @ white.to_linear_rgb, 0, 1))
+        _note_nearest(state, f"{where}: highlights", edit.colour, reached)
     for index in chosen:
         state.gloss[index] *= edit.scale
         if edit.colour is not None:
@@ -327,14 +327,6 @@ _HANDLERS: dict[type[Operation], Callable[[MaterialState, Any, str], None]] = {
     Rename: _rename,
     Gloss: _gloss,
 }
-
-
-def _linear(srgb: tuple[float, float, float]) -> np.ndarray:
-    return srgb_to_linear(torch.tensor(srgb, dtype=torch.float64)).numpy()
-
-
-def _srgb(linear_rgb: np.ndarray) -> np.ndarray:
-    return linear_to_srgb(torch.from_numpy(np.clip(linear_rgb, 0, 1))).numpy()
 
 
 def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> None:

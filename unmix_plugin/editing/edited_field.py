@@ -30,7 +30,8 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.lamp import MovingLamp
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -86,7 +87,7 @@ class _Appearance:
     def mean_srgb(self, linear_rgb: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         """What pixels show in the mean if the spectrum has this colour."""
         shown = np.clip(self.behind + self.strengths[:, None] * linear_rgb, 0, 1)
-        return np.average(linear_to_srgb(torch.from_numpy(shown)).numpy(), axis=0, weights=self.weights)
+        return np.average(encode_srgb(shown), axis=0, weights=self.weights)
 
 
 def appearance_of(state: MaterialState, index: int) -> _Appearance | None:

@@ -18,12 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from unmix_plugin.figures.plotting import FIGURE_DPI, Colour, draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.formats.files import rgba_png_bytes
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
+from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 
 NEUTRAL = 0.92
 """sRGB grey of what shows nothing."""
@@ -79,9 +78,9 @@ def over_neutral(picture: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture
 
 def premultiplied_over_neutral(linear_rgb: Picture, opacity: Float[np.ndarray, "H W"]) -> Picture:
     """Linear light seen on black, laid over the neutral grey and encoded as sRGB."""
-    behind = float(srgb_to_linear(torch.tensor(NEUTRAL, dtype=torch.float64)))
+    behind = decode_srgb(np.array(NEUTRAL))
     light = linear_rgb + behind * (1 - np.clip(opacity, 0, 1)[..., None])
-    return linear_to_srgb(torch.from_numpy(np.asarray(light, dtype=np.float64)).clamp(0, 1)).numpy()
+    return encode_srgb(np.clip(light.astype(np.float64), 0, 1))
 
 
 def columns_for(count: int) -> int:

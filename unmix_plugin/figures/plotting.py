@@ -19,12 +19,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import (
-    XYZ_TO_LINEAR_SRGB,
-    linear_to_srgb,
-    rgb_matrix,
-    srgb_to_linear,
-)
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.colour.difference import srgb_to_lab
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 
 FIGURE_DPI = 130
 RIGHT, WRONG = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -162,7 +159,7 @@ _LEVELS = 21
 def own_colours(spectra: Float[Tensor, "K B"], bands: Bands) -> Float64[np.ndarray, "K 3"]:
     """The sRGB colour of each spectrum, [0, 1]: what a surface of it looks like, or its false colour."""
     linear = spectra.detach().cpu().double().clamp(min=0) @ rgb_matrix(bands, torch.float64)
-    return linear_to_srgb(linear.clamp(0, 1)).numpy()
+    return encode_srgb(linear.clamp(0, 1).numpy())
 
 
 def distinct_colours(own_srgb: Float[np.ndarray, "K 3"]) -> Float64[np.ndarray, "K 3"]:
@@ -173,7 +170,7 @@ def distinct_colours(own_srgb: Float[np.ndarray, "K 3"]) -> Float64[np.ndarray, 
            [0.2, 0.3, 0.8]])
     """
     distance = _DISTANCE
-    while (chosen := _choose_apart(_lab(own_srgb), distance)) is None:
+    while (chosen := _choose_apart(srgb_to_lab(own_srgb), distance)) is None:
         distance *= 0.9
     return chosen
 
@@ -197,17 +194,7 @@ def _visible_colours() -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, 
     """Colours to choose from, as sRGB and as L*a*b*."""
     levels = np.linspace(0, 1, _LEVELS)
     srgb = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
-    lab = _lab(srgb)
+    lab = srgb_to_lab(srgb)
     low, high = _LIGHTNESS_BOUNDS
     visible = (lab[:, 0] >= low) & (lab[:, 0] <= high)
     return srgb[visible], lab[visible]
-
-
-def _lab(srgb: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    """CIE 1976 L*a*b* of sRGB colours."""
-    linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
-    to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
-    ratio = (linear @ to_xyz.T) / to_xyz.sum(axis=1)
-    root = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio / (3 * (6 / 29) ** 2) + 4 / 29)
-    x, y, z = root.T
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=-1)

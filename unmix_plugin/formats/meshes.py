@@ -28,6 +28,7 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 from unmix_plugin import __version__
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.spectral.colour.srgb import decode_srgb
 
 _TYPES = {"float32": "float", "float64": "double", "uint8": "uchar", "int32": "int"}
 _FLOAT, _UNSIGNED_INT = 5126, 5125
@@ -285,10 +286,9 @@ def write_splats_glb(
     """
     own = "KHR_gaussian_splatting"
     opacity = np.full(len(splats.positions), splats.opacity, dtype=np.float32)
-    linear = np.where(splats.srgb <= 0.04045, splats.srgb / 12.92, ((splats.srgb + 0.055) / 1.055) ** 2.4)
     attributes = {
         "POSITION": splats.positions,
-        "COLOR_0": np.concatenate([linear, opacity[:, None]], axis=1),
+        "COLOR_0": np.concatenate([decode_srgb(splats.srgb), opacity[:, None]], axis=1),
         f"{own}:ROTATION": splats.rotations,
         f"{own}:SCALE": splats.scales,
         f"{own}:OPACITY": opacity,

@@ -39,7 +39,8 @@ from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
 from unmix_plugin.products.segmentation import paint_ids
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb
+from unmix_plugin.spectral.colour.conversion import describe_colour
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.alignment import align_gain, align_pose, align_rows
 from unmix_plugin.trained.evaluation import (
@@ -292,4 +293,4 @@ def _draw_matched_abundances(
 
 def _srgb_on_black(spectra: Float[Tensor, "H W b"], weights: Float[Tensor, "b 3"]) -> np.ndarray:
     linear = spectra.double().clamp(0, 1) @ weights
-    return linear_to_srgb(linear.clamp(0, 1)).numpy()
+    return encode_srgb(linear.clamp(0, 1).numpy())

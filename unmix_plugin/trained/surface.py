@@ -22,7 +22,8 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.spectral.colour.conversion import describe_colour, linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 from unmix_plugin.trained.measures import Scale, describe_scale
@@ -290,7 +291,7 @@ class SurfaceAppearance:
     @property
     def srgb(self) -> Float64[np.ndarray, "P 3"]:
         """Colours for displays, [0, 1]."""
-        return linear_to_srgb(torch.from_numpy(self.linear_rgb).double()).numpy()
+        return encode_srgb(self.linear_rgb.astype(np.float64))
 
     @property
     def material_ids(self) -> UInt8[np.ndarray, " P"]:

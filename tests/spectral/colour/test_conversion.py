@@ -24,6 +24,7 @@ from unmix_plugin.spectral.colour.conversion import (
     srgb_to_linear,
     xyz_matrix,
 )
+from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 
 visible = st.lists(st.floats(385, 775), min_size=4, max_size=60, unique_by=lambda x: round(x, 1)).map(
     lambda values: Bands.of(sorted([*values, 455.03, 545.03, 615.03]))
@@ -175,6 +176,8 @@ def test_band_composite_refuses_what_the_sensor_does_not_see():
 def test_srgb_encoding_inverts(value):
     x = torch.tensor([value], dtype=torch.float64)
     assert_close(srgb_to_linear(linear_to_srgb(x)), x, atol=2e-7, rtol=0)
+    assert_close(torch.from_numpy(encode_srgb(x.numpy())), linear_to_srgb(x))
+    assert_close(torch.from_numpy(decode_srgb(x.numpy())), srgb_to_linear(x))
 
 
 def test_srgb_encoding_has_the_standards_values():

@@ -23,6 +23,7 @@ from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import BandIndex, SpectralFile, require_comparable
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.srgb import decode_srgb
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 _BLOCK_VALUES = 1 << 22
@@ -45,11 +46,9 @@ def stated_values(
     Args:
         stored: Numbers (h, W, b) that were read of these rows and bands.
     """
-    if is_srgb(file):  # IEC 61966-2-1:1999
+    if is_srgb(file):
         top = np.iinfo(stored.dtype).max
-        levels = np.arange(top + 1) / top
-        light = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
-        return light.astype(np.float32)[stored]
+        return decode_srgb(np.arange(top + 1) / top).astype(np.float32)[stored]
     model = radiometric_model(file)
     if model is not None:
         return model.apply(stored.astype(np.float32), rows)

@@ -46,6 +46,7 @@ from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 
 FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
@@ -161,9 +162,7 @@ def write_view(
         if (tally.opacity < OPAQUE).any():
             with write_errors_as(path):
                 _cut_out(temporary, start, tally, recipe)
-    light = np.clip(tally.rgb, 0.0, 1.0)
-    srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)  # IEC 61966-2-1
-    pixels = np.rint(srgb * 255).astype(np.uint8)
+    pixels = np.rint(encode_srgb(np.clip(tally.rgb, 0.0, 1.0)) * 255).astype(np.uint8)
     if recipe.background is not None or recipe.use_opacity:
         pixels = np.dstack([pixels, tally.opacity])
     write_file(folder / paths["file_path"], rgba_png_bytes(pixels))

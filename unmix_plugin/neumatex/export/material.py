@@ -28,7 +28,8 @@ from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.products.atlas import Atlas, Texels, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
+from unmix_plugin.spectral.colour.conversion import rgb_matrix
+from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import default_names
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
@@ -182,7 +183,7 @@ def _write_texture(folder: Path, baked: BakedMaterial, texture: _Texture) -> tup
     """Write a texture as PNG and as OpenEXR (float32); gives the bytes of the PNG, too."""
     picture_path, numbers_path = _texture_paths(make_folder(folder), texture.name)
     numbers = baked.texture(texture.values)
-    shown = linear_to_srgb(torch.from_numpy(numbers)).numpy() if texture.is_colour else numbers
+    shown = encode_srgb(numbers) if texture.is_colour else numbers
     channels = ", ".join(texture.channels)
     description = f"{texture.name}: {channels}; {'sRGB' if texture.is_colour else 'linear'}"
     picture = rgba_png_bytes(np.round(255 * shown.clip(0, 1)).astype(np.uint8), description)

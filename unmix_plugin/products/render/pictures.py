@@ -12,7 +12,6 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float64, UInt8
 
 from unmix_plugin.engine.registry import Output
@@ -25,7 +24,7 @@ from unmix_plugin.figures.pictures import (
 )
 from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes
 from unmix_plugin.formats.files import csv_bytes
-from unmix_plugin.spectral.colour.conversion import linear_to_srgb, srgb_to_linear
+from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
 
@@ -111,7 +110,7 @@ def transparent_tiles(
     """Colours with opacity as the fourth channel; black where nothing is."""
     if output.kind in LIGHT_KINDS:
         straight = _linear(output, values) / np.maximum(opacity, 1e-6)[..., None]
-        tiles = _encoded(straight)[:, :, None]
+        tiles = encode_srgb(np.clip(straight, 0, 1))[:, :, None]
     else:
         tiles = _symbols(output, values, opacity, palette)
     alpha = np.ones_like(opacity) if output.name == "accumulation" else opacity
@@ -142,7 +141,7 @@ def _linear(output: Output, values: np.ndarray) -> Float64[np.ndarray, "h W 3"]:
     """Linear light on black, in [0, 1]."""
     light = np.clip(np.asarray(values, dtype=np.float64), 0, 1)
     if output.kind == "srgb":
-        return srgb_to_linear(torch.from_numpy(light)).numpy()
+        return decode_srgb(light)
     return _grey(light) if output.kind == "grey" else light
 
 
@@ -154,10 +153,6 @@ def _over_grey(
     linear: Float64[np.ndarray, "h W 3"], opacity: Float[np.ndarray, "h W"]
 ) -> UInt8[np.ndarray, "h W 1 3"]:
     return _eight_bits(premultiplied_over_neutral(linear, opacity))[:, :, None]
-
-
-def _encoded(linear: Float64[np.ndarray, "h W 3"]) -> Float64[np.ndarray, "h W 3"]:
-    return linear_to_srgb(torch.from_numpy(linear).clamp(0, 1)).numpy()
 
 
 def _eight_bits(values: np.ndarray) -> np.ndarray:

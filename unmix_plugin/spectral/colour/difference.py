@@ -18,10 +18,9 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
     XYZ_TO_LINEAR_SRGB,
     colour_mode,
-    linear_to_srgb,
-    srgb_to_linear,
     xyz_matrix,
 )
+from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 
 
 def reflectance_to_lab(
@@ -39,8 +38,7 @@ def reflectance_to_lab(
 def srgb_to_lab(srgb: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
     """L*a*b* of sRGB colours in [0, 1] on a display whose white is D65."""
     to_xyz = np.linalg.inv(XYZ_TO_LINEAR_SRGB)
-    linear = srgb_to_linear(torch.from_numpy(np.asarray(srgb, dtype=np.float64))).numpy()
-    return _xyz_to_lab(linear @ to_xyz.T, to_xyz.sum(axis=1))
+    return _xyz_to_lab(decode_srgb(srgb) @ to_xyz.T, to_xyz.sum(axis=1))
 
 
 def lab_to_srgb(lab: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
@@ -50,8 +48,7 @@ def lab_to_srgb(lab: Float[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*sha
     root = np.stack([y + a / 500, y, y - b / 200], axis=-1)
     ratio = np.where(root > 6 / 29, root**3, 3 * (6 / 29) ** 2 * (root - 4 / 29))
     xyz = ratio * np.linalg.inv(XYZ_TO_LINEAR_SRGB).sum(axis=1)
-    linear = np.clip(xyz @ XYZ_TO_LINEAR_SRGB.T, 0, 1)
-    return linear_to_srgb(torch.from_numpy(linear)).numpy()
+    return encode_srgb(np.clip(xyz @ XYZ_TO_LINEAR_SRGB.T, 0, 1))
 
 
 def _xyz_to_lab(
