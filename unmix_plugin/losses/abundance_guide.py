@@ -1,7 +1,10 @@
 """The endmembers that a training starts from, and how they guide abundances.
 
 They come from a file or are found in the training pixels. The model keeps the first ones: pixels are unmixed with them
-one by one, and abundances are drawn to what is found.
+one by one, and abundances are drawn to what is found. A rendered spectrum is never exact, and where endmembers resemble
+mixtures of each other a small error in a spectrum is a large one in its mixture. Measured spectra are the better
+witnesses; a field that must agree with all of them takes the mean over views, in which noise and highlights that wander
+over a surface lose.
 
 Notation: `N` and `R` pixels, `K` endmembers, `B` bands of the scene, `b` channels of a sensor of a rig.
 """
@@ -12,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from unmix_plugin.sensors.batches import MeasuredPixels
@@ -20,26 +23,32 @@ from unmix_plugin.sensors.views import BandBalance, SensorViews
 from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import (
     distinct_spectra,
+    drop_uninformative_pixels,
     fill_bands,
     given_endmembers,
     has_spectral_shape,
     initialise_endmembers,
 )
-from unmix_plugin.spectral.unmixing.mixture_guide import (
-    MixtureCache,
-    abundance_error,
-    margin_error,
-    margin_variance,
-    mixing_penalty,
-)
+from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
 
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of margins is followed."""
-MIXING_PENALTY = 2.0
-"""By how much a further material must improve the fit of a spectrum, in multiples of the mean angle that mixtures of
-two leave unexplained where that is 0.02 rad; less where it is less, more where it is more."""
+_PLAIN_UNEXPLAINED = 0.02
+"""Mean angle, in radians, that mixtures of two materials usually leave unexplained. Of three scenes, two of little
+coloured light leave 0.014 and 0.015, one whose walls colour each other 0.029."""
+_RELATIVE_PENALTY = 2.0
+"""By how much a further material must improve the fit of a spectrum there, in multiples of that angle."""
+_MOST_STRICT = 1.5
+"""Largest factor on that multiple: noise leaves angles too, and is not coloured light."""
+_CLEAR_MARGIN = 0.9
+"""Nearly pure pixels, whose margin is larger, hardly err, and would hide what the others do."""
+_DECAY = 0.99
+_CACHE_BYTES = 1 << 26
+_SHARED_ERROR = 2.0
+"""Variance of a margin's error in multiples of that of field against pixels: errors of both cancel in it."""
 
 
 class AbundanceGuide(nn.Module):
@@ -54,49 +63,110 @@ class AbundanceGuide(nn.Module):
         self.register_buffer("endmembers", torch.zeros(num_endmembers, num_bands))
         self.register_buffer("penalty", torch.zeros(()))
         self.register_buffer("margin_variance", torch.full((), torch.inf))
-        self._cache: MixtureCache | None = None
+        self._cache: _MixtureCache | None = None
 
     @property
     def margin_error(self) -> Float[Tensor, ""]:
         """Standard error of the margin of a ray's largest abundance over its second; infinite before any training."""
-        return margin_error(self.margin_variance)
+        return (_SHARED_ERROR * self.margin_variance).sqrt()
 
     def start(
         self, pixels: Float[Tensor, "N b"], endmembers: Float[Tensor, "K B"], seen: Float[Tensor, "K b"]
     ) -> None:
         """Unmix with these endmembers, `seen` as the pixels are, from now on."""
         self.endmembers.copy_(endmembers)
-        self.penalty.fill_(mixing_penalty(pixels, seen, MIXING_PENALTY))
+        self.penalty.fill_(mixing_penalty(pixels, seen))
 
     def error(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
     ) -> Float[Tensor, ""]:
-        """Mean squared distance of composited abundances to what pixels are made of.
+        """Mean squared distance of composited abundances, which sum to the opacity, to what pixels are made of.
 
         Args:
             endmembers: The guide's, as the sensor of these pixels sees them.
         """
-        mixtures = self._mixtures(measured, endmembers)
-        return abundance_error(abundances, mixtures, measured.alpha, _is_informative(measured))
+        mixtures = measured.alpha[:, None] * self._mixtures(measured, endmembers)
+        distances = (abundances - mixtures).square().sum(dim=1)
+        return torch.where(_is_informative(measured), distances, 0.0).mean()
 
     def observe(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
     ) -> None:
         """Follow how far margins of composited abundances are from those of the measured spectra."""
+        if abundances.shape[1] == 1:
+            return
         few = measured.first(_OBSERVED_PIXELS)
         counts = _is_informative(few) & (few.alpha > OPAQUE_ALPHA)
         own, mixtures = abundances[:_OBSERVED_PIXELS].detach(), self._mixtures(few, endmembers)
-        self.margin_variance.copy_(margin_variance(self.margin_variance, own, mixtures, counts))
+        largest = own.topk(2, dim=1)
+        margins = largest.values[:, 0] - largest.values[:, 1]
+        first, second = mixtures.gather(1, largest.indices).unbind(1)
+        counts = counts & (margins < _CLEAR_MARGIN)
+        errors = torch.where(counts, (margins - first + second).square(), 0.0)
+        variance, before = errors.sum() / counts.sum().clamp(min=1), self.margin_variance
+        moved = torch.where(before.isinf(), variance, before.lerp(variance, 1 - _DECAY))
+        # Without any such pixel, or where the field is not finite, it stays as it is.
+        self.margin_variance.copy_(torch.where((counts.sum() > 0) & variance.isfinite(), moved, before))
 
     def _mixtures(self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]) -> Float[Tensor, "R K"]:
         if self._cache is None:
-            self._cache = MixtureCache(len(self.endmembers), self.endmembers.device)
+            self._cache = _MixtureCache(len(self.endmembers), self.endmembers.device)
         return self._cache.mixtures(measured.pixels, measured.spectra, endmembers, self.penalty)
 
 
 def _is_informative(measured: MeasuredPixels) -> Bool[Tensor, "R"]:
     found = has_spectral_shape(measured.spectra)
     return found if measured.alpha_trust is None else found & (measured.alpha_trust > 0)
+
+
+def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> float:
+    """By how many radians a further material must improve the fit of a spectrum to count, from all training pixels.
+
+    It grows with the square of the mean angle that mixtures of two leave unexplained, up to 0.03, and then in
+    proportion: light that is coloured by what it met before leaves more, and makes more mixtures that are none.
+    """
+    unexplained = mean_pair_distance(drop_uninformative_pixels(pixels), endmembers.to(pixels))
+    return _RELATIVE_PENALTY * min(unexplained / _PLAIN_UNEXPLAINED, _MOST_STRICT) * unexplained
+
+
+class _MixtureCache:
+    """Mixtures of pixels that were unmixed recently: a mixture depends on the pixel alone, and pixels come again.
+
+    A fixed number of slots, whatever the size of the scene; values are kept, and given even the first time, in half
+    precision, so that a resumed training sees the same ones.
+    """
+
+    def __init__(self, num_endmembers: int, device: torch.device) -> None:
+        num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers))
+        self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
+        self._values = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
+
+    @torch.no_grad()
+    def mixtures(
+        self,
+        pixels: Int[Tensor, "R"],
+        spectra: Float[Tensor, "R B"],
+        endmembers: Float[Tensor, "K B"],
+        penalty: Tensor,
+    ) -> Float[Tensor, "R K"]:
+        """Abundances of measured spectra, summing to 1, as mixtures of few endmembers.
+
+        Args:
+            pixels: Number of each pixel, which stands for its spectrum.
+            spectra: Their spectra; premultiplied ones too, since brightness does not matter.
+            endmembers, penalty: As `sparse_abundances` takes them; the same in each call.
+        """
+        slots = pixels % len(self._keys)
+        is_new = (self._keys[slots] != pixels).nonzero()[:, 0]
+        values = self._values[slots]
+        if len(is_new):
+            found = sparse_abundances(spectra[is_new], endmembers, penalty).to(values)
+            values[is_new] = found
+            self._keys[slots[is_new]] = pixels[is_new]
+            # Two pixels of a batch may share a slot; only one of them has it in the end.
+            kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
+            self._values[slots[kept]] = values[kept]
+        return values.to(spectra)
 
 
 def first_endmembers(

@@ -1,5 +1,3 @@
-""""""
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ from torch.testing import assert_close
 from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing import abundances as sparse_unmixing
-from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances, sunsal
+from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances
 
 
 def random_problem(num_endmembers, num_pixels=40, num_bands=9, seed=0):
@@ -19,11 +17,6 @@ def random_problem(num_endmembers, num_pixels=40, num_bands=9, seed=0):
     generator = seeded(seed)
     endmembers = torch.rand(num_endmembers, num_bands, dtype=torch.float64, generator=generator)
     return torch.rand(num_pixels, num_bands, dtype=torch.float64, generator=generator), endmembers
-
-
-def objective(amounts, pixels, endmembers, sparsity=0.0):
-    error = (amounts @ endmembers - pixels).square().sum(1)
-    return error / 2 + sparsity * amounts.sum(1)
 
 
 @given(st.integers(1, 8), st.integers(0, 500))
@@ -75,7 +68,7 @@ def test_black_pixels_hold_nothing():
     assert not nnls(torch.zeros(3, 9), endmembers.float()).any()
 
 
-@pytest.mark.parametrize("solve", [nnls, fcls, sunsal])
+@pytest.mark.parametrize("solve", [nnls, fcls])
 def test_no_pixels_give_no_abundances_and_types_stay(solve):
     _, endmembers = random_problem(4)
     found = solve(torch.zeros(0, 9), endmembers.float())
@@ -103,32 +96,7 @@ def test_shading_misleads_shares_but_not_amounts():
     assert float(fcls(shaded, endmembers)[0, 1]) > 0.5
 
 
-@given(st.integers(1, 6), st.integers(0, 100))
-def test_without_a_price_sparse_amounts_are_least_squares(num_endmembers, seed):
-    pixels, endmembers = random_problem(num_endmembers, seed=seed)
-    found = sunsal(pixels, endmembers, sparsity=0.0)
-    assert float(found.min()) >= 0
-    gap = objective(found, pixels, endmembers) - objective(nnls(pixels, endmembers), pixels, endmembers)
-    assert float(gap.max()) < 1e-6
-
-
-@given(st.integers(1, 6), st.floats(0.01, 0.5), st.integers(0, 100))
-def test_sparse_amounts_are_optimal_for_their_price(num_endmembers, sparsity, seed):
-    pixels, endmembers = random_problem(num_endmembers, seed=seed)
-    found = sunsal(pixels, endmembers, sparsity)
-    slopes = (found @ endmembers - pixels) @ endmembers.T + sparsity
-    assert float(found.min()) >= 0
-    assert float(slopes.min()) > -1e-3
-    assert float((slopes * found).abs().max()) < 1e-3
-
-
-def test_a_higher_price_buys_less():
-    pixels, endmembers = random_problem(5)
-    sums = [float(sunsal(pixels, endmembers, price).sum()) for price in (0.0, 0.1, 0.5, 10.0)]
-    assert sums[0] > sums[1] > sums[2] > sums[3] == 0
-
-
-@pytest.mark.parametrize("solve", [nnls, fcls, sunsal])
+@pytest.mark.parametrize("solve", [nnls, fcls])
 def test_bad_input_is_refused_with_its_fault(solve):
     pixels, endmembers = random_problem(3)
     with pytest.raises(SpectrumError, match="at least one endmember"):
@@ -137,12 +105,6 @@ def test_bad_input_is_refused_with_its_fault(solve):
         solve(pixels / 0.0 * 0.0, endmembers)
     with pytest.raises(SpectrumError, match="the endmembers hold NaN"):
         solve(pixels, endmembers / 0.0)
-
-
-def test_a_negative_price_is_refused():
-    pixels, endmembers = random_problem(3)
-    with pytest.raises(SpectrumError, match=r"must not be negative; found -0\.1"):
-        sunsal(pixels, endmembers, -0.1)
 
 
 def test_more_pixels_than_are_solved_at_a_time_are_all_solved():

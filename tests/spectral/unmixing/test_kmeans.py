@@ -28,9 +28,9 @@ def same_partition(a, b):
 @given(st.integers(1, 7), st.integers(0, 500))
 def test_materials_are_told_apart_under_any_shading(num_clusters, seed):
     pixels, ids, materials = shaded_clusters(num_clusters, seed=seed)
-    result = normalised_kmeans(pixels, num_clusters, seeded(seed))
-    assert same_partition(result.cluster_ids, ids)
-    angles = spectral_angle(result.endmembers[:, None], materials[None]).amin(1)
+    found, clusters = normalised_kmeans(pixels, num_clusters, seeded(seed))
+    assert same_partition(clusters, ids)
+    angles = spectral_angle(found[:, None], materials[None]).amin(1)
     assert float(angles.max()) < 0.01
 
 
@@ -39,40 +39,40 @@ def test_gains_change_neither_clusters_nor_shapes(seed):
     pixels, _, _ = shaded_clusters(4, seed=seed, noise=0.1)
     gains = 10 ** (4 * torch.rand(len(pixels), 1, dtype=torch.float64, generator=seeded(seed)) - 2)
     plain, scaled = (normalised_kmeans(p, 4, seeded(seed)) for p in (pixels, gains * pixels))
-    assert torch.equal(plain.cluster_ids, scaled.cluster_ids)
-    assert float(spectral_angle(plain.endmembers, scaled.endmembers).max()) < 1e-6
-    assert plain.inertia == pytest.approx(scaled.inertia, rel=1e-6)
+    assert torch.equal(plain[1], scaled[1])
+    assert float(spectral_angle(plain[0], scaled[0]).max()) < 1e-6
 
 
 def test_every_pixel_is_with_its_nearest_centre_and_centres_are_mean_shapes():
     pixels = torch.rand(400, 6, dtype=torch.float64, generator=seeded(3)) + 0.01
-    result = normalised_kmeans(pixels, 5, seeded(3))
+    found, clusters = normalised_kmeans(pixels, 5, seeded(3))
     shapes = torch.nn.functional.normalize(pixels, dim=1)
-    centres = torch.stack([shapes[result.cluster_ids == k].mean(0) for k in range(5)])
+    centres = torch.stack([shapes[clusters == k].mean(0) for k in range(5)])
     centres = torch.nn.functional.normalize(centres, dim=1)
-    assert_close(torch.nn.functional.normalize(result.endmembers, dim=1), centres)
-    assert torch.equal((shapes @ centres.T).argmax(1), result.cluster_ids)
-    inertia = (shapes - centres[result.cluster_ids]).square().sum(1).mean()
-    assert result.inertia == pytest.approx(float(inertia), rel=1e-9)
+    assert_close(torch.nn.functional.normalize(found, dim=1), centres)
+    assert torch.equal((shapes @ centres.T).argmax(1), clusters)
 
 
 def test_clusters_come_largest_first():
     pixels, _, _ = shaded_clusters(3)
-    result = normalised_kmeans(torch.cat([pixels, pixels[60:120], pixels[60:120], pixels[120:]]), 3, seeded())
-    assert torch.bincount(result.cluster_ids).tolist() == [180, 120, 60]
+    pixels = torch.cat([pixels, pixels[60:120], pixels[60:120], pixels[120:]])
+    assert torch.bincount(normalised_kmeans(pixels, 3, seeded())[1]).tolist() == [180, 120, 60]
 
 
 def test_more_restarts_never_fit_worse():
     pixels = torch.rand(300, 8, dtype=torch.float64, generator=seeded(1))
-    few, many = (normalised_kmeans(pixels, 6, seeded(2), restarts=n).inertia for n in (1, 12))
-    assert many < few
+    shapes, misfits = torch.nn.functional.normalize(pixels, dim=1), []
+    for restarts in (1, 12):
+        found, _ = normalised_kmeans(pixels, 6, seeded(2), restarts)
+        centres = torch.nn.functional.normalize(found, dim=1)
+        misfits.append(float((2 - 2 * (shapes @ centres.T).amax(dim=1)).mean()))
+    assert misfits[1] < misfits[0]
 
 
 def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
     shape = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
     pixels = torch.linspace(0.01, 0.81, 101, dtype=torch.float64)[:, None] * shape
-    result = normalised_kmeans(pixels, 1, seeded(), brightness_quantile=0.9)
-    assert_close(result.endmembers[0], 0.73 * shape)
+    assert_close(normalised_kmeans(pixels, 1, seeded())[0][0], 0.77 * shape)
 
 
 def test_scaling_up_stops_where_a_band_would_pass_one_and_keeps_the_shape():
@@ -89,9 +89,9 @@ def test_a_spectrum_without_pixels_keeps_its_length():
 
 def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes():
     pixels = torch.eye(5) * torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5])[:, None]
-    result = normalised_kmeans(pixels.repeat_interleave(3, 0), 5, seeded())
-    assert sorted(torch.bincount(result.cluster_ids).tolist()) == [3] * 5
-    assert result.inertia == pytest.approx(0, abs=1e-6)
+    _, clusters = normalised_kmeans(pixels.repeat_interleave(3, 0), 5, seeded())
+    assert torch.bincount(clusters).tolist() == [3] * 5
+    assert same_partition(clusters, torch.arange(5).repeat_interleave(3))
 
 
 def test_shapes_that_differ_only_in_brightness_are_one():
@@ -108,4 +108,4 @@ def test_zero_spectra_are_refused():
 def test_the_same_generator_gives_the_same_clusters():
     pixels = torch.rand(500, 8, generator=seeded(1))
     first, again = (normalised_kmeans(pixels, 6, seeded(9)) for _ in range(2))
-    assert torch.equal(first.endmembers, again.endmembers)
+    assert torch.equal(first[0], again[0])

@@ -78,46 +78,6 @@ def fcls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Floa
     return (shares / shares.sum(dim=1, keepdim=True).clamp(min=1e-12)).to(pixels.dtype)
 
 
-def sunsal(
-    pixels: Float[Tensor, "N B"],
-    endmembers: Float[Tensor, "K B"],
-    sparsity: float = 1e-3,
-    max_iterations: int = 2000,
-    tolerance: float = 1e-6,
-) -> Float[Tensor, "N K"]:
-    """Sparse amounts a >= 0 that minimise |E^T a - x|^2 / 2 + sparsity sum(a).
-
-    Args:
-        sparsity: Weight of the sum, in the unit of squared radiance.
-        tolerance: Iteration ends when no amount differs by more between the two halves of the splitting, nor moves by
-            more in a step, in units of the pixels' largest amount.
-    Raises:
-        SpectrumError: as `nnls`; a negative sparsity.
-    Source:
-        SUnSAL (constrained basis pursuit denoising by alternating directions), J. M. Bioucas-Dias and M. A. T.
-        Figueiredo, WHISPERS 2010, algorithm 1 with the positivity constraint.
-    """
-    _require_fitting(pixels, endmembers)
-    if sparsity < 0:
-        raise SpectrumError(f"the sparsity weight must not be negative; found {sparsity:g}")
-    spectra = endmembers.double()
-    gram, loads = spectra @ spectra.T, pixels.double() @ spectra.T
-    # The geometric mean of the extreme curvatures converges fastest on quadratics (Ghadimi et al., IEEE TAC 2015).
-    curvatures = torch.linalg.eigvalsh(gram)
-    top = curvatures[-1].clamp(min=1e-12)
-    step = float((top * curvatures[0].clamp(min=1e-6 * top)).sqrt())
-    inverse = torch.linalg.inv(gram + step * torch.eye(len(gram)).to(gram))
-    split, dual = torch.zeros_like(loads), torch.zeros_like(loads)
-    for _ in range(max_iterations):
-        amounts = (loads + step * (split - dual)) @ inverse
-        previous, split = split, (amounts + dual - sparsity / step).clamp(min=0)
-        dual = dual + amounts - split
-        moved = torch.maximum((split - previous).abs(), (split - amounts).abs())
-        if len(moved) == 0 or float(moved.max()) <= tolerance * float(split.max().clamp(min=1e-12)):
-            break
-    return split.to(pixels.dtype)
-
-
 def _solve(loads: Float[Tensor, "N K"], gram: Float[Tensor, "K K"]) -> Float[Tensor, "N K"]:
     """Amounts a >= 0 that minimise a . gram a / 2 - load . a for every row of loads."""
     num_pixels, num_endmembers = loads.shape

@@ -1,12 +1,7 @@
 """First guess of a scene's endmembers from the pixels of all its training views, from a file, or from partial bands.
 
-`minimum_volume_simplex` finds the smallest simplex that holds nearly all pixels, where pure pixels may be missing.
-There pixels are scaled to sum 1, which removes shading, and lie near a plane of K - 1 dimensions; `lifted` are their
-coordinates on it, a 1 in front. Abundances are `lifted @ Q`, the corners of the simplex are the rows of the inverse of
-Q. Abundances sum to 1 if the columns of Q sum to (1, 0, ..., 0).
-
-Notation: `N` pixels pooled over views, `B` bands, `b` channels of a sensor, `K` endmembers, `D` = K - 1; spectra in
-[0, 1], bands last.
+Notation: `N` pixels pooled over views, `B` bands, `b` channels of a sensor, `K` endmembers; spectra in [0, 1], bands
+last.
 """
 
 from __future__ import annotations
@@ -23,16 +18,12 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans, scale_to_lit_pixels
-from unmix_plugin.spectral.unmixing.nfindr_winter1999 import nfindr
 from unmix_plugin.spectral.unmixing.pooled_search import pooled_search
+from unmix_plugin.spectral.unmixing.simplex_corners import minimum_volume_simplex, nfindr, vca
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_endmembers
-from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
-_ROUNDING = 0.01
-"""Abundance below which the hinge is a parabola."""
-
-_HEAD_START = 1.2
-"""How much larger than N-FINDR's simplex the first one is."""
+_MOST_PIXELS = 20_000
+"""That endmembers are searched in; more are thinned out at random."""
 _VCA_DRAWS = 5
 """Of which that of the largest simplex stays. The other methods restart by themselves, as often."""
 DARK_RMS = 0.005
@@ -46,81 +37,9 @@ _CONTRAST = 0.6
 _LIT_QUANTILE = 0.99
 _LIT_SCALE = 0.75
 """Scale that fully lit pixels should need: a sigmoid near 1 hardly learns (vnir-pots, 500 steps: +0.9 dB against 1)."""
-_MOST_PIXELS = 5000
+_PIXELS_FOR_BRIGHTNESS = 5000
 _DARK_MATERIAL = 0.25
 """Length of the darkest endmember, as a share of the brightest, below which brightness does not decide amounts."""
-
-
-def minimum_volume_simplex(
-    pixels: Float[Tensor, "N B"],
-    num_endmembers: int,
-    generator: torch.Generator,
-    outlier_penalty: float = 50.0,
-    max_iterations: int = 200,
-) -> Float[Tensor, "K B"]:
-    """Corners of the smallest simplex around the shapes of the pixels, each with a sum over bands of 1.
-
-    Source: J. M. Bioucas-Dias, "A variable splitting augmented Lagrangian approach to linear spectral unmixing"
-    (SISAL), WHISPERS 2009: least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay
-    outside; here the hinge is rounded near zero, which lets a quasi-Newton method minimise it.
-
-    Args:
-        pixels: Spectra of positive sum, in any unit. Drop dark ones first: noise is all the shape they have.
-        generator: On the CPU; seeds the start, the only source of randomness.
-        outlier_penalty: Price of a mean negative abundance, against the logarithm of the volume. Small values let many
-            pixels stay outside, large ones reach for every noisy one: about K / penalty of them stay outside.
-    Raises:
-        SpectrumError: K below 2, above the bands or the pixels; pixels without light; a simplex that is flat.
-    """
-    sums = pixels.double().sum(dim=1, keepdim=True)
-    if not bool((sums > 0).all()):
-        raise SpectrumError(
-            f"the minimum volume needs spectra of positive sum; found {int((sums <= 0).sum())} others"
-        )
-    shapes = pixels.double() / sums
-    first = nfindr(shapes, num_endmembers, generator)
-    mean = shapes.mean(dim=0)
-    centred = shapes - mean
-    eigen = torch.linalg.eigh(centred.T @ centred / len(shapes))
-    spreads = eigen.eigenvalues.flip(0)[: num_endmembers - 1].clamp(min=0).sqrt()
-    axes = (
-        eigen.eigenvectors.flip(1)[:, : num_endmembers - 1] * spreads
-    ).T  # principal, as long as the spread
-    lifted = torch.cat([torch.ones_like(sums), centred @ torch.linalg.pinv(axes)], dim=1)
-    centre = lifted[first].mean(dim=0)
-    start = centre + _HEAD_START * (lifted[first] - centre)
-    corners = _minimise(lifted, start, outlier_penalty, max_iterations)
-    spectra = (mean + corners[:, 1:] @ axes).clamp(min=0)
-    return (spectra / spectra.sum(dim=1, keepdim=True)).to(pixels.dtype)
-
-
-def _minimise(
-    lifted: Float[Tensor, "N K"], corners: Float[Tensor, "K K"], outlier_penalty: float, max_iterations: int
-) -> Float[Tensor, "K K"]:
-    """Lifted corners of the best simplex, found from the given ones."""
-    unit = torch.eye(len(corners), dtype=lifted.dtype, device=lifted.device)[:, :1]
-    free = torch.linalg.inv(corners)[:, :-1].contiguous().requires_grad_(True)
-    optimizer = torch.optim.LBFGS(
-        [free],
-        max_iter=max_iterations,
-        history_size=20,
-        tolerance_change=1e-10,
-        line_search_fn="strong_wolfe",
-    )
-
-    def objective() -> Tensor:
-        optimizer.zero_grad()
-        unmixing = torch.cat([free, unit - free.sum(dim=1, keepdim=True)], dim=1)
-        missing = (-(lifted @ unmixing)).clamp(min=0)
-        hinge = torch.where(missing < _ROUNDING, missing.square() / (2 * _ROUNDING), missing - _ROUNDING / 2)
-        loss = outlier_penalty * hinge.sum(dim=1).mean() - torch.linalg.slogdet(unmixing).logabsdet
-        loss.backward()
-        return loss
-
-    with torch.enable_grad():
-        optimizer.step(objective)  # type: ignore[arg-type] - the closure may return a tensor
-    free = free.detach()
-    return torch.linalg.inv(torch.cat([free, unit - free.sum(dim=1, keepdim=True)], dim=1))
 
 
 EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", "pooled"]
@@ -131,7 +50,6 @@ def initialise_endmembers(
     num_endmembers: int,
     method: EndmemberMethod,
     generator: torch.Generator,
-    max_pixels: int = 20_000,
 ) -> Float[Tensor, "K B"]:
     """Endmember spectra in [0, 1], as bright as the well-lit pixels that look like them.
 
@@ -143,14 +61,13 @@ def initialise_endmembers(
             without pure pixels; `pairs` takes the mean shapes that explain the pixels best as mixtures of two, which
             serves surfaces whose materials meet; `pooled` chooses among the sets that several of these searches find.
         generator: On the CPU; the only source of randomness.
-        max_pixels: More are thinned out at random to this number.
     Raises:
         SpectrumError: NaN or infinite values, more endmembers than bands or than distinct pixels neither dark nor
             saturated, pixels that span too few dimensions, or more than 64 endmembers for `pairs`.
     """
-    usable = usable_pixels(pixels, num_endmembers, generator, max_pixels)
+    usable = usable_pixels(pixels, num_endmembers, generator)
     if method == "kmeans" or num_endmembers == 1:
-        return normalised_kmeans(usable, num_endmembers, generator).endmembers.clamp(0, 1)
+        return normalised_kmeans(usable, num_endmembers, generator)[0].clamp(0, 1)
     return as_lit_pixels(_shapes(usable, num_endmembers, method, generator), usable)
 
 
@@ -187,7 +104,7 @@ def _shapes(
 ) -> Float[Tensor, "K B"]:
     """Endmembers of any brightness."""
     if method == "vca":
-        draws = [vca(usable, num_endmembers, generator).endmembers.clamp(min=0) for _ in range(_VCA_DRAWS)]
+        draws = [vca(usable, num_endmembers, generator)[0].clamp(min=0) for _ in range(_VCA_DRAWS)]
         return max(draws, key=_log_volume)
     if method == "minimum-volume":
         return minimum_volume_simplex(usable, num_endmembers, generator)
@@ -207,9 +124,9 @@ def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
 
 
 def usable_pixels(
-    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator, max_pixels: int
+    pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator
 ) -> Float[Tensor, "kept B"]:
-    """At most so many of the pixels that show a spectral shape.
+    """Pixels that show a spectral shape, thinned out at random where there are more than 20,000.
 
     Raises:
         SpectrumError: NaN or infinite values, or more endmembers than bands or than these pixels are distinct.
@@ -226,8 +143,8 @@ def usable_pixels(
             f"{int((~finite).sum())} of {len(pixels)} pixels hold NaN or infinite values; mask them out first"
         )
     usable = drop_uninformative_pixels(pixels)
-    if len(usable) > max_pixels:
-        kept = torch.randperm(len(usable), generator=generator)[:max_pixels]
+    if len(usable) > _MOST_PIXELS:
+        kept = torch.randperm(len(usable), generator=generator)[:_MOST_PIXELS]
         usable = usable[kept.to(usable.device)]
     num_distinct = _count_distinct(usable, num_endmembers)
     if num_distinct < num_endmembers:
@@ -292,30 +209,6 @@ def distinct_spectra(typical: Float[Tensor, "B"], count: int) -> Float[Tensor, "
     return (shapes.to(typical) * typical).clamp(0, 1)
 
 
-def _brightness_factor(
-    endmembers: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], generator: torch.Generator
-) -> float:
-    """The one factor on all endmembers with which nearly every pixel is a mixture of amounts that sum to at most 0.75.
-
-    Spectra from a file are as bright as a white surface in the brightest band of the lamp; a scene's exposure is
-    anything. Ratios between endmembers, which the file gives, stay.
-
-    Args:
-        endmembers: Reflectance times the lamp's relative power.
-        pixels: Spectra of all training views.
-        generator: On the CPU; chooses at most 5000 of them.
-    Raises:
-        SpectrumError: no pixel is a mixture of them.
-    """
-    usable = drop_uninformative_pixels(pixels)
-    usable = usable[torch.randperm(len(usable), generator=generator)[:_MOST_PIXELS]]
-    amounts = nnls(usable.double(), endmembers.double()).sum(dim=1)
-    factor = float(torch.quantile(amounts, _LIT_QUANTILE)) / _LIT_SCALE if len(amounts) else 0.0
-    if not factor > 0:
-        raise SpectrumError("the given endmembers explain no pixel of the training views")
-    return factor
-
-
 def given_endmembers(
     path: Path,
     count: int,
@@ -326,13 +219,16 @@ def given_endmembers(
 ) -> Float[Tensor, "K B"]:
     """Radiance of the reflectances in a CSV (wavelength,name,...), as bright as the scene.
 
+    Reflectances times the lamp are as bright as a white surface in its brightest band; a scene's exposure is anything.
+    So all are multiplied by the one factor with which nearly every pixel is a mixture of amounts that sum to at most
+    0.75; ratios between them, which the file gives, stay.
+
     Args:
-        path: The file.
         count: K, which must be the number of its spectra.
         bands: To resample to.
         lamp: Relative power of the scene's light.
         pixels: Spectra of all training views.
-        generator: On the CPU.
+        generator: On the CPU; chooses at most 5000 of them.
     Raises:
         ConfigError: another number of spectra.
         SpectrumError: they don't cover the bands, or explain no pixel.
@@ -343,7 +239,13 @@ def given_endmembers(
             f"{path} has {len(table.names)} spectra but num-endmembers is {count}; give both the same number"
         )
     radiance = (torch.as_tensor(table.spectra, dtype=torch.float32) * lamp).clamp(min=0)
-    return radiance * _brightness_factor(radiance, pixels, generator)
+    usable = drop_uninformative_pixels(pixels)
+    usable = usable[torch.randperm(len(usable), generator=generator)[:_PIXELS_FOR_BRIGHTNESS]]
+    amounts = nnls(usable.double(), radiance.double()).sum(dim=1)
+    factor = float(torch.quantile(amounts, _LIT_QUANTILE)) / _LIT_SCALE if len(amounts) else 0.0
+    if not factor > 0:
+        raise SpectrumError("the given endmembers explain no pixel of the training views")
+    return radiance * factor
 
 
 def comparable_brightness(endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "K B"]:

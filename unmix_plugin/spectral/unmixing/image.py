@@ -28,8 +28,7 @@ from unmix_plugin.spectral.unmixing.pooled_search import PooledEndmembers, poole
 _LIT = 0.9
 """Value that the 99.9th percentile of the pixels' peaks is scaled to, so that few count as saturated."""
 _LIT_QUANTILE = 0.999
-_MOST_PIXELS = 20_000
-"""Pixels that endmembers are searched in; more are thinned out at random."""
+_PIXELS_TO_COUNT_BY = 20_000
 _LEAST_MARGIN_ERROR = 0.02
 """Standard error of a margin where all sets agree."""
 
@@ -97,7 +96,7 @@ def unmix_image(
     pixels = spectra * (_LIT / brightest)
     generator = torch.Generator().manual_seed(seed)
     count, evidence = _proposed(pixels, generator) if endmembers == "auto" else (endmembers, "")
-    usable = usable_pixels(pixels, count, generator, _MOST_PIXELS)
+    usable = usable_pixels(pixels, count, generator)
     _require_signal(usable, count)
     found = pooled_search(usable, count, generator)
     lit = as_lit_pixels(found.endmembers, usable)
@@ -149,7 +148,7 @@ def _proposed(pixels: Float[Tensor, "N B"], generator: torch.Generator) -> tuple
     informative = drop_uninformative_pixels(pixels)
     if len(informative) == 0:
         raise SpectrumError("no pixel is neither dark nor saturated: there is nothing to count materials by")
-    some = informative[torch.randperm(len(informative), generator=generator)[:_MOST_PIXELS]]
+    some = informative[torch.randperm(len(informative), generator=generator)[:_PIXELS_TO_COUNT_BY]]
     proposed = propose_num_materials(some, generator)
     dimensions = proposed.signal_dimensions
     if dimensions is None or proposed.number <= max(1, dimensions):

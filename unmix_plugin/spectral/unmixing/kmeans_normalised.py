@@ -8,8 +8,6 @@ Notation: `N` pixels, `B` bands, `K` clusters; a `shape` is a spectrum divided b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -19,20 +17,10 @@ from unmix_plugin.errors import SpectrumError
 _SAME_SHAPE = 1e-10
 """Squared distance of unit spectra below which they are the same shape (an angle of 1e-5 rad, above float32 noise)."""
 
+_WELL_LIT = 0.95
+"""Quantile of the lengths of a spectrum's pixels that becomes its own."""
 _SAMPLES_PER_PRODUCT = 65_536
 """Pixels compared with the centres at a time, so that memory stays small."""
-
-
-@dataclass(frozen=True)
-class _KmeansResult:
-    """Clusters, largest first."""
-
-    endmembers: Float[Tensor, "K B"]
-    """Mean shape of each cluster at the brightness of its well-lit pixels, no value above 1."""
-    cluster_ids: Int[Tensor, " N"]
-    """Cluster of each pixel."""
-    inertia: float
-    """Mean squared distance between shapes and their centres."""
 
 
 def normalised_kmeans(
@@ -41,14 +29,17 @@ def normalised_kmeans(
     generator: torch.Generator,
     restarts: int = 5,
     max_iterations: int = 100,
-    brightness_quantile: float = 0.95,
-) -> _KmeansResult:
+) -> tuple[Float[Tensor, "K B"], Int[Tensor, " N"]]:
     """Cluster spectra by shape; the best of several restarts.
 
     Args:
         pixels: Spectra of non-zero length. Drop dark ones first: noise is all the shape they have.
         generator: On the CPU; the only source of randomness.
-        brightness_quantile: How bright the returned endmembers are: see `scale_to_lit_pixels`.
+
+    Returns:
+        The mean shape of each cluster at the brightness of its well-lit pixels, the largest cluster first, and the
+        cluster of each pixel.
+
     Raises:
         SpectrumError: no pixels, a zero spectrum, or fewer distinct shapes than clusters.
     """
@@ -58,35 +49,27 @@ def normalised_kmeans(
         raise SpectrumError(f"k-means needs spectra of non-zero length; found {found}")
     shapes = pixels / lengths[:, None]
     runs = [_cluster(shapes, num_clusters, generator, max_iterations) for _ in range(restarts)]
-    inertia, centres, ids = min(runs, key=lambda run: run[0])
+    _, centres, ids = min(runs, key=lambda run: run[0])
     order = torch.bincount(ids, minlength=num_clusters).argsort(descending=True, stable=True)
     ids = order.argsort()[ids]
-    endmembers = scale_to_lit_pixels(centres[order], pixels, ids, brightness_quantile)
-    return _KmeansResult(endmembers, ids, inertia)
+    return scale_to_lit_pixels(centres[order], pixels, ids), ids
 
 
 def scale_to_lit_pixels(
-    spectra: Float[Tensor, "K B"],
-    pixels: Float[Tensor, "N B"],
-    ids: Int[Tensor, " N"],
-    brightness_quantile: float = 0.95,
+    spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], ids: Int[Tensor, " N"]
 ) -> Float[Tensor, "K B"]:
-    """Spectra of the same shape, each as long as the well-lit ones of the pixels that belong to it.
+    """Spectra of the same shape, each as long as the well-lit ones of the pixels that belong to it by their `ids`.
 
     A shading factor below 1 can only darken an endmember, so one as dark as its pixels' mean could not explain their
-    bright half: hence the quantile. Where it would push a band above 1 the whole spectrum is scaled down, so that its
-    shape stays. A spectrum without pixels keeps its length.
-
-    Args:
-        ids: Which spectrum each pixel belongs to.
-        brightness_quantile: Quantile in [0, 1] of the lengths of a spectrum's pixels that becomes its own length.
+    bright half. Where a band would come above 1 the whole spectrum is scaled down, so that its shape stays. A spectrum
+    without pixels keeps its length.
     """
     brightness = spectra.norm(dim=1)
     lengths = pixels.norm(dim=1)
     for k in range(len(spectra)):
         own = lengths[ids == k]
         if len(own) > 0:
-            brightness[k] = own.quantile(brightness_quantile)
+            brightness[k] = own.quantile(_WELL_LIT)
     lit = torch.nn.functional.normalize(spectra, dim=1) * brightness[:, None]
     return lit / lit.amax(dim=1, keepdim=True).clamp(min=1)
 

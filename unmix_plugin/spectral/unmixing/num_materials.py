@@ -21,6 +21,8 @@ from torch import Tensor
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fits
 
+_MOST_MATERIALS = 12
+"""Largest number tried."""
 _LEAST_SHARE = 0.2
 """A further material must take away at least this share of the mean distance that is left."""
 
@@ -41,11 +43,6 @@ class _MaterialCount:
     signal_dimensions: int | None
     """What HySime counts; None where there are too few pixels for it."""
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the largest number tried is the one proposed, so that there may be more."""
-        return self.number == len(self.mean_distances)
-
     def evidence(self) -> str:
         """Why this number, in a few lines for people."""
         lines = ["materials  distance left  taken away by the last one"]
@@ -63,20 +60,17 @@ class _MaterialCount:
         return "\n".join(lines)
 
 
-def propose_num_materials(
-    pixels: Float[Tensor, "N B"], generator: torch.Generator, most_materials: int = 12
-) -> _MaterialCount:
+def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generator) -> _MaterialCount:
     """Number of materials from the elbow of the distance to mixtures of two, and HySime's count beside it.
 
     Args:
         pixels: Spectra of a scene's training views, neither dark nor saturated, background left out.
         generator: On the CPU; the only source of randomness.
-        most_materials: Largest number tried; the number of bands bounds it too.
     Raises:
-        SpectrumError: no pixels, zero spectra, or `most_materials` not in 1 to 64.
+        SpectrumError: no pixels, or zero spectra.
     """
     num_pixels, num_bands = pixels.shape
-    fits = two_material_fits(pixels, min(most_materials, num_bands), generator)
+    fits = two_material_fits(pixels, min(_MOST_MATERIALS, num_bands), generator)
     is_enough = num_bands > 2 and num_pixels > num_bands
     noise = _noise_distance(pixels) if is_enough else 0.0
     # Distances in independent directions add as squares.

@@ -33,6 +33,7 @@ from torch.nn.functional import normalize
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans
+from unmix_plugin.spectral.unmixing.simplex_corners import vca
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     MOST_ENDMEMBERS,
     PairSearch,
@@ -40,7 +41,6 @@ from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     distances_to_pairs,
     two_material_endmembers,
 )
-from unmix_plugin.spectral.unmixing.vca_nascimento2005 import vca
 
 _NUM_JUDGES = 600
 """Pixels that decide which candidates are pairs."""
@@ -145,7 +145,7 @@ def _pair_sets(
         count = count_shapes(few, max(_NUM_CANDIDATES, num_endmembers))
         few = few if count >= num_endmembers else shapes
         count = max(count, num_endmembers)
-        means = normalised_kmeans(few, count, generator, restarts=1, max_iterations=10).endmembers
+        means = normalised_kmeans(few, count, generator, restarts=1, max_iterations=10)[0]
         draws.append(searched(normalize(means.double(), dim=1), price))
     together = torch.cat(draws)
     return [*draws, *(searched(together, price) for price in _POOLED_PRICES)]
@@ -154,9 +154,9 @@ def _pair_sets(
 def _corners_and_clusters(
     shapes: Float[Tensor, "N d"], num_endmembers: int, generator: torch.Generator
 ) -> list[Float[Tensor, "K d"]]:
-    clusters = normalised_kmeans(shapes, num_endmembers, generator, restarts=3).endmembers
+    clusters = normalised_kmeans(shapes, num_endmembers, generator, restarts=3)[0]
     try:
-        return [clusters, vca(shapes, num_endmembers, generator).endmembers]
+        return [clusters, vca(shapes, num_endmembers, generator)[0]]
     except SpectrumError:  # the pixels span too few dimensions for corners
         return [clusters]
 

@@ -66,7 +66,7 @@ def two_material_fits(
             "ask for fewer or take another method"
         )
     num_candidates = max(1, min(_NUM_CANDIDATES, count_shapes(pixels, _NUM_CANDIDATES)))
-    candidates = normalised_kmeans(pixels, num_candidates, generator, restarts=1).endmembers
+    candidates = normalised_kmeans(pixels, num_candidates, generator, restarts=1)[0]
     judges = pixels[torch.randperm(len(pixels), generator=generator)[:_NUM_JUDGES].to(pixels.device)]
     candidates = normalize(candidates.double(), dim=1)
     search = PairSearch(distances_to_pairs(normalize(judges.double(), dim=1), candidates))

@@ -1,0 +1,107 @@
+"""What measured spectra say of abundances: the loss, the penalty of further materials, and the error of margins."""
+
+import torch
+from torch.testing import assert_close
+
+from tests.spectral.mixtures import seeded, smooth_endmembers
+from unmix_plugin.losses import abundance_guide
+from unmix_plugin.losses.abundance_guide import AbundanceGuide, mixing_penalty
+from unmix_plugin.sensors.batches import MeasuredPixels
+from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
+from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
+from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
+
+ENDMEMBERS = smooth_endmembers(4).float() * 0.8
+
+
+def noisy_pixels(noise):
+    off = torch.rand(120, ENDMEMBERS.shape[1], generator=seeded(0))
+    return torch.eye(4).repeat(30, 1) @ ENDMEMBERS + noise * off
+
+
+def guide():
+    found = AbundanceGuide(*ENDMEMBERS.shape)
+    found.start(noisy_pixels(0.0), ENDMEMBERS, ENDMEMBERS)
+    return found
+
+
+def measured(spectra, alpha=1.0, first=0):
+    count = len(spectra)
+    return MeasuredPixels(
+        None, count, spectra, torch.full((count,), alpha), torch.arange(first, first + count)
+    )
+
+
+def error(abundances, spectra, alpha=1.0):
+    return float(guide().error(abundances, measured(spectra, alpha), ENDMEMBERS))
+
+
+def test_abundances_that_the_measured_spectra_show_are_no_error():
+    assert error(torch.eye(4), 0.5 * ENDMEMBERS) < 1e-6
+    assert abs(error(torch.eye(4).roll(1, dims=1), 0.5 * ENDMEMBERS) - 2.0) < 1e-2
+
+
+def test_a_half_transparent_pixel_shows_half_of_its_mixture():
+    assert error(0.5 * torch.eye(4), 0.5 * ENDMEMBERS, 0.5) < 1e-6
+    assert error(torch.eye(4), 0.5 * ENDMEMBERS, 0.5) > 0.1
+
+
+def test_black_and_saturated_pixels_do_not_count():
+    dark = torch.stack([torch.zeros_like(ENDMEMBERS[0]), torch.ones_like(ENDMEMBERS[0])])
+    assert error(torch.rand(2, 4, generator=seeded(2)), dark) == 0
+
+
+def test_what_pairs_leave_unexplained_sets_the_penalty_of_further_materials():
+    """It grows with the square of that, and then in proportion."""
+    seen = []
+    for noise in (0.01, 0.02, 0.4):
+        pixels = noisy_pixels(noise)
+        angle = mean_pair_distance(drop_uninformative_pixels(pixels), ENDMEMBERS)
+        seen.append(angle)
+        expected = 100 * angle**2 if angle < 0.03 else 3 * angle
+        assert_close(mixing_penalty(pixels, ENDMEMBERS), expected, rtol=1e-4, atol=0)
+    assert seen[0] < seen[1] < 0.03 < seen[2]
+    assert mixing_penalty(noisy_pixels(0.0), ENDMEMBERS) < 1e-3
+
+
+def observed(deviation, steps=60):
+    """A guide after steps in which margins are off by a normal error: two materials, one share too large."""
+    found = guide()
+    for step in range(steps):
+        generator = seeded(6 + step)
+        share = 0.5 + 0.4 * torch.rand(200, 1, generator=generator)
+        pure = torch.eye(4)[torch.randint(4, (200,), generator=generator)]
+        mixed = share * pure + (1 - share) * pure.roll(1, dims=1)
+        off = deviation / 2 * torch.randn(200, 1, generator=generator)
+        pixels = measured(mixed @ ENDMEMBERS, first=200 * step)
+        found.observe(mixed + off * (pure - pure.roll(1, dims=1)), pixels, ENDMEMBERS)
+    return found
+
+
+def test_the_error_of_margins_is_what_field_and_pixels_differ_by_widened_for_what_both_get_wrong():
+    assert guide().margin_error.isinf()
+    small = float(observed(0.02).margin_error)
+    assert abs(small - 2**0.5 * 0.02) < 0.005
+    assert float(observed(0.2, steps=300).margin_error) > 3 * small
+
+
+def test_what_does_not_count_or_is_not_finite_leaves_the_error_of_margins_as_it_was():
+    known = observed(0.05, steps=3)
+    before = known.margin_error.clone()
+    even = torch.full((4, 4), 0.25)
+    known.observe(even, measured(torch.zeros(4, ENDMEMBERS.shape[1]), first=600), ENDMEMBERS)
+    known.observe(torch.nan * even, measured(even @ ENDMEMBERS, first=604), ENDMEMBERS)
+    assert torch.equal(known.margin_error, before)
+
+
+def test_remembered_mixtures_are_those_computed_anew_whatever_shares_a_slot(monkeypatch):
+    monkeypatch.setattr(abundance_guide, "_CACHE_BYTES", 7 * 8)
+    cached = guide()
+    spectra = torch.rand(50, 4, generator=seeded(5)) @ ENDMEMBERS * 0.3
+    for seed in range(20):
+        pixels = torch.randint(50, (16,), generator=seeded(seed))
+        part = MeasuredPixels(None, 16, spectra[pixels], torch.ones(16), pixels)
+        expected = sparse_abundances(spectra[pixels], ENDMEMBERS, cached.penalty)
+        first, again = (cached.error(expected, part, ENDMEMBERS) for _ in range(2))
+        assert first < 1e-6
+        assert torch.equal(first, again)
