@@ -99,11 +99,6 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     as many as leave out no more than noise. What training compares are spectra on all bands in any case."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
         super().__post_init__()
         rules = {
             "memory-gb of at least 0.01 or auto": self.memory_gb == "auto" or self.memory_gb >= 0.01,
@@ -144,11 +139,6 @@ class UnmixFieldConfig:
     """One brightness a point, or one a point and endmember."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
         finest, rows = self.finest_resolution, self.log2_rows_per_level
         rules = {
             "num-levels of 1 to 32": 1 <= self.num_levels <= 32,
@@ -182,11 +172,6 @@ class RendererConfig:
     are left out; 1 leaves none out. Auto is 0.05 with alpha or before a backdrop, else 1."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
         rules = {
             "samples-per-pixel of 0.01 to 100 or auto": self.samples_per_pixel == "auto"
             or 0.01 <= self.samples_per_pixel <= 100,
@@ -239,11 +224,6 @@ class LossConfig:
     relative ones. Auto is 0 unless alpha is known and the brighter pixels are much brighter than the others."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
         rules = {
             "spectral of at least 0": self.spectral >= 0,
             "rgb of at least 0": self.rgb == "auto" or self.rgb >= 0,
@@ -340,11 +320,6 @@ class UnmixModelConfig(ModelConfig):
     """What training asks for, and how strongly."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range or settings that contradict each other.
-        """
         super().__post_init__()
         count, opacity = self.num_endmembers, self.initial_opacity
         rules = {

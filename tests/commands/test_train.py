@@ -216,7 +216,7 @@ def test_training_into_a_pipe_that_closes_saves_and_exits_141(trained, tmp_path)
     code = (
         "from unmix_plugin.engine.training.progress import ProgressDisplay\n"
         "ProgressDisplay.__init__.__defaults__ = (0.2, 0.2)  # seconds between lines\n"
-        "from unmix_plugin.commands.train import main\nmain()"
+        "from unmix_plugin.commands import scripts\nscripts.train()"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code, *argv], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -22,7 +22,7 @@ class Started:
         # A test run in the background of a script inherits an ignored SIGINT, which Python would leave ignored.
         launch = (
             "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-            f"from unmix_plugin.commands.{command} import main; main()"
+            f"from unmix_plugin.commands import scripts; scripts.{command}()"
         )
         self.process = subprocess.Popen(
             [sys.executable, "-c", launch, *map(str, words)],

@@ -11,7 +11,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import ConfigError
 
 
@@ -147,8 +146,3 @@ def _numbers(options: DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple
 def _print_files(folder: Path, files: Iterable[tuple[str, str]]) -> None:
     for name, content in files:
         print(f"  {folder / name}  {content}")
-
-
-def main() -> None:
-    """Console script."""
-    run_command(write_demo_scene)

@@ -234,10 +234,5 @@ def _unit(name: str) -> str:
 _UNITS = {"psnr": " dB", "sam": " rad", "angle": " rad", "seconds": " s"}
 
 
-def main() -> None:
-    """Console script."""
+if __name__ == "__main__":  # of one of several processes
     run_command(evaluate)
-
-
-if __name__ == "__main__":
-    main()

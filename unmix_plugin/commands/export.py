@@ -161,10 +161,5 @@ def _open(product: RunWork, own: dict[str, OwnProduct], processes: Processes) ->
     )
 
 
-def main() -> None:
-    """Console script."""
+if __name__ == "__main__":  # of one of several processes
     run_command(export)
-
-
-if __name__ == "__main__":
-    main()

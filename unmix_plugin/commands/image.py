@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from unmix_plugin.captures.spectral_file import Axes, ReadOptions
-from unmix_plugin.commands.entry import run_command
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 if TYPE_CHECKING:
@@ -163,8 +162,3 @@ def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
         return kept, None
     wavelengths, first = np.unique(table.wavelengths_nm[kept], return_index=True)
     return kept[first], wavelengths
-
-
-def main() -> None:
-    """Console script."""
-    run_command(image)

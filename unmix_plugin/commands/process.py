@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from unmix_plugin.commands.entry import run_command
-
 
 def process(arguments: list[str]) -> None:
     """Parse the arguments, make the scene, say where it is.
@@ -39,8 +37,3 @@ def process(arguments: list[str]) -> None:
     for finding in findings:
         print(f"looks wrong: {finding}")
     print(f"scene: {options.output_dir}")
-
-
-def main() -> None:
-    """Console script."""
-    run_command(process)

@@ -255,10 +255,5 @@ def _list(
             print(f"{paths[0].parent}  {len(paths)} files {suffixes}; {what}")
 
 
-def main() -> None:
-    """Console script."""
+if __name__ == "__main__":  # of one of several processes
     run_command(render)
-
-
-if __name__ == "__main__":
-    main()

@@ -214,10 +214,5 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
         viewer.stop()
 
 
-def main() -> None:
-    """Console script."""
+if __name__ == "__main__":  # of one of several processes
     run_command(train)
-
-
-if __name__ == "__main__":
-    main()

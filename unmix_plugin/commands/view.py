@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.configs import DeviceName
 from unmix_plugin.viewer.access import ViewerOptions
 
@@ -111,8 +110,3 @@ def _scene_of(source: SceneSource, data: Path | None) -> Scene:
             f"it is no longer, or no longer the same, at {summary.get('root')}; name it with --data"
         )
     return scene
-
-
-def main() -> None:
-    """Console script."""
-    run_command(view)
