@@ -26,6 +26,8 @@ from unmix_plugin.scenes.reading.faults import find_named
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.conversion import illuminant_power
 
 
 def test_every_part_of_a_scene_is_what_was_written(tmp_path):
@@ -56,11 +58,18 @@ def test_every_part_of_a_scene_is_what_was_written(tmp_path):
 
 def test_light_and_endmembers_come_at_the_scenes_bands(tmp_path):
     scene = load_scene(make_scene(tmp_path / "scene").root)
-    assert scene.illuminant is not None
     assert scene.endmembers is not None
-    at_520 = 1.0 + (520 - 450) / (600 - 450)  # the table has no row at 520 nm
-    np.testing.assert_allclose(scene.illuminant, np.array([1.0, at_520, 2.0, 4.0]) / 4.0)
     np.testing.assert_allclose(scene.endmembers, [[0.1, 0.3, 0.1, 0.1], SPECTRUM.tolist()], atol=1e-7)
+
+
+def test_lines_of_a_lamp_between_bands_count_in_the_light_of_a_scene_as_in_a_light_to_show_it_in(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    path = folder.root / "illuminant.csv"
+    path.write_text("wavelength,power\n450,1\n559,1\n560,101\n561,1\n680,1\n")
+    light = load_scene(folder.root).illuminant
+    assert light is not None
+    np.testing.assert_allclose(light, illuminant_power(path, Bands.of([450, 520, 600, 680])))
+    assert light[1] > 1.5 * light[0]  # 560 nm is where the intervals of the bands at 520 and 600 nm meet
 
 
 def test_endmember_columns_follow_the_materials_by_name(tmp_path):

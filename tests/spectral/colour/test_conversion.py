@@ -236,6 +236,12 @@ def test_a_line_counts_in_its_band_wherever_it_lies_between_centres(tmp_path):
     assert power.sum() == pytest.approx(2)
 
 
+def test_a_light_that_is_given_at_the_bands_is_taken_as_it_is(tmp_path):
+    path = tmp_path / "lines.csv"
+    path.write_text("wavelength,power\n450,1\n500,10\n550,2\n")
+    np.testing.assert_allclose(illuminant_power(path, Bands.of([450, 500, 550])), [0.1, 1.0, 0.2])
+
+
 def test_a_light_linear_in_wavelength_is_sampled_at_band_centres(tmp_path):
     path = tmp_path / "ramp.csv"
     path.write_text("wavelength,power\n300,0\n800,5\n")

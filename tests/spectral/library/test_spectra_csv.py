@@ -7,7 +7,6 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import (
     SpectraTable,
-    read_illuminant_csv,
     read_spectra_csv,
     resample_spectra,
     write_spectra_csv,
@@ -135,21 +134,3 @@ def test_rounding_of_the_ends_is_no_extrapolation():
 def test_spectra_of_another_length_do_not_fit_their_bands():
     with pytest.raises(SpectrumError, match="spectra of 2 values do not fit 3 bands"):
         resample_spectra(np.ones((4, 2)), SMALL.bands, SMALL.bands)
-
-
-def test_an_illuminant_is_resampled_then_scaled_to_a_maximum_of_one(tmp_path):
-    path = written(tmp_path, "wavelength,power\n400,10\n500,20\n600,80\n")
-    np.testing.assert_allclose(read_illuminant_csv(path, Bands.of([450, 500, 525])), [15 / 35, 20 / 35, 1])
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("wavelength,a,b\n400,1,1\n600,1,1\n", "two columns, wavelength and power; found 3"),
-        ("wavelength,power\n400,0\n600,0\n", "the illuminant is zero at all of 2 bands, 450-550 nm"),
-        ("wavelength,power\n460,1\n600,1\n", "10 nm below their range"),
-    ],
-)
-def test_an_unusable_illuminant_is_refused_with_its_file(tmp_path, text, message):
-    with pytest.raises(SpectrumError, match=f"spectra.csv: .*{message}"):
-        read_illuminant_csv(written(tmp_path, text), Bands.of([450, 550]))

@@ -44,7 +44,8 @@ from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, S
 from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_illuminant_csv, read_spectra_csv
+from unmix_plugin.spectral.colour.conversion import illuminant_power
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv
 from unmix_plugin.spectral.sensor import SceneSensor
 
 _FAR_OFF, _MOST_FAR_OFF = 20.0, 0.1
@@ -331,7 +332,7 @@ def _read_illuminant(
 ) -> Float64[np.ndarray, " B"] | None:
     """Relative power of the light, greatest value 1; None and a noted fault if it cannot be had at these bands."""
     try:
-        return read_illuminant_csv(path, Bands(wavelengths_nm))
+        return illuminant_power(path, Bands(wavelengths_nm))
     except SpectrumError as error:
         faults.add(where, str(error))
         return None

@@ -92,7 +92,7 @@ def illuminant_names() -> tuple[str, ...]:
 def illuminant_power(
     light: str | Path, bands: Bands, beyond: Literal["refuse", "hold"] = "refuse"
 ) -> Float64[np.ndarray, " B"]:
-    """Relative power of a light in each band, greatest 1.
+    """Relative power of a light in each band, greatest 1; what is given at the bands themselves is taken as it is.
 
     Args:
         light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
@@ -108,7 +108,7 @@ def illuminant_power(
             resample_spectra(power, source, bands)
         except SpectrumError as error:
             raise SpectrumError(f"light {light}: {error}") from error
-    means = _band_means(power, source, bands)
+    means = power if source == bands else _band_means(power, source, bands)
     if not means.max() > 0:
         raise SpectrumError(f"light {light} has no power in any of {bands}; choose one that shines there")
     return means / means.max()

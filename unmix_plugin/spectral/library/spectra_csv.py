@@ -118,28 +118,6 @@ def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]
     return header, values
 
 
-def read_illuminant_csv(path: Path, bands: Bands) -> Float64[np.ndarray, " B"]:
-    """Relative power of a light at the bands' centres, scaled to a maximum of 1.
-
-    Raises:
-        SpectrumError: as `read_spectra_csv`; not exactly one spectrum; it does not reach all bands; zero everywhere.
-    """
-    table = read_spectra_csv(path)
-    if len(table.names) != 1:
-        raise SpectrumError(
-            f"{path}: an illuminant has two columns, wavelength and power; found {len(table.names) + 1}"
-        )
-    try:
-        power = table.resampled(bands).spectra[0]
-    except SpectrumError as error:
-        raise SpectrumError(f"{path}: {error}") from error
-    if not power.max() > 0:
-        raise SpectrumError(
-            f"{path}: the illuminant is zero at all of {bands}; give the light that lit the scene"
-        )
-    return power / power.max()
-
-
 def write_spectra_csv(path: Path, table: SpectraTable) -> None:
     """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step.
 
