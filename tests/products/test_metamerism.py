@@ -2,7 +2,6 @@
 
 import csv
 import io
-from typing import Literal
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -11,13 +10,10 @@ import torch
 from PIL import Image
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.products.metamerism import (
-    _find_metamers,
-    _metamerism_paths,
-    _write_metamerism,
-    export_metamerism,
-)
+from unmix_plugin.products import metamerism
+from unmix_plugin.products.metamerism import _find_metamers, export_metamerism
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Metamerism
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
@@ -27,7 +23,7 @@ from unmix_plugin.spectral.materials import Materials
 BANDS = Bands.of(np.linspace(400, 700, 31))
 SCENE_LIGHT = illuminant_power("D50", BANDS)
 GREY = np.full(31, 0.4)
-BOTH = ("all", ("D65", "A"), 2.0, 4.0)
+BOTH = ("D65", "A")
 
 
 def hidden(strength: float) -> np.ndarray:
@@ -41,7 +37,7 @@ def hidden(strength: float) -> np.ndarray:
 
 def run_materials(*reflectances: np.ndarray, names: tuple[str, ...]) -> Materials:
     spectra = torch.tensor(np.stack(reflectances) * SCENE_LIGHT, dtype=torch.float32)
-    return Materials(BANDS, spectra, torch.zeros(0, 31), names=names)
+    return Materials(BANDS, spectra, torch.zeros(0, 31), names=names, light=torch.tensor(SCENE_LIGHT).float())
 
 
 LIBRARY = MaterialLibrary(
@@ -61,63 +57,88 @@ def with_grey(name: str, *wavelengths_nm: float) -> MaterialLibrary:
 MATERIALS = run_materials(GREY, hidden(0.25), names=("slate", "paint"))
 
 
-def pairs_of(surfaces: Literal["run", "library", "all"]) -> list[set[str]]:
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, surfaces, *BOTH[1:])
+@pytest.fixture(autouse=True)
+def known(monkeypatch):
+    """Has every product know `LIBRARY`, or what a test puts in its place."""
+    library = [LIBRARY]
+    monkeypatch.setattr(metamerism, "library_of", lambda *_: library[0])
+    return library
+
+
+def pairs_of(found):
     return [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
 
 
+def exported(folder, materials, lights=BOTH, **asked):
+    job = MagicMock(spec=Job, materials=materials, folder=folder, working=MagicMock(), say=MagicMock())
+    written = export_metamerism(job, Metamerism(lights=lights, **asked))
+    assert written == [folder / "metamerism.csv", folder / "metamerism.png"]
+    job.claim.assert_called_once_with(written)
+    return job
+
+
 def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first():
-    assert pairs_of("run") == [{"slate", "paint"}]
-    assert pairs_of("library") == [{"own/a", "own/b"}]
-    every = pairs_of("all")
+    run, library, every = (
+        pairs_of(_find_metamers(MATERIALS, Metamerism(surfaces=of, lights=BOTH)))
+        for of in ("run", "library", "all")
+    )
+    assert run == [{"slate", "paint"}]
+    assert library == [{"own/a", "own/b"}]
     assert {"slate", "own/a"} in every
     assert {"slate", "paint"} in every
     assert every[-1] == {"own/a", "own/b"}
 
 
-def test_materials_that_do_not_reach_all_bands_are_passed_over():
-    longer = with_grey("own/short", 500, 600)
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, longer, *BOTH)
-    assert "own/short" not in found.names
+def test_materials_that_do_not_reach_all_bands_are_passed_over(known):
+    known[0] = with_grey("own/short", 500, 600)
+    assert "own/short" not in _find_metamers(MATERIALS, Metamerism(lights=BOTH)).names
 
 
-def test_bands_that_no_eye_sees_play_no_part():
+def test_bands_that_no_eye_sees_play_no_part(known):
     """Neither the lights nor the library reach 1000 nm."""
     wide = Bands.of(np.linspace(400, 1000, 61))
     spectra = torch.full((2, 61), 0.4)
     spectra[:, :31] = MATERIALS.endmembers
-    light = np.concatenate([SCENE_LIGHT, np.ones(30)])
-    library = with_grey("own/wide", 390, 790)
-    found = _find_metamers(
-        Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names), light, library, *BOTH
-    )
+    light = torch.tensor(np.concatenate([SCENE_LIGHT, np.ones(30)])).float()
+    known[0] = with_grey("own/wide", 390, 790)
+    materials = Materials(wide, spectra, torch.zeros(0, 61), names=MATERIALS.names, light=light)
+    found = _find_metamers(materials, Metamerism(lights=BOTH))
     assert found.bands == Bands.of(np.linspace(400, 780, 39))
     assert {"slate", "own/wide"} <= set(found.names)
-    assert {"slate", "paint"} in [{found.names[pair.first], found.names[pair.second]} for pair in found.pairs]
+    assert {"slate", "paint"} in pairs_of(found)
     infrared = Bands.of(np.linspace(800, 1000, 61))
     with pytest.raises(SpectrumError, match="no visible light"):
-        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), None, library, *BOTH)
+        _find_metamers(Materials(infrared, spectra, torch.zeros(0, 61)), Metamerism(lights=BOTH))
 
 
-def test_a_library_of_the_visible_range_serves_a_run_that_goes_far_beyond(tmp_path):
+@pytest.mark.parametrize("dark", [0.0, 1e-5])
+def test_bands_that_the_scenes_light_leaves_dark_play_no_part(dark):
+    """There an endmember says nothing of the material that it is."""
+    light = SCENE_LIGHT * np.where(np.arange(31) < 4, dark, 1.0)
+    spectra = torch.tensor(np.stack([GREY, LIBRARY.materials[0].reflectance]) * light + 1e-4).float()
+    materials = Materials(
+        BANDS, spectra, torch.zeros(0, 31), names=("slate", "a"), light=torch.tensor(light).float()
+    )
+    found = _find_metamers(materials, Metamerism(lights=BOTH))
+    assert found.bands == Bands.of(np.linspace(440, 700, 27))
+    own, same = (found.reflectance[found.names.index(name)] for name in ("a", "own/a"))
+    np.testing.assert_allclose(own, same, atol=0.01)
+
+
+def test_a_library_of_the_visible_range_serves_a_run_that_goes_far_beyond(tmp_path, monkeypatch):
     """Of which it covers less than half of the bands."""
+    monkeypatch.undo()
     paints = tmp_path / "paints.csv"
     paints.write_text("wavelength,red,Red\n380,0.1,0.2\n580,0.3,0.2\n780,0.8,0.7\n")
     wide = Bands.of(np.linspace(400, 2500, 106))
     materials = Materials(wide, torch.full((1, 106), 0.4), torch.zeros(0, 106), names=("slate",))
-    job = MagicMock(
-        spec=Job, materials=materials, folder=tmp_path / "out", working=MagicMock(), say=MagicMock()
-    )
-    job.scene.light_power = None
-    export_metamerism(job, *BOTH, [paints])
+    job = exported(tmp_path / "out", materials, library=(paints,))
     assert job.say.call_args.args[0].startswith("0 pairs of 3 materials, seen in D65, A over 20 bands")
 
 
 def test_the_table_names_materials_lights_and_differences(tmp_path):
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, "run", *BOTH[1:])
-    assert _write_metamerism(tmp_path / "new", found) == _metamerism_paths(tmp_path / "new")
-    rows = list(csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text())))
-    [row] = rows
+    exported(tmp_path / "new", MATERIALS, surfaces="run")
+    [row] = csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text()))
     assert {row["first"], row["second"]} == {"slate", "paint"}
     assert (row["alike in"], row["different in"]) == ("D65", "A")
     assert float(row["CIEDE2000 in D65"]) < 0.05
@@ -125,23 +146,19 @@ def test_the_table_names_materials_lights_and_differences(tmp_path):
 
 
 def test_swatches_have_the_colours_that_an_adapted_eye_sees(tmp_path):
-    found = _find_metamers(MATERIALS, SCENE_LIGHT, LIBRARY, "run", *BOTH[1:])
-    _write_metamerism(tmp_path, found)
+    exported(tmp_path, MATERIALS, surfaces="run")
     with Image.open(tmp_path / "metamerism.png") as picture:
         pixels = np.asarray(picture.convert("RGB")).reshape(-1, 3) / 255
-    for name in ("D65", "A"):
+    for name in BOTH:
         lab = reflectance_to_lab(np.stack([GREY, hidden(0.25)]), illuminant_power(name, BANDS), BANDS)
         for colour in lab_to_srgb(lab):
             assert (np.abs(pixels - colour).max(axis=1) < 0.01).sum() > 500
     assert pixels.reshape(-1, 3)[0].min() == 1
 
 
-@pytest.mark.parametrize("lights", [("D65", "A"), ("D65", "A", "FL2", "FL11", "E")])
+@pytest.mark.parametrize("lights", [BOTH, ("D65", "A", "FL2", "FL11", "E")])
 def test_a_figure_without_pairs_is_drawn_all_the_same(tmp_path, lights):
-    grey = run_materials(GREY, names=("slate",))
-    found = _find_metamers(grey, None, MaterialLibrary(()), "all", lights, 2.0, 4.0)
-    assert found.pairs == []
-    _write_metamerism(tmp_path, found)
+    exported(tmp_path, run_materials(GREY, names=("slate",)), lights, surfaces="run")
     with Image.open(tmp_path / "metamerism.png") as picture:
         assert np.asarray(picture.convert("L")).min() < 50
     assert len((tmp_path / "metamerism.csv").read_text().splitlines()) == 1

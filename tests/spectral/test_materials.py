@@ -101,6 +101,11 @@ def test_confidence_is_how_probably_the_largest_share_is_so_in_truth():
     assert known.confidence(shared(*mixtures, opacity=0.2)).tolist() == [0, 0, 0]
 
 
+def test_of_a_lone_material_confidence_is_sure_where_it_is_seen_and_0_where_nothing_is():
+    lone = materials(torch.ones(1, 5))
+    assert [lone.confidence(shared([1.0], opacity=opacity)).item() for opacity in (0.9, 0.4)] == [1, 0]
+
+
 def test_confidence_without_known_errors_is_the_margin():
     found = materials(torch.eye(3, 5)).confidence(shared([0.5, 0.3, 0.2], opacity=0.8))
     assert found.tolist() == pytest.approx([0.2])

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ from unmix_plugin.trained.measures import (
     require_on_surface,
     scale_between,
 )
+from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 VIEWS = tuple(
     RunView(f"view_{index}", camera)
@@ -61,6 +64,16 @@ def test_points_count_on_the_surface_that_views_show():
     for place, reason in (((RADIUS + 0.3) * facing, "pixels off"), (np.array([0.0, 0, 90]), "no view shows")):
         with pytest.raises(ConfigError, match=f"not on the object: .*{reason}"):
             require_on_surface(BALL, FRAME.to_world(place).tolist())
+
+
+def test_a_point_in_haze_that_hardly_shows_is_not_on_the_surface():
+    place = FRAME.to_world(np.array([0.9, 0.2, 0.3]))
+    hazy = MagicMock(spec=TrainedScene, frame=FRAME, views=VIEWS)
+    hazy.probe.return_value = Probe({}, 0.1, None, place)
+    with pytest.raises(ConfigError, match="not on the object: no view shows anything there"):
+        require_on_surface(hazy, place.tolist())
+    hazy.probe.return_value = Probe({}, 0.9, None, place)
+    require_on_surface(hazy, place.tolist())
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from unmix_plugin.editing.apply import relight
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.libraries import library_of
+from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import seen_reflectance
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
@@ -40,8 +41,9 @@ def test_where_the_light_is_unknown_radiance_stands_for_reflectance():
     assert_close(seen_reflectance(spectra, torch.ones(1), None, 0.5), spectra)
 
 
-def test_a_band_that_the_light_leaves_dark_has_no_reflectance():
-    found = seen_reflectance(torch.tensor([[0.0, 0.4]]), torch.ones(1), torch.tensor([0.0, 1.0]), 0.5)
+@pytest.mark.parametrize("dark", [0.0, 1e-4])
+def test_a_band_that_the_light_leaves_dark_has_no_reflectance(dark):
+    found = seen_reflectance(torch.tensor([[0.1, 0.4]]), torch.ones(1), torch.tensor([dark, 1.0]), 0.5)
     assert found[0].isnan().tolist() == [True, False]
 
 
@@ -231,5 +233,8 @@ def test_reflectance_is_an_output_where_the_light_is_known_and_words_follow_the_
     assert lit.output("spectral").what.startswith("radiance on black")
     assert "of radiance, since the scene's light is unknown" in unknown.output("continuum").what
     assert "reflectance" not in [output.name for output in unknown.outputs]
+    four_bands = make_scene(light=[0.0, 0.8, 1.0, 0.9, 0.6])  # fewer than a derivative takes
+    assert not [one.name for one in four_bands.outputs if "derivative" in one.name]
+    assert len(choose_formats(["all"], [], four_bands, is_path=False)) > 10
     with pytest.raises(SpectrumError, match="the scene's light is unknown, so that it has no reflectance"):
         unknown.output("reflectance")

@@ -1,18 +1,16 @@
 """Materials that look alike in one light and differ in another: a table and a figure of swatches.
 
 Surfaces are the endmembers of a run, as reflectances (radiance over the scene's light), and measured materials of the
-library that reach all of the run's visible bands; the other bands play no part.
+library that reach all of the run's visible bands with light; the other bands play no part.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
@@ -20,6 +18,7 @@ from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
 from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Metamerism
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
 from unmix_plugin.spectral.colour.difference import (
@@ -28,38 +27,11 @@ from unmix_plugin.spectral.colour.difference import (
     metameric_pairs,
     reflectance_to_lab,
 )
-from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
 
 _MOST_DRAWN = 12
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
 _SWATCH = 0.46
-
-
-_Surfaces = Literal["run", "library", "all"]
-
-
-def export_metamerism(
-    job: Job,
-    surfaces: _Surfaces,
-    lights: Sequence[str],
-    alike: float,
-    different: float,
-    library: Sequence[Path],
-) -> list[Path]:
-    """Compare all pairs in all lights; `alike` and `different` are bounds of CIEDE2000."""
-    job.claim(_metamerism_paths(job.folder))
-    with job.working("comparing colours"):
-        known = library_of(library, _visible(job.materials.bands))
-        found = _find_metamers(
-            job.materials, job.scene.light_power, known, surfaces, lights, alike, different
-        )
-        written = _write_metamerism(job.folder, found)
-    job.say(
-        f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
-        f"over {found.bands}"
-    )
-    return written
 
 
 @dataclass(frozen=True)
@@ -73,53 +45,46 @@ class _Metamers:
     lights: tuple[str, ...]
     powers: Float64[np.ndarray, "L B"]
     pairs: list[MetamericPair]
+    """Those with an endmember of the run first, each kind by its greatest difference."""
 
 
-def _visible(bands: Bands) -> Bands:
-    """The visible ones."""
-    if not bands.visible_mask.any():
-        raise SpectrumError(f"{bands} hold no visible light, so nothing is known of metamerism")
-    return Bands.of(bands.centers_nm[bands.visible_mask])
-
-
-def _metamerism_paths(folder: Path) -> list[Path]:
-    """Files that `_write_metamerism` makes."""
-    return [folder / "metamerism.csv", folder / "metamerism.png"]
-
-
-def _find_metamers(
-    materials: Materials,
-    scene_light: Float64[np.ndarray, " B"] | None,
-    library: MaterialLibrary,
-    surfaces: _Surfaces,
-    light_names: Sequence[str],
-    alike: float,
-    different: float,
-) -> _Metamers:
-    """Look at all pairs of surfaces in all lights."""
-    bands = _visible(materials.bands)
-    lights = [parse_light(word) for word in light_names]
-    powers = (
-        np.stack([illuminant_power(light, bands) for light in lights])
-        if lights
-        else np.zeros((0, len(bands)))
+def export_metamerism(job: Job, asked: Metamerism) -> list[Path]:
+    """Compare all pairs in all lights; write them as CSV, and swatches of the first dozen in every light."""
+    table_path, figure_path = job.folder / "metamerism.csv", job.folder / "metamerism.png"
+    job.claim([table_path, figure_path])
+    with job.working("comparing colours"):
+        found = _find_metamers(job.materials, asked)
+        written = [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
+    job.say(
+        f"{len(found.pairs)} pairs of {len(found.names)} materials, seen in {', '.join(found.lights)} "
+        f"over {found.bands}"
     )
-    names, rows = _surfaces(materials, scene_light, library, surfaces, bands)
+    return written
+
+
+def _find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
+    kept = materials.bands.visible_mask & materials.is_lit.cpu().numpy()
+    if not kept.any():
+        raise SpectrumError(f"{materials.bands} hold no visible light, so nothing is known of metamerism")
+    bands = Bands.of(materials.bands.centers_nm[kept])
+    lights = [parse_light(word) for word in asked.lights]
+    powers = np.array([illuminant_power(light, bands) for light in lights]).reshape(-1, len(bands))
+    names: list[str] = []
+    rows: list[Float64[np.ndarray, " B"]] = []
+    if asked.surfaces != "library":
+        light = 1.0 if materials.light is None else materials.light.double()
+        names += materials.names
+        rows += list((materials.endmembers.detach().double() / light).cpu().numpy()[:, kept])
+    num_own, library = len(names), library_of(asked.library, bands)
+    for material in library.materials if asked.surfaces != "run" else ():
+        with suppress(SpectrumError):  # of those that do not reach all bands
+            rows.append(library.reflectance(material.name, bands))
+            names.append(material.name)
     reflectance = np.array(rows).reshape(len(names), len(bands))
-    pairs = metameric_pairs(reflectance, powers, bands, alike, different)
-    num_own = 0 if surfaces == "library" else len(materials.names)
-    pairs.sort(key=lambda pair: pair.first >= num_own)  # stable: the run's own first, then by difference
+    pairs = metameric_pairs(reflectance, powers, bands, asked.alike, asked.different)
+    pairs.sort(key=lambda pair: pair.first >= num_own)  # stable
     labels = tuple(light.stem if isinstance(light, Path) else light for light in lights)
     return _Metamers(tuple(names), reflectance, bands, labels, powers, pairs)
-
-
-def _write_metamerism(folder: Path, found: _Metamers) -> list[Path]:
-    """Write the pairs as CSV and swatches of the first dozen in every light.
-
-    Pairs with an endmember of the run come first, each kind sorted by their greatest difference.
-    """
-    table_path, figure_path = _metamerism_paths(folder)
-    return [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
 
 
 def _draw_metamers(found: _Metamers) -> bytes:
@@ -153,31 +118,6 @@ def _draw_metamers(found: _Metamers) -> bytes:
 def _column(index: int) -> float:
     """Where the column of a light begins."""
     return _MARGIN + _NAME_WIDTH + index * _CELL
-
-
-def _surfaces(
-    materials: Materials,
-    scene_light: Float64[np.ndarray, " B"] | None,
-    library: MaterialLibrary,
-    chosen: _Surfaces,
-    bands: Bands,
-) -> tuple[list[str], list[Float64[np.ndarray, " V"]]]:
-    """Names of what is paired, and reflectances at `bands`, the visible ones of the run."""
-    names: list[str] = []
-    rows: list[Float64[np.ndarray, " V"]] = []
-    if chosen != "library":
-        light = np.ones(len(materials.bands)) if scene_light is None else scene_light
-        spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy()
-        names += list(materials.names)
-        reflectance = np.divide(spectra, light, out=np.zeros_like(spectra), where=light > 0)
-        rows += list(reflectance[:, materials.bands.visible_mask])
-    for material in library.materials if chosen != "run" else ():
-        try:
-            rows.append(library.reflectance(material.name, bands))
-        except SpectrumError:
-            continue  # it does not reach all of them
-        names.append(material.name)
-    return names, rows
 
 
 def _table(found: _Metamers) -> bytes:

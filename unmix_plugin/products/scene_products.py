@@ -127,7 +127,7 @@ class Metamerism(Product):
         """Compare all pairs in all lights."""
         from unmix_plugin.products.metamerism import export_metamerism
 
-        return export_metamerism(job, self.surfaces, self.lights, self.alike, self.different, self.library)
+        return export_metamerism(job, self)
 
 
 @dataclass(frozen=True)

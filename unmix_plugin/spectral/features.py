@@ -108,8 +108,8 @@ def absorption(
     return torch.where(depth >= LEAST_DEPTH, middle + offset, torch.nan)
 
 
-_WINDOW = 5
-"""Bands that a parabola is fitted to."""
+FEWEST_BANDS = 5
+"""Of a derivative: a parabola is fitted to so many."""
 
 
 def derivative_matrix(
@@ -125,12 +125,12 @@ def derivative_matrix(
         SpectrumError: fewer than five bands.
     """
     count = len(wavelengths_nm)
-    if count < _WINDOW:
-        raise SpectrumError(f"a derivative takes {_WINDOW} bands or more; found {count}")
+    if count < FEWEST_BANDS:
+        raise SpectrumError(f"a derivative takes {FEWEST_BANDS} bands or more; found {count}")
     matrix = np.zeros((count, count))
     for band, wavelength in enumerate(wavelengths_nm):
-        first = min(max(band - _WINDOW // 2, 0), count - _WINDOW)
-        near = slice(first, first + _WINDOW)
+        first = min(max(band - FEWEST_BANDS // 2, 0), count - FEWEST_BANDS)
+        near = slice(first, first + FEWEST_BANDS)
         fit = np.linalg.pinv(np.vander(wavelengths_nm[near] - wavelength, 3, increasing=True))
         matrix[near, band] = order * fit[order]
     return matrix

@@ -122,7 +122,7 @@ def seen_reflectance(
     Args:
         spectra, opacity: Radiance on black, and the opacity in [0, 1] by which it is multiplied.
         light: Relative power of the scene's light; None: unknown, so that radiance is returned. NaN in bands that it
-            leaves dark.
+            leaves dark, as `DARK_LIGHT` says.
         smallest_opacity: NaN where there is less.
     """
     is_seen = (opacity >= smallest_opacity)[..., None]
@@ -130,7 +130,7 @@ def seen_reflectance(
     if light is None:
         return radiance
     power = light.to(radiance)
-    return radiance / torch.where(power > 0, power, torch.nan)
+    return radiance / torch.where(power > DARK_LIGHT * power.max(), power, torch.nan)
 
 
 SegmentationMethod = Literal["abundances", "probe"]
@@ -259,11 +259,11 @@ class Materials:
         """
         abundances, accumulation = coefficients.abundances, coefficients.accumulation
         if abundances.shape[-1] == 1:
-            return accumulation
+            return coefficients.is_occupied.to(accumulation)
         chosen = self.scores(coefficients).argmax(dim=-1, keepdim=True)
         own = abundances.gather(-1, chosen)[..., 0]
         others = abundances.scatter(-1, chosen, -torch.inf).amax(dim=-1)
         margin = (own - others) / accumulation.clamp(min=OCCUPIED_ACCUMULATION)
         if self.margin_error is not None:
             margin = torch.special.ndtr(margin / self.margin_error.clamp(min=1e-3))
-        return margin.clamp(min=0) * (accumulation > OCCUPIED_ACCUMULATION)
+        return margin.clamp(min=0) * coefficients.is_occupied

@@ -19,6 +19,7 @@ from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, did_you_mean
 from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.regions import MOST_REGIONS, Region, check_name, region_from_json, region_to_json
 
@@ -219,7 +220,7 @@ def require_on_surface(scene: RenderableScene, point: Sequence[float]) -> None:
         if not (depths[0] > 0 and 0 <= column < width and 0 <= row < height):
             continue
         found = scene.probe(camera, column, row)
-        if found.world_position is None:
+        if found.world_position is None or found.opacity < OCCUPIED_ACCUMULATION:
             continue
         pixel = float(depths[0] / camera.focal_px[0].min()) / scene.frame.scale
         nearest = min(nearest, float(np.linalg.norm(found.world_position - world)) / pixel)

@@ -6,6 +6,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -18,7 +19,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import Output, OutputKind, no_output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
-from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
+from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.spectral.segmentation import material_scores
 from unmix_plugin.spectral.subspace import PcaColours
@@ -382,6 +383,15 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
     return family.make(name, argument, materials)
 
 
+def available_outputs(materials: Materials) -> tuple[MaterialOutput, ...]:
+    """All outputs that take no argument, but those that `find_output` refuses."""
+    found = []
+    for output in OUTPUTS.values():
+        with suppress(SpectrumError):
+            found.append(_told(output, materials))
+    return tuple(found)
+
+
 def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
     """An output with the right words for its spectra: reflectance in flat light, radiance in any other."""
     if output.kind == "channels" and materials.quantity == "reflectance":
@@ -394,7 +404,6 @@ def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
             "or name the light as illuminant_path in transforms.json"
         )
     if output.name.endswith("derivative"):
-        derivative_matrix(
-            materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
-        )  # which refuses too few bands
+        lit_nm = materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
+        derivative_matrix(lit_nm[:FEWEST_BANDS])  # which refuses fewer
     return replace(output, what=output.what + (_OF_RADIANCE if materials.light is None else ""))

@@ -26,7 +26,7 @@ from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.trained.outputs import OUTPUTS, MaterialOutput, MaterialView, find_output
+from unmix_plugin.trained.outputs import MaterialOutput, MaterialView, available_outputs, find_output
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView
 
@@ -105,8 +105,8 @@ class TrainedScene:
 
     @property
     def outputs(self) -> tuple[MaterialOutput, ...]:
-        """All outputs that take no argument; without a known light no reflectance."""
-        return tuple(one for one in OUTPUTS.values() if one.name != "reflectance" or self.light is not None)
+        """All outputs that take no argument, but those that its bands or its light don't allow."""
+        return available_outputs(self.materials)
 
     def output(self, name: str) -> MaterialOutput:
         """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
