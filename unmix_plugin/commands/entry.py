@@ -9,16 +9,19 @@ from __future__ import annotations
 import codecs
 import errno
 import io
+import logging
 import os
+import re
 import select
 import signal
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from unmix_plugin.errors import UnmixError
 
@@ -65,7 +68,7 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     interrupts: list[int] = []
     try:
         _ready_streams()
-        with _signals_as_exits(interrupts):
+        with _signals_as_exits(interrupts), _libraries_in_short():
             command([argument for argument in argv if argument != "--debug"])
             sys.stdout.flush()
     except KeyboardInterrupt:
@@ -104,6 +107,37 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
         return codecs.lookup_error("surrogateescape")(error)
     except UnicodeError:
         return codecs.lookup_error("backslashreplace")(error)
+
+
+@contextmanager
+def _libraries_in_short() -> Iterator[None]:
+    """Context in which libraries say in one line what they need many for.
+
+    Matplotlib tells of a home folder that can't be written, where it helps itself, and of every letter that its font
+    lacks.
+    """
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    usual, is_said = warnings.showwarning, False
+
+    def show(message: Warning | str, *where: Any, **more: Any) -> None:
+        nonlocal is_said
+        lacking = re.match(r"Glyph (\d+) .*missing from", str(message))
+        if lacking is None:
+            usual(message, *where, **more)
+        elif not is_said:
+            is_said = True
+            letter = chr(int(lacking[1]))
+            _say(
+                f"warning: figures have boxes in place of letters such as {letter}, which their font lacks; other "
+                "files have them. Rename materials or views if that matters",
+                is_debug=False,
+            )
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = usual
 
 
 @contextmanager

@@ -65,7 +65,10 @@ def warp() -> Any:
 
 
 def _is_initialised(wp: Any) -> bool:
-    """Initialise Warp; False if its cache of kernels can't be written: a read-only home folder, a full disk."""
+    """Initialise Warp; False if its cache of kernels can't be written: no home folder, a read-only one, a full disk."""
+    is_named = os.environ.get("WARP_CACHE_PATH") or os.environ.get("XDG_CACHE_HOME")
+    if not is_named and os.path.expanduser("~") == "~":  # noqa: PTH111 - which Warp would take for a folder's name
+        return False
     try:
         wp.init()
         with tempfile.TemporaryFile(dir=wp.config.kernel_cache_dir) as file:

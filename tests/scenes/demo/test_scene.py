@@ -5,6 +5,7 @@ The built-in scene as a folder, and the folder that is kept.
 
 import json
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -308,12 +309,34 @@ def test_a_cache_that_cannot_be_written_is_a_scene_error_with_a_way_out(tmp_path
         demo_scene_path(tmp_path / "cache")
 
 
+@pytest.mark.usefixtures("small_default")
+def test_a_full_cache_is_told_as_one_with_a_way_out(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError("285696 requested and 79808 written")  # what numpy.save says
+
+    monkeypatch.setattr(np, "save", fail)
+    with pytest.raises(SceneError, match=r"disk is full .*XDG_CACHE_HOME to a folder with room"):
+        demo_scene_path(tmp_path / "cache")
+
+
+def test_without_a_home_folder_the_demo_scene_says_how_to_name_one(monkeypatch):
+    def fail():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", fail)
+    with pytest.raises(SceneError, match=r"no home folder .*set HOME or XDG_CACHE_HOME"):
+        demo_scene_path()
+
+
 @pytest.mark.usefixtures("one_ray_a_pixel")
 def test_a_full_disk_is_named_and_nothing_is_left(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError("285696 requested and 276416 written")  # what numpy.save says
 
     monkeypatch.setattr(np, "save", fail)
-    with pytest.raises(SceneError, match=r"can't write the demo scene to .*276416 written; make room"):
+    with pytest.raises(
+        SceneError, match=r"can't write the demo scene to .*disk is full .*276416 written.*make room"
+    ):
         make_demo_scene(tmp_path / "scene", size=16, bands=4, views=4)
     assert list(tmp_path.iterdir()) == []

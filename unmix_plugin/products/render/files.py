@@ -187,7 +187,9 @@ def require_tifffile() -> Any:
     try:
         return importlib.import_module("tifffile")
     except ImportError as error:
-        raise ConfigError("--formats tif needs tifffile: pip install tifffile imagecodecs") from error
+        raise ConfigError(
+            "--formats tif needs tifffile: python -m pip install tifffile imagecodecs"
+        ) from error
 
 
 def _format(name: str) -> _Format:

@@ -100,7 +100,7 @@ def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
             yield staging
     except OSError as error:  # NumPy's own has no strerror
         raise SceneError(
-            f"can't write {what} to {directory}: {error.strerror or error}; make room there or choose another folder"
+            f"can't write {what} to {directory}: {_why(error)}; make room there or choose another folder"
         ) from error
 
 
@@ -117,7 +117,7 @@ def written_once(
     what: str,
     write: Callable[[Path], None],
     is_complete: Callable[[Path], bool],
-    remedy: str = "set XDG_CACHE_HOME to a folder that can be written",
+    remedy: str = "set XDG_CACHE_HOME to a folder with room that can be written",
 ) -> Path:
     """A folder of a cache, written on first use and again if a file of it is missing.
 
@@ -141,10 +141,13 @@ def written_once(
     except OSError as error:
         # Another process may have been quicker; what it wrote is as good.
         if not is_complete(target):
-            raise SceneError(
-                f"can't write {what} to {target}: {error.strerror or error}; {remedy}"
-            ) from error
+            raise SceneError(f"can't write {what} to {target}: {_why(error)}; {remedy}") from error
     return target
+
+
+def _why(error: OSError) -> str:
+    """What went wrong with a file; numpy and Pillow have numbers of their own for a full disk."""
+    return error.strerror or f"the disk is full ({error})"
 
 
 def demo_cameras(size: int, views: int, angle_deg: float = _VIEW_ANGLE_DEG) -> Cameras:
@@ -334,8 +337,8 @@ def demo_scene_path(cache_dir: Path | None = None) -> Path:
         "the demo scene",
         lambda folder: _write_scene(folder, DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS),
         is_complete,
-        "set XDG_CACHE_HOME to a folder that can be written, or write the scene elsewhere with unmix-demo-scene DIR "
-        "and train on that",
+        "set XDG_CACHE_HOME to a folder with room that can be written, or write the scene elsewhere with "
+        "unmix-demo-scene DIR and train on that",
     )
 
 
@@ -464,9 +467,19 @@ def _move_files(built: Path, directory: Path) -> None:
 
 
 def user_cache() -> Path:
-    """Where generated data is kept, by the XDG base directory specification: XDG_CACHE_HOME counts only if absolute."""
+    """Where generated data is kept, by the XDG base directory specification: XDG_CACHE_HOME counts only if absolute.
+
+    Raises:
+        SceneError: it is not set, and there is no home folder.
+    """
     configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (configured if configured.is_absolute() else Path.home() / ".cache") / "unmix-nerf"
+    try:
+        return (configured if configured.is_absolute() else Path.home() / ".cache") / "unmix-nerf"
+    except RuntimeError as error:  # as in a container, for a user that it does not know
+        raise SceneError(
+            "there is no home folder to keep the demo scene in; set HOME or XDG_CACHE_HOME to a folder that can be "
+            "written, or write the scene with unmix-demo-scene DIR and train on that"
+        ) from error
 
 
 def _generator_hash() -> str:
