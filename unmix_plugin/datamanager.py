@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,9 +32,10 @@ from unmix_plugin.scenes.evidence import (
     rig_warnings,
 )
 from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_explained
-from unmix_plugin.scenes.geometry.lighting import judge_light
+from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
+from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, commonest, parallax_warning
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
@@ -325,7 +326,7 @@ class HyperspectralDataManager(DataManager):
     def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
         """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""
         if not self.scene.has_alpha:
-            return {"light": np.array("fixed")}
+            return {"light": np.array(self._judge_matched())}
         views, seen = self._evidence.log_brightness()
         cameras = self.train_cameras[views]
         light = judge_light(cameras, seen, reachable, self.scene_box)
@@ -333,6 +334,16 @@ class HyperspectralDataManager(DataManager):
         if light == "camera":
             lamp = find_lamp(cameras, self._evidence.log_shading(), reachable, self.scene_box)
         return {"light": np.array(light), "lamp": np.array(() if lamp is None else lamp.numbers())}
+
+    def _judge_matched(self) -> Literal["fixed", "per-view"]:
+        """Of views without alpha: whether matched places say that they differ in exposure."""
+        train = self.scene.train_indices
+        alike = commonest([self.scene.frames[view].sensor for view in train])
+        cameras = self.train_cameras[alike]
+        points = find_matched_points(cameras, lambda row, part: self.scene.cube(train[alike[row]], part))
+        if points is None:
+            return "fixed"
+        return judge_exposure(cameras, points.places, points.seen_by(len(alike)))
 
 
 def _scene_folder(data: Path) -> Path:

@@ -293,7 +293,8 @@ class UnmixModelConfig(ModelConfig):
     """Whether endmembers change while training; else they stay the first guess, or the spectra from a file."""
     light: Annotated[Light | Auto, Common, short("light")] = "auto"
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
-    view to view (also exposure). Auto finds which it is, and takes fixed without alpha."""
+    view to view (also exposure). Auto finds which it is; without alpha only whether
+    exposures differ."""
     lamp: tuple[float, ...] | Auto = "auto"
     """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
     it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp

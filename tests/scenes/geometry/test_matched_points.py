@@ -17,6 +17,7 @@ from tests.scenes.geometry.ground_views import (
     strip_cameras,
 )
 from unmix_plugin.scenes.geometry.bounds import find_bounds
+from unmix_plugin.scenes.geometry.lighting import judge_exposure
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.reading.loader import load_scene
 
@@ -75,6 +76,16 @@ def test_views_that_share_nothing_or_show_one_colour_have_no_matched_places():
     plain = [np.full((HEIGHT, WIDTH, 1), 0.5, np.float32)] * 5
     assert find_matched_points(cameras, read_from(unrelated)) is None
     assert find_matched_points(cameras, read_from(plain)) is None
+
+
+@pytest.mark.parametrize(("spread", "light"), [(0.0, "fixed"), (0.15, "per-view")])
+def test_exposures_that_differ_are_told_by_matched_places(spread, light):
+    cameras = flight_cameras(flight_poses(16))
+    gains = np.exp(np.random.default_rng(2).normal(size=16) * spread).astype(np.float32)
+    views = [view * gain for view, gain in zip(ground_views(cameras), gains, strict=True)]
+    found = find_matched_points(cameras, read_from(views))
+    assert found is not None
+    assert judge_exposure(cameras, found.places, found.seen_by(16)) == light
 
 
 def test_views_from_one_place_tell_no_distance():

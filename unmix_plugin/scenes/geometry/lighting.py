@@ -1,4 +1,4 @@
-"""Does the light move with the camera, or differ from view to view? Judged by the hull's surface, before any training.
+"""Does the light move with the camera, or differ from view to view? Judged by places on surfaces, before any training.
 
 Where an object is turned before a fixed camera and lamp, the light follows the camera: a place gets brighter when it
 turns to the side of the image that the lamp is on. Where the light is fixed to the object, a place looks about as
@@ -10,7 +10,7 @@ lamp at the camera's very place is not found.
 
 Where exposures differ, all places of a view are brighter or darker than in other views, by the same factor: what one
 half of the places says of the views' gains, the other half says too, whichever way the places are halved. Highlights
-and errors of the hull change some places only.
+and errors of the hull change some places only. Places that two views were matched by (`matched_points`) serve as well.
 
 Notation: `P` places on the surface of a hull, `N` views, `F` functions of a normal, `V` values, `R` cells along an
 edge.
@@ -169,7 +169,22 @@ def judge_light(
     places, seen = seen_places(cameras, log_brightness, hull, box)
     if _foretold_share(cameras, places, seen) > _MOVING_SHARE:
         return "camera"
-    return "per-view" if _gain_spread(cameras, places, seen) > _LEAST_GAIN_SPREAD else "fixed"
+    followed = seen.isfinite().sum(dim=1) >= _FEWEST_VIEWS
+    return judge_exposure(cameras, places.positions[followed], seen[followed])
+
+
+def judge_exposure(
+    cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Float[Tensor, "P N"]
+) -> Literal["fixed", "per-view"]:
+    """Whether views differ in exposure; fixed where too little is seen to tell.
+
+    Args:
+        cameras: Of the views.
+        positions: Of places on surfaces.
+        seen: Logarithm of the brightness of each place in each view, NaN where a view does not see it. Two views that
+            see a place are enough.
+    """
+    return "per-view" if _gain_spread(cameras, positions, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
 def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
@@ -190,15 +205,13 @@ def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]
     return _least_share(seen, turned, (along > along.median(dim=0).values).T)
 
 
-def _gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
+def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Float[Tensor, "P N"]) -> float:
     """Standard deviation of the views' log gains, as far as two halves of the places agree on them.
 
-    The least of the three ways to halve the places, along the axes; 0 if too little is seen. Gains that are a smooth
-    function of the camera's direction don't count: where brightness changes across a surface, a hull that is a little
-    too large looks as if they were there. Arguments as above.
+    The least of the ways to halve the places along an axis so that enough views see both; 0 if there is none. Gains
+    that are a smooth function of the camera's direction don't count: where brightness changes across a surface, a hull
+    that is a little too large looks as if they were there. Arguments as of `judge_exposure`.
     """
-    enough = seen.isfinite().sum(dim=1) >= _FEWEST_VIEWS
-    seen, positions = seen[enough], places.positions[enough]
     if len(seen) < _FEWEST_PLACES:
         return 0.0
     directions = torch.nn.functional.normalize(
@@ -211,12 +224,12 @@ def _gain_spread(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -
         one, other = _view_gains(seen[half]), _view_gains(seen[~half])
         both = one.isfinite() & other.isfinite()
         left = int(both.sum()) - smooth.shape[1]
-        if left < _FEWEST_VIEWS:
-            return 0.0
+        if left < _FEWEST_VIEWS:  # halves of a flight are seen by different views
+            continue
         gains = torch.stack([one[both], other[both]], dim=1)
         rest = gains - smooth[both] @ torch.linalg.lstsq(smooth[both], gains, driver="gelsd").solution
         shared.append(float(rest.prod(dim=1).sum()) / left)
-    return max(min(shared), 0.0) ** 0.5
+    return max(min(shared, default=0.0), 0.0) ** 0.5
 
 
 def _view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:

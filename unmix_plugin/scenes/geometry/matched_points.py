@@ -19,6 +19,7 @@ from jaxtyping import Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 from unmix_plugin.scenes.geometry.view_agreement import ReadView, Thinning
 
 LONGEST_SIDE_PX = 320
@@ -50,10 +51,17 @@ class MatchedPoints:
 
     places: Float[Tensor, "P 3"]
     """In the cameras' space."""
-    views: Int[Tensor, " P"]
-    """A camera that sees each."""
+    pairs: Int[Tensor, "P 2"]
+    """The two cameras that see each."""
+    log_brightness: Float[Tensor, "P 2"]
+    """What each of them sees: the logarithm of the mean around; NaN where it sees nothing or no light."""
     depths: Float[Tensor, " P"]
-    """How far before that camera, along its optical axis."""
+    """How far before the first of them, along its optical axis."""
+
+    @property
+    def views(self) -> Int[Tensor, " P"]:
+        """A camera that sees each: the one that depths are of."""
+        return self.pairs[:, 0]
 
     @property
     def are_equally_far(self) -> bool:
@@ -61,11 +69,16 @@ class MatchedPoints:
         near, far = self.depths.quantile(_ENDS)
         return bool(far < _MOST_DEPTH_RATIO * near)
 
+    def seen_by(self, num_cameras: int) -> Float[Tensor, "P N"]:
+        """`log_brightness` in each of so many cameras; NaN in all but two."""
+        unseen = self.log_brightness.new_full((len(self.places), num_cameras), torch.nan)
+        return unseen.scatter_(1, self.pairs, self.log_brightness)
+
     @property
     def nearer(self) -> MatchedPoints:
         """Those before a distant background: at most twice as deep as the nearest quarter."""
         kept = self.depths <= _MOST_DEPTH_RATIO * self.depths.quantile(_NEAR)
-        return MatchedPoints(self.places[kept], self.views[kept], self.depths[kept])
+        return MatchedPoints(*(values[kept] for values in vars(self).values()))
 
 
 def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints | None:
@@ -79,13 +92,9 @@ def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints 
     pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
     features = {view: _features_of(thinning, read_view, view) for view in sorted({*sum(pairs, ())})}
     found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]
-    if sum(len(points.views) for points in found) < _LEAST_POINTS:
+    if sum(len(points.depths) for points in found) < _LEAST_POINTS:
         return None
-    return MatchedPoints(
-        torch.cat([points.places for points in found]),
-        torch.cat([points.views for points in found]),
-        torch.cat([points.depths for points in found]),
-    )
+    return MatchedPoints(*map(torch.cat, zip(*(vars(points).values() for points in found), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -95,6 +104,7 @@ class _Features:
     coords: Float[Tensor, "F 2"]
     """In the whole view, pixels."""
     descriptors: Float32[np.ndarray, "F 128"]
+    log_brightness: Float[Tensor, " F"]
 
 
 def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
@@ -119,9 +129,11 @@ def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Feature
     try:
         sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
     except (RuntimeError, ValueError, IndexError):  # nothing stands out, or the view is too small for it
-        return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32))
+        return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32), torch.zeros(0))
     coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
-    return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32))
+    columns, rows = coords.long().unbind(-1)
+    seen = torch.from_numpy(local_log_brightness(brightness)).float()[rows, columns]
+    return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32), seen)
 
 
 def _triangulate(
@@ -136,7 +148,9 @@ def _triangulate(
             warnings.simplefilter("ignore", RuntimeWarning)  # of descriptors that differ by nothing
             matches = match_descriptors(one.descriptors, other.descriptors, max_ratio=_MOST_AMBIGUOUS)
         chosen = torch.from_numpy(np.array(matches, dtype=np.int64))
-    ends = zip(pair, (one.coords[chosen[:, 0]], other.coords[chosen[:, 1]]), strict=True)
+    first_of, second_of = chosen.unbind(-1)
+    ends = zip(pair, (one.coords[first_of], other.coords[second_of]), strict=True)
+    seen = torch.stack([one.log_brightness[first_of], other.log_brightness[second_of]], dim=-1)
     rays = [cameras.generate_rays(torch.full((len(chosen),), view), coords) for view, coords in ends]
     along, across = (ray.directions.double() for ray in rays)
     between = (rays[1].origins - rays[0].origins).double()
@@ -152,4 +166,5 @@ def _triangulate(
     reached = (first[:, None] * along)[meets].float()
     assert rays[0].axes is not None
     depths = (reached * rays[0].axes[meets]).sum(dim=-1)
-    return MatchedPoints(rays[0].origins[meets] + reached, torch.full((len(depths),), pair[0]), depths)
+    pairs = torch.tensor(pair).expand(len(depths), 2)
+    return MatchedPoints(rays[0].origins[meets] + reached, pairs, seen[meets], depths)

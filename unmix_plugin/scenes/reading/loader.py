@@ -473,7 +473,7 @@ def _find_model_space(
     has_masks = first_box is not None or foreground is not None
     if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
         points = find_matched_points(cameras[alike], read_view)
-        points = None if points is None else replace(points, views=torch.tensor(alike)[points.views])
+        points = None if points is None else replace(points, pairs=torch.tensor(alike)[points.pairs])
     try:
         first_box = first_box or find_bounds(root, cameras, foreground, points)
     except SceneError as error:
