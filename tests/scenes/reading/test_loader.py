@@ -271,6 +271,26 @@ def test_a_frames_own_lens_goes_before_that_of_the_scene(tmp_path):
     assert cameras.focal_px[3].tolist() == [FOCAL, FOCAL]
 
 
+def test_the_angle_of_a_frame_goes_before_the_focal_length_of_the_scene(tmp_path):
+    angle = 2 * np.arctan(0.5 * WIDTH / 33.0)
+    matrix = [[34.0, 0, 9.5], [0, 34.0, 8.5], [0, 0, 1]]
+    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][4].update(camera_angle_x=angle))
+    cameras = load_scene(folder.edit(lambda c: c["frames"][3].update(intrinsic_matrix=matrix)).root).cameras
+    np.testing.assert_allclose(
+        cameras.focal_px[2:5].numpy(), [[FOCAL] * 2, [34.0] * 2, [33.0] * 2], rtol=1e-6
+    )
+    assert cameras.center_px[3].tolist() == [9.5, 8.5]
+
+
+def test_keys_that_are_not_followed_or_not_known_are_said(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    assert not load_scene(folder.root).warnings
+    folder.edit(lambda c: c["frames"][0].update(rolling_shutter=[0, 0, 1, 0], mask_file="masks/0.png"))
+    said, unknown = load_scene(folder.root).warnings
+    assert said.startswith("transforms.json: 'rolling_shutter' is set and not followed")
+    assert unknown == "transforms.json: keys that are not known and not used: mask_file"
+
+
 def test_distortion_params_are_read_in_nerfstudios_order(tmp_path):
     folder = make_scene(tmp_path / "scene").edit(
         lambda c: c.update(distortion_params=[0.1, 0.2, 0, 0, 0.3, 0.4])

@@ -105,6 +105,7 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         )
     faults.raise_if_any()
     assert checked is not None
+    warnings = (*entry.warnings, *warnings)
     if entry.fwhm_nm is not None and (unknown := int(np.isnan(entry.fwhm_nm).sum())):
         said = f"'fwhm' has 0 or null for {unknown} of {len(entry.fwhm_nm)} bands: the widths of all count as unknown"
         entry, warnings = replace(entry, fwhm_nm=None), (*warnings, said)

@@ -25,7 +25,7 @@ from unmix_plugin.scenes.reading.faults import (
     read_json_file,
     read_number,
 )
-from unmix_plugin.scenes.reading.foreign_keys import refused_keys
+from unmix_plugin.scenes.reading.foreign_keys import keys_to_say, refused_keys
 from unmix_plugin.spectral.bands import require_nanometres
 
 FILE_NAME = "transforms.json"
@@ -42,6 +42,7 @@ _SMALLEST_ANGLE = 1e-6
 """Field of view in radians that is still one, and how much less than pi it must be."""
 _BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Also the order of nerfstudio's `distortion_params`."""
+_FOCAL_KEYS, _ANGLE_KEYS = ("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
 _A_NUMBER = "a finite number, at most 1e9"
 
 _RIGID_TOLERANCE = 5e-3
@@ -109,15 +110,19 @@ def read_lens(
     noted_before = faults.noted
     for message in refused_keys(content, frame, is_scene):
         faults.add(where, message)
-    given = frame.get("intrinsic_matrix", content.get("intrinsic_matrix"))
-    matrix = _read_intrinsic_matrix(given, where, faults)
+    own, common = (
+        _read_intrinsic_matrix(one.get("intrinsic_matrix"), where, faults) | one for one in (frame, content)
+    )
+    has_angle, has_focal = (
+        any(own.get(key) is not None for key in keys) for keys in (_ANGLE_KEYS, _FOCAL_KEYS)
+    )
+    if has_angle and not has_focal:  # which the focal length of others would go before
+        common = {key: value for key, value in common.items() if key not in _FOCAL_KEYS}
 
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
-        source = frame if frame.get(key) is not None else content
+        source = own if own.get(key) is not None else common
         value = source.get(key)
-        if value is None and key in matrix:
-            return matrix[key]
-        number, owner = read_number(value), FILE_NAME if source is content else where
+        number, owner = read_number(value), FILE_NAME if source is common else where
         if value is not None and (number is None or abs(number) > _GREATEST_PX):
             faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
         elif number is not None and (not low <= number <= high or (is_whole and number != int(number))):
@@ -412,6 +417,8 @@ class SceneEntry:
     """Metres in a unit of the world that the poses come from."""
     fwhm_nm: Float64[np.ndarray, " B"] | None = None
     """Widths of the instrument's bands, NaN where one is unknown."""
+    warnings: tuple[str, ...] = ()
+    """Keys that stand for something and are not followed, or that nobody knows."""
 
 
 def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> SceneEntry:
@@ -433,7 +440,9 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
     frames = frames if isinstance(frames, list) else []
     if not frames:
         faults.add(FILE_NAME, "'frames' is empty; a scene needs frames to train on and to evaluate")
+    said = keys_to_say(content, [frame for frame in frames if isinstance(frame, dict)])
     return SceneEntry(
+        warnings=tuple(f"{FILE_NAME}: {text}" for texts in said for text in texts),
         wavelengths_nm=_read_wavelengths(content, faults, needs_cubes),
         materials=_read_materials(content, faults),
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
