@@ -25,9 +25,11 @@ from tests.captures.capture_factory import (
 from tests.captures.file_factory import present
 from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
+from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.process import process_capture
+from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -167,6 +169,19 @@ def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     assert findings[0].startswith(f"values are reflectance divided by {scale:g}, as ")
     kept = process(capture.root, tmp_path / "kept", **references, white_reflectance="0.02", scale=1.0)
     assert not any("divided by" in finding for finding in kept)
+
+
+def test_views_come_in_the_order_of_their_numbers(tmp_path: Path):
+    """Ranges of --angles, and neighbours among many views, go by it."""
+    capture = make_capture(tmp_path / "capture", views=3)
+    names = ["turn_9", "turn_10", "turn_11"]
+    for old, new in zip(capture.reflectance, names, strict=True):
+        for suffix in ("hdr", "raw"):
+            (capture.root / f"{old}.{suffix}").rename(capture.root / f"{new}.{suffix}")
+    assert [view.name for view in find_cubes(capture.root, ReadOptions()).views] == names
+    write_poses(capture.root / "transforms.json", names)
+    process(capture.root, tmp_path / "scene")
+    assert [frame.name for frame in load_scene(tmp_path / "scene").frames] == names
 
 
 def test_views_without_a_pose_are_left_out(tmp_path: Path):

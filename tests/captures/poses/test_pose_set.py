@@ -57,3 +57,11 @@ def test_cameras_without_names_go_by_order_and_need_as_many_views():
 def test_no_match_at_all_names_both_sides():
     with pytest.raises(CaptureError, match=r"views are called p, q, the cameras of poses x\.png, y\.png"):
         match(named("x.png", "y.png"), ("p", []), ("q", []))
+
+
+def test_poses_without_names_go_by_names_as_texts_which_is_said_where_numbers_go_otherwise():
+    poses = named("#0000", "#0001", "#0002")
+    found, notes = match(poses, ("v1", []), ("v2", []), ("v10", []))
+    assert found == {"v1": "#0000", "v10": "#0001", "v2": "#0002"}
+    assert "names were sorted as texts: v1, v10, v2" in notes[1]
+    assert len(match(poses, ("v1", []), ("v2", []), ("v3", []))[1]) == 1

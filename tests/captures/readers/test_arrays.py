@@ -344,3 +344,11 @@ def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
     np.testing.assert_array_equal(found.read(), stored)
     assert found.dtype.kind == ("u" if "_Unsigned" in attributes else "i")
     assert (found.valid_range, found.no_data) == (valid_range, no_data)
+
+
+def test_arrays_that_are_not_used_are_named(tmp_path):
+    cube, nm = np.ones((4, 5, 3), np.float32), np.array([450.0, 550.0, 650.0])
+    np.savez(tmp_path / "a.npz", cube=cube, wavelengths=nm, exposure_ms=np.array(5.0))
+    assert not open_spectral_file(tmp_path / "a.npz").notes
+    np.savez(tmp_path / "a.npz", cube=cube, wavelengths=nm, scale=np.array(1e4), mask=cube[..., 0] > 0)
+    assert open_spectral_file(tmp_path / "a.npz").notes == ("also in the file, and not used: scale, mask",)

@@ -200,3 +200,19 @@ def test_the_exposure_is_that_of_its_attributes(tmp_path):
     header = head() | {"expTime": 0.25, "isoSpeed": 200.0}
     metadata = opened(tmp_path / "a.exr", header, channels(CUBE)).metadata
     assert (metadata["exposure_s"], metadata["gain"]) == (0.25, 2.0)
+
+
+@pytest.mark.parametrize(("form", "has_nm"), [("w{:g}nm", True), ("w{:g}", True), ("band{}", False)])
+def test_channels_of_other_names_are_bands_in_the_order_of_their_numbers(tmp_path, form, has_nm):
+    nm = [800.0, 900.0, 1000.0, 1100.0]
+    names = [form.format(value if has_nm else place + 8) for place, value in enumerate(nm)]  # 10 after 9
+    planes = {name: np.full((4, 5), value, np.float32) for name, value in zip(names, nm, strict=True)}
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    file = open_spectral_file(tmp_path / "a.exr")
+    assert file.bands.names == tuple(names)
+    np.testing.assert_array_equal(file.read()[0, 0], nm)
+    if has_nm:
+        np.testing.assert_array_equal(centres_nm(file), nm)
+    else:
+        assert file.bands.wavelengths_nm is None

@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from unmix_plugin.captures.layouts.registry import view_names
+from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.readers.envi import described_image
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
@@ -78,7 +79,7 @@ def _capture_of_plain(
     _refuse_same_names(found)
     views = [
         CaptureView(_name(path), _open(path, options), picture=pictures.get(_name(path)))
-        for path in sorted(found, key=_name)
+        for path in sorted(found, key=lambda path: natural_order(_name(path)))
     ]
     return Capture("cubes", root, tuple(views))
 
@@ -120,7 +121,9 @@ def _capture_of_groups(
         names = view_names([str(place.relative_to(root) / f"{name}.x") for place, name in paths], str(root))
     views: list[CaptureView] = []
     references: dict[str, int] = {"dark": 0, "white": 0}
-    for name, (key, path) in sorted(zip(names, paths.items(), strict=True), key=lambda pair: pair[0]):
+    for name, (key, path) in sorted(
+        zip(names, paths.items(), strict=True), key=lambda pair: natural_order(pair[0])
+    ):
         assert path is not None
         view = CaptureView(name, _open(path, options), picture=pictures.get(name))
         for kind in references:

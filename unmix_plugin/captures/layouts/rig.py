@@ -30,6 +30,7 @@ from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
 from unmix_plugin.captures.poses.lens_models import Points
+from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted, name_some
@@ -86,7 +87,8 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
         f"lens {sensor}: {note} ({counted(count, 'file')})" for (sensor, note), count in lens_notes.items()
     ]
     views = _with_given_bands(views, options)
-    return Capture("rig", root, tuple(sorted(views, key=lambda view: view.name)), notes=tuple(notes))
+    ordered = sorted(views, key=lambda view: natural_order(view.name))
+    return Capture("rig", root, tuple(ordered), notes=tuple(notes))
 
 
 def _is_thermal(file: SpectralFile) -> bool:
@@ -222,7 +224,7 @@ def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
 def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
     """One of every eight releases is for evaluation, with all its lenses: in their middle, since what the first and
     the last of a flight show no other does."""
-    names = sorted(set(releases))
+    names = sorted(set(releases), key=natural_order)
     evaluated = names[min(_EVAL_INTERVAL, len(names)) // 2 :: _EVAL_INTERVAL]
     return {release: "eval" if release in evaluated else "train" for release in names}
 

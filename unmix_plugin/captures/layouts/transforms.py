@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
-from unmix_plugin.captures.poses.pose_set import load_json, path_text
+from unmix_plugin.captures.poses.pose_set import load_json, natural_order, path_text
 from unmix_plugin.captures.poses.reading import frames_of, read_poses
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
@@ -155,7 +155,8 @@ def make_capture(
         poses = replace(poses, cameras=cameras)
     except CaptureError as error:
         said.append(f"the poses of the capture can't be used: {error}")
-    return Capture(layout, root, tuple(sorted(views, key=lambda view: view.name)), poses, tuple(said))
+    ordered = sorted(views, key=lambda view: natural_order(view.name))
+    return Capture(layout, root, tuple(ordered), poses, tuple(said))
 
 
 def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
 from unmix_plugin.captures.poses.colmap import read_colmap
-from unmix_plugin.captures.poses.pose_set import PoseSet
+from unmix_plugin.captures.poses.pose_set import PoseSet, natural_order
 from unmix_plugin.errors import CaptureError, install_hint, name_some
 
 _LEAST_VIEWS = 3
@@ -106,7 +106,8 @@ def estimate_poses(
     require_pycolmap()
     if len(pictures) < _LEAST_VIEWS:
         raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_WHAT_TO_DO}")
-    files = {name: f"{index:06d}.png" for index, name in enumerate(sorted(pictures))}
+    ordered = sorted(pictures, key=natural_order)
+    files = {name: f"{index:06d}.png" for index, name in enumerate(ordered)}
     _write_pictures(folder, {files[name]: picture for name, picture in pictures.items()}, "images")
     if masks is not None:
         shown = {
@@ -115,7 +116,7 @@ def estimate_poses(
         }
         _write_pictures(folder, shown, "masks")
     sensors: dict[str, list[str]] = {}
-    for name in sorted(pictures):
+    for name in ordered:
         sensors.setdefault((sensor_of or {}).get(name, ""), []).append(files[name])
     settings = {
         "folder": str(folder.resolve()),

@@ -7,6 +7,7 @@ over what is written; `make_pose_set` refuses what is no pose and makes the othe
 
 from __future__ import annotations
 
+import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -133,6 +134,16 @@ def path_text(text: str) -> str:
     'images/0001.png'
     """
     return text.strip().replace("\\", "/").removeprefix("./")
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbers in names by their size.
+
+    >>> sorted(["view_10", "view_9"], key=natural_order)
+    ['view_9', 'view_10']
+    """
+    parts = re.split(r"(\d+)", name.lower())
+    return [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
 
 
 def make_pose_set(
@@ -314,7 +325,9 @@ def number_of(parent: ElementTree.Element, tag: str, where: str, default: float 
 # Which camera took which view, by the names of files.
 
 BY_ORDER = "#"
-"""Names of cameras whose source gives none begin with it; they are matched in the order of names."""
+"""Names of cameras whose source gives none begin with it; they are matched in the order of names, sorted as texts as
+LLFF does."""
+_IN_ORDER = "by their order, as the poses have no names"
 
 
 def match_poses(
@@ -335,7 +348,7 @@ def match_poses(
     """
     owners = {name: [name, *camera.other_names] for name, camera in poses.cameras.items()}
     wanted = {name: [name, *(str(file) for file in files)] for name, files in views}
-    found, how = _by_order(list(owners), list(wanted)), "by their order, as the poses have no names"
+    found, how = _by_order(list(owners), list(wanted)), _IN_ORDER
     if found is None:
         found, how = _by_names(owners, wanted), "by name"
     if not found:
@@ -359,6 +372,10 @@ def match_poses(
         )
     ]
     notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
+    if how == _IN_ORDER and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
+        notes.append(
+            f"names were sorted as texts: {', '.join(ordered[:3])}; if poses go by numbers, give these leading zeros"
+        )
     if unposed:
         notes.append(f"views without pose: {', '.join(unposed)}")
     if unused:

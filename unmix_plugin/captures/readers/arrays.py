@@ -32,7 +32,7 @@ from unmix_plugin.captures.spectral_file import (
     take_part,
 )
 from unmix_plugin.captures.wavelengths import StatedBands, check_bands
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_decoded, allow_parts, open_zip, refuse
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
@@ -49,6 +49,7 @@ _CENTRES = re.compile(
     r"(list_cw_[^_]*)|(bands)|((band_?|cent(er|re|ral)_?|sensor_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?))(_?(nm|um))?"
 )
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
+_SIDES = re.compile("n(row|col)s?")
 _GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
 _NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data", "fill_value")
 _GAINS, _OFFSETS = ("scale_factor", "reflectance_scale_factor"), ("add_offset",)
@@ -149,6 +150,15 @@ def image_of_arrays(
             return take(axes, rows, wanted).astype(dtype, copy=False)
         return take_part(image.whole().reshape(shape), axes, rows, wanted).astype(dtype, copy=False)
 
+    known = (_CENTRES, _WIDTHS, _GOOD, _SIDES)
+    others = [
+        one.name
+        for one in arrays
+        if one is not image
+        and not is_exposure(one.own_name)
+        and one.own_name not in _AXES
+        and not any(names.fullmatch(one.own_name) for names in known)
+    ]
     return SpectralFile(
         path=path,
         reader=reader,
@@ -159,6 +169,7 @@ def image_of_arrays(
         linear=linear,
         no_data=no_data,
         valid_range=valid,
+        notes=(f"also in the file, and not used: {name_some(others)}",) if others else (),
         warnings=axis_warnings + band_warnings + exposure_warnings,
         metadata={**({"dataset": image.name} if len(arrays) > 1 else {}), "axes": axes, **exposure},
     )

@@ -17,7 +17,7 @@ import re
 import struct
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,9 @@ import numpy as np
 from jaxtyping import Int
 
 from unmix_plugin.captures.exposure import exposure_facts
+from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
+from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 
@@ -201,8 +203,15 @@ def _choose(
     if not spectral:
         own = [channel.name for channel in channels if channel.part == channels[0].part]
         bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
-        bands.sort(key=lambda name: _COLOURS.index(name) if name in _COLOURS else -1)
-        return BandTable(names=tuple(bands)), [by_name[name] for name in bands], ()
+        bands.sort(key=lambda name: (_COLOURS.index(name) if name in _COLOURS else -1, natural_order(name)))
+        found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
+        if found is not None:
+            table = replace(
+                table,
+                wavelengths_nm=found[0],
+                evidence=f"names of channels, such as {bands[0]!r}: {found[1]}",
+            )
+        return table, [by_name[name] for name in bands], ()
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
     widths = [channel.width_nm for channel in taken if channel.width_nm is not None]

@@ -5,7 +5,6 @@ Numbers are as they are stored: what is gamma-encoded stays so, and `metadata["e
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, parse_xmp
+from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     BandTable,
@@ -124,7 +124,10 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
         raise CaptureError(f"{folder}: no band files in this folder; expected one {', '.join(_KINDS)} a band")
     kind, number = kinds.most_common(1)[0]
     allow_parts(folder, number, "band files", CaptureError)
-    files = sorted((path for path in found if _KINDS.get(path.suffix.lower()) == kind), key=_natural)
+    files = sorted(
+        (path for path in found if _KINDS.get(path.suffix.lower()) == kind),
+        key=lambda path: natural_order(path.name),
+    )
     bands = [open_band(path) for path in files]
     for band in bands:
         if band.shape[2] != 1:
@@ -149,9 +152,3 @@ def _with_wavelengths_of_names(bands: list[SpectralFile]) -> list[SpectralFile]:
         replace(band, bands=replace(band.bands, wavelengths_nm=np.array([nm]), evidence=evidence))
         for band, nm in zip(bands, found[0].tolist(), strict=True)
     ]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Numbers in names by their size: band_9 before band_10."""
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
