@@ -24,8 +24,10 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.camera_files import read_camera_file
+from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import read_measures
 from unmix_plugin.trained.model_scene import ModelScene
+from unmix_plugin.trained.regions import InView
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.rendering.painting import BACKGROUNDS
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
@@ -200,6 +202,47 @@ def test_no_scale_is_set_before_training_has_ended(tmp_path):
     with serving(make_source(tmp_path, TrainingControl())) as (viewer, _), opened(viewer) as page:
         page.set("set scale", True)
         page.wait_until(lambda: any("when training has ended" in text for _, text in page.notices))
+
+
+@pytest.mark.slow
+def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
+    source = make_source(tmp_path, initial_opacity=0.6)
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        options = lambda: page.controls[page.control("region")]["options"]  # noqa: E731
+        page.set("keep the region", True)
+        page.wait_until(lambda: any("can't be the name of a region" in text for _, text in page.notices))
+        page.set("region name", "middle part")
+        page.set("keep the region", True)
+        page.wait_until(lambda: any("draw a region first" in text for _, text in page.notices))
+        page.set("draw where I click", True)
+        page.wait_until(lambda: page.controls[page.control("probe where I click")]["value"] is False)
+        page.click(0.4, 0.4)
+        page.wait_until(lambda: "Corners: 1" in page.texts)
+        page.click(0.6, 0.6)
+        page.wait_until(lambda: "Corners: 2" in page.texts)
+        page.set("keep the region", True)
+        page.wait_until(lambda: options() == ["none: choose one", "middle part"])
+        page.wait_until(lambda: " square units</td>" in page.texts)
+        kept = read_measures(source.run).regions["middle part"]
+        assert isinstance(kept, InView)
+        rows, columns = np.nonzero(kept.mask())
+        height, width = kept.mask().shape
+        assert (rows.min() / height, columns.max() / width) == (
+            pytest.approx(0.4, abs=0.01),
+            pytest.approx(0.6, abs=0.01),
+        )
+        with source.borrowed_materials() as scene:
+            found = MeasuredSurface.of(scene).measure(kept, "")
+        assert f"{found.area:.4g} square units" in page.texts
+        page.look_from(0.9)
+        page.click(0.5, 0.5)
+        page.wait_until(lambda: "Corners: 1" in page.texts)
+        page.look_from(0.3)
+        page.click(0.5, 0.5)
+        page.wait_until(lambda: "The view has changed, so the outline begins here" in page.texts)
+        page.set("remove the region", True)
+        page.wait_until(lambda: options() == ["none: choose one"])
+        assert read_measures(source.run).regions == {}
 
 
 def test_depth_comes_with_objects_and_goes_with_them(viewer):

@@ -63,7 +63,7 @@ class MeasuredSurface:
             scene: Unedited or edited.
             mesh: Its surface, model space.
         """
-        self._scene, self.mesh = scene, mesh
+        self.scene, self.mesh = scene, mesh
         positions, normals = (torch.from_numpy(values).float() for values in (mesh.vertices, mesh.normals))
         self._abundances, self._diffuse = look_from_above(scene, positions, normals)
         self._materials = SurfaceAppearance(scene.materials, self._abundances, self._diffuse).material_ids
@@ -90,16 +90,16 @@ class MeasuredSurface:
     @cached_property
     def areas(self) -> Float64[np.ndarray, " F"]:
         """Of the triangles, square units of the world."""
-        return self.mesh.areas() / self._scene.frame.scale**2
+        return self.mesh.areas() / self.scene.frame.scale**2
 
     def shares(self, region: Region) -> Float64[np.ndarray, "F 3"]:
         """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""
         faces = self.mesh.faces
         if isinstance(region, OfMaterial):
-            return _in_material(self._scene, region, self._materials)[faces].astype(np.float64)
+            return _in_material(self.scene, region, self._materials)[faces].astype(np.float64)
         corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
         points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
-        inside = points_in(self._scene, region, torch.from_numpy(points).float())
+        inside = points_in(self.scene, region, torch.from_numpy(points).float())
         return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
 
     def measure(self, region: Region, name: str) -> MeasuredRegion:
@@ -112,7 +112,7 @@ class MeasuredSurface:
         weights = shares * (self.areas / 3)[:, None]
         area = float(weights.sum())
         if area <= 0:
-            low, high = (self._scene.frame.to_world(self.mesh.vertices).round(3) for _ in range(2))
+            low, high = (self.scene.frame.to_world(self.mesh.vertices).round(3) for _ in range(2))
             raise ConfigError(
                 f"the region {name} has nothing of the surface in it, which lies between "
                 f"{' '.join(f'{x:g}' for x in low.min(axis=0))} and {' '.join(f'{x:g}' for x in high.max(axis=0))} "
@@ -148,8 +148,11 @@ def points_in(
     columns, rows = coords[inside].long().numpy().T
     inside[inside.clone()] = torch.from_numpy(mask[rows, columns])
     if bool(inside.any()):
-        seen = SeenSurface(scene, width * height, [camera])
-        seen.look(camera)
+        rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+        height, width = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
+        part = camera.crop(int(columns[0]), int(rows[0]), width, height)
+        seen = SeenSurface(scene, width * height, [part])
+        seen.look(part)
         inside[inside.clone()] = seen.shows(positions[inside])
     return inside.numpy()
 

@@ -39,6 +39,7 @@ from unmix_plugin.viewer.rendering.pictures import (
     PictureMaker,
     Shown,
 )
+from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
@@ -130,6 +131,7 @@ class Services:
             )
             """Names of the scene's lights, and the paths of those that a user gives."""
         self.maker = PictureMaker(source)
+        self.regions = RunRegions(self.maker)
         self.loop = RenderLoop(self.maker)
         self.first_recipe = Recipe()
         """Every client's first recipe; endmembers are given by their numbers."""

@@ -8,6 +8,7 @@ from unmix_plugin.viewer.panels.capture import CapturePanel
 from unmix_plugin.viewer.panels.materials import MaterialsPanel
 from unmix_plugin.viewer.panels.measure import MeasurePanel
 from unmix_plugin.viewer.panels.probe import ProbePanel, ValuesPanel
+from unmix_plugin.viewer.panels.regions import RegionsPanel
 from unmix_plugin.viewer.panels.training import TrainingPanel
 from unmix_plugin.viewer.panels.view import LayerPanel, LightPanel, ScenePanel
 from unmix_plugin.viewer.session import Services, Session
@@ -21,6 +22,7 @@ def panels_of(services: Services) -> list[tuple[str, Callable[[Session], object]
         ("scene", ScenePanel, True),
         ("probe", ProbePanel if services.has_materials else ValuesPanel, True),
         ("measure", MeasurePanel, True),
+        ("regions", RegionsPanel, services.has_materials),
         ("materials", MaterialsPanel, services.has_materials),
         ("capture", CapturePanel, True),
         ("training", TrainingPanel, services.source.control is not None),

@@ -87,9 +87,7 @@ class MeasurePanel:
 
     def _set_scale(self) -> None:
         source = self._session.services.source
-        control = source.control
-        if control is not None and (control.is_running or control.status is None):
-            raise ConfigError("the scene still changes; set the scale when training has ended")
+        source.require_final("set the scale")
         if len(self._points) < 2:
             raise ConfigError("click two points of the object first, then type how far apart they are")
         first, second = (point.tolist() for point in self._points)

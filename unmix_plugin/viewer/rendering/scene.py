@@ -23,6 +23,7 @@ from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients
 from unmix_plugin.trained.measures import Scale, read_measures, recorded_scale
@@ -86,6 +87,18 @@ class SceneSource:
             RunError: what is kept is damaged.
         """
         return read_measures(self.run).scale or recorded_scale(self.record.summary)
+
+    def require_final(self, what: str) -> None:
+        """Refuse what is kept with a run while training still changes it.
+
+        Args:
+            what: What to do when training has ended.
+        Raises:
+            ConfigError: it has not.
+        """
+        control = self.control
+        if control is not None and (control.is_running or control.status is None):
+            raise ConfigError(f"the scene still changes; {what} when training has ended")
 
     @property
     def version(self) -> int:

@@ -1,0 +1,95 @@
+"""The regions of a run while pages are drawn: kept in its folder, measured on a surface that is found once for all."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
+from unmix_plugin.trained.measures import keep_region, read_measures
+from unmix_plugin.trained.regions import Region, region_to_json
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.rendering.pictures import PictureMaker
+from unmix_plugin.viewer.rendering.scene import Edit
+
+_PAUSE_S = 0.002
+"""Between two turns on the device, so that pages which wait for it come in between."""
+
+
+class RunRegions:
+    """The regions kept with a run, and what they are on its surface, which is found when it is first asked for."""
+
+    def __init__(self, maker: PictureMaker) -> None:
+        self._maker, self._source = maker, maker.source
+        self._lock = threading.Lock()
+        self._surface: MeasuredSurface | None = None
+        self._measured: dict[str, MeasuredRegion] = {}
+        """By what a region is, as JSON: names may be given anew."""
+
+    @property
+    def kept(self) -> Mapping[str, Region]:
+        """By name, as they are by now: commands and other pages keep some, too."""
+        return read_measures(self._source.run).regions
+
+    def measured(self, region: Region) -> tuple[MeasuredRegion, MeasuredSurface] | None:
+        """What a region is, and on which surface; None if it was not measured yet."""
+        found = self._measured.get(json.dumps(region_to_json(region)))
+        return None if found is None or self._surface is None else (found, self._surface)
+
+    def measure(self, name: str, region: Region, show: Callable[[str], None]) -> MeasuredRegion:
+        """What a region of the unedited scene is.
+
+        Args:
+            name, region: Kept or not.
+            show: Told how far it is; the first one takes long.
+        Raises:
+            ConfigError: training goes on, or nothing of the surface is in it.
+            RunError: no camera of the run sees a surface.
+        """
+        self._source.require_final("measure regions")
+        with self._lock:
+            surface = self._surface = self._surface or self._find_surface(show)
+            show(f"measuring {name}")
+            with self._turn():
+                found = surface.measure(region, name)
+            self._measured[json.dumps(region_to_json(region))] = found
+            return found
+
+    def keep(self, name: str, region: Region | None) -> None:
+        """Keep a region with the run, in place of one of its name; None removes that.
+
+        Raises:
+            ConfigError: the name can't be one, or there are too many.
+        """
+        with self._lock:
+            keep_region(self._source.run, name, region)
+
+    def _find_surface(self, show: Callable[[str], None]) -> MeasuredSurface:
+        """The surface, found in many short turns on the device, between which pages are drawn."""
+        with self._turn() as scene:
+            pass
+
+        def follow(doing: str, items: Sequence[Any]) -> Iterator[Any]:
+            for index, item in enumerate(items):
+                show(f"{doing}: {index} of {len(items)}")
+                with self._turn():
+                    yield item
+
+        @contextmanager
+        def working(doing: str) -> Iterator[None]:
+            show(doing)
+            with self._turn():
+                yield
+
+        return MeasuredSurface.of(scene, follow, working)
+
+    @contextmanager
+    def _turn(self) -> Iterator[TrainedScene]:
+        """The device and the unedited scene, after pages that wait."""
+        time.sleep(_PAUSE_S)
+        with self._maker.edit_turn(Edit()) as (scene, _):
+            yield scene
