@@ -331,6 +331,22 @@ def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectra
     assert len(pixels.views) == int((~masked).sum())
 
 
+@pytest.mark.parametrize("kind", ["cubes/000.npy", "images/000.png", "mask.png"])
+def test_another_cube_alpha_or_mask_makes_it_another_object(spectral_folder, kind):
+    Image.new("L", (SIZE, SIZE), 255).save(spectral_folder / "mask.png")
+    frames = json.loads((spectral_folder / "transforms.json").read_text())["frames"]
+    change(spectral_folder, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
+    before = load_object(spectral_folder).summary()["input_hashes"]
+    path = spectral_folder / kind
+    if path.suffix == ".npy":
+        np.save(path, np.load(path) * np.float32(0.9))
+    else:
+        pixels = np.array(Image.open(path))
+        pixels[0, 0] = 0 if pixels[0, 0].any() else 1
+        Image.fromarray(pixels).save(path)
+    assert load_object(spectral_folder).summary()["input_hashes"] != before
+
+
 def _fewer_bands(spectral_folder: Path) -> None:
     for path in (spectral_folder / "relit" / "dim" / "cubes").glob("*.npy"):
         np.save(path, np.load(path)[..., :4])

@@ -166,8 +166,13 @@ class PosedPictures:
 
     @cached_property
     def hashes(self) -> dict[str, str]:
-        """SHA-256 of each file, by its picture's name."""
-        return {files.name: sha256_of(files.colours) for files in self.files}
+        """SHA-256 of each file, by its picture's name and what else it holds of it."""
+        return {
+            f"{files.name}{what}": sha256_of(path)
+            for files in self.files
+            for what, path in (("", files.colours), (" alpha", files.opacity), (" mask", files.mask))
+            if path is not None
+        }
 
 
 def _read_files(files: _PictureFiles) -> Picture:
