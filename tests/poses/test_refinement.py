@@ -321,6 +321,8 @@ def test_a_pose_that_fits_again_is_an_inlier_again():
         robust.observe(torch.arange(KNOTS), torch.full((KNOTS,), 1e-3), torch.ones(KNOTS, dtype=torch.bool))
     robust.update(Processes())
     assert_close(robust.weights, torch.ones(KNOTS))
+    broken = observed(torch.cat([torch.ones(KNOTS - 1), torch.tensor([torch.nan])]))
+    assert_close(broken.weights, torch.ones(KNOTS))
     unseen = RobustWeights(KNOTS)
     unseen.update(Processes())
     assert_close(unseen.weights, torch.ones(KNOTS))

@@ -84,9 +84,10 @@ class RobustWeights(nn.Module):
     def observe(
         self, knots: Int[Tensor, " R"], squares: Float[Tensor, " R"], shows_matter: Bool[Tensor, " R"]
     ) -> None:
-        """Note the mean squared errors of pixels, each near one of the knots."""
-        shown = shows_matter.to(squares)
-        self.squares.mul_(_MEMORY).index_add_(0, knots, squares * shown)
+        """Note the mean squared errors of pixels, each near one of the knots; those that are no numbers are left out."""
+        is_known = shows_matter & squares.isfinite()
+        shown, squares = is_known.to(squares), squares.where(is_known, 0.0)
+        self.squares.mul_(_MEMORY).index_add_(0, knots, squares)
         self.counts.mul_(_MEMORY).index_add_(0, knots, shown)
 
     @torch.no_grad()
