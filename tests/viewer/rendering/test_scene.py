@@ -16,6 +16,7 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.outputs import MaterialView
+from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.panels.probe import _take_probe
 from unmix_plugin.viewer.rendering import scene as scene_module
@@ -113,7 +114,13 @@ def views(scene, source, monkeypatch):
     return MeasuredViews(scene, source)
 
 
-def ball_frame(camera):
+@pytest.fixture
+def ball_of(scene):
+    """A view of the ball from a camera, as a run on the scene has it."""
+    return lambda camera: ball_frame(camera, [scene.cameras[index] for index in scene.train_indices])
+
+
+def ball_frame(camera, trained_on=()):
     """A view of a ball at the middle of model space: solid, and endmember 0 only."""
     bundle = camera.image_rays(0)
     along = -(bundle.directions * bundle.origins).sum(dim=-1)
@@ -124,14 +131,15 @@ def ball_frame(camera):
     coefficients = Coefficients.of(hits, hits * distance, shares, shares, torch.zeros(len(hits), 1))
     bands = Bands.of([450.0, 490.0, 530.0, 570.0, 610.0, 650.0])
     materials = Materials(bands, torch.full((3, 6), 0.25), torch.zeros(1, 6))
-    ball = replace(make_scene(), materials=materials)
+    own = tuple(RunView(f"train_{index:03d}", one, "train") for index, one in enumerate(trained_on))
+    ball = replace(make_scene(), materials=materials, views=own)
     return MaterialView(ball, camera, coefficients.unflatten(camera.height, camera.width))
 
 
-def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene):
+def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene, ball_of):
     index = 2
     camera = scene.cameras[scene.train_indices[index]]
-    frame = ball_frame(camera)
+    frame = ball_of(camera)
     errors, is_known, name = views.error(frame)
     assert name == scene.frames[scene.train_indices[index]].name
     hits = frame.coefficients.accumulation > 0.5
@@ -142,24 +150,39 @@ def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, sc
     assert float(errors[~hits].abs().max()) == 0
 
 
-def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, scene):
+def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, scene, ball_of):
     camera = scene.cameras[scene.train_indices[0]]
     turned = camera.camera_to_world.clone()
     angle = torch.tensor(0.9)
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0.0], [angle.sin(), angle.cos(), 0.0], [0.0, 0.0, 1.0]])
     turned[0] = turn @ turned[0]
-    frame = ball_frame(replace(camera, camera_to_world=turned))
+    frame = ball_of(replace(camera, camera_to_world=turned))
     _, is_known, _ = views.error(frame)
     hits = frame.coefficients.accumulation > 0.5
     assert 0 < int(is_known.sum()) < int(hits.sum())
     assert not bool((is_known & ~hits).any())
 
 
-def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
+def test_views_stand_where_training_corrected_them(views, scene, ball_of):
+    index = scene.train_indices[2]
+    given = scene.cameras[index]
+    shifted = replace(given, center_px=given.center_px + 2.0)
+    frame = ball_of(shifted)
+    corrected = tuple(
+        replace(one, camera=replace(one.camera, center_px=one.camera.center_px + 2.0))
+        for one in frame.scene.views
+    )
+    frame = replace(frame, scene=replace(frame.scene, views=corrected))
+    errors, is_known, _ = views.error(frame)
+    expected = (torch.from_numpy(scene.cube(index)) - 0.25).abs().mean(dim=-1)
+    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
+
+
+def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene, ball_of):
     index = 1
     camera = scene.cameras[scene.train_indices[index]]
     towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
-    found = views.measurement(BALL * towards, camera, None, ball_frame(camera).scene)
+    found = views.measurement(BALL * towards, camera, None, ball_of(camera).scene)
     assert found is not None
     name, spectrum = found
     assert name == scene.frames[scene.train_indices[index]].name
@@ -168,14 +191,14 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera(views, scene):
     np.testing.assert_allclose(spectrum, scene.cube(scene.train_indices[index])[row, column])
 
 
-def test_a_point_inside_is_seen_by_nobody(views, scene):
+def test_a_point_inside_is_seen_by_nobody(views, scene, ball_of):
     camera = scene.cameras[scene.train_indices[0]]
-    assert views.measurement(torch.zeros(3), camera, None, ball_frame(camera).scene) is None
+    assert views.measurement(torch.zeros(3), camera, None, ball_of(camera).scene) is None
 
 
-def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene):
+def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene, ball_of):
     index = scene.train_indices[2]
-    camera, frame = scene.cameras[index], ball_frame(scene.cameras[index])
+    camera, frame = scene.cameras[index], ball_of(scene.cameras[index])
     light = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
     endmembers = frame.materials.endmembers * light
     materials = replace(frame.materials, endmembers=endmembers, light=light)
@@ -192,9 +215,9 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
     assert_close(relit[1], plain[1] * light)
 
 
-def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, source, monkeypatch):
+def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_of, source, monkeypatch):
     camera = scene.cameras[scene.train_indices[1]]
-    ball = replace(source, take=lambda: ball_frame(camera).scene)
+    ball = replace(source, take=lambda: ball_of(camera).scene)
     maker = PictureMaker(ball)
     maker.aids.set_measured(views)
     turns, turn = [], source.device.guest_turn

@@ -205,7 +205,7 @@ class MeasuredViews:
         self._scene = scene
         self._source = source
         self._indices = usable_views(scene)
-        self._cameras = scene.cameras[self._indices]
+        self._rows = [scene.train_indices.index(index) for index in self._indices]
         self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -215,7 +215,7 @@ class MeasuredViews:
         Returns:
             Errors; where they are known; the name of the view.
         """
-        index = int(self._by_nearness(frame.camera)[0])
+        index = int(self._by_nearness(frame.camera, frame.scene)[0])
         coefficients, device = frame.coefficients.flatten(), frame.coefficients.accumulation.device
         errors = torch.zeros(frame.camera.height * frame.camera.width)
         is_known = torch.zeros(len(errors), dtype=torch.bool)
@@ -223,7 +223,7 @@ class MeasuredViews:
         if len(seen):
             rays = frame.camera.to(device).image_rays(0)
             points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
-            rows, columns, sees = self._pixels_of(points, index)
+            rows, columns, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
             cube = self._in_light(self._scene.cube(self._indices[index]), frame.scene.light_power)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
             places = seen[sees].cpu()
@@ -249,8 +249,9 @@ class MeasuredViews:
             light: In which the scene is shown, relative power; what was measured is relit to it. None if unknown.
             scene: The unedited scene, which is lent.
         """
-        for index in self._by_nearness(camera)[:_VIEWS_TRIED].tolist():
-            rows, columns, sees = self._pixels_of(point[None], index, scene)
+        for index in self._by_nearness(camera, scene)[:_VIEWS_TRIED].tolist():
+            own = self._camera(index, scene)
+            rows, columns, sees = self._pixels_of(point[None], index, own, scene)
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
                 spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
@@ -266,20 +267,25 @@ class MeasuredViews:
         found = measured if is_same else relit_measurement(measured, recorded, light).astype(np.float32)
         return torch.from_numpy(found)
 
-    def _by_nearness(self, camera: Cameras) -> Tensor:
+    def _camera(self, index: int, scene: TrainedScene) -> Cameras:
+        """Of a training view, as training corrected it."""
+        return scene.views[self._rows[index]].camera
+
+    def _by_nearness(self, camera: Cameras, scene: TrainedScene) -> Tensor:
         """Training views by the angle between their axis and the camera's, and by their distance to it."""
         middle = self._scene.scene_box.aabb.mean(dim=0)
-        pose, poses = camera.camera_to_world[0].cpu(), self._cameras.camera_to_world
+        own = [self._camera(index, scene).camera_to_world for index in range(len(self._rows))]
+        pose, poses = camera.camera_to_world[0].cpu(), torch.cat(own).cpu()
         reach = (pose[:, 3] - middle).norm().clamp(min=1e-3)
         offsets = (poses[:, :, 3] - pose[:, 3]).norm(dim=-1) / reach
         angles = (poses[:, :, 2] * pose[:, 2]).sum(dim=-1).clamp(-1, 1).arccos()
         return (offsets + angles).argsort()
 
     def _pixels_of(
-        self, points: Float[Tensor, "P 3"], index: int, lent: TrainedScene | None = None
+        self, points: Float[Tensor, "P 3"], index: int, camera: Cameras, lent: TrainedScene | None = None
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
         """Row and column of each point in a training view, and whether that view sees it."""
-        camera = self._cameras[index]
+        camera = camera.to("cpu")
         coords, depths = camera.project(points.cpu(), 0)
         columns, rows = coords.nan_to_num(-1.0).clamp(-1, 1e6).floor().long().unbind(-1)
         inside = (depths > 0) & (columns >= 0) & (rows >= 0)
@@ -287,10 +293,10 @@ class MeasuredViews:
         rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
         places = camera.poses_at(torch.zeros_like(rows), coords[:, 1].nan_to_num(0.0))[:, :, 3]
         distance = (points.cpu() - places).norm(dim=-1)
-        rendered = self._distance_of(index, lent)[rows, columns]
+        rendered = self._distance_of(index, camera, lent)[rows, columns]
         return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
 
-    def _distance_of(self, index: int, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
+    def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""
         step = self._source.version
         with self._lock:
@@ -298,7 +304,7 @@ class MeasuredViews:
         if kept is not None and step - kept[0] < _STEPS_KEPT:
             return kept[1]
         with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
-            seen = scene.look(self._cameras[index], subpixels=1).coefficients
+            seen = scene.look(camera, subpixels=1).coefficients
         distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
         with self._lock:
             self._distances[index] = (step, distance)
