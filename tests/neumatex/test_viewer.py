@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests.neumatex.surfaces import RECORD, make_object
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
@@ -12,8 +13,10 @@ from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import LightChoice, ModelView, relit
+from unmix_plugin.viewer.rendering import render_loop
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import Services
+from unmix_plugin.viewer.view_cameras import sized_camera
 
 
 @pytest.fixture
@@ -92,6 +95,24 @@ def test_light_is_exchanged_and_turned_for_this_page_alone_and_kept_when_it_is_l
         again = finished(page, viewer)["linear_rgb"]
         np.testing.assert_allclose(again.mean(), before.mean(), rtol=0.05)
         assert decoded(page.last_picture).shape == (48, 64, 3)
+
+
+def test_the_strips_of_a_screenshot_have_the_scale_of_the_picture_on_screen(source, monkeypatch):
+    monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 32 * 6)
+    with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
+        show_layer(page, "depth")
+        finished(page, viewer)
+        (session,) = viewer._sessions.values()
+        page.set("width", 32)
+        page.set("height", 24)
+        page.set("save a screenshot (PNG)", True)
+        page.wait_until(lambda: page.downloads == ["view.png"])
+        camera, maker = sized_camera(session.pose(), 32, 24), viewer.services.maker
+        settings = session.view.settings.changed("value_range", session.value_range_shown)
+        with source.borrowed() as scene:
+            whole = maker.paint(scene.look(camera, session.view.subpixels), settings, False, False).picture
+    saved = np.asarray(Image.open(viewer.services.folder / "view.png").convert("RGB"))
+    np.testing.assert_allclose(saved, whole, atol=1)
 
 
 def test_screenshots_are_finished_views(source, monkeypatch):

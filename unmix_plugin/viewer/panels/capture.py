@@ -91,6 +91,8 @@ class CapturePanel:
     def _save_picture(self) -> None:
         camera = self._camera()
         settings, maker = self._session.view.settings, self._session.services.maker
+        if self._session.value_range_shown is not None:  # strips would each have a scale of their own
+            settings = settings.changed("value_range", self._session.value_range_shown)
         pixels = np.zeros((camera.height, camera.width, 3), np.uint8)
         path = self._new_file(".png")
 
