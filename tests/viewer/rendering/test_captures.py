@@ -1,6 +1,8 @@
 """Pictures in strips are the pictures of the whole; videos are rendered by `unmix-render`, one at a time."""
 
 import queue
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -123,6 +125,10 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     assert [product.format for product in products] == ["mp4"]
 
 
+def test_an_absorption_is_an_output_of_renders_by_its_own_name():
+    assert output_of(LayerSettings(layer="index", index="absorption:650-700")) == "absorption:650-700"
+
+
 @pytest.mark.parametrize("layer", ["error", "index"])
 def test_the_error_and_an_index_that_is_not_chosen_are_no_outputs(layer):
     with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
@@ -214,6 +220,13 @@ def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead)
     assert [one.wait() for one in (first, second)] == [(None, "cancelled")] * 2
     third.wait()
     assert third.parts == [1.0]
+
+
+def test_a_render_that_has_just_ended_by_itself_can_be_cancelled():
+    with subprocess.Popen([sys.executable, "-c", ""], start_new_session=True) as process:
+        process.wait()
+        captures._end(process)
+    assert process.returncode == 0
 
 
 def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead):

@@ -13,6 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.rendering.painting import LayerSettings
+from unmix_plugin.viewer.rendering.painting import LayerSettings, index_output
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""
@@ -177,12 +178,11 @@ def _end(process: subprocess.Popen[str]) -> None:
         process.kill()
         return
     for number in (signal.SIGTERM, signal.SIGKILL):
-        os.killpg(process.pid, number)
-        try:
+        with suppress(ProcessLookupError):  # it has just ended by itself
+            os.killpg(process.pid, number)
+        with suppress(subprocess.TimeoutExpired):
             process.wait(_WAIT_S)
             return
-        except subprocess.TimeoutExpired:
-            continue
 
 
 def output_of(settings: LayerSettings) -> str:
@@ -196,7 +196,7 @@ def output_of(settings: LayerSettings) -> str:
     if settings.layer == "false-colour":
         return "false-colour:" + ",".join(f"{value:g}" for value in settings.false_colour_nm)
     if settings.layer == "index" and settings.index:
-        return f"index:{settings.index}"
+        return index_output(settings.index)
     if settings.layer == "abundance":
         return "abundances"
     if settings.layer in ("error", "index"):

@@ -425,6 +425,12 @@ _CHUNK = 1 << 16
 _LONGEST_LABEL = 120
 
 
+def index_output(asked: str) -> str:
+    """The output that the layer `index` shows: an absorption if that is asked for, otherwise an index."""
+    # Of the outputs with an argument only these: others read files, which a page must not name.
+    return asked if asked.startswith("absorption:") else f"index:{asked}"
+
+
 def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     """The index or absorption that is chosen, over the background where it is undefined or hardly anything is seen."""
     materials, bands = frame.materials, frame.materials.bands
@@ -434,10 +440,7 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
             f"no spectral index is chosen: type a formula of the wavelengths from {edges[0]:g} to {edges[-1]:g} nm "
             f"that the bands cover, such as r{float(centers[-1]):g}/r{float(centers[0]):g}"
         )
-    # Of the outputs with an argument only these: others read files, which a page must not name.
-    is_absorption = settings.index.startswith("absorption:")
-    name = settings.index if is_absorption else f"index:{settings.index}"
-    asked = parse_reflectance_map(name, bands, materials.is_lit)
+    asked = parse_reflectance_map(index_output(settings.index), bands, materials.is_lit)
     index, rows = asked.fit(torch.empty(0, len(bands))), frame.coefficients.flatten()
     # Chunk by chunk: the spectra of a whole picture may not fit into memory.
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
