@@ -17,7 +17,10 @@ from unmix_plugin.commands.render import RenderOptions
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import choose_formats
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
+from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import (
     SpectraCanvas,
@@ -27,7 +30,7 @@ from unmix_plugin.viewer.rendering.captures import (
     output_of,
     render_argv,
 )
-from unmix_plugin.viewer.rendering.painting import LAYERS, LayerSettings
+from unmix_plugin.viewer.rendering.painting import LAYERS, LayerSettings, first_settings
 from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.view_cameras import sized_camera
@@ -123,6 +126,13 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     with source.borrowed() as scene:
         products = choose_formats((output,), ("mp4",), scene, True)
     assert [product.format for product in products] == ["mp4"]
+
+
+def test_the_first_settings_are_outputs_of_renders_for_bands_anywhere():
+    bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
+    materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
+    for layer in ("band", "false-colour"):
+        find_output(output_of(replace(first_settings(bands), layer=layer)), materials)
 
 
 def test_an_absorption_is_an_output_of_renders_by_its_own_name():
@@ -223,7 +233,7 @@ def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead)
 
 
 def test_a_render_that_has_just_ended_by_itself_can_be_cancelled():
-    with subprocess.Popen([sys.executable, "-c", ""], start_new_session=True) as process:
+    with subprocess.Popen([sys.executable, "-c", ""], text=True, start_new_session=True) as process:
         process.wait()
         captures._end(process)
     assert process.returncode == 0

@@ -99,7 +99,8 @@ def first_settings(bands: Bands) -> LayerSettings:
     """What a page shows at first; false colour from the middles of the long, middle and short third of the bands."""
     centers_nm, count = bands.centers_nm.tolist(), len(bands)
     starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
-    return LayerSettings(false_colour_nm=starts, index=next(iter(available_indices(bands)), ""))
+    wavelength_nm = covered(bands, LayerSettings.wavelength_nm)
+    return LayerSettings("rgb", wavelength_nm, starts, index=next(iter(available_indices(bands)), ""))
 
 
 def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
