@@ -4,14 +4,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.space import contracted_unit
 from unmix_plugin.operators.contracted_marching import (
     FAR_RADIUS,
     LINEAR_RADIUS,
     march_contracted,
     march_contracted_first,
     march_contracted_twin,
-    unit_points,
 )
 from unmix_plugin.operators.occupancy import skip_distances
 
@@ -79,11 +77,6 @@ def test_a_ray_from_beyond_the_far_end_has_no_samples():
     full = torch.zeros(4, 4, 4, dtype=torch.uint8)
     origins, directions = torch.tensor([[600.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0]])
     assert len(march_contracted(origins, directions, torch.zeros(1), full, 0.05)) == 0
-
-
-def test_grids_and_fields_contract_space_alike():
-    points = 5 * torch.randn(100, 3, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(unit_points(points), contracted_unit(points))
 
 
 def test_steps_of_no_length_are_refused():

@@ -92,20 +92,6 @@ def test_a_table_of_another_shape_is_refused():
         hash_encode(positions, table[:-1], DENSE)
 
 
-@pytest.mark.parametrize(
-    ("sizes", "message"),
-    [
-        ((0, 4, 16, 256, 17), "at least 1 level"),
-        ((8, 9, 16, 256, 17), "1 to 8 features"),
-        ((8, 4, 32, 16, 17), "coarsest <= finest"),
-        ((8, 4, 16, 256, 30), "log2_rows_per_level must be 4 to 24; got 30"),
-    ],
-)
-def test_impossible_layouts_are_refused(sizes, message):
-    with pytest.raises(ValueError, match=message):
-        HashGridLayout(*sizes)
-
-
 def test_a_known_encoding_is_taken_over_with_the_gradients_of_a_computed_one():
     positions, table = make(HASHED, 60)
     for tensor in (positions, table):

@@ -158,7 +158,7 @@ def test_marching_on_from_the_ends_gives_what_follows(most, device):
 
 def test_selecting_samples_keeps_them_packed_by_ray():
     samples = PackedSamples(
-        torch.arange(5.0), torch.tensor([0, 0, 2, 2, 2]), torch.tensor([[0, 2], [2, 0], [2, 3]]), 0.1
+        torch.arange(5.0), torch.tensor([0, 0, 2, 2, 2]), torch.tensor([[0, 2], [2, 0], [2, 3]])
     )
     kept = samples.select(torch.tensor([False, True, True, False, True]))
     assert kept.t.tolist() == [1.0, 2.0, 4.0]

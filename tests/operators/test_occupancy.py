@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_cdt
 
-from unmix_plugin.operators.occupancy import OccupancyGrid, VisibleCells, skip_distances
+from unmix_plugin.operators.occupancy import OccupancyGrid, _VisibleCells, skip_distances
 
 
 def ball(points: torch.Tensor) -> torch.Tensor:
@@ -140,15 +140,15 @@ ENOUGH_RAYS = 16 * SIDE * SIDE
 
 def looked_at(
     *sights: tuple[tuple[int, int, int], int], seen: bool = True, num_rays=ENOUGH_RAYS
-) -> VisibleCells:
+) -> _VisibleCells:
     """Cells after samples in the middle of these ones, each with the number of its view, and a judgement."""
-    cells = VisibleCells((SIDE, SIDE, SIDE))
+    cells = _VisibleCells((SIDE, SIDE, SIDE))
     record(cells, *sights, seen=seen, num_rays=num_rays)
     cells.update()
     return cells
 
 
-def record(cells: VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
+def record(cells: _VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
     points = (torch.tensor([cell for cell, _ in sights]) + 0.5) / SIDE
     views = torch.tensor([view for _, view in sights])
     cells.record(points, views, torch.full((len(sights),), seen), num_rays)
@@ -175,7 +175,7 @@ def test_of_a_single_view_all_that_it_sees_stays():
 
 
 def test_samples_that_send_too_little_light_see_nothing():
-    cells = VisibleCells((SIDE, SIDE, SIDE))
+    cells = _VisibleCells((SIDE, SIDE, SIDE))
     record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
     record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
     cells.update()
@@ -199,7 +199,7 @@ def test_nothing_is_left_out_before_enough_rays_were_cast():
 
 
 def test_large_pictures_need_more_rays_before_anything_is_left_out():
-    cells = VisibleCells((SIDE, SIDE, SIDE))
+    cells = _VisibleCells((SIDE, SIDE, SIDE))
     record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
     cells.update(fewest_rays=ENOUGH_RAYS + 1)
     assert cells.visible.all()
@@ -223,7 +223,7 @@ def test_views_of_large_numbers_are_told_apart():
 
 
 def test_points_on_the_faces_of_the_box_belong_to_the_outermost_cells():
-    cells = VisibleCells((SIDE, SIDE, SIDE))
+    cells = _VisibleCells((SIDE, SIDE, SIDE))
     corners = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]).repeat(2, 1)
     cells.record(corners, torch.tensor([0, 0, 1, 1]), torch.ones(4, dtype=torch.bool), ENOUGH_RAYS)
     cells.update()

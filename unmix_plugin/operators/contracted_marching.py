@@ -20,14 +20,9 @@ import warp as wp
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.operators.launching import KernelArray, as_warp, launch, vector_type
-from unmix_plugin.operators.marching import (
-    FirstSamples,
-    PackedSamples,
-    check_step,
-    count_and_write,
-    room_for_samples,
-)
+from unmix_plugin.engine.geometry.space import contracted_unit
+from unmix_plugin.operators.launching import KernelArray, as_warp, vector_type
+from unmix_plugin.operators.marching import FirstSamples, PackedSamples, check_step, take_all, take_first
 from unmix_plugin.operators.occupancy import cells_at
 
 FAR_RADIUS = 512.0
@@ -51,8 +46,8 @@ def march_contracted(
     Raises:
         ValueError: step isn't positive.
     """
-    rays = _rays(origins, directions, jitter, skips, step)
-    return PackedSamples(*count_and_write(_count_kernel, _write_kernel, rays, origins), step)
+    rays = _rays(origins, directions, torch.zeros_like(jitter), jitter, skips, step)
+    return take_all(_count_kernel, _write_kernel, rays, origins)
 
 
 def march_contracted_first(
@@ -68,26 +63,24 @@ def march_contracted_first(
     Args:
         t_start: 0, or the `ends` of the samples before.
     """
-    rays = _rays(origins, directions, torch.full_like(t_start, 0.5), skips, step)
-    t, counts = room_for_samples(origins, most)
-    ends = torch.empty_like(t_start)
-    arrays = [as_warp(values) for values in (t_start.contiguous(), counts, ends, t)]
-    launch(_first_kernel, len(origins), [*rays, *arrays], origins.device)
-    return FirstSamples(t, counts, ends)
+    rays = _rays(origins, directions, t_start, torch.full_like(t_start, 0.5), skips, step)
+    return take_first(_write_kernel, rays, origins, most)
 
 
 def _rays(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
     jitter: Float[Tensor, "R"],
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> list[KernelArray | float]:
-    """The arguments that all kernels share."""
+    """The arguments that both kernels share."""
     check_step(step)
     point = vector_type(3, torch.float32)
     lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
-    return [*lines, as_warp(jitter.contiguous()), step, as_warp(skips.contiguous())]
+    numbers = [as_warp(values.contiguous()) for values in (t_start, jitter)]
+    return [*lines, *numbers, step, as_warp(skips.contiguous())]
 
 
 def march_contracted_twin(
@@ -109,7 +102,7 @@ def march_contracted_twin(
         near = radius.clamp(min=1.0)
         stride = step * near * (near / LINEAR_RADIUS).clamp(min=1.0)
         at = t + jitter * stride
-        unit = unit_points(origins + at[:, None] * directions)
+        unit = contracted_unit(origins + at[:, None] * directions)
         hit = is_inside & (skips[tuple(cells_at(unit, skips.shape).unbind(-1))] == 0)
         found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
@@ -121,13 +114,7 @@ def march_contracted_twin(
     )
     counts = hit.sum(dim=1)
     packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
-    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info, step)
-
-
-def unit_points(points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-    """Where points of the world lie in the unit cube that the grid fills."""
-    radius = points.abs().amax(dim=-1, keepdim=True).clamp(min=1.0)
-    return points * ((2.0 - 1.0 / radius) / radius) / 4.0 + 0.5
+    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info)
 
 
 @wp.func
@@ -163,6 +150,7 @@ def _count_kernel(
     stride: int,
     origins: wp.array(dtype=wp.vec3f),
     directions: wp.array(dtype=wp.vec3f),
+    t_start: wp.array(dtype=float),
     jitter: wp.array(dtype=float),
     step: float,
     skips: wp.array3d(dtype=wp.uint8),
@@ -171,8 +159,8 @@ def _count_kernel(
     index = first + wp.tid()
     while index < end:
         count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
-        t = float(0.0)  # noqa: UP018
-        radius = _radius_at(origins[index])
+        t = t_start[index]
+        radius = _radius_at(origins[index] + t * directions[index])
         while radius <= 512.0:
             length = _stride_at(radius, step)
             count += _is_occupied(origins[index] + (t + jitter[index] * length) * directions[index], skips)
@@ -190,59 +178,27 @@ def _write_kernel(
     stride: int,
     origins: wp.array(dtype=wp.vec3f),
     directions: wp.array(dtype=wp.vec3f),
-    jitter: wp.array(dtype=float),
-    step: float,
-    skips: wp.array3d(dtype=wp.uint8),
-    packed_info: wp.array2d(dtype=wp.int64),
-    ray_indices: wp.array(dtype=wp.int64),
-    t_samples: wp.array(dtype=float),
-):
-    index = first + wp.tid()
-    while index < end:
-        slot = int(packed_info[index, 0])
-        stop = slot + int(packed_info[index, 1])
-        t = float(0.0)  # noqa: UP018
-        radius = _radius_at(origins[index])
-        while slot < stop and radius <= 512.0:
-            length = _stride_at(radius, step)
-            middle = t + jitter[index] * length
-            # An empty point's entry is overwritten by the next point's.
-            ray_indices[slot] = wp.int64(index)
-            t_samples[slot] = middle
-            slot += _is_occupied(origins[index] + middle * directions[index], skips)
-            t += length
-            radius = _radius_at(origins[index] + t * directions[index])
-        index += stride
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
-def _first_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    jitter: wp.array(dtype=float),
-    step: float,
-    skips: wp.array3d(dtype=wp.uint8),
     t_start: wp.array(dtype=float),
+    jitter: wp.array(dtype=float),
+    step: float,
+    skips: wp.array3d(dtype=wp.uint8),
+    room: wp.array2d(dtype=wp.int64),
+    t_samples: wp.array(dtype=float),
     counts: wp.array(dtype=wp.int64),
     ends: wp.array(dtype=float),
-    t_samples: wp.array2d(dtype=float),
 ):
-    # One pass: there is room for as many samples of each ray as are wanted.
     index = first + wp.tid()
-    most = t_samples.shape[1]
     while index < end:
-        row = t_samples[index]
+        start = int(room[index, 0])
+        own = t_samples[start : start + int(room[index, 1])]
         slot = int(0)  # noqa: RUF046, UP018
         t = t_start[index]
         radius = _radius_at(origins[index] + t * directions[index])
-        while slot < most and radius <= 512.0:
+        while slot < own.shape[0] and radius <= 512.0:
             length = _stride_at(radius, step)
             middle = t + jitter[index] * length
-            row[slot] = middle
+            # An empty point's entry is overwritten by the next point's.
+            own[slot] = middle
             slot += _is_occupied(origins[index] + middle * directions[index], skips)
             t += length
             radius = _radius_at(origins[index] + t * directions[index])

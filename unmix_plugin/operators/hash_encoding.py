@@ -31,28 +31,15 @@ from unmix_plugin.operators.launching import as_warp, launch, vector_type
 class HashGridLayout:
     """Sizes of the levels of a hash grid and where each lies in the common table."""
 
-    num_levels: int = 8
-    features_per_level: int = 4
-    coarsest_resolution: int = 16
+    num_levels: int
+    features_per_level: int
+    """1 to 8."""
+    coarsest_resolution: int
     """Cells a side of the first level."""
-    finest_resolution: int = 256
+    finest_resolution: int
     """Cells a side of the last level; those between grow geometrically."""
-    log2_rows_per_level: int = 17
+    log2_rows_per_level: int
     """Upper bound of a level's rows, as a power of two."""
-
-    def __post_init__(self) -> None:
-        if self.num_levels < 1 or not 1 <= self.features_per_level <= 8:
-            raise ValueError(
-                "a hash grid needs at least 1 level and 1 to 8 features a level; "
-                f"got {self.num_levels} and {self.features_per_level}"
-            )
-        if not 1 <= self.coarsest_resolution <= self.finest_resolution <= 2**20:
-            raise ValueError(
-                "resolutions must satisfy 1 <= coarsest <= finest <= 2^20; "
-                f"got {self.coarsest_resolution} and {self.finest_resolution}"
-            )
-        if not 4 <= self.log2_rows_per_level <= 24:
-            raise ValueError(f"log2_rows_per_level must be 4 to 24; got {self.log2_rows_per_level}")
 
     @cached_property
     def levels(self) -> Int[Tensor, "L 3"]:

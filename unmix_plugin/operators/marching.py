@@ -11,7 +11,7 @@ arithmetic, so that the second pass fills what the first one counted.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, no_type_check
 
 import torch
@@ -32,30 +32,22 @@ class PackedSamples:
     ray_indices: Int[Tensor, "S"]
     packed_info: Int[Tensor, "R 2"]
     """First sample and number of samples of each ray."""
-    step: float
-    """Length of every sample's interval; in contracted space of those in the inner cube."""
 
     def __len__(self) -> int:
         return len(self.t)
 
     def rows(self, chosen: Int[Tensor, "some"]) -> "PackedSamples":
         """Some samples by their places, with no regard to which belong to one ray: `packed_info` stays as it is."""
-        return PackedSamples(
-            self.t.index_select(0, chosen),
-            self.ray_indices.index_select(0, chosen),
-            self.packed_info,
-            self.step,
-        )
+        t, rays = (values.index_select(0, chosen) for values in (self.t, self.ray_indices))
+        return PackedSamples(t, rays, self.packed_info)
 
     def select(self, keep: Bool[Tensor, "S"]) -> "PackedSamples":
         """Only the samples marked in `keep`, still packed."""
         kept_before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
         starts = kept_before[self.packed_info[:, 0]]
         ends = kept_before[self.packed_info[:, 0] + self.packed_info[:, 1]]
-        packed_info = torch.stack([starts, ends - starts], dim=-1)
-        kept = keep.nonzero()[:, 0]
-        return PackedSamples(
-            self.t.index_select(0, kept), self.ray_indices.index_select(0, kept), packed_info, self.step
+        return replace(
+            self.rows(keep.nonzero()[:, 0]), packed_info=torch.stack([starts, ends - starts], dim=-1)
         )
 
 
@@ -92,7 +84,7 @@ def march(
         ValueError: step isn't positive.
     """
     rays = _rays(origins, directions, t_near, t_far, jitter, skips, step)
-    return PackedSamples(*count_and_write(_count_kernel, _write_kernel, rays, origins), step)
+    return take_all(_count_kernel, _write_kernel, rays, origins)
 
 
 def march_first(
@@ -106,18 +98,7 @@ def march_first(
 ) -> FirstSamples:
     """The first samples that `march` takes of each ray at t_near + (i + 1/2) step, at most `most`."""
     rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), skips, step)
-    t, counts = room_for_samples(origins, most)
-    launch(_first_kernel, len(origins), [*rays, as_warp(counts), as_warp(t)], origins.device)
-    return FirstSamples(t, counts, t[:, -1] + step / 2)
-
-
-def room_for_samples(
-    origins: Float[Tensor, "R 3"], most: int
-) -> tuple[Float[Tensor, "R M"], Int[Tensor, "R"]]:
-    """Memory for M samples of each ray, and for how many each has."""
-    device = origins.device
-    t = torch.empty(len(origins), most, dtype=torch.float32, device=device)
-    return t, torch.empty(len(origins), dtype=torch.int64, device=device)
+    return take_first(_write_kernel, rays, origins, most)
 
 
 def count_samples(
@@ -130,9 +111,7 @@ def count_samples(
 ) -> Int[Tensor, "R"]:
     """How many samples of each ray `march` takes at t_near + (i + 1/2) step."""
     rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), skips, step)
-    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
-    launch(_count_kernel, len(origins), [*rays, as_warp(counts)], origins.device)
-    return counts
+    return _counted(_count_kernel, rays, origins)
 
 
 def _rays(
@@ -152,32 +131,50 @@ def _rays(
     return [*lines, *numbers, step, as_warp(skips.contiguous())]
 
 
-def count_and_write(
-    _count_kernel: Any,
-    _write_kernel: Any,
-    rays: Sequence[KernelArray | float],
-    origins: Float[Tensor, "R 3"],
-) -> tuple[Float[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "R 2"]]:
+def take_all(
+    count_kernel: Any, write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
+) -> PackedSamples:
     """Samples of rays by two launches: one counts them, the other writes them where there is then room.
 
     Args:
         rays: Arguments of both kernels.
         origins: Of the rays.
-    Returns:
-        Distances and rays of the samples, and each ray's first sample and number of samples.
     """
-    num_rays, device = len(origins), origins.device
-    counts = torch.empty(num_rays, dtype=torch.int64, device=device)
-    launch(_count_kernel, num_rays, [*rays, as_warp(counts)], device)
+    counts = _counted(count_kernel, rays, origins)
     ends = counts.cumsum(0)
     packed_info = torch.stack([ends - counts, counts], dim=-1)
     total = int(ends[-1]) if len(ends) else 0
-    t_samples = torch.empty(total, dtype=torch.float32, device=device)
-    ray_indices = torch.empty(total, dtype=torch.int64, device=device)
-    if total:
-        written = [as_warp(packed_info), as_warp(ray_indices), as_warp(t_samples)]
-        launch(_write_kernel, num_rays, [*rays, *written], device)
-    return t_samples, ray_indices, packed_info
+    t, _, _ = _written(write_kernel, rays, packed_info, total)
+    return PackedSamples(t, torch.repeat_interleave(counts, output_size=total), packed_info)
+
+
+def take_first(
+    write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"], most: int
+) -> FirstSamples:
+    """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
+    starts = most * torch.arange(len(origins), device=origins.device)
+    room = torch.stack([starts, torch.full_like(starts, most)], dim=-1)
+    t, counts, ends = _written(write_kernel, rays, room, most * len(origins))
+    return FirstSamples(t.view(len(origins), most), counts, ends)
+
+
+def _counted(
+    kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
+) -> Int[Tensor, "R"]:
+    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
+    launch(kernel, len(origins), [*rays, as_warp(counts)], origins.device)
+    return counts
+
+
+def _written(
+    kernel: Any, rays: Sequence[KernelArray | float], room: Int[Tensor, "R 2"], size: int
+) -> tuple[Float[Tensor, "S"], Int[Tensor, "R"], Float[Tensor, "R"]]:
+    """Samples, how many each ray has, and where it goes on; `room` are the first place of each ray and the number."""
+    t, ends = (torch.empty(count, dtype=torch.float32, device=room.device) for count in (size, len(room)))
+    counts = torch.empty_like(room[:, 0])
+    if size:
+        launch(kernel, len(room), [*rays, *map(as_warp, (room, t, counts, ends))], room.device)
+    return t, counts, ends
 
 
 def march_twin(
@@ -201,7 +198,7 @@ def march_twin(
     counts = hit.sum(dim=1)
     starts = counts.cumsum(0) - counts
     ray_indices, _ = hit.nonzero(as_tuple=True)
-    return PackedSamples(t[hit], ray_indices, torch.stack([starts, counts], dim=-1), step)
+    return PackedSamples(t[hit], ray_indices, torch.stack([starts, counts], dim=-1))
 
 
 def check_step(step: float) -> None:
@@ -323,65 +320,31 @@ def _write_kernel(
     jitter: wp.array(dtype=float),
     step: float,
     skips: wp.array3d(dtype=wp.uint8),
-    packed_info: wp.array2d(dtype=wp.int64),
-    ray_indices: wp.array(dtype=wp.int64),
+    room: wp.array2d(dtype=wp.int64),
     t_samples: wp.array(dtype=float),
-):
-    index = first + wp.tid()
-    while index < end:
-        ray = _ray_at(index, origins, directions, t_near, t_far, jitter, step, skips)
-        slot = int(packed_info[index, 0])
-        stop = slot + int(packed_info[index, 1])
-        i = int(0)  # noqa: RUF046, UP018
-        while slot < stop and i < ray.num_points:
-            clear = _skip_at(ray, _point_at(ray, step, i), skips)
-            if clear <= _NEAR:
-                for k in range(8):
-                    t = _point_at(ray, step, i + k)
-                    clear = _skip_at(ray, t, skips)
-                    if clear == 0 and slot < stop:
-                        ray_indices[slot] = wp.int64(index)
-                        t_samples[slot] = t
-                        slot += 1
-                i += 7
-            i += _points_to_next(ray, clear)
-        index += stride
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
-def _first_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    t_near: wp.array(dtype=float),
-    t_far: wp.array(dtype=float),
-    jitter: wp.array(dtype=float),
-    step: float,
-    skips: wp.array3d(dtype=wp.uint8),
     counts: wp.array(dtype=wp.int64),
-    t_samples: wp.array2d(dtype=float),
+    ends: wp.array(dtype=float),
 ):
-    # One pass: there is room for as many samples of each ray as are wanted.
     index = first + wp.tid()
-    most = t_samples.shape[1]
     while index < end:
         ray = _ray_at(index, origins, directions, t_near, t_far, jitter, step, skips)
-        row = t_samples[index]
+        start = int(room[index, 0])
+        own = t_samples[start : start + int(room[index, 1])]
         slot = int(0)  # noqa: RUF046, UP018
         i = int(0)  # noqa: RUF046, UP018
-        while slot < most and i < ray.num_points:
+        last = ray.t_first
+        while slot < own.shape[0] and i < ray.num_points:
             clear = _skip_at(ray, _point_at(ray, step, i), skips)
             if clear <= _NEAR:
                 for k in range(8):
                     t = _point_at(ray, step, i + k)
                     clear = _skip_at(ray, t, skips)
-                    if clear == 0 and slot < most and i + k < ray.num_points:
-                        row[slot] = t
+                    if clear == 0 and slot < own.shape[0] and i + k < ray.num_points:
+                        own[slot] = t
+                        last = t
                         slot += 1
                 i += 7
             i += _points_to_next(ray, clear)
         counts[index] = wp.int64(slot)
+        ends[index] = last + (1.0 - jitter[index]) * step
         index += stride

@@ -64,7 +64,7 @@ _NO_VIEW = 255
 """Views are told apart by their number modulo this, which takes one byte a cell and leaves this number for none."""
 
 
-class VisibleCells(nn.Module):
+class _VisibleCells(nn.Module):
     """Cells that two training views have seen, by the rays cast since the last update."""
 
     visible: Bool[Tensor, "X Y Z"]
@@ -162,7 +162,7 @@ class OccupancyGrid(nn.Module):
             records_observed: Whether densities that rays meet are noted, so that updates need not probe those cells.
         """
         super().__init__()
-        self.visibility = VisibleCells(reachable.shape)
+        self.visibility = _VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
         self.register_buffer("peak_densities", torch.full(reachable.shape, torch.inf))
         self.register_buffer("occupied", reachable.to(torch.uint8))
