@@ -123,13 +123,6 @@ class DataManager(ABC):
         resumed or evaluated."""
         return {}
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """What a resumed run needs beyond (seed, step) and the rays per batch; usually nothing."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:  # noqa: B027
-        """Restore what `state_dict` gave."""
-
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""
         return []
@@ -227,23 +220,13 @@ class Model(nn.Module, ABC):
         """
         outputs = self(ray_bundle)
         metrics = self.get_metrics_dict(outputs, batch)
-        losses = self.get_loss_dict(outputs, batch, metrics)
-        with torch.no_grad():
-            self.observe(outputs, batch)
-        return outputs, losses, metrics
+        return outputs, self.get_loss_dict(outputs, batch, metrics), metrics
 
     @abstractmethod
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Metrics of one whole image, nan where there is no truth; pictures of it (height, width, 3) in sRGB [0, 1]."""
-
-    @torch.no_grad()
-    def evaluate_image(
-        self, camera: Cameras, batch: dict[str, Tensor]
-    ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Render a view as `get_evaluation_outputs` does, and measure it: `get_image_metrics_and_images`."""
-        return self.get_image_metrics_and_images(self.get_evaluation_outputs(camera, batch), batch)
 
     @torch.no_grad()
     def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -258,10 +241,6 @@ class Model(nn.Module, ABC):
     def get_training_callbacks(self) -> list[TrainingCallback]:
         """Functions to call around each step."""
         return []
-
-    def observe(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> None:
-        """Learn from a training batch what is not learnt by gradients; called after each step's losses, without
-        gradients. `get_outputs` and `get_loss_dict` change nothing in the model."""
 
     def num_samples(self, outputs: dict[str, Tensor]) -> int:
         """Field samples behind `outputs`, for the log; 0 where a model does not count."""

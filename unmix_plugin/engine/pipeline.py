@@ -72,7 +72,8 @@ class Pipeline(nn.Module):
         for index in range(self.datamanager.num_eval_images):
             camera, batch = self.datamanager.eval_image(index)
             with evaluating(self.model):
-                metrics, pictures = self.model.evaluate_image(camera, batch)
+                outputs = self.model.get_evaluation_outputs(camera, batch)
+                metrics, pictures = self.model.get_image_metrics_and_images(outputs, batch)
             yield self.datamanager.eval_name(index), metrics, pictures
 
     def get_average_eval_image_metrics_and_images(self) -> tuple[dict[str, float], dict[str, Tensor]]:

@@ -1,7 +1,7 @@
 """Checkpoints: all that training goes on from, as safetensors beside a JSON record with their hash.
 
 `step-NNNNNN.json` is written last, so a checkpoint exists if and only if its record does; and it counts as complete
-only if the tensors' SHA-256 is the record's. The tensors are those of parameters, optimiser, average and data manager.
+only if the tensors' SHA-256 is the record's. The tensors are those of parameters, optimiser and average.
 """
 
 import hashlib
@@ -16,7 +16,6 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import require_in_range
-from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.runs.atomic_files import (
     OtherFormatError,
     read_run_json,
@@ -34,7 +33,7 @@ _MOST_BYTES = 1 << 33
 """Of a checkpoint's tensors; the largest grids that settings allow take some gigabytes with the optimiser's state."""
 
 
-_MODEL, _OPTIMIZER, AVERAGE, _DATAMANAGER = "model/", "optimizer/", "average/", "datamanager/"
+_MODEL, _OPTIMIZER, AVERAGE = "model/", "optimizer/", "average/"
 
 
 @dataclass(frozen=True)
@@ -223,10 +222,7 @@ class TrainingRecord:
 
 
 def collect_tensors(
-    model: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    average: ParameterAverage | None,
-    datamanager: DataManager,
+    model: nn.Module, optimizer: torch.optim.Optimizer, average: ParameterAverage | None
 ) -> dict[str, Tensor]:
     """The tensors of a checkpoint by name; they share memory with what is trained."""
     names = {id(param): name for name, param in model.named_parameters()}
@@ -236,15 +232,11 @@ def collect_tensors(
             tensors[f"{_OPTIMIZER}{names[id(param)]}/{key}"] = value
     if average is not None:
         tensors.update({AVERAGE + name: value for name, value in average.values.items()})
-    tensors.update({_DATAMANAGER + name: value for name, value in datamanager.state_dict().items()})
     return tensors
 
 
 def restore_training(
-    tensors: Mapping[str, Tensor],
-    model: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    datamanager: DataManager,
+    tensors: Mapping[str, Tensor], model: nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
     """Restore what `collect_tensors` gave, but for the average.
 
@@ -260,7 +252,6 @@ def restore_training(
             raise RunError(f"the checkpoint is damaged: its optimiser state {name} fits no parameter")
         # Cloned: on the CPU `to` returns its argument, and the optimiser writes into its state.
         optimizer.state[params[owner]][key] = value.to(params[owner].device).clone()
-    datamanager.load_state_dict(part(tensors, _DATAMANAGER))
 
 
 def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: bool) -> None:

@@ -125,7 +125,7 @@ class TrainingSteps:
             RunError: it does not fit the model, or is damaged.
             ConfigError: more processes than rays.
         """
-        restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer, self.pipeline.datamanager)
+        restore_training(checkpoint.tensors, self.pipeline.model, self.optimizer)
         record = TrainingRecord.from_json(checkpoint.record)
         self.share_rays(record.num_rays)
         self.learning_rates = record.learning_rates
@@ -378,9 +378,7 @@ class Trainer:
         """
         if self._saved_step == self.step:
             return
-        tensors = collect_tensors(
-            self.pipeline.model, self.optimizer, self.average, self.pipeline.datamanager
-        )
+        tensors = collect_tensors(self.pipeline.model, self.optimizer, self.average)
         record, kept = self.record.to_json(), self.config.checkpoints_kept
         try:
             save_checkpoint(self.run.checkpoints, self.step, tensors, record, kept)
