@@ -46,6 +46,11 @@ def refinement(lens: str = "fixed", size: float = 0.04, pixel_size: float = 0.1)
     return found
 
 
+def corrections(poses: PoseRefinement) -> torch.Tensor:
+    """By how much the cameras are turned and moved at the knots."""
+    return (poses.free_steps() * poses.scale[:, None]).detach()
+
+
 def some_pixels(view: int) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(view)
     coords = torch.rand(50, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT])

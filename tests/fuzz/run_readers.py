@@ -30,7 +30,7 @@ from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.run_views import recorded_views, world_frame
-from unmix_plugin.viewer.connections import is_heard
+from unmix_plugin.viewer.connections import _is_heard
 
 
 def config_reader() -> Reader:
@@ -193,5 +193,5 @@ def viewer_message_reader() -> Reader:
 
 def _read_message(data: bytes) -> None:
     """What the viewer listens to is a message that viser reads."""
-    if is_heard(data):
+    if _is_heard(data):
         Message.deserialize(data)

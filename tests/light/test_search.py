@@ -8,7 +8,7 @@ from tests.scenes.geometry.ball_views import LAMP, ball_views, make_cameras
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light import search as lamp_search
-from unmix_plugin.light.search import LampEvidence, best_lamp, find_lamp, turning_axis
+from unmix_plugin.light.search import _best_lamp, _LampEvidence, _turning_axis, find_lamp
 from unmix_plugin.scenes.demo.scene import _LOOK_AT, demo_cameras
 from unmix_plugin.scenes.demo.shading import _LAMP_POSITION, render_view
 from unmix_plugin.scenes.geometry.carving import carve_box
@@ -18,8 +18,8 @@ from unmix_plugin.scenes.geometry.lighting import local_log_brightness, seen_pla
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_the_brightness_of_a_turned_ball_tells_the_direction_of_its_lamp(noise):
     cameras, images, hull, box = ball_views(True, noise)
-    evidence = LampEvidence.of(cameras, *seen_places(cameras, images, hull, box), hull, box)
-    share, lamp = best_lamp(evidence, cameras)
+    evidence = _LampEvidence.of(cameras, *seen_places(cameras, images, hull, box), hull, box)
+    share, lamp = _best_lamp(evidence, cameras)
     place = np.array(lamp.place) / np.linalg.norm(lamp.place)
     assert share > 0.15
     assert np.degrees(np.arccos(place @ LAMP / np.linalg.norm(LAMP))) < 12
@@ -52,8 +52,8 @@ def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
         matter.append(view.alpha > 0)
     box = SceneBox(torch.tensor([[-1.4, -1.4, -0.15], [1.4, 1.4, 1.2]]))
     hull = carve_box(cameras, matter, box, 64)
-    evidence = LampEvidence.of(cameras, *seen_places(cameras, shading, hull, box), hull, box)
-    found = best_lamp(evidence, cameras)[1]
+    evidence = _LampEvidence.of(cameras, *seen_places(cameras, shading, hull, box), hull, box)
+    found = _best_lamp(evidence, cameras)[1]
     true = np.array([_LAMP_POSITION[1], _LAMP_POSITION[2] - _LOOK_AT[2], _LAMP_POSITION[0]])
     cosine = np.dot(found.place, true) / np.linalg.norm(found.place) / np.linalg.norm(true)
     assert found.frame == "turntable"
@@ -61,6 +61,6 @@ def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
 
 
 def test_the_axis_is_what_cameras_stand_upright_to():
-    middle, axis = turning_axis(make_cameras(ring_poses(9)))
+    middle, axis = _turning_axis(make_cameras(ring_poses(9)))
     np.testing.assert_allclose(middle, (0, 0, 0), atol=1e-4)
     np.testing.assert_allclose(axis, (0, 0, 1), atol=1e-4)

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.poses.row_fitting import fit_rows, main_axes, solve_banded
+from unmix_plugin.poses.row_fitting import _solve_banded, fit_rows, main_axes
 
 ROWS, WIDTH, FOCAL_PX, HEIGHT, SWEEP = 64, 48, 60.0, 2.0, 2.0
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -0.1], [1.0, 1.0, 0.1]]))
@@ -115,4 +115,4 @@ def test_the_banded_solution_is_the_dense_one(num_knots: int) -> None:
     matrix = dense.reshape(6 * num_knots, -1)
     matrix[np.diag_indices_from(matrix)] *= 1.01
     expected = np.linalg.solve(matrix, pull.ravel()).reshape(pull.shape)
-    np.testing.assert_allclose(solve_banded(blocks, pull, 0.01), expected, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(_solve_banded(blocks, pull, 0.01), expected, rtol=1e-8, atol=1e-12)

@@ -8,7 +8,7 @@ import torch
 
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.operators.occupancy import skip_distances
-from unmix_plugin.rendering.grid_upkeep import occupied_density
+from unmix_plugin.rendering.grid_upkeep import _occupied_density
 from unmix_plugin.rendering.renderer import VolumeRenderer
 
 CELLS = 10
@@ -24,15 +24,15 @@ RENDERER = VolumeRenderer(
 
 
 def test_a_cell_as_wide_as_a_sample_is_occupied_from_an_opacity_of_3_percent():
-    assert 1 - math.exp(-occupied_density(RENDERER, CELLS) * RENDERER.step) == pytest.approx(0.03)
+    assert 1 - math.exp(-_occupied_density(RENDERER, CELLS) * RENDERER.step) == pytest.approx(0.03)
 
 
 def test_a_cell_of_many_samples_is_occupied_from_an_opacity_of_8_percent_across_it_the_short_way():
     for step in (0.05, 0.02, 0.001):
-        density = occupied_density(replace(RENDERER, step=step), CELLS)
+        density = _occupied_density(replace(RENDERER, step=step), CELLS)
         assert 1 - math.exp(-density * SHORT_WAY) == pytest.approx(0.08)
 
 
 def test_cells_of_an_unbounded_world_are_twice_as_wide():
-    density = occupied_density(replace(RENDERER, step=0.001, is_unbounded=True), CELLS)
+    density = _occupied_density(replace(RENDERER, step=0.001, is_unbounded=True), CELLS)
     assert 1 - math.exp(-density * 0.4) == pytest.approx(0.08)

@@ -16,7 +16,7 @@ from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
-from unmix_plugin.rendering.renderer import VolumeRenderer, _mean_log, points_of, visible_samples
+from unmix_plugin.rendering.renderer import VolumeRenderer, _mean_log, _points_of, _visible_samples
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -158,8 +158,8 @@ def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity)
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         field.log_initial_density = math.log(-math.log1p(-opacity) / step)
         samples = renderer._march(bundle, None)
-        found = visible_samples(field, samples, bundle, step, smallest_weight)
-        encoded = field.encode(points_of(samples, bundle)[0])
+        found = _visible_samples(field, samples, bundle, step, smallest_weight)
+        encoded = field.encode(_points_of(samples, bundle)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
     assert torch.equal(found.samples.t, samples.t[keep])
@@ -177,7 +177,7 @@ def test_what_lies_behind_an_opaque_front_is_not_evaluated():
         field.table.zero_()
         field.log_initial_density = math.log(10 / renderer.step)
         samples = renderer._march(bundle, None)
-        found = visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
+        found = _visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
     assert found.num_evaluated == 30 * 8
     assert len(samples) > 10 * found.num_evaluated
     assert len(found.samples) == 30
@@ -187,7 +187,7 @@ def test_rays_that_miss_have_no_samples():
     renderer, field = make()
     bundle = rays(3)
     away = type(bundle)(bundle.origins, -bundle.directions, bundle.camera_indices)
-    found = visible_samples(field, renderer._march(away, None), away, renderer.step, 0.1)
+    found = _visible_samples(field, renderer._march(away, None), away, renderer.step, 0.1)
     assert (len(found.samples), len(found.encoded()), found.num_evaluated) == (0, 0, 0)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unmix_plugin.viewer import gate as gates
-from unmix_plugin.viewer.gate import MOST_PAGES, Gate, is_own_page
+from unmix_plugin.viewer.gate import MOST_PAGES, Gate, _is_own_page
 
 HERE = {"host": "127.0.0.1:7007"}
 OPENING = {**HERE, "upgrade": "websocket"}
@@ -140,7 +140,7 @@ def test_foreign_pages_take_no_place_and_their_site_is_said_once(ask):
     ],
 )
 def test_pages_of_other_sites_are_told_by_their_origin_and_host(headers, is_own):
-    assert is_own_page(lowered(headers), "127.0.0.1") is is_own
+    assert _is_own_page(lowered(headers), "127.0.0.1") is is_own
 
 
 @pytest.mark.parametrize(
@@ -157,16 +157,16 @@ def test_pages_of_other_sites_are_told_by_their_origin_and_host(headers, is_own)
     ],
 )
 def test_with_the_token_a_page_may_come_through_a_proxy_but_not_from_elsewhere(headers, is_own):
-    assert is_own_page(lowered(headers), "127.0.0.1", has_token=True) is is_own
+    assert _is_own_page(lowered(headers), "127.0.0.1", has_token=True) is is_own
 
 
 def test_a_name_is_own_if_the_viewer_listens_there_and_this_machines_name_if_it_listens_everywhere():
     def page_at(name):
         return lowered({"Origin": f"http://{name}:7007", "Host": f"{name}:7007"})
 
-    assert is_own_page(page_at("lab.example"), "lab.example")
-    assert not is_own_page(page_at("lab.example"), "0.0.0.0")
-    assert is_own_page(page_at(socket.gethostname()), "0.0.0.0")
+    assert _is_own_page(page_at("lab.example"), "lab.example")
+    assert not _is_own_page(page_at("lab.example"), "0.0.0.0")
+    assert _is_own_page(page_at(socket.gethostname()), "0.0.0.0")
 
 
 def test_a_malformed_cookie_of_another_program_does_not_hide_ours(ask):

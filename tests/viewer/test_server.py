@@ -25,7 +25,7 @@ from tests.viewer.view_factory import make_source
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.viewer import connections
-from unmix_plugin.viewer.connections import _Connection, is_heard
+from unmix_plugin.viewer.connections import _Connection, _is_heard
 
 
 def test_stopping_frees_the_port_and_every_thread_and_prints_nothing(source, capsys):
@@ -318,12 +318,12 @@ HEARD = {
 @pytest.mark.parametrize("kind", HEARD)
 def test_what_a_page_sends_is_checked_before_anything_of_it_is_kept(kind):
     message = {"type": kind, **HEARD[kind]}
-    assert is_heard(msgspec.msgpack.encode(message))
+    assert _is_heard(msgspec.msgpack.encode(message))
     for name in HEARD[kind]:
         with pytest.raises(ValueError, match=r"missing|Expected"):
-            is_heard(msgspec.msgpack.encode({key: value for key, value in message.items() if key != name}))
+            _is_heard(msgspec.msgpack.encode({key: value for key, value in message.items() if key != name}))
         with pytest.raises(ValueError, match="Expected"):
-            is_heard(msgspec.msgpack.encode({**message, name: b"x"}))
+            _is_heard(msgspec.msgpack.encode({**message, name: b"x"}))
 
 
 @pytest.mark.parametrize(
@@ -336,13 +336,13 @@ def test_what_a_page_sends_is_checked_before_anything_of_it_is_kept(kind):
     ],
 )
 def test_what_no_control_of_the_viewer_needs_is_not_listened_to(message):
-    assert not is_heard(msgspec.msgpack.encode(message))
+    assert not _is_heard(msgspec.msgpack.encode(message))
 
 
 @given(st.binary(max_size=100))
 def test_bytes_of_any_kind_are_a_message_or_none(data):
     with contextlib.suppress(ValueError):
-        is_heard(data)
+        _is_heard(data)
 
 
 def test_a_fault_is_said_in_one_short_line_and_once():

@@ -52,7 +52,7 @@ Candidate = tuple[float, Lamp]
 
 
 @dataclass(frozen=True)
-class LampEvidence:
+class _LampEvidence:
     """Places of a hull, and how bright views show them."""
 
     positions: Float[Tensor, "S 3"]
@@ -73,11 +73,11 @@ class LampEvidence:
         seen: Float[Tensor, "P N"],
         hull: Bool[np.ndarray, "R R R"],
         box: SceneBox,
-    ) -> LampEvidence:
+    ) -> _LampEvidence:
         """Of places that enough views see; arguments as `seen_places` gives and takes them."""
         known = seen.isfinite() & (seen.isfinite().sum(dim=1, keepdim=True) >= FEWEST_VIEWS)
         place, view = known.nonzero().unbind(-1)
-        return LampEvidence(
+        return _LampEvidence(
             places.positions[place],
             places.normals[place],
             cameras.camera_to_world[view, :, 3],
@@ -134,10 +134,10 @@ def find_lamp(
     by_shadows = 0.0
     for half in (is_even, ~is_even):
         part = Places(places.positions[half], places.normals[half])
-        evidence = LampEvidence.of(cameras, part, seen[half], hull, box)
+        evidence = _LampEvidence.of(cameras, part, seen[half], hull, box)
         if len(evidence.place.unique()) < FEWEST_PLACES:
             return None
-        share, lamp = best_lamp(evidence, cameras)
+        share, lamp = _best_lamp(evidence, cameras)
         if share < LEAST_SHARE:
             return None
         by_shadows += 0.5 * (share - evidence.share(lamp, with_shadows=False))
@@ -149,9 +149,9 @@ def find_lamp(
     return max(found, key=lambda candidate: candidate[0])[1] if agree else None
 
 
-def best_lamp(evidence: LampEvidence, cameras: Cameras) -> Candidate:
+def _best_lamp(evidence: _LampEvidence, cameras: Cameras) -> Candidate:
     """The lamp whose light explains most."""
-    middle, axis = turning_axis(cameras)
+    middle, axis = _turning_axis(cameras)
     distance = FIRST_DISTANCE * float(evidence.box.size.max())
     frames: tuple[LampFrame, ...] = ("turntable", "camera")
     kept: list[Lamp] = []
@@ -168,7 +168,7 @@ def best_lamp(evidence: LampEvidence, cameras: Cameras) -> Candidate:
     return best
 
 
-def turning_axis(cameras: Cameras) -> tuple[Triple, Triple]:
+def _turning_axis(cameras: Cameras) -> tuple[Triple, Triple]:
     """The point nearest to all lines of sight, and the unit vector upwards to which the cameras' right sides are
     perpendicular."""
     rotations, origins = cameras.camera_to_world[:, :, :3], cameras.camera_to_world[:, :, 3]

@@ -228,18 +228,20 @@ def lamplight(
     towards = normalize(fixed - positions, dim=-1)
     if generator is None:
         corners = spread * positions.new_tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-        parts = [visible_part(positions, fixed + corner, box, skips, detail) for corner in corners]
+        parts = [_visible_part(positions, fixed + corner, box, skips, detail) for corner in corners]
         return Lamplight(torch.stack(parts).mean(dim=0), towards)
     drawn = torch.randn(positions.shape, generator=generator, device=generator.device)
     offsets = spread * drawn.to(positions)
-    one, other = (visible_part(positions, fixed + shift, box, skips, detail) for shift in (offsets, -offsets))
+    one, other = (
+        _visible_part(positions, fixed + shift, box, skips, detail) for shift in (offsets, -offsets)
+    )
     # Stein's identity: the mean of these slopes is the gradient of the visible part, blurred over the points.
     slopes = ((one - other) / (2 * spread**2))[:, None] * offsets
     return Lamplight((one + other) / 2 + (slopes * (middle - fixed)).sum(dim=-1), towards)
 
 
 @torch.no_grad()
-def visible_part(
+def _visible_part(
     positions: Float[Tensor, "S 3"],
     lamps: Float[Tensor, "S 3"],
     box: SceneBox,

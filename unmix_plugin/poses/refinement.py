@@ -66,7 +66,7 @@ _FEWEST_PIXELS = 3.0
 _LEAST_WEIGHT = 1e-4
 
 
-class RobustWeights(nn.Module):
+class _RobustWeights(nn.Module):
     """Errors of the pixels around each knot, and what these pixels weigh; all 1 at first."""
 
     squares: Tensor
@@ -84,7 +84,7 @@ class RobustWeights(nn.Module):
     def observe(
         self, knots: Int[Tensor, " R"], squares: Float[Tensor, " R"], shows_matter: Bool[Tensor, " R"]
     ) -> None:
-        """Note the mean squared errors of pixels, each near one of the knots; those that are no numbers are left out."""
+        """Note the mean squared errors of pixels, each near one of the knots; infinite ones and NaN are left out."""
         is_known = shows_matter & squares.isfinite()
         shown, squares = is_known.to(squares), squares.where(is_known, 0.0)
         self.squares.mul_(_MEMORY).index_add_(0, knots, squares)
@@ -148,7 +148,7 @@ class PoseRefinement(nn.Module):
         total = int(counts.sum())
         self.steps = nn.Parameter(torch.zeros(total, 6))
         self.lens = _LensRefinement(lens)
-        self.robust = RobustWeights(total)
+        self.robust = _RobustWeights(total)
         self.register_buffer("reach", torch.ones(total))
         self.register_buffer("scale", torch.ones(total))
         self.register_buffer("bound", torch.full((total,), LARGEST_STEP))
@@ -193,11 +193,6 @@ class PoseRefinement(nn.Module):
         free = self.is_free.repeat_interleave(self.counts)[:, None]
         steps = (self._at_knots() * free).flatten()
         return (steps - self.gauge @ (self.gauge.T @ steps)).view(-1, 6) * free
-
-    @property
-    def corrections(self) -> Float[Tensor, "M 6"]:
-        """By how much the cameras are turned and moved at the knots."""
-        return self.free_steps() * self.scale[:, None]
 
     @torch.no_grad()
     def figures(self, steps: Float[Tensor, "M 6"]) -> dict[str, Tensor]:

@@ -188,7 +188,7 @@ def _fitted(
             blocks[apart, : len(diagonal)] += diagonal[:, None, None] * np.eye(_NUMBERS)
         pull, before = pull + prior @ steps.numpy(), _cost(found, limit, deviation) + large(steps)
         for _ in range(_TRIES):
-            tried = steps - torch.from_numpy(solve_banded(blocks, pull, damping))
+            tried = steps - torch.from_numpy(_solve_banded(blocks, pull, damping))
             seen = view.residuals(tried, blur)
             if _cost(seen, limit, deviation) + large(tried) < before:
                 steps, found, damping = tried, seen, max(damping / 3, 1e-6)
@@ -248,7 +248,7 @@ def _smooth_prior(num_knots: int, pixel: float) -> csr_matrix:
     return (total / pixel**2).tocsr()
 
 
-def solve_banded(
+def _solve_banded(
     blocks: Float64[np.ndarray, "4 n 6 6"], pull: Float64[np.ndarray, "n 6"], damping: float
 ) -> Float64[np.ndarray, "n 6"]:
     """Solution of normal equations whose diagonal is larger by a share (Levenberg-Marquardt).

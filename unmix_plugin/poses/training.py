@@ -28,7 +28,7 @@ from unmix_plugin.settings import PoseConfig
 
 
 @runtime_checkable
-class CarvesAgain(Protocol):
+class _CarvesAgain(Protocol):
     """Data with masks by which space can be carved."""
 
     def carved_by(self, cameras: Cameras) -> Bool[Tensor, "X Y Z"] | None:
@@ -87,7 +87,7 @@ class PoseTraining:
             return None
         if self._cameras is None:
             self._cameras = data.train_cameras.to(self._poses.steps.device)
-        if self._poses.is_carved or not self._is_fine or not isinstance(data, CarvesAgain):
+        if self._poses.is_carved or not self._is_fine or not isinstance(data, _CarvesAgain):
             return None
         self._poses.finish_carving()
         return data.carved_by(self._poses.refined(data.train_cameras))

@@ -60,16 +60,6 @@ class FrontToBack:
     rays_at_once: int = 32_768
     """Rays under way."""
 
-    @property
-    def ending_light(self) -> float:
-        """Share of its light at which a ray ends."""
-        return _ENDING_LIGHT * self.smallest_weight
-
-    @property
-    def merge_limits(self) -> MergeLimits:
-        """Which samples are merged."""
-        return MergeLimits(self.step, self.smallest_weight, _MERGED_WEIGHT * self.smallest_weight)
-
 
 @dataclass(frozen=True)
 class _Front:
@@ -138,7 +128,8 @@ class _Front:
 @torch.no_grad()
 def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how: FrontToBack) -> Coefficients:
     """Coefficients (R, ...) of each ray of a field."""
-    origins = ray_bundle.origins
+    origins, ending_light = ray_bundle.origins, _ENDING_LIGHT * how.smallest_weight
+    limits = MergeLimits(how.step, how.smallest_weight, _MERGED_WEIGHT * how.smallest_weight)
     left = torch.ones_like(origins[:, 0])
     all_rays = torch.arange(len(left), device=left.device)
     going = waiting = _Front.before(all_rays[:0], origins)
@@ -148,7 +139,7 @@ def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how:
         num_begun += len(new)
         marched = waiting.join(_Front.before(new, origins)).marched(ray_bundle, how.march)
         front = going.join(marched)
-        merged = _look(field, ray_bundle, front, how.merge_limits)
+        merged = _look(field, ray_bundle, front, limits)
         values = _values(field, ray_bundle, front.rays, merged, how.light_at)
         if totals is None or last is None:
             totals = values.packed.new_zeros(len(left), values.packed.shape[1])
@@ -158,13 +149,13 @@ def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how:
             found = merged.packed_info[:, 1].nonzero()[:, 0]
             last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
         left[front.rays] = merged.left
-        going, waiting = front.after(merged.left, how.ending_light)
+        going, waiting = front.after(merged.left, ending_light)
         if num_begun == len(left) and len(going) == len(waiting) == 0:
             break
     if how.residual_on_last_sample:
         totals = totals + (1 - totals[:, :1]) * last
     else:
-        totals *= torch.where(left > how.ending_light, 1.0, 1 / (1 - left))[:, None]
+        totals *= torch.where(left > ending_light, 1.0, 1 / (1 - left))[:, None]
     return Coefficients(totals, values.num_endmembers)
 
 

@@ -65,12 +65,12 @@ def update_grid(
     device = torch.device("cpu") if generator is None else generator.device
     drawn = torch.randint(2**62, (1,), generator=generator, device=device)
     seed = int(processes.of_first(drawn))
-    share_sights(grid, processes)
+    _share_sights(grid, processes)
     space = renderer.space
     begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
         lambda points: field.get_density(space.from_unit(points))[0],
-        threshold=occupied_density(renderer, max(grid.occupied.shape)),
+        threshold=_occupied_density(renderer, max(grid.occupied.shape)),
         decay=_GRID_DECAY,
         num_cells=_PROBED_CELLS,
         generator=torch.Generator().manual_seed(seed),
@@ -79,7 +79,7 @@ def update_grid(
     )
 
 
-def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
+def _occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
     """Density from which a cell counts as occupied.
 
     Args:
@@ -94,7 +94,7 @@ def occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
     return min(by_sample, across)
 
 
-def share_sights(grid: OccupancyGrid, processes: Processes) -> None:
+def _share_sights(grid: OccupancyGrid, processes: Processes) -> None:
     """Share which cells the rays of all processes saw, and what they met; twice is as good as once."""
     visibility = grid.visibility
     processes.smallest(visibility.lowest_view)

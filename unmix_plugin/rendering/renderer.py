@@ -70,7 +70,7 @@ class _VisibleSamples:
 
 
 @torch.no_grad()
-def visible_samples(
+def _visible_samples(
     field: CoefficientField,
     samples: PackedSamples,
     ray_bundle: RayBundle,
@@ -102,7 +102,7 @@ def visible_samples(
         shifts = torch.repeat_interleave(starts + first - ends + wanted, wanted, output_size=size)
         chosen = shifts + torch.arange(size, device=shifts.device)
         part = samples.rows(chosen)
-        all_positions.append(points_of(part, ray_bundle)[0])
+        all_positions.append(_points_of(part, ray_bundle)[0])
         all_encoded.append(field.encode(all_positions[-1]))
         densities, features = field.density_of(all_encoded[-1])
         all_features.append(features)
@@ -127,7 +127,7 @@ def _mean_log(shares: Float[Tensor, "S K"]) -> Float[Tensor, "S"]:
     return shares.clamp(min=_SMALLEST_SHARE).log().mean(dim=1)
 
 
-def points_of(
+def _points_of(
     samples: PackedSamples, ray_bundle: RayBundle
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 3"]]:
     """Positions of samples and the directions they are seen along."""
@@ -204,9 +204,9 @@ class VolumeRenderer:
             generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
         """
         samples = self._march(ray_bundle, generator)
-        seen = visible_samples(field, samples, ray_bundle, self.step, self.smallest_weight)
+        seen = _visible_samples(field, samples, ray_bundle, self.step, self.smallest_weight)
         kept = seen.samples
-        positions, along = points_of(kept, ray_bundle)
+        positions, along = _points_of(kept, ray_bundle)
         if torch.is_grad_enabled():
             densities, features = field.density_of(field.encode(positions, seen.encoded()))
         else:
@@ -297,14 +297,9 @@ class VolumeRenderer:
             parts.append(torch.nn.functional.normalize(-gradient, dim=-1))
         return torch.cat(parts)
 
-    @property
-    def occupied(self) -> Bool[Tensor, "X Y Z"]:
-        """Cells of the box that rays are sampled in."""
-        return self.skips == 0
-
     def is_occupied(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that rays are sampled in."""
-        return self._lie_in(self.occupied, positions)
+        return self._lie_in(self.skips == 0, positions)
 
     def is_reachable(self, positions: Float[Tensor, "P 3"]) -> Bool[Tensor, "P"]:
         """Points in the box, in cells that were not carved away before training."""

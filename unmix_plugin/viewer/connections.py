@@ -120,7 +120,7 @@ _ANY_DECODER = msgspec.msgpack.Decoder(_Any)
 _KINDS = {kind.__struct_config__.tag for kind in (_Camera, _Update, _Stored, _Pointer)}
 
 
-def is_heard(data: bytes) -> bool:
+def _is_heard(data: bytes) -> bool:
     """Whether a message is one that the viewer listens to; others, such as uploads and requests for a tunnel, are not.
 
     Raises:
@@ -148,7 +148,7 @@ class _Connection(ServerConnection):
             data = await self._next_message()
             await self._keep_pace(len(data))
             try:
-                if is_heard(data):
+                if _is_heard(data):
                     return data
             except ValueError:
                 await self.close(1007, "not a message of a page")

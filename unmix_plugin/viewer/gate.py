@@ -40,7 +40,7 @@ _MOST_SITES_NAMED = 16
 
 
 @dataclass(frozen=True)
-class Refusal:
+class _Refusal:
     """What is answered in place of the page or the connection that was asked for."""
 
     status: HTTPStatus
@@ -62,7 +62,7 @@ class Gate:
 
     async def judge(
         self, page: Hashable, headers: Mapping[str, str], address: str, port: int
-    ) -> Refusal | None:
+    ) -> _Refusal | None:
         """What to answer to a request instead of what it asks for; None if it is let in.
 
         A connection that is let in takes a place, to be given back by `leave`.
@@ -81,17 +81,17 @@ class Gate:
                 if refusal is not None:
                     return refusal
             elif opens:
-                return Refusal(HTTPStatus.UNAUTHORIZED, "load this page again and give the viewer's token")
+                return _Refusal(HTTPStatus.UNAUTHORIZED, "load this page again and give the viewer's token")
             else:
-                return Refusal(HTTPStatus.UNAUTHORIZED, _ASKING, _HTML)
+                return _Refusal(HTTPStatus.UNAUTHORIZED, _ASKING, _HTML)
             if not opens:
                 value = f"{cookie}={self._cookie_value}; Path=/; HttpOnly; SameSite=Strict"
-                return Refusal(HTTPStatus.OK, "welcome", {"Set-Cookie": value})
-        if not is_own_page(headers, self._host, self._token is not None):
+                return _Refusal(HTTPStatus.OK, "welcome", {"Set-Cookie": value})
+        if not _is_own_page(headers, self._host, self._token is not None):
             return self._foreign(headers.get("origin", headers.get("host", "unknown")), opens)
         if not await self._has_room(page, opens):
             reason = f"{MOST_PAGES} pages are open already: close one and load this page again"
-            return Refusal(HTTPStatus.SERVICE_UNAVAILABLE, reason if opens else _page(reason), _HTML)
+            return _Refusal(HTTPStatus.SERVICE_UNAVAILABLE, reason if opens else _page(reason), _HTML)
         return None
 
     def leave(self, page: Hashable) -> None:
@@ -107,22 +107,22 @@ class Gate:
             for name, _, value in pairs
         )
 
-    async def _check(self, given: str, address: str) -> Refusal | None:
+    async def _check(self, given: str, address: str) -> _Refusal | None:
         """Check the token, in turn for each address; why it is turned down, None if it is right."""
         now = time.monotonic()
         self._turns = {known: turn for known, turn in self._turns.items() if turn > now}
         turn = self._turns[address] = max(self._turns.get(address, now), now) + _GUESS_S
         if turn - now > _MOST_WAITING * _GUESS_S:
             self._turns[address] = turn - _GUESS_S
-            return Refusal(
+            return _Refusal(
                 HTTPStatus.TOO_MANY_REQUESTS, "Too many guesses are waiting: try again in some seconds."
             )
         await asyncio.sleep(turn - now)
         assert self._token is not None
         is_right = hmac.compare_digest(_given_word(given), self._token)
-        return None if is_right else Refusal(HTTPStatus.UNAUTHORIZED, "That is not the token.")
+        return None if is_right else _Refusal(HTTPStatus.UNAUTHORIZED, "That is not the token.")
 
-    def _foreign(self, site: str, opens: bool) -> Refusal:
+    def _foreign(self, site: str, opens: bool) -> _Refusal:
         site = "".join(character for character in site[:100] if character.isprintable())
         if site not in self._sites_warned_of and len(self._sites_warned_of) < _MOST_SITES_NAMED:
             self._sites_warned_of.add(site)
@@ -131,7 +131,7 @@ class Gate:
                 "start the viewer with --viewer.token"
             )
         reason = "this page is from another site; the viewer must be started with --viewer.token to serve it"
-        return Refusal(HTTPStatus.FORBIDDEN, reason if opens else _page(reason), _HTML)
+        return _Refusal(HTTPStatus.FORBIDDEN, reason if opens else _page(reason), _HTML)
 
     async def _has_room(self, page: Hashable, opens: bool) -> bool:
         until = time.monotonic() + _ROOM_S
@@ -154,7 +154,7 @@ def _given_word(authorization: str) -> bytes:
     return word.partition(b":")[2] if scheme.lower() == "basic" else b""
 
 
-def is_own_page(headers: Mapping[str, str], host: str, has_token: bool = False) -> bool:
+def _is_own_page(headers: Mapping[str, str], host: str, has_token: bool = False) -> bool:
     """Whether a request comes from a page that this server sent, and not from one of another site.
 
     A site can let its own name point here (DNS rebinding), so without a token the name must be one that only this
