@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from tools.procedural_objects import seeded_surface
 from unmix_plugin.engine.pipeline import average_metrics
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface
 from unmix_plugin.neumatex.fit.model import NeumatexModel
@@ -75,7 +76,7 @@ def _fit(words: list[str], oracle_seed: int | None, processes: int, found: Path)
     if oracle_seed is not None:
         assert isinstance(model, NeumatexModel)
         assert isinstance(model.anchor, PriorAnchor)
-        model.anchor = OracleAnchor(model.anchor, LayeredSurface(oracle_seed))  # type: ignore[assignment]
+        model.anchor = OracleAnchor(model.anchor, seeded_surface(oracle_seed))  # type: ignore[assignment]
     started = time.process_time()
     record = trainer.train()
     cpu_seconds = time.process_time() - started

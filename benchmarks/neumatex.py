@@ -146,13 +146,16 @@ class _Fit:
 
 def written_object(root: Path, seed: int, size: int, views: int, lights: int) -> Path:
     """An object's folder, made if it is not there."""
-    from unmix_plugin.neumatex.demo.objects import demo_object
+    from tools.procedural_objects import seeded_lights, seeded_mesh, seeded_surface
+    from unmix_plugin.neumatex.demo.objects import write_object
+    from unmix_plugin.scenes.demo.scene import written_once
 
-    folder = root / f"object-{seed}"
-    if not folder.exists():
+    def write(folder: Path) -> None:
         print(f"object {seed}: rendering its pictures ...", flush=True)
-        demo_object(folder, seed, size=size, views=views, lights=lights)
-    return folder
+        shown_in = seeded_lights(seed)[: lights + 1]
+        write_object(folder, seeded_mesh(seed), seeded_surface(seed), shown_in, size, views, seed)
+
+    return written_once(root / f"object-{seed}", f"object {seed}", write, Path.is_dir)
 
 
 def measure(fit: _Fit, root: Path, processes: int) -> dict[str, Any]:

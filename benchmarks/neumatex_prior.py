@@ -20,11 +20,11 @@ import torch
 import tyro
 from torch import Tensor
 
+from unmix_plugin.neumatex.prior.observations import Observations
 from unmix_plugin.neumatex.prior.small import (
     SHIPPED,
     Estimates,
     MaterialName,
-    Observations,
     SmallPrior,
     fit_planes,
     read_record,

@@ -117,12 +117,17 @@ def main(options: Options) -> None:
 
 def written_object(folder: Path, seed: int, size: int, views: int, bands: int) -> Path:
     """An object's folder, made if it is not there."""
-    from unmix_plugin.neumatex.demo.objects import demo_spectral_object
+    from tools.procedural_objects import seeded_lights, seeded_mesh
+    from unmix_plugin.neumatex.demo.objects import DEFAULT_SPECTRAL_LIGHTS, write_spectral_object
+    from unmix_plugin.scenes.demo.scene import written_once
 
-    if not folder.exists():
+    def write(place: Path) -> None:
         print(f"object {seed}: rendering its pictures ...", flush=True)
-        demo_spectral_object(folder, seed, size=size, views=views, bands=bands, lights=2)
-    return folder
+        first = DEFAULT_SPECTRAL_LIGHTS[0]
+        lights = [first, *[name for name in seeded_lights(seed) if name != first][:2]]
+        write_spectral_object(place, seeded_mesh(seed), lights, size, views, bands, seed)
+
+    return written_once(folder, f"object {seed}", write, Path.is_dir)
 
 
 def way_of_fitting(name: str, pixels: int, field: Path | None) -> list[str]:
@@ -218,7 +223,7 @@ def seen_pixels(
 def direct_light(truth: Any, index: int) -> tuple[torch.Tensor, torch.Tensor]:
     """What a white matt surface would send to a view in direct light, mean over the bands; and alpha."""
     from unmix_plugin.neumatex.tracing.families import SpectralFamily
-    from unmix_plugin.neumatex.tracing.path_tracer import render_view
+    from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
     from unmix_plugin.neumatex.tracing.rays import RayMesh
 
     class White:
@@ -227,16 +232,9 @@ def direct_light(truth: Any, index: int) -> tuple[torch.Tensor, torch.Tensor]:
         def parameters(self, positions: torch.Tensor) -> torch.Tensor:
             return positions.new_tensor([1.0, 1.0, 0.0]).expand(len(positions), -1)
 
-    image, alpha = render_view(
-        White(),
-        RayMesh(truth.mesh),
-        truth.environment,
-        truth.pictures.cameras,
-        index,
-        samples=64,
-        bounces=0,
-        generator=torch.Generator().manual_seed(0),
-    )
+    traced = TracedObject(RayMesh(truth.mesh), truth.environment, White())
+    generator = torch.Generator().manual_seed(0)
+    image, alpha = traced.picture(truth.pictures.cameras, index, 64, bounces=0, generator=generator)
     return image.mean(dim=-1), alpha
 
 

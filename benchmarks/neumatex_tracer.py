@@ -26,11 +26,11 @@ import torch
 import tyro
 from _reference_materials import ConductorBlend, UniformSurface
 
+from tools.procedural_objects import seeded_mesh
 from unmix_plugin.neumatex.demo.objects import viewpoints
-from unmix_plugin.neumatex.demo.shapes import demo_mesh
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.path_tracer import render_view
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 
 ASKED = _common.Limit(1.0, is_upper=True, unit=" %")
@@ -74,15 +74,8 @@ def ours(mesh: Mesh, parameters: list[float], bounces: int, options: Options) ->
     rays, cameras = RayMesh(mesh), camera(mesh, options)
     surface, generator = UniformSurface(ConductorBlend(), parameters), torch.Generator().manual_seed(1)
     started = time.process_time()
-    radiance, alpha = render_view(
-        surface,
-        rays,
-        LIGHT,
-        cameras,
-        samples=options.paths,
-        bounces=bounces,
-        subpixels=4,
-        generator=generator,
+    radiance, alpha = TracedObject(rays, LIGHT, surface).picture(
+        cameras, 0, options.paths, bounces, subpixels=4, generator=generator
     )
     return Picture(radiance.numpy(), time.process_time() - started), alpha.numpy()
 
@@ -95,7 +88,7 @@ def camera(mesh: Mesh, options: Options) -> Any:
 def compare(name: str, bounces: int, options: Options) -> dict[str, Any]:
     """Both programs on one object."""
     seed, parameters = OBJECTS[name]
-    mesh = demo_mesh(seed, resolution=64)
+    mesh = seeded_mesh(seed, resolution=64)
     picture, alpha = ours(mesh, parameters, bounces, options)
     with TemporaryDirectory() as folder:
         scene = _mitsuba_scene.Scene(Path(folder), mesh, parameters, LIGHT, camera(mesh, options))

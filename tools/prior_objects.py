@@ -18,16 +18,14 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.nn import functional
 
+from tools.procedural_objects import seeded_mesh, seeded_surface
 from unmix_plugin.formats.files import write_file
-from unmix_plugin.neumatex.demo.shapes import demo_mesh
-from unmix_plugin.neumatex.demo.surfaces import LayeredSurface
-from unmix_plugin.neumatex.prior.observations import KnownLight, known_light, sample_surface
-from unmix_plugin.neumatex.prior.small import Observations
+from unmix_plugin.neumatex.prior.observations import KnownLight, Observations, known_light, sample_surface
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
-from unmix_plugin.neumatex.tracing.path_tracer import reflected_radiance
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
 from unmix_plugin.neumatex.tracing.surface import Surface
 
@@ -231,11 +229,11 @@ def training_object(
     generator = torch.Generator().manual_seed(seed)
     kind = float(torch.rand((), generator=torch.Generator().manual_seed(_FIRST_DEMO_SEED + seed)))
     ray_mesh = RayMesh(
-        demo_mesh(_FIRST_DEMO_SEED + seed, resolution=40)
+        seeded_mesh(_FIRST_DEMO_SEED + seed, resolution=40)
         if kind < demo_share * 2 / 3
         else random_mesh(generator)
     )
-    surface = LayeredSurface(_FIRST_DEMO_SEED + seed) if kind < demo_share else PatchedSurface.draw(generator)
+    surface = seeded_surface(_FIRST_DEMO_SEED + seed) if kind < demo_share else PatchedSurface.draw(generator)
     environment = random_environment(generator)
     points = sample_surface(ray_mesh.mesh, num_points, generator)
     eyes = random_eyes(num_views, generator)
@@ -272,16 +270,8 @@ def traced_colours(
     rows = known.visible.nonzero()
     to_eye = functional.normalize(eyes[rows[:, 1]] - points.positions[rows[:, 0]], dim=-1)
     with torch.no_grad():
-        radiance = reflected_radiance(
-            surface,
-            ray_mesh,
-            environment,
-            points.select(rows[:, 0]),
-            to_eye,
-            samples=samples,
-            bounces=1,
-            generator=generator,
-        )
+        traced = TracedObject(ray_mesh, environment, surface)
+        radiance = traced.light(points.select(rows[:, 0]), to_eye, samples, generator=generator)
     colours = torch.zeros(*known.visible.shape, 3)
     colours[known.visible] = radiance / environment.mean_radiance().mean().clamp(min=1e-12)
     return colours

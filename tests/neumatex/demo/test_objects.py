@@ -9,30 +9,29 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from tools.procedural_objects import SHAPES, seeded_lights, seeded_mesh, seeded_surface
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.demo import objects as module
 from unmix_plugin.neumatex.demo.objects import (
-    demo_object,
+    DEFAULT_SPECTRAL_LIGHTS,
     demo_object_path,
-    demo_spectral_object,
-    demo_spectral_object_path,
     viewpoints,
+    write_object,
+    write_spectral_object,
 )
-from unmix_plugin.neumatex.demo.shapes import SHAPES, Noise, demo_mesh
-from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface
+from unmix_plugin.neumatex.demo.surfaces import Noise, SpectralSurface, demo_mesh, demo_surface
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.light_files import read_environment
 from unmix_plugin.neumatex.tracing.mesh import read_mesh
-from unmix_plugin.neumatex.tracing.path_tracer import render_view
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
 @pytest.mark.parametrize("seed", range(len(SHAPES)))
 def test_shapes_are_closed_and_face_outwards(seed):
-    mesh = demo_mesh(seed, resolution=32)
+    mesh = seeded_mesh(seed, resolution=32)
     solid = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
     assert solid.is_watertight
     assert solid.volume > 0.1
@@ -45,14 +44,13 @@ def test_shapes_are_closed_and_face_outwards(seed):
 
 
 def test_a_seed_repeats_and_another_differs():
-    first, again, other = (demo_mesh(seed, resolution=24) for seed in (0, 0, len(SHAPES)))
+    first, again, other = (seeded_mesh(seed, resolution=24) for seed in (0, 0, len(SHAPES)))
     assert torch.equal(first.vertices, again.vertices)
     assert first.vertices.shape != other.vertices.shape
+    assert torch.equal(first.vertices, demo_mesh(resolution=24).vertices)
 
 
 def test_noise_has_unit_variance():
-    import numpy as np
-
     noise = Noise.draw(np.random.default_rng(0), 5.0)
     values = noise.at(20 * torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)))
     assert_close(values.mean(), torch.tensor(0.0), atol=0.05, rtol=0)
@@ -66,7 +64,7 @@ def _positions():
 def test_parameters_are_in_range_and_vary():
     seen = set()
     for seed in range(12):
-        surface = LayeredSurface(seed)
+        surface = seeded_surface(seed)
         parameters = surface.parameters(_positions())
         assert parameters.shape == (5000, surface.family.num_parameters)
         assert bool(((parameters >= 0) & (parameters <= 1)).all())
@@ -76,15 +74,18 @@ def test_parameters_are_in_range_and_vary():
 
 
 def test_every_layer_is_used_by_some_object():
-    largest = torch.stack([LayeredSurface(seed).parameters(_positions()).amax(dim=0) for seed in range(12)])
+    largest = torch.stack([seeded_surface(seed).parameters(_positions()).amax(dim=0) for seed in range(12)])
     named = dict(zip(LayeredFamily.PARAMETERS, largest.amax(dim=0).tolist(), strict=True))
     assert all(value > 0.3 for value in named.values()), named
 
 
 def test_a_seed_repeats_and_another_differs_layered_surface():
-    first, again, other = (LayeredSurface(seed).parameters(_positions()) for seed in (3, 3, 4))
+    first, again, other = (seeded_surface(seed).parameters(_positions()) for seed in (3, 3, 4))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+    built_in = demo_surface()
+    assert built_in.kinds == seeded_surface(0).kinds
+    assert torch.equal(built_in.parameters(_positions()), seeded_surface(0).parameters(_positions()))
 
 
 SIZE = 20
@@ -94,7 +95,7 @@ SIZE = 20
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "object"
     said = []
-    demo_object(folder, seed=3, size=SIZE, views=9, lights=1, say=said.append)
+    write_object(folder, seeded_mesh(3), seeded_surface(3), seeded_lights(3)[:2], SIZE, 9, 3, said.append)
     assert len(said) == 2
     return folder
 
@@ -121,16 +122,9 @@ def test_pictures_can_be_rendered_again_from_the_files(folder):
     for part in (folder, relit):
         content = json.loads((part / "transforms.json").read_text())
         picture = _read(part / content["frames"][0]["file_path"])
-        again, alpha = render_view(
-            LayeredSurface(3),
-            rays,
-            read_environment(part / "environment.exr"),
-            _cameras(content),
-            0,
-            samples=160,
-            bounces=2,
-            generator=torch.Generator().manual_seed(1),
-        )
+        light, generator = read_environment(part / "environment.exr"), torch.Generator().manual_seed(1)
+        traced = TracedObject(rays, light, seeded_surface(3))
+        again, alpha = traced.picture(_cameras(content), 0, 160, bounces=2, generator=generator)
         assert_close(picture[..., 3], alpha, atol=0.26, rtol=0)
         assert (picture[..., 3] - alpha).abs().mean() < 2e-3
         inner = alpha == 1
@@ -159,22 +153,21 @@ def test_base_colours_are_those_of_evaluation_views(folder):
     assert colours[colours[..., 3] > 0][:, :3].std() > 0.01
 
 
-def test_a_folder_in_use_and_wrong_numbers_are_refused(folder):
-    with pytest.raises(ConfigError, match="not empty"):
-        demo_object(folder)
-    with pytest.raises(ConfigError, match="--size of a demo object must be 16 to 1024; found 3"):
-        demo_object(folder / "other", size=3)
-
-
-def test_the_default_object_is_written_once(tmp_path, monkeypatch):
-    for name, number in (("DEFAULT_SIZE", 16), ("DEFAULT_VIEWS", 2), ("DEFAULT_LIGHTS", 0)):
-        monkeypatch.setattr(module, name, number)
-    path = demo_object_path(tmp_path)
-    written = (path / "images" / "001.exr").stat().st_mtime_ns
-    assert demo_object_path(tmp_path) == path
-    assert (path / "images" / "001.exr").stat().st_mtime_ns == written
-    (path / "images" / "000.exr").unlink()
-    assert (demo_object_path(tmp_path) / "images" / "000.exr").is_file()
+@pytest.mark.parametrize("name", ["demo-object", "demo-spectral-object"])
+def test_a_default_object_is_written_once(tmp_path, monkeypatch, name):
+    for what, number in {"SIZE": 16, "VIEWS": 2, "BANDS": 4}.items():
+        monkeypatch.setattr(module, f"DEFAULT_{what}", number)
+    for what in ("LIGHTS", "SPECTRAL_LIGHTS"):
+        monkeypatch.setattr(module, f"DEFAULT_{what}", getattr(module, f"DEFAULT_{what}")[:1])
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    said = []
+    path = demo_object_path(name, said.append)
+    assert demo_object_path(name, said.append) == path
+    assert len(said) == 1
+    bands = load_object(path).bands
+    assert (bands is None) is (name == "demo-object")
+    next((path / "images").iterdir()).unlink()
+    assert len(list((demo_object_path(name, said.append) / "images").iterdir())) == 2
 
 
 def test_cameras_look_at_the_object_from_all_sides():
@@ -195,14 +188,15 @@ def test_cameras_look_at_the_object_from_all_sides():
 def spectral_folder(tmp_path_factory):
     spectral_folder = tmp_path_factory.mktemp("demo") / "object"
     said = []
-    demo_spectral_object(spectral_folder, seed=3, size=20, views=9, bands=6, lights=1, say=said.append)
+    lights = DEFAULT_SPECTRAL_LIGHTS[:2]
+    write_spectral_object(spectral_folder, seeded_mesh(3), lights, 20, 9, 6, 3, said.append)
     assert len(said) == 2
     return spectral_folder
 
 
 def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(spectral_folder):
     scene = load_object(spectral_folder)
-    mesh = demo_mesh(3)
+    mesh = seeded_mesh(3)
     assert scene.bands is not None
     assert scene.lamp is not None
     surface = SpectralSurface(3, scene.bands.centers_nm, mesh.vertices)
@@ -212,9 +206,8 @@ def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(spectra
     )
     for pictures, light in ((scene.pictures, scene.environment), (held_out.pictures, held_out.environment)):
         generator = torch.Generator().manual_seed(5)
-        radiance, alpha = render_view(
-            surface, RayMesh(mesh), light, pictures.cameras, 0, samples=160, bounces=2, generator=generator
-        )
+        traced = TracedObject(RayMesh(mesh), light, surface)
+        radiance, alpha = traced.picture(pictures.cameras, 0, 160, bounces=2, generator=generator)
         picture = pictures.read(0)
         assert picture.alpha is not None
         found, seen = torch.from_numpy(picture.numbers), alpha > 0.99
@@ -234,7 +227,7 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder
     assert alpha is not None
     np.testing.assert_allclose(shares.sum(axis=-1)[alpha > 0.5], 1, atol=2e-3)
     assert truth.abundances(1) is None
-    vertices = demo_mesh(3).vertices
+    vertices = seeded_mesh(3).vertices
     surface = SpectralSurface(3, scene.bands.centers_nm, vertices)
     means = surface.parameters(vertices)[:, :4].mean(dim=0)
     assert_close(means, torch.full((4,), 0.25), atol=0.02, rtol=0)
@@ -251,22 +244,3 @@ def test_it_is_a_spectral_scene_like_any_other(spectral_folder):
     assert scene.has_abundances
     content = json.loads((spectral_folder / "transforms.json").read_text())
     assert len(content["frames"]) == 9
-
-
-def test_impossible_numbers_are_refused(tmp_path):
-    with pytest.raises(ConfigError, match="--bands of a demo object must be 4 to 512; found 3"):
-        demo_spectral_object(tmp_path / "object", bands=3)
-    with pytest.raises(ConfigError, match="no environment 'clear-sy'"):
-        demo_spectral_object(tmp_path / "object", size=16, views=2, light="clear-sy")
-
-
-def test_the_default_object_is_written_once_spectral_object(tmp_path, monkeypatch):
-    for name, number in {"SIZE": 16, "VIEWS": 2, "BANDS": 4, "SPECTRAL_LIGHTS": 0}.items():
-        monkeypatch.setattr(module, f"DEFAULT_{name}", number)
-    said = []
-    spectral_folder = demo_spectral_object_path(tmp_path, said.append)
-    assert demo_spectral_object_path(tmp_path, said.append) == spectral_folder
-    assert len(said) == 1
-    bands = load_object(spectral_folder).bands
-    assert bands is not None
-    assert len(bands) == 4

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,41 +29,31 @@ from torch import Tensor
 from unmix_plugin.engine import Cameras, upright_cameras
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.meshes import write_glb
-from unmix_plugin.neumatex.demo.shapes import demo_mesh
-from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface
-from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
+from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface, demo_mesh, demo_surface
+from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.light_files import of_lamp, read_lamp
 from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.path_tracer import render_view
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
-from unmix_plugin.scenes.demo.scene import (
-    check_bounds,
-    lens_entries,
-    staging_for,
-    transform_matrix,
-    user_cache,
-    written_once,
-)
+from unmix_plugin.scenes.demo.scene import lens_entries, transform_matrix, user_cache, written_once
 from unmix_plugin.scenes.demo.shading import band_centers_nm
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
-DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS = 96, 24, 4
-DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS = 16, 2
-VIEWS_A_LIGHT = 3
+DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS = 96, 24, 16
+DEFAULT_LIGHTS = ("overcast", "lantern", "window-room", "studio", "ring-light")
+"""Of the object in colours, the light of training first: one that shows all colours of a material."""
+DEFAULT_SPECTRAL_LIGHTS = ("clear-sky", "overcast", "lantern")
+"""Of the spectral object; the sun of the first casts shadows."""
+_VIEWS_A_LIGHT = 3
 """Pictures under each light that training never sees."""
-EVALUATION_INTERVAL = 8
+_EVALUATION_INTERVAL = 8
 """Every so many views one is for evaluation, from the first on."""
-LAMP, OTHER_LAMP = "D50", "A"
+_LAMP, _OTHER_LAMP = "D50", "A"
 """That light a spectral object in training, and elsewhere."""
-TRAINING_LIGHT = "clear-sky"
-"""Environment of a spectral object in training, whose sun casts shadows."""
-_TRAINING_LIGHTS = ("studio", "softbox-strips", "clear-sky", "window-room", "overcast")
-"""Lights that show all colours of a material; an object in colours is captured under one of them."""
-_BOUNDS = {"size": (16, 1024), "views": (2, 1000), "bands": (4, 512), "lights": (0, len(NAMES) - 1)}
 _SAMPLES, _EVALUATION_SAMPLES, _SPECTRAL_EVALUATION_SAMPLES = 64, 384, 160
 """Paths a pixel."""
 _BOUNCES = 2
@@ -80,78 +70,31 @@ Say = Callable[[str], object]
 """What to do with a line about the progress."""
 
 
-def demo_object(
-    folder: Path,
-    seed: int = 0,
-    size: int = DEFAULT_SIZE,
-    views: int = DEFAULT_VIEWS,
-    lights: int = DEFAULT_LIGHTS,
-    say: Say | None = None,
-) -> None:
-    """Write an object. It is built beside the folder and moved in when complete.
+def demo_object_path(name: str, say: Say) -> Path:
+    """The folder of a default demo object, written on first use, which takes a minute or two; kept in the user's cache,
+    where a changed generator writes into a new folder.
 
     Args:
-        folder: Made if absent, parents too.
-        seed: Shape, materials and lights follow from it; shapes take turns.
-        size: Rows and columns of the pictures.
-        views: Pictures under the light of training.
-        lights: Other lights, each with `VIEWS_A_LIGHT` pictures.
-        say: Gets a line for each light.
-    Raises:
-        ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
-        SceneError: the folder can't be written, or the disk is full.
-    """
-    numbers = {"size": size, "views": views, "lights": lights}
-    _write_into(folder, numbers, lambda place: _write_object(place, seed, size, views, lights, say))
-
-
-def demo_spectral_object(
-    folder: Path,
-    seed: int = 0,
-    size: int = DEFAULT_SIZE,
-    views: int = DEFAULT_VIEWS,
-    bands: int = DEFAULT_BANDS,
-    lights: int = DEFAULT_SPECTRAL_LIGHTS,
-    say: Say | None = None,
-    light: str = TRAINING_LIGHT,
-) -> None:
-    """Write a spectral object, as `demo_object` writes one in colours.
-
-    Args:
-        bands: Evenly spaced over 400 to 700 nm.
-        light: Built-in environment of training.
-    Raises:
-        ConfigError: a number out of bounds; no such light; a folder with something in it, or no folder at all.
-        SceneError: the folder can't be written, or the disk is full.
-    """
-    numbers = {"size": size, "views": views, "bands": bands, "lights": lights}
-    _write_into(
-        folder,
-        numbers,
-        lambda place: _write_spectral_object(place, seed, size, views, bands, lights, say, light),
-    )
-
-
-def demo_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
-    """The folder of the default demo object, written on first use, which takes a minute or two.
-
-    Args:
-        cache_dir: Where to keep it; None is `unmix-nerf` in XDG_CACHE_HOME or ~/.cache. A changed generator writes
-            into a new folder.
+        name: `demo-object`, or `demo-spectral-object`.
         say: Gets a line for each light.
     Raises:
         SceneError: the cache can't be written.
     """
-    numbers = DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_LIGHTS
-    return _cached("demo-object", cache_dir, lambda place: _write_object(place, 0, *numbers, say))
+    digest = hashlib.sha256()
+    for room in ("demo", "tracing"):
+        for path in sorted((Path(__file__).parent.parent / room).glob("*.py")):
+            digest.update(path.read_bytes())
 
+    def write(folder: Path) -> None:
+        if name == "demo-object":
+            mesh, surface = demo_mesh(), demo_surface()
+            write_object(folder, mesh, surface, DEFAULT_LIGHTS, DEFAULT_SIZE, DEFAULT_VIEWS, say=say)
+        else:
+            numbers = DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS
+            write_spectral_object(folder, demo_mesh(), DEFAULT_SPECTRAL_LIGHTS, *numbers, say=say)
 
-def demo_spectral_object_path(cache_dir: Path | None = None, say: Say | None = None) -> Path:
-    """The folder of the default spectral demo object, written on first use; see `demo_object_path`."""
-    numbers = DEFAULT_SIZE, DEFAULT_VIEWS, DEFAULT_BANDS, DEFAULT_SPECTRAL_LIGHTS
-    return _cached(
-        "demo-spectral-object", cache_dir, lambda place: _write_spectral_object(place, 0, *numbers, say)
-    )
+    target = user_cache() / f"{name}-{digest.hexdigest()[:12]}" / "object"
+    return written_once(target, f"the {name.replace('-', ' ')}", write, _is_complete)
 
 
 def viewpoints(views: int, size: int, radius: float, first: int = 0) -> Cameras:
@@ -192,17 +135,8 @@ class _Subject:
         self, light: Environment, cameras: Cameras, index: int, samples: int
     ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
         """Radiance multiplied by alpha, and alpha."""
-        return render_view(
-            self.surface,
-            self.ray_mesh,
-            light,
-            cameras,
-            index,
-            samples=samples,
-            bounces=_BOUNCES,
-            subpixels=_SUBPIXELS,
-            generator=self.generator,
-        )
+        traced = TracedObject(self.ray_mesh, light, self.surface)
+        return traced.picture(cameras, index, samples, _BOUNCES, _SUBPIXELS, self.generator)
 
     def exposure(self, light: Environment, mean_radiance: float) -> Float[Tensor, ""]:
         """Factor of a light that gives the object a mean radiance."""
@@ -212,22 +146,39 @@ class _Subject:
         return mean_radiance * light.num_colours * alpha / radiance
 
 
-def _write_object(folder: Path, seed: int, size: int, views: int, lights: int, say: Say | None) -> None:
-    surface = LayeredSurface(seed)
-    subject = _Subject(RayMesh(demo_mesh(seed)), surface, torch.Generator().manual_seed(seed), size)
+def write_object(
+    folder: Path,
+    mesh: Mesh,
+    surface: LayeredSurface,
+    lights: Sequence[str],
+    size: int,
+    views: int,
+    seed: int = 0,
+    say: Say = lambda _: None,
+) -> None:
+    """Write an object in colours.
+
+    Args:
+        folder: Not there yet.
+        lights: Built-in ones; the first is that of training.
+        size: Rows and columns of the pictures.
+        views: Pictures under the light of training.
+        seed: Of the lights, and of the paths that are traced.
+        say: Gets a line for each light.
+    """
+    subject = _Subject(RayMesh(mesh), surface, torch.Generator().manual_seed(seed), size)
     colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
     _write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
-    names = _light_names(seed)[: lights + 1]
-    for number, name in enumerate(names):
-        _tell(say, number, names)
+    for number, name in enumerate(lights):
+        _tell(say, number, lights)
         light = built_in_environment(name, seed)
         light = Environment(light.image * subject.exposure(light, _MEAN_RADIANCE))
         if number == 0:
             cameras = subject.cameras(views, 0)
-            _write_pictures(folder, subject, light, cameras, EVALUATION_INTERVAL)
+            _write_pictures(folder, subject, light, cameras, _EVALUATION_INTERVAL)
             _write_base_colours(folder / "truth" / "base_colour", subject, cameras)
         else:
-            cameras = subject.cameras(VIEWS_A_LIGHT, 1000 + VIEWS_A_LIGHT * number)
+            cameras = subject.cameras(_VIEWS_A_LIGHT, 1000 + _VIEWS_A_LIGHT * number)
             _write_pictures(folder / "relit" / name, subject, light, cameras, 1)
 
 
@@ -249,40 +200,41 @@ def _write_pictures(
 
 def _write_base_colours(folder: Path, subject: _Subject, cameras: Cameras) -> None:
     """Base colours of evaluation views."""
-    for index in range(0, len(cameras), EVALUATION_INTERVAL):
+    for index in range(0, len(cameras), _EVALUATION_INTERVAL):
         hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
         colours = subject.surface.family.base_colour(subject.surface.parameters(hits.points.positions))
         _write_straight(folder / f"{index:03d}.exr", hits.image(colours), hits.alpha())
 
 
-def _write_spectral_object(
+def write_spectral_object(
     folder: Path,
-    seed: int,
+    mesh: Mesh,
+    lights: Sequence[str],
     size: int,
     views: int,
     num_bands: int,
-    lights: int,
-    say: Say | None,
-    light_name: str = TRAINING_LIGHT,
+    seed: int = 0,
+    say: Say = lambda _: None,
 ) -> None:
-    bands, ray_mesh = Bands.of(band_centers_nm(num_bands)), RayMesh(demo_mesh(seed))
+    """Write a spectral object as `write_object` does one in colours; bands lie evenly between 400 and 700 nm, and the
+    seed says of what materials it is."""
+    bands, ray_mesh = Bands.of(band_centers_nm(num_bands)), RayMesh(mesh)
     surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
     subject = _Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
     colours = surface.family.base_colour(surface.parameters(ray_mesh.mesh.vertices)) @ rgb_matrix(bands)
     _write_mesh(folder / "mesh.glb", ray_mesh.mesh, colours.clamp(0, 1), surface.names)
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
     write_spectra_csv(folder / "endmembers.csv", table)
-    names = [light_name, *[name for name in _light_names(seed) if name != light_name][:lights]]
-    for number, name in enumerate(names):
-        _tell(say, number, names)
+    for number, name in enumerate(lights):
+        _tell(say, number, lights)
         light = built_in_environment(name, seed)
         if number == 0:
             cameras = subject.cameras(views, 0)
             truth = {"materials": list(surface.names), "endmembers_path": "endmembers.csv"}
-            _write_cubes(folder, subject, light, cameras, bands, LAMP, truth)
+            _write_cubes(folder, subject, light, cameras, bands, _LAMP, truth)
         else:
-            cameras = subject.cameras(VIEWS_A_LIGHT, 1000 + VIEWS_A_LIGHT * number)
-            lamp = OTHER_LAMP if number % 2 else LAMP
+            cameras = subject.cameras(_VIEWS_A_LIGHT, 1000 + _VIEWS_A_LIGHT * number)
+            lamp = _OTHER_LAMP if number % 2 else _LAMP
             _write_cubes(folder / "relit" / name, subject, light, cameras, bands, lamp, {})
 
 
@@ -302,7 +254,7 @@ def _write_cubes(
     light, frames = Environment(light.image * factor), list[dict[str, Any]]()
     splits: dict[str, list[str]] = {"train_filenames": [], "val_filenames": []}
     for index in range(len(cameras)):
-        is_evaluation = bool(truth) and index % EVALUATION_INTERVAL == 0
+        is_evaluation = bool(truth) and index % _EVALUATION_INTERVAL == 0
         samples = _SPECTRAL_EVALUATION_SAMPLES if is_evaluation or not truth else _SAMPLES
         radiance, alpha = subject.picture(light, cameras, index, samples)
         frame = _write_view(folder, f"{index:03d}", radiance, alpha, rgb_matrix(bands))
@@ -355,16 +307,8 @@ def _abundances(subject: _Subject, cameras: Cameras, index: int) -> Float[Tensor
     return found / hits.alpha().clamp(min=1e-6)[..., None]
 
 
-def _light_names(seed: int) -> list[str]:
-    """A light of training, one of `_TRAINING_LIGHTS`, and all others after it."""
-    rng = np.random.default_rng([3, seed])
-    chosen = str(rng.choice(_TRAINING_LIGHTS))
-    return [chosen, *(str(name) for name in rng.permutation(NAMES) if name != chosen)]
-
-
-def _tell(say: Say | None, number: int, names: Sequence[str]) -> None:
-    if say is not None:
-        say(f"demo object: rendering light {number + 1} of {len(names)} ({names[number]})")
+def _tell(say: Say, number: int, names: Sequence[str]) -> None:
+    say(f"demo object: rendering light {number + 1} of {len(names)} ({names[number]})")
 
 
 def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
@@ -392,26 +336,6 @@ def _write_json(folder: Path, content: dict[str, Any]) -> None:
 def _save(path: Path, numbers: Tensor) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, numbers.numpy().astype(np.float16))
-
-
-def _write_into(folder: Path, numbers: Mapping[str, int], write: Callable[[Path], None]) -> None:
-    """Check the numbers, write beside the folder, and move what was written in."""
-    check_bounds("a demo object", {name: (number, _BOUNDS[name]) for name, number in numbers.items()})
-    with staging_for(folder, "the demo object", overwrite=False) as staging:
-        write(staging / "object")
-        if folder.exists():
-            folder.rmdir()
-        (staging / "object").rename(folder)
-
-
-def _cached(name: str, cache_dir: Path | None, write: Callable[[Path], None]) -> Path:
-    """The folder of an object that is written once for each version of the generator's code."""
-    digest = hashlib.sha256()
-    for room in ("demo", "tracing"):
-        for path in sorted((Path(__file__).parent.parent / room).glob("*.py")):
-            digest.update(path.read_bytes())
-    target = (cache_dir or user_cache()) / f"{name}-{digest.hexdigest()[:12]}" / "object"
-    return written_once(target, f"the {name.replace('-', ' ')}", write, _is_complete)
 
 
 def _is_complete(folder: Path) -> bool:

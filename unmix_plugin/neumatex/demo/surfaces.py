@@ -1,28 +1,108 @@
-"""Surfaces of built-in objects: layered materials in regions, and measured materials that mix smoothly.
+"""The built-in object: its mesh, layered materials in regions, and measured materials that mix smoothly.
 
-Notation: `N` positions, `K` materials, `B` bands, `P` parameters of the family.
+It is the first of the objects that tools/procedural_objects.py makes of seeds, of other shapes and materials too.
+
+Notation: `N` positions or points, `F` waves of a noise, `R` samples along the longest edge of the bounding cube, `K`
+materials, `B` bands, `P` parameters of the family.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.neumatex.demo.shapes import Noise
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.scenes.demo.shading import MATERIALS, reflectances
 
-NUM_MATERIALS = 4
+_HALF_EDGE = 1.4
+"""Of the cube that is sampled."""
+_NUM_KINDS = 7
+"""Of materials, of which an object has three."""
+_NUM_MATERIALS = 4
 _ROUNDS = 30
+Field: TypeAlias = Callable[[Float[np.ndarray, "N 3"]], Float[np.ndarray, " N"]]
+"""About the distance to a surface, negative inside."""
 
 
 @dataclass(frozen=True)
-class _Pattern:
+class Noise:
+    """A sum of plane waves, about normally distributed with mean 0 and variance 1 over space."""
+
+    waves: Float[Tensor, "F 3"]
+    """Angular frequencies, radians a unit."""
+    phases: Float[Tensor, " F"]
+
+    @staticmethod
+    def draw(rng: np.random.Generator, frequency: float, num_waves: int = 24) -> Noise:
+        """Waves of about `frequency` radians a unit, in all directions."""
+        directions = rng.normal(size=(num_waves, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        lengths = frequency * rng.uniform(0.5, 1.5, (num_waves, 1))
+        phases = rng.uniform(0, 2 * np.pi, num_waves)
+        return Noise(*(torch.tensor(part, dtype=torch.float32) for part in (directions * lengths, phases)))
+
+    def at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """Values at positions."""
+        angles = positions @ self.waves.to(positions).T + self.phases.to(positions)
+        return angles.cos().sum(dim=-1) * (2 / len(self.phases)) ** 0.5
+
+
+def demo_mesh(resolution: int = 96) -> Mesh:
+    """The shape of the built-in object, in model space; R is `resolution`."""
+    rng = np.random.default_rng([1, 0])
+    return meshed(blob(rng), resolution)
+
+
+def blob(rng: np.random.Generator) -> Field:
+    """A ball with bumps."""
+    broad, fine = Noise.draw(rng, 3.0), Noise.draw(rng, 9.0)
+    return lambda p: np.linalg.norm(p, axis=-1) - 0.8 - 0.09 * noise_at(broad, p) - 0.02 * noise_at(fine, p)
+
+
+def meshed(field: Field, resolution: int) -> Mesh:
+    """The zero level by marching cubes with R samples an edge, with normals by the field's gradient; in model space."""
+    from skimage.measure import marching_cubes
+
+    axis = np.linspace(-_HALF_EDGE, _HALF_EDGE, resolution)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    values = field(grid.reshape(-1, 3)).reshape(grid.shape[:3])
+    spacing = axis[1] - axis[0]
+    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, allow_degenerate=False)
+    vertices = vertices.astype(np.float64) - _HALF_EDGE
+    faces = _largest_volume_outwards(vertices, faces.astype(np.int64))
+    normals = torch.tensor(_gradient(field, vertices, spacing))
+    mesh = mesh_of(torch.tensor(vertices), torch.tensor(faces), normals)
+    return mesh.transformed(*mesh.to_model_space())
+
+
+def _largest_volume_outwards(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    volume = np.einsum("ij,ij->", a, np.cross(b, c))
+    return faces if volume > 0 else faces[:, ::-1].copy()
+
+
+def _gradient(field: Field, points: np.ndarray, spacing: float) -> np.ndarray:
+    """Unit gradients by central differences over a part of a cell."""
+    step = 0.3 * spacing
+    offsets = step * np.eye(3)
+    gradient = np.stack([field(points + offset) - field(points - offset) for offset in offsets], axis=-1)
+    return gradient / np.maximum(np.linalg.norm(gradient, axis=-1, keepdims=True), 1e-12)
+
+
+def noise_at(noise: Noise, points: np.ndarray) -> np.ndarray:
+    """Values of a noise as NumPy has them."""
+    return noise.at(torch.from_numpy(points).float()).numpy()
+
+
+@dataclass(frozen=True)
+class Pattern:
     """A material that changes back and forth between two sets of parameters."""
 
     noise: Noise
@@ -44,13 +124,14 @@ class _Pattern:
 
 
 class LayeredSurface:
-    """Three materials in regions, all a function of a seed."""
+    """Materials in regions."""
 
-    def __init__(self, seed: int) -> None:
-        rng = np.random.default_rng([2, seed])
-        kinds = rng.choice(list(_KINDS), size=3, replace=False)
-        self.kinds = tuple(str(kind) for kind in kinds)
-        self._patterns = [_KINDS[kind](rng) for kind in self.kinds]
+    def __init__(
+        self, kinds: Mapping[str, Callable[[np.random.Generator], Pattern]], rng: np.random.Generator
+    ) -> None:
+        """Each kind of material in a region of its own."""
+        self.kinds = tuple(kinds)
+        self._patterns = [make(rng) for make in kinds.values()]
         self._regions = [Noise.draw(rng, rng.uniform(1.8, 3.2)) for _ in self.kinds]
         self._sharpness = float(np.exp(rng.uniform(np.log(8.0), np.log(60.0))))
 
@@ -67,7 +148,7 @@ class LayeredSurface:
         return (values * shares[:, None]).sum(dim=-1).clamp(0.0, 1.0)
 
 
-def _vector(values: Mapping[str, float], colour: np.ndarray) -> Tensor:
+def layered_parameters(values: Mapping[str, float], colour: np.ndarray) -> Tensor:
     """Parameters by name; those not named are 0, the specular level 0.5."""
     named = {"specular level": 0.5, **values}
     scalars = [named.pop(name, 0.0) for name in LayeredFamily.PARAMETERS[3:]]
@@ -76,7 +157,7 @@ def _vector(values: Mapping[str, float], colour: np.ndarray) -> Tensor:
     return torch.tensor([*colour.tolist(), *scalars], dtype=torch.float32).clamp(0.0, 1.0)
 
 
-def _colour(
+def random_colour(
     rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]
 ) -> np.ndarray:
     """A linear colour of random hue."""
@@ -85,114 +166,60 @@ def _colour(
     return brightness * (1 - strength * (1 - wheel))
 
 
-def _metallic_tone(rng: np.random.Generator) -> np.ndarray:
-    tones = ((0.95, 0.64, 0.37), (1.0, 0.78, 0.34), (0.91, 0.92, 0.92), (0.56, 0.57, 0.58), (0.8, 0.62, 0.5))
-    return np.array(tones[rng.integers(len(tones))]) * rng.uniform(0.8, 1.0)
-
-
-def _car_paint(rng: np.random.Generator) -> _Pattern:
-    colour = _colour(rng, (0.6, 0.95), (0.3, 0.8))
+def _car_paint(rng: np.random.Generator) -> Pattern:
+    colour = random_colour(rng, (0.6, 0.95), (0.3, 0.8))
     coat = {"coat weight": rng.uniform(0.8, 1.0), "coat roughness": rng.uniform(0.05, 0.2)}
     base = {"metallicity": rng.uniform(0.5, 0.9), "roughness": rng.uniform(0.4, 0.6)}
     second = base | {"roughness": base["roughness"] - 0.12}
-    return _Pattern(
+    return Pattern(
         Noise.draw(rng, 5.0),
-        _vector(base | coat, colour),
-        _vector(second | coat, colour * rng.uniform(0.55, 0.8)),
+        layered_parameters(base | coat, colour),
+        layered_parameters(second | coat, colour * rng.uniform(0.55, 0.8)),
         sharpness=1.5,
         stripes=0.0,
     )
 
 
-def _velvet(rng: np.random.Generator) -> _Pattern:
-    first, second = (_colour(rng, (0.5, 0.9), (0.12, 0.5)) for _ in range(2))
+def _velvet(rng: np.random.Generator) -> Pattern:
+    first, second = (random_colour(rng, (0.5, 0.9), (0.12, 0.5)) for _ in range(2))
     fuzz = {"sheen weight": rng.uniform(0.6, 1.0), "sheen roughness": rng.uniform(0.25, 0.6)}
     cloth = {
         "roughness": rng.uniform(0.75, 0.95),
         "specular level": 0.25,
         "sheen tint": rng.uniform(0.0, 0.8),
     }
-    return _Pattern(
+    return Pattern(
         Noise.draw(rng, rng.uniform(4, 8)),
-        _vector(fuzz | cloth, first),
-        _vector(fuzz | cloth, second),
+        layered_parameters(fuzz | cloth, first),
+        layered_parameters(fuzz | cloth, second),
         9.0,
         0.0,
     )
 
 
-def _hazy_plastic(rng: np.random.Generator) -> _Pattern:
-    first, second = _colour(rng, (0.3, 0.9), (0.4, 0.8)), _colour(rng, (0.0, 0.5), (0.3, 0.8))
-    haze = {"haze weight": rng.uniform(0.5, 1.0), "haze spread": rng.uniform(0.3, 0.8), "specular level": 0.7}
-    return _Pattern(
-        Noise.draw(rng, rng.uniform(3, 6)),
-        _vector(haze | {"roughness": rng.uniform(0.12, 0.25)}, first),
-        _vector(haze | {"roughness": rng.uniform(0.25, 0.4)}, second),
-        sharpness=14.0,
-        stripes=rng.choice([0.0, 4.0]),
-    )
-
-
-def _dusty_gloss(rng: np.random.Generator) -> _Pattern:
-    colour = _colour(rng, (0.3, 0.9), (0.1, 0.45))
-    gloss = {
-        "roughness": rng.uniform(0.12, 0.25),
-        "specular level": 0.6,
-        "coat weight": rng.choice([0.0, 0.8]),
-    }
-    return _Pattern(
-        Noise.draw(rng, rng.uniform(4, 7)),
-        _vector(gloss | {"dust": rng.uniform(0.0, 0.1)}, colour),
-        _vector(gloss | {"dust": rng.uniform(0.6, 1.0)}, colour),
-        sharpness=2.5,
-        stripes=0.0,
-    )
-
-
-def _coated_wood(rng: np.random.Generator) -> _Pattern:
+def _coated_wood(rng: np.random.Generator) -> Pattern:
     dark = np.array([0.22, 0.10, 0.045]) * rng.uniform(0.6, 1.5)
     light = np.array([0.55, 0.32, 0.16]) * rng.uniform(0.8, 1.3)
     coat = {"coat weight": rng.uniform(0.7, 1.0), "coat roughness": rng.uniform(0.1, 0.35), "roughness": 0.7}
-    return _Pattern(
+    return Pattern(
         Noise.draw(rng, 2.2, num_waves=6),
-        _vector(coat, dark),
-        _vector(coat, light),
+        layered_parameters(coat, dark),
+        layered_parameters(coat, light),
         sharpness=2.5,
         stripes=rng.uniform(7, 11),
     )
 
 
-def _worn_metal(rng: np.random.Generator) -> _Pattern:
-    tone = _metallic_tone(rng)
-    return _Pattern(
-        Noise.draw(rng, rng.uniform(5, 9)),
-        _vector({"metallicity": 1.0, "roughness": rng.uniform(0.15, 0.3)}, tone),
-        _vector({"metallicity": 1.0, "roughness": rng.uniform(0.45, 0.65)}, tone * rng.uniform(0.6, 0.9)),
-        sharpness=4.0,
-        stripes=0.0,
-    )
+DEMO_KINDS = {"velvet": _velvet, "car paint": _car_paint, "coated wood": _coated_wood}
 
 
-def _glazed_clay(rng: np.random.Generator) -> _Pattern:
-    clay, glaze = np.array([0.55, 0.27, 0.16]) * rng.uniform(0.7, 1.2), _colour(rng, (0.2, 0.8), (0.2, 0.7))
-    return _Pattern(
-        Noise.draw(rng, rng.uniform(2.5, 5)),
-        _vector({"roughness": 0.9, "specular level": 0.3, "dust": 0.2}, clay),
-        _vector({"roughness": 0.6, "coat weight": 1.0, "coat roughness": rng.uniform(0.1, 0.3)}, glaze),
-        sharpness=25.0,
-        stripes=0.0,
-    )
-
-
-_KINDS: dict[str, Callable[[np.random.Generator], _Pattern]] = {
-    "car paint": _car_paint,
-    "velvet": _velvet,
-    "hazy plastic": _hazy_plastic,
-    "dusty gloss": _dusty_gloss,
-    "coated wood": _coated_wood,
-    "worn metal": _worn_metal,
-    "glazed clay": _glazed_clay,
-}
+def demo_surface() -> LayeredSurface:
+    """The materials of the built-in object."""
+    rng = np.random.default_rng([2, 0])
+    rng.choice(
+        _NUM_KINDS, size=len(DEMO_KINDS), replace=False
+    )  # draws the kinds, in the order that they have above
+    return LayeredSurface(DEMO_KINDS, rng)
 
 
 class SpectralSurface:
@@ -208,14 +235,14 @@ class SpectralSurface:
             positions: Points of the surface, of which each material covers about the same part.
         """
         rng = np.random.default_rng([4, seed])
-        chosen = np.sort(rng.choice(len(MATERIALS), NUM_MATERIALS, replace=False))
+        chosen = np.sort(rng.choice(len(MATERIALS), _NUM_MATERIALS, replace=False))
         self.names = tuple(MATERIALS[index] for index in chosen)
         endmembers = reflectances(wavelengths_nm)[chosen]
         self.family = SpectralFamily(torch.tensor(endmembers, dtype=torch.float32))
         self._regions = [Noise.draw(rng, rng.uniform(1.8, 3.2)) for _ in self.names]
         self._sharpness = float(np.exp(rng.uniform(np.log(4.0), np.log(16.0))))
         gloss = np.stack(
-            [rng.uniform(0.25, 0.7, NUM_MATERIALS), rng.uniform(0.1, 0.3, NUM_MATERIALS)], axis=1
+            [rng.uniform(0.25, 0.7, _NUM_MATERIALS), rng.uniform(0.1, 0.3, _NUM_MATERIALS)], axis=1
         )
         self._shifts = self._balanced(positions)
         self._gloss = torch.tensor(gloss, dtype=torch.float32)
@@ -231,8 +258,8 @@ class SpectralSurface:
 
     def _balanced(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, " K"]:
         """Shifts of the levels that give every material about the same mean share."""
-        shifts = torch.zeros(NUM_MATERIALS)
+        shifts = torch.zeros(_NUM_MATERIALS)
         for _ in range(_ROUNDS):
             means = self._shares(positions, shifts).mean(dim=0)
-            shifts = shifts - (NUM_MATERIALS * means).clamp(min=1e-3).log() / self._sharpness
+            shifts = shifts - (_NUM_MATERIALS * means).clamp(min=1e-3).log() / self._sharpness
         return shifts
