@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.layers import LayerStack
-from unmix_plugin.neumatex.tracing.microfacet import alpha_of, roughness_of
+from unmix_plugin.neumatex.tracing.microfacet import SMALLEST_ALPHA, alpha_of
 from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder
 
 
@@ -118,7 +118,7 @@ def response_error(
     size, strength = torch.rand(rows, generator=generator), torch.randn(rows, generator=generator)
     widening = (size - 0.2).clamp_min(0.0) ** 2
     base = base.repeat_interleave(lights, 1)
-    truth, found = _widened(truth.repeat(lights), widening), _widened(found.repeat(lights), widening)
+    truth, found = (_widened(_repeated(one, lights), widening) for one in (truth, found))
     wo = _eyes(rows, generator)
     with torch.no_grad():
         wi = truth.mixture(wo, base).sample(wo, torch.rand(rows, 3, generator=generator).T)
@@ -137,7 +137,13 @@ def _reflected(stack: LayerStack, base: Tensor, wi: Tensor, wo: Tensor) -> Tenso
 
 def _widened(stack: LayerStack, widening: Tensor) -> LayerStack:
     alpha = torch.sqrt(alpha_of(stack.roughness).square() + widening.square()).clamp_max(1.0)
-    return replace(stack, roughness=roughness_of(alpha))
+    roughness = torch.sqrt(((alpha - SMALLEST_ALPHA) / (1.0 - SMALLEST_ALPHA)).clamp(1e-8, 1.0))
+    return replace(stack, roughness=roughness)
+
+
+def _repeated(stack: LayerStack, times: int) -> LayerStack:
+    """Each material so many times in a row."""
+    return LayerStack(**{name: part.repeat_interleave(times, -1) for name, part in vars(stack).items()})
 
 
 def _eyes(number: int, generator: torch.Generator) -> Tensor:

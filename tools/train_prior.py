@@ -23,12 +23,13 @@ from typing import Annotated, Any, Union
 import safetensors.torch
 import torch
 import tyro
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from rich.console import Console
 from torch import Tensor
 
 from tools.prior_objects import TrainingObjects, read_objects, training_object, write_objects
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.neumatex.prior.observations import Observations
 from unmix_plugin.neumatex.prior.small import (
     RECORD,
     RESOLUTION,
@@ -36,7 +37,6 @@ from unmix_plugin.neumatex.prior.small import (
     WEIGHTS,
     Estimates,
     MaterialName,
-    Observations,
     SmallPrior,
     TaskName,
     fit_loss,
@@ -166,6 +166,15 @@ def training_loss(
     return total
 
 
+def selected(o: Observations, points: Int[Tensor, " n"], views: Int[Tensor, " v"]) -> Observations:
+    """Some of the points and some of the views, in the order asked for."""
+    per_view = ("colours", "visible", "cosines", "mirrored", "mirror_open")
+    some = {name: values[:, points] for name, values in vars(o).items()}
+    return Observations(
+        **{name: part[:, :, views] if name in per_view else part for name, part in some.items()}
+    )
+
+
 def draw_batch(
     objects: TrainingObjects, truth: Truth, settings: PriorTraining, generator: torch.Generator
 ) -> tuple[Observations, Truth]:
@@ -176,7 +185,7 @@ def draw_batch(
     num_points, num_views = batch.visible.shape[1:]
     points = torch.randperm(num_points, generator=generator)[: settings.points]
     views = torch.randperm(num_views, generator=generator)[: settings.views]
-    seen = replace(batch, positions=positions).selected(points, views)
+    seen = selected(replace(batch, positions=positions), points, views)
     hidden = torch.rand(settings.batch, 1, len(views), generator=generator)
     hidden = hidden < 0.6 * torch.rand(settings.batch, 1, 1, generator=generator)
     seen = replace(seen, visible=seen.visible & ~hidden)

@@ -8,7 +8,7 @@ from unmix_plugin.engine import MethodSpecification, OptimizerConfig, PipelineCo
 
 
 def _scene(*arguments: Any) -> Any:
-    """See `object_snapshot.trained_object`; imported when a run is opened."""
+    """See `trained_object`; imported when a run is opened."""
     from unmix_plugin.neumatex.fit.trained_object import trained_object
 
     return trained_object(*arguments)

@@ -14,7 +14,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
-from unmix_plugin.neumatex.export.product import _require_texture_size
+from unmix_plugin.neumatex.export.product import MaterialProduct
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
@@ -157,7 +157,7 @@ def test_a_layered_material_that_is_a_gltf_one_is_found_again(monkeypatch):
 @pytest.mark.parametrize("size", [0, 15, 8193])
 def test_impossible_sizes_are_refused(size):
     with pytest.raises(ConfigError, match=f"--texture-size is {size}; choose 16 to 8192"):
-        _require_texture_size(size)
+        MaterialProduct(texture_size=size)
 
 
 def unwrapped(mesh, texture_size):

@@ -15,6 +15,7 @@ from unmix_plugin.engine import PipelineConfig, load_model
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
 from unmix_plugin.neumatex.fit.model import NeumatexModel, _squared_error
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
+from unmix_plugin.neumatex.fit.trained_object import trained_object
 
 PBR = [*SMALL, "--pipeline.model.material=pbr"]
 
@@ -53,7 +54,8 @@ def test_a_run_renders_from_its_folder_alone(trained):
     model = load_model(trained, "cpu").model
     assert isinstance(model, NeumatexModel)
     assert float(model.mesh.vertices.abs().max()) == pytest.approx(1, abs=1e-5)
-    found = model.get_outputs_for_camera(load_model(trained, "cpu").scene.eval_cameras[0])
+    record = load_model(trained, "cpu").scene
+    found = trained_object(model, record).look(record.eval_cameras[0], 1)
     assert found["accumulation"][12, 12] == 1
     assert found["accumulation"][0, 0] == 0
     red, green, blue = found["base_colour"][12, 12].tolist()

@@ -34,11 +34,6 @@ def test_no_view_is_taken_twice_even_if_cameras_coincide():
     assert well_spread(torch.eye(3), 12) == [0, 1, 2]
 
 
-def test_every_camera_needs_its_picture_and_alpha():
-    with pytest.raises(ValueError, match="1 pictures and 2 alphas for 2 cameras"):
-        PosedViews(ring_cameras(2, 8), [torch.zeros(8, 8, 3)], [torch.zeros(8, 8)] * 2)
-
-
 def test_chosen_views_keep_picture_alpha_and_camera_together():
     pictures = [torch.full((8, 8, 3), float(index)) for index in range(3)]
     alphas = [torch.full((8, 8), float(index)) for index in range(3)]

@@ -23,6 +23,7 @@ from tools.train_prior import (
     beta_nll,
     draw_batch,
     nll_weight,
+    selected,
     train,
     train_readers,
     training_loss,
@@ -228,7 +229,7 @@ def test_the_order_of_points_and_of_views_changes_nothing(objects, axis):
     orders = [torch.arange(count) for count in observations.visible.shape[1:]]
     orders[axis - 1] = torch.randperm(len(orders[axis - 1]), generator=generator())
     with torch.no_grad():
-        expected, found = prior(observations), prior(observations.selected(*orders))
+        expected, found = prior(observations), prior(selected(observations, *orders))
     assert_close(found, expected[:, orders[0]], atol=1e-5, rtol=1e-4)
 
 

@@ -9,7 +9,20 @@ from safetensors.torch import load_file, save_file
 from torch.testing import assert_close
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.prior.wan import WAN_1_3B, WanPrior, diffusers_models, read_wan_prior
+from unmix_plugin.neumatex.prior.wan import WanPrior, _diffusers_models, read_wan_prior
+
+WAN_1_3B = {
+    "num_layers": 30,
+    "num_attention_heads": 12,
+    "attention_head_dim": 128,
+    "ffn_dim": 8960,
+    "patch_size": (1, 2, 2),
+    "in_channels": 16,
+    "out_channels": 16,
+    "text_dim": 4096,
+    "freq_dim": 256,
+}
+"""Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
 
 TINY = {
     **WAN_1_3B,
@@ -23,7 +36,7 @@ TINY_AUTOENCODER = {"base_dim": 4, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1
 
 
 def tiny_models():
-    transformer, autoencoder = diffusers_models()
+    transformer, autoencoder = _diffusers_models()
     return transformer(**TINY), autoencoder(**TINY_AUTOENCODER)
 
 
@@ -40,7 +53,7 @@ def count(module: torch.nn.Module) -> int:
 @pytest.fixture(scope="module")
 def real_size() -> WanPrior:
     with torch.device("meta"):
-        transformer, autoencoder = diffusers_models()
+        transformer, autoencoder = _diffusers_models()
         models = transformer(**WAN_1_3B), autoencoder()
     return WanPrior(*models, num_parameters=9)
 
@@ -48,7 +61,7 @@ def real_size() -> WanPrior:
 def test_the_real_size_has_the_published_parameters(real_size):
     # 2.84 GB in bfloat16 and 0.51 GB in float32 are what the files of Wan2.1-T2V-1.3B have.
     assert count(real_size.transformer) == 1_418_996_800
-    _, autoencoder = diffusers_models()
+    _, autoencoder = _diffusers_models()
     with torch.device("meta"):
         assert count(autoencoder()) == 126_892_531
     assert len(real_size.transformer.blocks) == 30

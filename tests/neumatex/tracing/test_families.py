@@ -14,7 +14,7 @@ from unmix_plugin.neumatex.tracing.layers import ggx_albedo
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
-from unmix_plugin.neumatex.tracing.path_tracer import reflected_radiance
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 
 NORMALS = torch.nn.functional.normalize(
@@ -266,15 +266,10 @@ def _ball_in_even_light(family, values, samples=256):
     origins = torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
     directions = unit(targets - origins)
     points = rays.points(rays.closest(origins, directions), directions)
-    radiance = reflected_radiance(
-        Uniform(family, values),
-        rays,
-        Environment(LIGHT.expand(8, 16, 5).contiguous()),
-        points,
-        -directions,
-        samples=samples,
-        generator=torch.Generator().manual_seed(1),
-    )
+    light = Environment(LIGHT.expand(8, 16, 5).contiguous())
+    generator = torch.Generator().manual_seed(1)
+    traced = TracedObject(rays, light, Uniform(family, values))
+    radiance = traced.light(points, -directions, samples, generator=generator)
     return radiance, -(directions * points.normals).sum(dim=-1)
 
 

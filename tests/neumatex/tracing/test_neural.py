@@ -14,7 +14,7 @@ from tests.neumatex.surfaces import eye_directions, numbers
 from tools.train_decoder import DecoderTraining, draw_materials, response_error, train, write_weights
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
-from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, NeuralFamily, read_weights
+from unmix_plugin.neumatex.tracing.neural import SHIPPED, Decoder, Encoder, NeuralFamily, _read_weights
 
 FAMILY = NeuralFamily()
 
@@ -98,14 +98,14 @@ def test_the_record_belongs_to_the_shipped_file():
 
 
 def test_shipped_weights_are_frozen():
-    decoder, encoder = read_weights()
+    decoder, encoder = _read_weights()
     assert not any(parameter.requires_grad for parameter in [*decoder.parameters(), *encoder.parameters()])
 
 
 def test_what_is_written_is_read_back(tmp_path: Path):
     decoder, encoder = Decoder(), Encoder()
     write_weights(tmp_path / "w.safetensors", decoder, encoder, {})
-    found, _ = read_weights(tmp_path / "w.safetensors")
+    found, _ = _read_weights(tmp_path / "w.safetensors")
     latents = torch.rand(5, 6)
     assert_close(found(latents).metal_colour, decoder(latents).metal_colour)
 
@@ -115,16 +115,16 @@ def test_weights_of_another_shape_are_refused(tmp_path: Path):
     with pytest.raises(
         ConfigError, match=r"weights of another shape .*decoder\.hidden\.0\.bias is \(7,\), expected"
     ):
-        read_weights(tmp_path / "w.safetensors")
+        _read_weights(tmp_path / "w.safetensors")
 
 
 def test_missing_tensors_are_named(tmp_path: Path):
     (tmp_path / "w.safetensors").write_bytes(safetensors.torch.save({"other": torch.zeros(2)}))
     with pytest.raises(ConfigError, match=r"decoder\.hidden\.0\.bias is missing"):
-        read_weights(tmp_path / "w.safetensors")
+        _read_weights(tmp_path / "w.safetensors")
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path: Path):
     (tmp_path / "w.safetensors").write_text("no weights")
     with pytest.raises(ConfigError, match="can't read the material decoder's weights"):
-        read_weights(tmp_path / "w.safetensors")
+        _read_weights(tmp_path / "w.safetensors")

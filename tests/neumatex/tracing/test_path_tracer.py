@@ -14,7 +14,7 @@ from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames
-from unmix_plugin.neumatex.tracing.path_tracer import _SamplePoints, reflected_radiance, render_view
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, _SamplePoints
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 
 GLOSSY = [0.4, 0.3, 0.2, 0.3, 0.5]
@@ -54,16 +54,7 @@ def _seen(rays, count=200, origin=(0.3, -3.0, 0.4), seed=0):
 
 
 def _radiance(surface, rays, environment, points, to_eye, samples=64, bounces=1, seed=0):
-    return reflected_radiance(
-        surface,
-        rays,
-        environment,
-        points,
-        to_eye,
-        samples=samples,
-        bounces=bounces,
-        generator=_generator(seed),
-    )
+    return TracedObject(rays, environment, surface).light(points, to_eye, samples, bounces, _generator(seed))
 
 
 def test_white_furnace_of_a_convex_lambertian():
@@ -236,8 +227,7 @@ def test_two_calls_are_independent_and_a_seed_repeats():
     points, to_eye = _seen(rays)
     surface, generator = Uniform(Glossy(), GLOSSY), _generator(4)
     first, second = (
-        reflected_radiance(surface, rays, light, points, to_eye, samples=4, generator=generator)
-        for _ in range(2)
+        TracedObject(rays, light, surface).light(points, to_eye, 4, generator=generator) for _ in range(2)
     )
     again = _radiance(surface, rays, light, points, to_eye, samples=4, seed=4)
     assert torch.equal(first, again)
@@ -254,13 +244,6 @@ def test_nothing_seen_gives_nothing():
         Uniform(Lambert(), [1.0] * 3), rays, _white(), points.select(nothing), to_eye[nothing]
     )
     assert radiance.shape == (0, 3)
-
-
-def test_colours_must_agree():
-    rays = _sphere(1)
-    points, to_eye = _seen(rays)
-    with pytest.raises(ValueError, match="environment has 5 colours, the materials have 3"):
-        _radiance(Uniform(Lambert(), [1.0] * 3), rays, Environment(torch.ones(4, 8, 5)), points, to_eye)
 
 
 def test_numbers_are_uniform_and_even():
@@ -314,32 +297,19 @@ def test_left_and_up_are_where_they_belong():
     image = torch.zeros(16, 32, 3)
     image[:8, :, 0] = 1  # +z
     image[:, 0:16, 1] = 1  # azimuths from 0 to pi, +y
-    picture, _ = render_view(
-        Uniform(Lambert(), [1.0] * 3),
-        _sphere_render_view(),
-        Environment(image),
-        _camera(),
-        samples=64,
-        bounces=0,
-    )
+    traced = TracedObject(_sphere_render_view(), Environment(image), Uniform(Lambert(), [1.0] * 3))
+    picture, _ = traced.picture(_camera(), 0, 64, bounces=0)
     half = SIZE // 2
     assert picture[:half, :, 0].mean() > 2 * picture[half:, :, 0].mean()
     assert picture[:, half:, 1].mean() > 2 * picture[:, :half, 1].mean()
 
 
-@pytest.mark.parametrize("background", ["black", "environment"])
-def test_white_sphere_in_a_white_world(background):
-    picture, alpha = render_view(
-        Uniform(Lambert(), [1.0] * 3),
-        _sphere_render_view(),
-        Environment(torch.ones(8, 16, 3)),
-        _camera(),
-        samples=256,
-        background=background,
-    )
-    expected = (
-        torch.ones_like(picture) if background == "environment" else alpha[..., None].expand_as(picture)
-    )
+WHITE_SPHERE = (Environment(torch.ones(8, 16, 3)), Uniform(Lambert(), [1.0] * 3))
+
+
+def test_white_sphere_in_a_white_world():
+    picture, alpha = TracedObject(_sphere_render_view(), *WHITE_SPHERE).picture(_camera(), 0, 256)
+    expected = alpha[..., None].expand_as(picture)
     assert_close(picture.mean(), expected.mean(), atol=0.004, rtol=0)
     assert_close(picture, expected, atol=0.06, rtol=0)
 
@@ -347,7 +317,5 @@ def test_white_sphere_in_a_white_world(background):
 def test_a_camera_that_sees_nothing_gives_black():
     away = torch.tensor([[[0.0, 0, -1, 4], [-1, 0, 0, 0], [0, 1, 0, 0]]])
     camera = dataclasses.replace(_camera(size=8), camera_to_world=away)
-    picture, alpha = render_view(
-        Uniform(Lambert(), [1.0] * 3), _sphere_render_view(), Environment(torch.ones(8, 16, 3)), camera
-    )
+    picture, alpha = TracedObject(_sphere_render_view(), *WHITE_SPHERE).picture(camera, 0, 64)
     assert picture.abs().sum() + alpha.sum() == 0

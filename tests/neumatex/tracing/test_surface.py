@@ -10,8 +10,22 @@ from unmix_plugin.neumatex.tracing.surface import (
     Triplane,
     encode,
     look_up,
-    look_up_twin,
 )
+
+
+def look_up_twin(planes: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
+    """`look_up` in plain steps."""
+    last = planes.shape[-1] - 1
+    texels = (positions.clamp(-1, 1) + 1) / 2 * last
+    low = texels.floor().clamp(0, last - 1).long()
+    share = texels - low
+    parts = []
+    for plane, (column, row) in zip(planes, PLANE_AXES, strict=True):
+        x, y, u, v = low[:, column], low[:, row], share[:, column], share[:, row]
+        upper = plane[:, y, x] * (1 - u) + plane[:, y, x + 1] * u
+        lower = plane[:, y + 1, x] * (1 - u) + plane[:, y + 1, x + 1] * u
+        parts.append((upper * (1 - v) + lower * v).T)
+    return torch.cat(parts, dim=-1)
 
 
 def points(count: int, seed: int = 0, reach: float = 1.0) -> torch.Tensor:

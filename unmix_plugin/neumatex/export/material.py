@@ -41,7 +41,7 @@ _CHUNK_BAKING = 1 << 17
 
 
 @dataclass(frozen=True)
-class BakedMaterial:
+class _BakedMaterial:
     """A surface's parameters at the texels of an atlas."""
 
     atlas: Atlas
@@ -55,7 +55,7 @@ class BakedMaterial:
 
 
 @torch.no_grad()
-def bake(mesh: Mesh, surface: Surface, texture_size: int) -> BakedMaterial:
+def _bake(mesh: Mesh, surface: Surface, texture_size: int) -> _BakedMaterial:
     """Unwrap a mesh and look up the surface's parameters at each texel.
 
     Args:
@@ -71,7 +71,7 @@ def bake(mesh: Mesh, surface: Surface, texture_size: int) -> BakedMaterial:
     positions = texels.of_corners(mesh.vertices.cpu().double().numpy(), faces)
     points = torch.from_numpy(positions).float().to(mesh.vertices.device)
     parameters = torch.cat([surface.parameters(part).cpu() for part in points.split(_CHUNK_BAKING)])
-    return BakedMaterial(atlas, texels, parameters)
+    return _BakedMaterial(atlas, texels, parameters)
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def write_material(
         ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
         RunError: the disk is full or refuses.
     """
-    family, baked = surface.family, bake(mesh, surface, texture_size)
+    family, baked = surface.family, _bake(mesh, surface, texture_size)
     seen = family
     if isinstance(family, SpectralFamily) and bands is not None:
         family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
@@ -179,7 +179,7 @@ def _texture_paths(folder: Path, name: str) -> list[Path]:
     return [folder / f"{name}.png", folder / f"{name}.exr"]
 
 
-def _write_texture(folder: Path, baked: BakedMaterial, texture: _Texture) -> tuple[list[Path], bytes]:
+def _write_texture(folder: Path, baked: _BakedMaterial, texture: _Texture) -> tuple[list[Path], bytes]:
     """Write a texture as PNG and as OpenEXR (float32); gives the bytes of the PNG, too."""
     picture_path, numbers_path = _texture_paths(make_folder(folder), texture.name)
     numbers = baked.texture(texture.values)
@@ -194,7 +194,7 @@ def _write_texture(folder: Path, baked: BakedMaterial, texture: _Texture) -> tup
 
 
 def _write_channels(
-    path: Path, baked: BakedMaterial, values: Tensor, names: Sequence[str], about: str
+    path: Path, baked: _BakedMaterial, values: Tensor, names: Sequence[str], about: str
 ) -> Path:
     """Numbers of texels as one OpenEXR image, a channel each; readers get channels in the order of their names."""
     numbers = baked.texture(values)
@@ -205,7 +205,7 @@ def _write_channels(
 def _write_glb(
     path: Path,
     mesh: Mesh,
-    baked: BakedMaterial,
+    baked: _BakedMaterial,
     frame: Normalisation,
     pictures: tuple[bytes, bytes],
     extras: dict[str, Any],
@@ -222,7 +222,7 @@ def _write_glb(
 
 
 def _report_bytes(
-    baked: BakedMaterial, family_name: str, names: Sequence[str], fit: PbrFit, textures: Sequence[_Texture]
+    baked: _BakedMaterial, family_name: str, names: Sequence[str], fit: PbrFit, textures: Sequence[_Texture]
 ) -> bytes:
     """What the other files are, as JSON."""
     content = {
@@ -276,7 +276,7 @@ def _spectral_paths(folder: Path) -> list[Path]:
 
 
 def _write_spectral_files(
-    folder: Path, baked: BakedMaterial, family: SpectralFamily, bands: Bands
+    folder: Path, baked: _BakedMaterial, family: SpectralFamily, bands: Bands
 ) -> list[Path]:
     """Write abundances as one texture, a channel an endmember, and the endmembers' reflectances."""
     textures, table = _spectral_paths(folder)

@@ -16,11 +16,13 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from trimesh import triangles
 
 from unmix_plugin.formats.files import rgba_png_bytes
+from unmix_plugin.light.shading import direction_features
 from unmix_plugin.neumatex.export.material import InColours
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
-from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels, solid_angles
 from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
@@ -62,8 +64,7 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         facts = spectral_facts(Materials(scene.bands, family.endmembers, none, light=flat))
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
         materials = arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
-        a, b, c = mesh.corners().double().unbind(dim=1)
-        areas = torch.linalg.cross(b - a, c - a).norm(dim=1).numpy() / 2 / scene.frame.scale**2
+        areas = triangles.area(mesh.corners().double().numpy()) / scene.frame.scale**2
         facts["areas"] = material_areas(areas, mesh.faces.numpy(), materials, shares.shape[1])
         family = InColours(family, scene.bands)
     fit = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
@@ -182,20 +183,12 @@ def _transfer(mesh: Mesh, reflected: Float[Tensor, " V"]) -> Float[Tensor, "V 16
 
 def _harmonics(directions: Float[Tensor, "*d 3"]) -> Float[Tensor, "*d 16"]:
     """Real spherical harmonics of degrees 0 to 3, orthonormal; number l^2 + l + m has degree l and order m."""
-    x, y, z = directions.unbind(-1)
-    one = torch.ones_like(x)
-    return torch.stack(
-        [
-            0.282095 * one,
-            *(0.488603 * each for each in (y, z, x)),
-            *(1.092548 * x * y, 1.092548 * y * z, 0.315392 * (3 * z * z - 1), 1.092548 * x * z),
-            0.546274 * (x * x - y * y),
-            *(0.590044 * y * (3 * x * x - y * y), 2.890611 * x * y * z, 0.457046 * y * (5 * z * z - 1)),
-            0.373176 * z * (5 * z * z - 3),
-            *(0.457046 * x * (5 * z * z - 1), 1.445306 * z * (x * x - y * y)),
-            0.590044 * x * (x * x - 3 * y * y),
-        ],
-        dim=-1,
+    found = direction_features(directions.reshape(-1, 3)).reshape(*directions.shape[:-1], -1)
+    x, y, z, *others = found.unbind(dim=-1)
+    degrees = torch.tensor([0, *[1] * 3, *[2] * 5, *[3] * 7])
+    return (
+        torch.stack([torch.ones_like(x), y, z, x, *others], dim=-1)
+        * ((2 * degrees + 1) / (4 * math.pi)).sqrt()
     )
 
 
@@ -205,19 +198,14 @@ def _picture(light: Environment, bands: Bands | None) -> Float[Tensor, "rows col
     radiance = light.radiance(directions_of_pixels(n * rows, n * columns).flatten(0, 1).to(light.image)).cpu()
     if bands is not None:
         radiance = (radiance @ rgb_matrix(bands)).clamp(min=0)
-    weights = _solid_angles(n * rows, n * columns).reshape(rows, n, columns, n, 1)
+    weights = solid_angles(n * rows, n * columns).float().reshape(rows, n, 1, 1, 1)
     summed = (radiance.reshape(rows, n, columns, n, 3) * weights).sum(dim=(1, 3))
-    return summed / weights.sum(dim=(1, 3))
-
-
-def _solid_angles(rows: int, columns: int) -> Float[Tensor, "rows columns"]:
-    edges = (torch.arange(rows + 1, dtype=torch.float64) * math.pi / rows).cos()
-    return ((edges[:-1] - edges[1:]) * 2 * math.pi / columns).float()[:, None].expand(rows, columns)
+    return summed / (n * weights.sum(dim=(1, 3)))
 
 
 def _projected(picture: Float[Tensor, "rows columns 3"]) -> Float[Tensor, "16 3"]:
     """A light's spherical harmonics."""
-    basis = _harmonics(directions_of_pixels(*_MAP)) * _solid_angles(*_MAP)[..., None]
+    basis = _harmonics(directions_of_pixels(*_MAP)) * solid_angles(*_MAP).float()[:, None, None]
     return torch.einsum("rci,rck->ik", basis, picture)
 
 
@@ -226,7 +214,7 @@ def _blurred(pictures: Float[Tensor, "lights rows columns 3"]) -> Any:
     of which is 1: (lights, levels, rows, columns, 4), flat."""
     directions = directions_of_pixels(*_MAP).flatten(0, 1)
     light = pictures.flatten(1, 2).permute(1, 0, 2).flatten(1)
-    solid = _solid_angles(*_MAP).flatten()
+    solid = solid_angles(*_MAP).float().repeat_interleave(_MAP[1])
     levels = [light]
     for roughness in torch.linspace(0, 1, _LEVELS)[1:]:
         a2 = float(alpha_of(roughness)) ** 2

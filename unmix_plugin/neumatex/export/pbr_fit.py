@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, PbrFamily
+from unmix_plugin.neumatex.tracing.microfacet import cosine_directions
 
 _STEPS, _MATERIALS, _DIRECTIONS, _WIDTH = 300, 256, 16, 48
 _CHUNK = 1 << 16
@@ -116,17 +117,13 @@ def _directions(
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
     """To the light and to the eye: the eye anywhere, every other light where the material reflects much."""
     uniforms = torch.rand(len(parameters), 7, generator=generator).to(parameters)
-    wo = _cosine_lobe(uniforms[:, :2])
-    spread, towards_lobe = _cosine_lobe(uniforms[:, 2:4]), family.sample(parameters, wo, uniforms[:, 4:])
+    wo = cosine_directions(uniforms[:, :2].T).T
+    spread, towards_lobe = (
+        cosine_directions(uniforms[:, 2:4].T).T,
+        family.sample(parameters, wo, uniforms[:, 4:]),
+    )
     is_lobe = (torch.arange(len(parameters), device=parameters.device) % 2 == 0)[:, None]
     return torch.where(is_lobe, towards_lobe, spread), wo
-
-
-def _cosine_lobe(uniforms: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Directions of the upper hemisphere, drawn as the cosine to its axis is distributed."""
-    radius, angle = uniforms[:, 0].sqrt(), 2 * torch.pi * uniforms[:, 1]
-    height = (1 - uniforms[:, 0]).sqrt()
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), height], dim=-1)
 
 
 def _mean_error(
@@ -135,7 +132,7 @@ def _mean_error(
     chosen = torch.randint(len(parameters), (_JUDGED,), generator=generator).to(parameters.device)
     repeated, pbr = (values[chosen].repeat_interleave(_DIRECTIONS, dim=0) for values in (parameters, fitted))
     uniforms = torch.rand(len(repeated), 4, generator=generator).to(repeated)
-    wi, wo = _cosine_lobe(uniforms[:, :2]), _cosine_lobe(uniforms[:, 2:])
+    wi, wo = cosine_directions(uniforms[:, :2].T).T, cosine_directions(uniforms[:, 2:].T).T
     light = _reflected(family, repeated, wi, wo), _reflected(PbrFamily(), pbr, wi, wo)
     target, found = (one / (1 + one) for one in light)
     return float((found - target).abs().mean() / target.mean().clamp(min=1e-9))

@@ -24,6 +24,11 @@ class MaterialProduct(RunProduct):
     texture_size: int = 1024
     """Width and height of the textures, texels."""
 
+    def __post_init__(self) -> None:
+        low, high = _SIZES
+        if not low <= self.texture_size <= high:
+            raise ConfigError(f"--texture-size is {self.texture_size}; choose {low} to {high} texels")
+
     def write(self, job: Job) -> list[Path]:
         """Unwrap, bake, fit, write."""
         from unmix_plugin.neumatex.export.material import material_paths, write_material
@@ -32,7 +37,6 @@ class MaterialProduct(RunProduct):
 
         scene = job.loaded.scene
         assert isinstance(scene, TrainedObject)  # what else has another method and is refused before
-        _require_texture_size(self.texture_size)
         job.claim(material_paths(job.folder, scene.surface.family))
         with job.working("unwrapping the mesh and baking its material"):
             written, error = write_material(
@@ -55,9 +59,3 @@ class MaterialProduct(RunProduct):
         )
         say_units(job, "material.glb")
         return written
-
-
-def _require_texture_size(texture_size: int) -> None:
-    low, high = _SIZES
-    if not low <= texture_size <= high:
-        raise ConfigError(f"--texture-size is {texture_size}; choose {low} to {high} texels")

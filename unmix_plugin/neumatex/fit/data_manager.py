@@ -34,16 +34,13 @@ from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
-from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
-DEMO_OBJECT = Path("demo-object")
-"""`--data demo-object` stands for the built-in object."""
-DEMO_SPECTRAL_OBJECT = Path("demo-spectral-object")
-"""And this for the one with spectral pictures."""
+_DEMOS = ("demo-object", "demo-spectral-object")
+"""What `--data` takes for the built-in objects, the latter with spectral pictures."""
 _CORNERS = ((0.02, 0.02), (0.98, 0.02), (0.02, 0.98), (0.98, 0.98), (0.5, 0.5))
 """Where in a pixel the mesh has to be seen, so that every place in it sees it."""
 _THINNEST = 1e-3
@@ -231,13 +228,6 @@ class ObjectDataManager(DataManager):
         }
 
 
-def batch_environment(batch: Mapping[str, Tensor]) -> Environment | None:
-    """The held-out light of an image batch; None where it has the object's own."""
-    if "environment" not in batch:
-        return None
-    return Environment(batch["environment"], *batch["environment_placement"].tolist())
-
-
 @dataclass(frozen=True)
 class _PixelList:
     """Pixels of training views that show the mesh and nothing else, by view and place."""
@@ -312,10 +302,8 @@ def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
 
 
 def _object_folder(data: Path) -> Path:
-    from unmix_plugin.neumatex.demo.objects import demo_object_path, demo_spectral_object_path
+    if str(data) not in _DEMOS:
+        return data
+    from unmix_plugin.neumatex.demo.objects import demo_object_path
 
-    if data == DEMO_SPECTRAL_OBJECT:
-        return demo_spectral_object_path()
-    if data == DEMO_OBJECT:
-        return demo_object_path(say=lambda line: sys.stderr.write(f"{line}\n"))
-    return data
+    return demo_object_path(str(data), lambda line: sys.stderr.write(f"{line}\n"))

@@ -18,7 +18,7 @@ from unmix_plugin.engine import Cameras
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
-from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import pixel_hits
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -42,7 +42,7 @@ def evaluation_outputs(
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select((batch["alpha"] >= OPAQUE_ALPHA).flatten()[hits.pixels])
     generator = torch.Generator(model.device).manual_seed(0)
-    light = rays_radiance(traced, hits, model.config.eval_samples, model.config.bounces, generator)
+    light = traced.light_of_rays(hits, model.config.eval_samples, model.config.bounces, generator)
     parameters = traced.surface.parameters(hits.points.positions)
     values = {"light": light, "base_colour": model.family.base_colour(parameters), "parameters": parameters}
     return {name: hits.image(value) for name, value in values.items()}

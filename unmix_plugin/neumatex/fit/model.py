@@ -15,15 +15,15 @@ and `B` bands of a spectral one; `H x W` pixels.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine import Cameras, Model, Output, RayBundle, TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine import Cameras, Model, RayBundle, TrainingCallback, TrainingCallbackLocation
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.fit.data_manager import batch_environment
 from unmix_plugin.neumatex.fit.evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
 from unmix_plugin.neumatex.fit.start import (
@@ -47,11 +47,6 @@ class NeumatexModel(Model):
     """Triplane, family of materials, tone curve; mesh and environment as buffers."""
 
     config: NeumatexModelConfig
-    outputs = (
-        Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
-        Output("base_colour", "linear", "base colour", "linear, 0 to 1, on black"),
-        Output("accumulation", "map", "opacity", "1 where the mesh is", (0.0, 1.0), "gray"),
-    )
 
     def populate_modules(self) -> None:
         """Modules and buffers in the shapes that config and object ask for."""
@@ -145,27 +140,15 @@ class NeumatexModel(Model):
         return self._traced.get(self.mesh, self.environment, self.surface)
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
-        """What is seen along the rays; in training two independent estimates of the light, `halves` (2, R, C)."""
+        """Two independent estimates of the light along the rays, `halves` (2, R, C); which rays meet the mesh, `found`
+        (R), and where, `positions` (N, 3). Pictures are those of `TrainedObject`."""
         traced = self.traced
         seen = traced.seen(ray_bundle.origins, ray_bundle.directions)
-        if self.training:
-            samples = self.config.samples // 2
-            rows = torch.arange(len(seen.to_eye), device=seen.to_eye.device).repeat(2)
-            points, to_eye = seen.points.select(rows), seen.to_eye[rows]
-            light = traced.light(points, to_eye, samples, self.config.bounces, self._random())
-            halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
-            return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
-        samples, bounces = self.config.render_samples, self.config.bounces
-        light = traced.light(seen.points, seen.to_eye, samples, bounces, self._random())
-        base = self.family.base_colour(self.surface.parameters(seen.points.positions))
-        if isinstance(self.curve, SpectralDisplay):
-            base = self.curve.rgb(base)
-        found = seen.found[:, None]
-        return {
-            "rgb": torch.where(found, self.curve(seen.scatter(light)), 0.0),
-            "base_colour": seen.scatter(base),
-            "accumulation": seen.found.float(),
-        }
+        rows = torch.arange(len(seen.to_eye), device=seen.to_eye.device).repeat(2)
+        points, to_eye = seen.points.select(rows), seen.to_eye[rows]
+        light = traced.light(points, to_eye, self.config.samples // 2, self.config.bounces, self.generator)
+        halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
+        return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
 
     def get_loss_dict(
         self,
@@ -194,8 +177,10 @@ class NeumatexModel(Model):
     @torch.no_grad()
     def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Light and base colour of the pixels that count, under the light that the batch may hold."""
-        light = batch_environment(batch)
-        traced = self.traced if light is None else self.traced.under(light)
+        traced = self.traced
+        if "environment" in batch:
+            light = Environment(batch["environment"], *batch["environment_placement"].tolist())
+            traced = replace(traced, environment=light)
         return evaluation_outputs(self, traced, camera.to(self.device), batch)
 
     def get_image_metrics_and_images(
@@ -210,13 +195,10 @@ class NeumatexModel(Model):
         bundle = RayBundle(
             -3 * towards, towards, torch.zeros(len(towards), dtype=torch.int64, device=self.device)
         )
-        was_training, generator = self.training, self.generator
-        self.train()
-        self.generator = torch.Generator(self.device).manual_seed(0)
+        generator, self.generator = self.generator, torch.Generator(self.device).manual_seed(0)
         halves = self.get_outputs(bundle)["halves"]
         torch.autograd.grad(halves.sum(), [self.triplane.planes], allow_unused=True)
         self.generator = generator
-        self.train(was_training)
 
     def compared(
         self,
@@ -270,12 +252,6 @@ class NeumatexModel(Model):
         assert self.endmembers is not None
         assert self.gains is not None
         _settle(self.endmembers, self.gains)
-
-    def _random(self) -> torch.Generator:
-        """The step's source of random numbers; outside training always the same."""
-        if self.generator is not None and self.training:
-            return self.generator
-        return torch.Generator(self.device).manual_seed(0)
 
 
 @torch.no_grad()

@@ -25,7 +25,6 @@ from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.light_files import (
     ENVIRONMENT_SUFFIXES,
-    mean_spectrum,
     read_environment,
     read_environment_of_bands,
     read_lamp,
@@ -176,7 +175,8 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     notes += [] if doubt is None else [doubt]
     own_lamp = None if spectral is None else spectral.lamp
     if spectral is not None and own_lamp is None:
-        own_lamp = mean_spectrum(environment).double().numpy()
+        light_of_all = environment.mean_radiance().double().numpy()
+        own_lamp = light_of_all / light_of_all.max()
     truth = root / "truth" / "base_colour"
     files = {path.name: sha256_of(path) for path in (mesh_path, light.environment_path)}
     return ObjectScene(

@@ -107,8 +107,6 @@ class NeumatexModelConfig(ModelConfig):
     """What is fitted, and how it is rendered meanwhile."""
 
     _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
-    eval_num_rays_per_chunk: int = 4096
-    """Pixels rendered at once for a whole image; fewer take less memory."""
     material: Annotated[MaterialName, Common] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""

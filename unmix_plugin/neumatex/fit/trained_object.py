@@ -29,7 +29,7 @@ from unmix_plugin.neumatex.tracing.light_files import (
     read_environment_of_bands,
 )
 from unmix_plugin.neumatex.tracing.mesh import Mesh
-from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, rays_radiance
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.scenes.scene import Normalisation
@@ -232,7 +232,7 @@ class TrainedObject:
         seed = 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
         traced = TracedObject(self.ray_mesh, self.environment, self.surface)
         generator = torch.Generator(self.device).manual_seed(seed)
-        light = rays_radiance(traced, hits, samples, self.bounces, generator)
+        light = traced.light_of_rays(hits, samples, self.bounces, generator)
         return ModelView(camera, self._view_outputs(camera, hits, light))
 
     def _view_outputs(

@@ -3,14 +3,13 @@
 A known light is sent into lobes: a cosine-weighted one for the diffuse part, narrower ones about a mirrored direction.
 All light is divided by the environment's mean, so that exposure does not matter.
 
-Notation: `V` views of `H` x `W` pixels, `N` points in model space, where the mesh lies in [-1, 1]^3, `K` lobes,
-`C` colours, `F` features. Leading axes of features are objects and points.
+Notation: `V` views of `H` x `W` pixels, `B` objects, `N` points in model space, where the mesh lies in [-1, 1]^3, `K`
+lobes, `C` colours, `F` features.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from unmix_plugin.engine import Cameras
-from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
+from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels, solid_angles
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.rays import RayMesh, SurfacePoints
 from unmix_plugin.neumatex.tracing.surface import encode
@@ -50,14 +49,6 @@ class PosedViews:
     """Linear radiance in the unit of the environment, not multiplied by alpha; a tone curve is undone before."""
     alphas: Sequence[Float[Tensor, "H W"]]
     """1 where the object is, 0 beside it; observations below 0.9 are not used."""
-
-    def __post_init__(self) -> None:
-        counts = (len(self.cameras), len(self.pictures), len(self.alphas))
-        if len(set(counts)) > 1 or counts[0] == 0:
-            raise ValueError(
-                "PosedViews needs as many pictures and alphas as cameras, at least one; got "
-                f"{counts[1]} pictures and {counts[2]} alphas for {counts[0]} cameras"
-            )
 
     def __getitem__(self, indices: list[int]) -> PosedViews:
         """Some of the views, in the order asked for."""
@@ -116,8 +107,7 @@ def _kernels() -> list[Float[Tensor, "P P"]]:
     """Weights of every pixel's light in the lobe about every pixel, the diffuse lobe first; they belong to no light."""
     directions = directions_of_pixels(_BLURRED_ROWS, 2 * _BLURRED_ROWS).reshape(-1, 3)
     cosines = directions @ directions.T
-    edges = torch.arange(_BLURRED_ROWS + 1, dtype=torch.float64) * math.pi / _BLURRED_ROWS
-    areas = (edges[:-1].cos() - edges[1:].cos()).repeat_interleave(2 * _BLURRED_ROWS).to(cosines)
+    areas = solid_angles(_BLURRED_ROWS, 2 * _BLURRED_ROWS).repeat_interleave(2 * _BLURRED_ROWS).to(cosines)
     shapes = [cosines.clamp(min=0), *(torch.exp(sharpness * (cosines - 1)) for sharpness in SHARPNESSES)]
     return [functional.normalize(shape * areas, p=1, dim=1) for shape in shapes]
 
@@ -218,43 +208,48 @@ def _unshadowed(
     return torch.where(total > 0, reaching / total.clamp(min=1e-12), 1.0)
 
 
+@dataclass(frozen=True)
+class Observations:
+    """What is known of points of B objects and what views show of them; light is divided by the environment's mean.
+
+    But for positions and colours these are the fields of `KnownLight`.
+    """
+
+    positions: Float[Tensor, "B N 3"]
+    colours: Float[Tensor, "B N V 3"]
+    visible: Bool[Tensor, "B N V"]
+    cosines: Float[Tensor, "B N V"]
+    mirrored: Float[Tensor, "B N V K 3"]
+    mirror_open: Float[Tensor, "B N V"]
+    irradiance: Float[Tensor, "B N 3"]
+    unshadowed: Float[Tensor, "B N 3"]
+
+    @property
+    def reaching(self) -> Float[Tensor, "B N 3"]:
+        """Irradiance over pi after shadows."""
+        return self.irradiance * self.unshadowed
+
+
 NUM_VIEW_FEATURES = 3 + 3 * NUM_LOBES + 3 + 3 + 3
 NUM_POINT_FEATURES = 3 + 3 + 1 + 3 + 18 + 7 * NUM_LOBES
 
 
-def view_features(
-    colours: Float[Tensor, "*n V 3"],
-    cosines: Float[Tensor, "*n V"],
-    mirrored: Float[Tensor, "*n V K 3"],
-    mirror_open: Float[Tensor, "*n V"],
-    reaching: Float[Tensor, "*n 3"],
-) -> Float[Tensor, "*n V F"]:
-    """What one view shows of a point and what light it could reflect to that view.
-
-    Args:
-        reaching: Irradiance over pi after shadows.
-    """
-    apparent = colours / (reaching[..., None, :] + 0.02)
-    single = torch.stack([cosines, (1 - cosines) ** 5, mirror_open], dim=-1)
-    light = _compressed(reaching)[..., None, :].expand_as(colours)
-    lobes = _compressed(mirrored).flatten(-2)
-    return torch.cat([_compressed(colours), lobes, light, _compressed(apparent), single], dim=-1)
+def view_features(o: Observations) -> Float[Tensor, "B N V F"]:
+    """What each view shows of a point and what light it could reflect to that view."""
+    apparent = o.colours / (o.reaching[..., None, :] + 0.02)
+    single = torch.stack([o.cosines, (1 - o.cosines) ** 5, o.mirror_open], dim=-1)
+    light = _compressed(o.reaching)[..., None, :].expand_as(o.colours)
+    lobes = _compressed(o.mirrored).flatten(-2)
+    return torch.cat([_compressed(o.colours), lobes, light, _compressed(apparent), single], dim=-1)
 
 
-def point_features(
-    positions: Float[Tensor, "*n 3"],
-    colours: Float[Tensor, "*n V 3"],
-    visible: Bool[Tensor, "*n V"],
-    mirrored: Float[Tensor, "*n V K 3"],
-    mirror_open: Float[Tensor, "*n V"],
-    irradiance: Float[Tensor, "*n 3"],
-    unshadowed: Float[Tensor, "*n 3"],
-) -> Float[Tensor, "*n F"]:
+def point_features(o: Observations) -> Float[Tensor, "B N F"]:
     """What all views together show of a point: fits of its colours by each lobe of light, and where it is."""
-    weights = visible * (0.2 + 0.8 * mirror_open)
-    fits = _lobe_fits(colours, mirrored, weights, irradiance * unshadowed)
-    seen = visible.sum(dim=-1, keepdim=True) / 8
-    return torch.cat([_compressed(irradiance), unshadowed, seen, positions, encode(positions), fits], dim=-1)
+    weights = o.visible * (0.2 + 0.8 * o.mirror_open)
+    fits = _lobe_fits(o.colours, o.mirrored, weights, o.reaching)
+    seen = o.visible.sum(dim=-1, keepdim=True) / 8
+    known = [_compressed(o.irradiance), o.unshadowed, seen, o.positions, encode(o.positions), fits]
+    return torch.cat(known, dim=-1)
 
 
 def _lobe_fits(

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import safetensors.torch
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
@@ -27,6 +27,7 @@ from unmix_plugin.errors import RunError, SceneError
 from unmix_plugin.neumatex.prior.observations import (
     NUM_POINT_FEATURES,
     NUM_VIEW_FEATURES,
+    Observations,
     PosedViews,
     known_light,
     point_features,
@@ -65,28 +66,6 @@ _MOST_VIEWS = 12
 _NUM_POINTS, _LEAST_ALPHA = 3072, 0.9
 
 
-@dataclass(frozen=True)
-class Observations:
-    """What is known of points and what views show of them; light is divided by the environment's mean."""
-
-    positions: Float[Tensor, "B N 3"]
-    colours: Float[Tensor, "B N V 3"]
-    visible: Bool[Tensor, "B N V"]
-    cosines: Float[Tensor, "B N V"]
-    mirrored: Float[Tensor, "B N V K 3"]
-    mirror_open: Float[Tensor, "B N V"]
-    irradiance: Float[Tensor, "B N 3"]
-    unshadowed: Float[Tensor, "B N 3"]
-
-    def selected(self, points: Int[Tensor, " n"], views: Int[Tensor, " v"]) -> Observations:
-        """Some of the points and some of the views, in the order asked for."""
-        per_view = ("colours", "visible", "cosines", "mirrored", "mirror_open")
-        some = {name: values[:, points] for name, values in vars(self).items()}
-        return Observations(
-            **{name: part[:, :, views] if name in per_view else part for name, part in some.items()}
-        )
-
-
 class SmallPrior(nn.Module):
     """Encoder of observations, what it says of each point, and the readers of planes that are fitted to that."""
 
@@ -107,8 +86,7 @@ class SmallPrior(nn.Module):
 
     def forward(self, o: Observations) -> Float[Tensor, "B N W"]:
         """Embeddings of points: what their views show, in any order, and what other points of the object are like."""
-        reaching = o.irradiance * o.unshadowed
-        encoded = self.view_encoder(view_features(o.colours, o.cosines, o.mirrored, o.mirror_open, reaching))
+        encoded = self.view_encoder(view_features(o))
         seen = o.visible.any(dim=-1)
         mask = o.visible[..., None].float()
         total = mask.sum(dim=-2).clamp(min=1)
@@ -116,10 +94,8 @@ class SmallPrior(nn.Module):
         spread = ((encoded - mean[..., None, :]).square() * mask).sum(dim=-2) / total
         largest = torch.where(o.visible[..., None], encoded, -1e4).amax(dim=-2)
         largest = torch.where(seen[..., None], largest, 0.0)
-        known = point_features(
-            o.positions, o.colours, o.visible, o.mirrored, o.mirror_open, o.irradiance, o.unshadowed
-        )
-        points = self.point_encoder(torch.cat([mean, (spread + 1e-6).sqrt(), largest, known], dim=-1))
+        shown = [mean, (spread + 1e-6).sqrt(), largest, point_features(o)]
+        points = self.point_encoder(torch.cat(shown, dim=-1))
         for exchange in self.exchanges:
             points = exchange(points, seen)
         return self.last_norm(points)

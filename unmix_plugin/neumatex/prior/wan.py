@@ -16,7 +16,6 @@ a text. Needs the extra `lmrm` (diffusers).
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -43,18 +42,6 @@ LATENT_FRAMES = 1 + (ORBIT_VIEWS - 1) // 4 + CANONICAL_VIEWS
 """F: the autoencoder puts the first frame of a film alone, then four into one."""
 TEXT_TOKENS = 512
 """Length of the text embedding that the transformer was trained with."""
-WAN_1_3B: Mapping[str, Any] = {
-    "num_layers": 30,
-    "num_attention_heads": 12,
-    "attention_head_dim": 128,
-    "ffn_dim": 8960,
-    "patch_size": (1, 2, 2),
-    "in_channels": 16,
-    "out_channels": 16,
-    "text_dim": 4096,
-    "freq_dim": 256,
-}
-"""Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
 _NULL_TEXT = "null_text.safetensors"
 
 
@@ -156,7 +143,7 @@ def widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
     return autoencoder
 
 
-def diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLWan]]:
+def _diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLWan]]:
     """The two classes of diffusers.
 
     Raises:
@@ -180,7 +167,7 @@ def read_wan_prior(folder: Path, num_parameters: int) -> WanPrior:
     Raises:
         ConfigError: the extra is not installed, or a file or tensor is missing, damaged or of another shape.
     """
-    transformer_class, autoencoder_class = diffusers_models()
+    transformer_class, autoencoder_class = _diffusers_models()
     transformer = _read_model(transformer_class, folder / "transformer")
     autoencoder = _read_model(autoencoder_class, folder / "vae")
     null_text = _read_null_text(folder / _NULL_TEXT, transformer.config["text_dim"])

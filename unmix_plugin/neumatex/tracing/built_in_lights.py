@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
 
 _Directions = Float64[np.ndarray, "*pixels 3"]
@@ -31,12 +30,7 @@ def built_in_environment(name: str, seed: int = 0, height: int = 128) -> Environ
         name: Which.
         seed: Turns lights about +z and varies their heights, sizes and tints; the same seed gives the same light.
         height: Rows of the picture, which has twice as many columns.
-    Raises:
-        ConfigError: there is none of this name.
     """
-    if name not in _MAKERS:
-        likely = did_you_mean(name, NAMES, form=" {}")
-        raise ConfigError(f"there is no environment {name!r};{likely} known are {', '.join(NAMES)}")
     rng = np.random.default_rng([zlib.crc32(name.encode()), seed])
     # Averages of finer pixels: the edges of lights are then neither jagged nor lost between pixels.
     fine = 2 * height

@@ -100,10 +100,7 @@ class Environment:
 
     @cached_property
     def _solid_angles(self) -> Float64[Tensor, " H"]:
-        """Solid angle of a pixel of each row, sr."""
-        height, width = self.image.shape[:2]
-        edges = torch.arange(height + 1, dtype=torch.float64, device=self.image.device) * math.pi / height
-        return (2 * math.pi / width) * (edges[:-1].cos() - edges[1:].cos())
+        return solid_angles(*self.image.shape[:2]).to(self.image.device)
 
     @cached_property
     def _weights(self) -> Float64[Tensor, "H W"]:
@@ -123,6 +120,12 @@ class Environment:
     @cached_property
     def _inversion(self) -> _PictureInversion:
         return _PictureInversion.of(self._weights)
+
+
+def solid_angles(height: int, width: int) -> Float64[Tensor, " H"]:
+    """Of a pixel of each row of an environment's picture, sr."""
+    edges = torch.arange(height + 1, dtype=torch.float64) * math.pi / height
+    return (2 * math.pi / width) * (edges[:-1].cos() - edges[1:].cos())
 
 
 def directions_of_pixels(height: int, width: int) -> Float[Tensor, "H W 3"]:

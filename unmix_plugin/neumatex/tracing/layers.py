@@ -11,7 +11,7 @@ Notation as in `microfacet`.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
@@ -210,12 +210,6 @@ class LayerStack:
     metallicity: Float[Tensor, " N"]
     metal_colour: Float[Tensor, "3 N"]
     dielectric_f0: Float[Tensor, " N"]
-
-    def repeat(self, times: int) -> "LayerStack":
-        """Each material `times` times in a row."""
-        return LayerStack(
-            **{each.name: getattr(self, each.name).repeat_interleave(times, -1) for each in fields(self)}
-        )
 
     def reflectance(
         self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]

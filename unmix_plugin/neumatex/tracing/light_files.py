@@ -240,15 +240,6 @@ def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
     return Environment(spectra, environment.rotation_deg, environment.exposure_stops)
 
 
-def mean_spectrum(environment: Environment) -> Float[Tensor, "B"]:
-    """Spectrum of all light of an environment together, greatest value 1."""
-    height = environment.image.shape[0]
-    rows = torch.arange(height, dtype=torch.float64) + 0.5
-    weights = (torch.pi * rows / height).sin().to(environment.image)
-    total = (environment.image * weights[:, None, None]).sum(dim=(0, 1))
-    return total / total.amax()
-
-
 def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
     if not (power > 0).all():
         dark = bands.centers_nm[int(np.argmin(power))]

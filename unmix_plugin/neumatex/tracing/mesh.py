@@ -188,8 +188,9 @@ def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 def _with_area(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """The triangles that have an area."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    from trimesh import triangles
+
+    areas = triangles.area(vertices[faces])
     diagonal = np.ptp(vertices[faces.reshape(-1)], axis=0)
     keep = areas > _SMALLEST_FACE * float(diagonal @ diagonal)
     if not keep.any():

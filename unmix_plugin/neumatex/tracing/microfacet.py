@@ -57,11 +57,6 @@ def alpha_of(roughness: Tensor) -> Tensor:
     return SMALLEST_ALPHA + (1.0 - SMALLEST_ALPHA) * roughness * roughness
 
 
-def roughness_of(alpha: Tensor) -> Tensor:
-    """Perceptual roughness of a lobe's width: the inverse of `alpha_of`."""
-    return torch.sqrt(((alpha - SMALLEST_ALPHA) / (1.0 - SMALLEST_ALPHA)).clamp(1e-8, 1.0))
-
-
 def half_vectors(wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
     """Unit vectors halfway; short ones where the directions are opposite."""
     return _unit(wi + wo)
@@ -153,7 +148,7 @@ class LobeMixture:
         lobe = (uniforms[2] >= self.shares.cumsum(0)).sum(0).clamp_max(len(self.alphas))
         alpha = self.alphas.gather(0, (lobe - 1).clamp_min(0)[None])[0]
         reflected = sample_reflections(alpha, wo, uniforms[:2])
-        return torch.where(lobe == 0, _cosine_directions(uniforms[:2]), reflected)
+        return torch.where(lobe == 0, cosine_directions(uniforms[:2]), reflected)
 
     def density(self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
         """Of `sample`, 1/sr, on the whole sphere."""
@@ -161,7 +156,7 @@ class LobeMixture:
         return self.shares[0] * (wi[2].clamp_min(0.0) / math.pi) + lobes
 
 
-def _cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
+def cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
     """Directions above the surface whose density is their cosine over pi."""
     radius, angle = torch.sqrt(uniforms[1]), 2.0 * math.pi * uniforms[0]
     z = torch.sqrt((1.0 - uniforms[1]).clamp_min(0.0))

@@ -86,8 +86,9 @@ def _layers_of(numbers: Float[Tensor, "L N"]) -> LayerStack:
 class Encoder(nn.Module):
     """Layers to latents: where the decoder comes nearest to them."""
 
-    def __init__(self, width: int = 128) -> None:
+    def __init__(self) -> None:
         super().__init__()
+        width = 128
         self.hidden = nn.ModuleList([nn.Linear(_NUM_FEATURES, width), nn.Linear(width, width)])
         self.last = nn.Linear(width, NUM_LATENTS)
 
@@ -113,7 +114,7 @@ def _features(stack: LayerStack) -> Tensor:
     return 2.0 * torch.cat([torch.stack(scalars), sheen, metal, torch.sqrt(metal + 1e-4)]).T - 1.0
 
 
-def read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
+def _read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     """Decoder and encoder, frozen.
 
     Raises:
@@ -139,7 +140,7 @@ def read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     return decoder, encoder
 
 
-_shipped_weights = lru_cache(maxsize=1)(read_weights)
+_shipped_weights = lru_cache(maxsize=1)(_read_weights)
 
 
 class _DecodedFamily(StackFamily):
@@ -160,16 +161,14 @@ class NeuralFamily(StackFamily):
     )  # fmt: skip
     num_parameters = 3 + NUM_LATENTS
 
-    def __init__(
-        self, device: torch.device | str = "cpu", weights: tuple[Decoder, Encoder] | None = None
-    ) -> None:
-        """Take decoder and encoder to a device; without any, those of the package.
+    def __init__(self) -> None:
+        """Take copies of the package's decoder and encoder.
 
         Raises:
-            ConfigError: the package's weights can't be read, or have another shape.
+            ConfigError: their weights can't be read, or have another shape.
         """
-        decoder, encoder = weights if weights is not None else _shipped_weights()
-        self.decoder, self.encoder = deepcopy(decoder).to(device), deepcopy(encoder).to(device)
+        decoder, encoder = _shipped_weights()
+        self.decoder, self.encoder = deepcopy(decoder), deepcopy(encoder)
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
         return self.decoder(parameters[:, 3:])

@@ -20,7 +20,6 @@ Randomization of Number Theoretic Methods for Multiple Integration.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -30,14 +29,7 @@ from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
-from unmix_plugin.neumatex.tracing.rays import (
-    Hits,
-    PixelHits,
-    RayMesh,
-    SurfacePoints,
-    pixel_hits,
-    subpixel_offsets,
-)
+from unmix_plugin.neumatex.tracing.rays import Hits, PixelHits, RayMesh, SurfacePoints, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface, decoded_once
 
 _PATHS_AT_ONCE = 1 << 18
@@ -72,10 +64,6 @@ class TracedObject:
     environment: Environment
     surface: Surface
 
-    def under(self, environment: Environment) -> TracedObject:
-        """The same object under another light."""
-        return replace(self, environment=environment)
-
     def seen(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> SeenPoints:
         """What rays of unit directions meet first."""
         with torch.no_grad():
@@ -89,20 +77,64 @@ class TracedObject:
         points: SurfacePoints,
         to_eye: Float[Tensor, "N 3"],
         samples: int,
-        bounces: int,
-        generator: torch.Generator | None,
+        bounces: int = 1,
+        generator: torch.Generator | None = None,
     ) -> Float[Tensor, "N C"]:
-        """Light that points send to the eye, an estimate from so many paths; differentiable by the materials."""
-        return reflected_radiance(
-            self.surface,
-            self.ray_mesh,
-            self.environment,
-            points,
-            to_eye,
-            samples=samples,
-            bounces=bounces,
-            generator=generator,
-        )
+        """Light that points send to the eye, an unbiased estimate, differentiable by the materials; two calls are
+        independent.
+
+        Args:
+            points: Of `RayMesh.points`.
+            to_eye: Unit vectors to the viewer.
+            samples: Paths a point, spread evenly over what can be drawn.
+            bounces: Reflections before the last one: 0 is direct light only.
+            generator: Of torch's numbers, on the device of the points.
+        """
+        num_colours = self.environment.num_colours
+        assert num_colours == self.surface.family.num_colours
+        world, device = replace(self, surface=decoded_once(self.surface)), to_eye.device
+        numbers = _SamplePoints.draw(len(to_eye), samples, bounces + 1, generator, device)
+        vertices = _first_vertices(world, points, to_eye, samples)
+        radiance = torch.zeros(len(to_eye), num_colours, device=device)
+        for depth in range(bounces + 1):
+            drawn = numbers.of(vertices.paths, depth)
+            lights, vertices = _shade(world, vertices, drawn, is_last=depth == bounces)
+            for paths, found in lights:
+                radiance = radiance.index_add(0, paths // samples, found)
+        return radiance / samples
+
+    @torch.no_grad()
+    def light_of_rays(
+        self, hits: PixelHits, samples: int, bounces: int, generator: torch.Generator | None
+    ) -> Float[Tensor, "K C"]:
+        """Light along each ray of a picture, chunk after chunk; samples are those of a pixel. Without gradient."""
+        samples_a_ray = max(1, -(-samples // hits.rays_a_pixel))
+        device = self.ray_mesh.device
+        parts = [
+            self.light(hits.points.select(rows), hits.to_eye[rows], samples_a_ray, bounces, generator)
+            for rows in torch.arange(len(hits), device=device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
+        ]
+        return torch.cat(parts) if parts else torch.zeros(0, self.environment.num_colours, device=device)
+
+    def picture(
+        self,
+        cameras: Cameras,
+        index: int,
+        samples: int,
+        bounces: int = 1,
+        subpixels: int = 2,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
+        """The picture of a camera, linear light multiplied by alpha, and the part of each pixel that the mesh covers.
+
+        Args:
+            cameras: In the mesh's space.
+            index: Which of them.
+            samples: Paths a pixel, spread over its rays; at least one a ray.
+            subpixels: A pixel has subpixels x subpixels rays.
+        """
+        hits = pixel_hits(self.ray_mesh, cameras, index, subpixels)
+        return hits.image(self.light_of_rays(hits, samples, bounces, generator)), hits.alpha()
 
 
 class TracedObjectCache:
@@ -147,49 +179,6 @@ class _Vertices:
     def select(self, rows: Int[Tensor, " M"]) -> _Vertices:
         others = {name: part[rows] for name, part in vars(self).items() if name != "points"}
         return _Vertices(points=self.points.select(rows), **others)
-
-
-def reflected_radiance(
-    surface: Surface,
-    ray_mesh: RayMesh,
-    environment: Environment,
-    points: SurfacePoints,
-    to_eye: Float[Tensor, "N 3"],
-    *,
-    samples: int,
-    bounces: int = 1,
-    generator: torch.Generator | None = None,
-) -> Float[Tensor, "N C"]:
-    """An unbiased estimate of the radiance that leaves points to the eye; two calls are independent.
-
-    Args:
-        surface: Materials of the mesh.
-        ray_mesh: The mesh, on the device of the points.
-        environment: Light from outside, with as many colours as the materials.
-        points: Of `RayMesh.points`.
-        to_eye: Unit vectors to the viewer.
-        samples: Paths a point, spread evenly over what can be drawn.
-        bounces: Reflections before the last one: 0 is direct light only.
-        generator: Of torch's numbers, on the device of the points.
-    Raises:
-        ValueError: materials and environment differ in colours.
-    """
-    if environment.num_colours != surface.family.num_colours:
-        raise ValueError(
-            f"the environment has {environment.num_colours} colours, the materials have "
-            f"{surface.family.num_colours}; they must be the same"
-        )
-    world = TracedObject(ray_mesh, environment, decoded_once(surface))
-    device, num_points = to_eye.device, len(to_eye)
-    numbers = _SamplePoints.draw(num_points, samples, bounces + 1, generator, device)
-    vertices = _first_vertices(world, points, to_eye, samples)
-    radiance = torch.zeros(num_points, environment.num_colours, device=device)
-    for depth in range(bounces + 1):
-        drawn = numbers.of(vertices.paths, depth)
-        lights, vertices = _shade(world, vertices, drawn, is_last=depth == bounces)
-        for paths, found in lights:
-            radiance = radiance.index_add(0, paths // samples, found)
-    return radiance / samples
 
 
 def _first_vertices(world: TracedObject, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
@@ -289,13 +278,7 @@ class _SamplePoints:
     def draw(
         num_points: int, samples: int, vertices: int, generator: torch.Generator | None, device: torch.device
     ) -> _SamplePoints:
-        """Numbers for paths of so many vertices.
-
-        Raises:
-            ValueError: there is no sample.
-        """
-        if samples < 1:
-            raise ValueError(f"samples must be at least 1; got {samples}")
+        """Numbers for paths of so many vertices."""
         dimensions = _NUMBERS_A_VERTEX * vertices
         sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
         shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
@@ -308,55 +291,3 @@ class _SamplePoints:
         moved = self.sequence[:, part][paths % samples] + self.shifts[:, part][paths // samples]
         # Rounding to float32 later must not reach 1.
         return (moved - moved.floor()).clamp(max=1 - 2.0**-24)
-
-
-def render_view(
-    surface: Surface,
-    ray_mesh: RayMesh,
-    environment: Environment,
-    cameras: Cameras,
-    index: int = 0,
-    *,
-    samples: int = 64,
-    bounces: int = 1,
-    subpixels: int = 2,
-    background: Literal["black", "environment"] = "black",
-    generator: torch.Generator | None = None,
-) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
-    """The picture of one camera, and the part of each pixel that the mesh covers.
-
-    Args:
-        cameras: In the mesh's space.
-        index: Which of them.
-        samples: Paths a pixel, spread over its rays; at least one a ray.
-        subpixels: A pixel has subpixels x subpixels rays.
-        background: What is seen where the mesh is not. With black, the colours are multiplied by alpha.
-    Returns:
-        Linear radiance and alpha; without gradient.
-    """
-    hits = pixel_hits(ray_mesh, cameras, index, subpixels)
-    traced = TracedObject(ray_mesh, environment, surface)
-    radiance = rays_radiance(traced, hits, samples, bounces, generator)
-    image, alpha = hits.image(radiance), hits.alpha()
-    if background == "environment":
-        missing = torch.zeros(alpha.numel(), environment.num_colours, device=ray_mesh.device)
-        for offset in subpixel_offsets(subpixels):
-            rays = cameras.to(ray_mesh.device).image_rays(index, offset)
-            missed = ~ray_mesh.blocked(rays.origins, rays.directions)
-            missing[missed] += environment.radiance(rays.directions[missed])
-        image = image + (missing / subpixels**2).reshape(image.shape)
-    return image, alpha
-
-
-@torch.no_grad()
-def rays_radiance(
-    traced: TracedObject, hits: PixelHits, samples: int, bounces: int, generator: torch.Generator | None
-) -> Float[Tensor, "K C"]:
-    """Radiance along each ray of an image, chunk after chunk; samples are those of a pixel. Without gradient."""
-    samples_a_ray = max(1, -(-samples // hits.rays_a_pixel))
-    device = traced.ray_mesh.device
-    parts = [
-        traced.light(hits.points.select(rows), hits.to_eye[rows], samples_a_ray, bounces, generator)
-        for rows in torch.arange(len(hits), device=device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
-    ]
-    return torch.cat(parts) if parts else torch.zeros(0, traced.environment.num_colours, device=device)

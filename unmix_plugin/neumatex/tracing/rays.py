@@ -197,7 +197,8 @@ def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int =
     """The hits of one camera."""
     width, height = cameras.size(index)
     pixels, parts, to_eye = [], [], []
-    for offset in subpixel_offsets(subpixels):
+    middles = [(place + 0.5) / subpixels for place in range(subpixels)]
+    for offset in [(x, y) for y in middles for x in middles]:
         rays = cameras.to(ray_mesh.device).image_rays(index, offset)
         hits = ray_mesh.closest(rays.origins, rays.directions)
         found = hits.found.nonzero()[:, 0]
@@ -211,9 +212,3 @@ def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int =
     order = torch.cat(pixels).argsort(stable=True)
     hits = PixelHits(torch.cat(pixels), points, torch.cat(to_eye), width, height, subpixels**2)
     return hits.select(order)
-
-
-def subpixel_offsets(subpixels: int) -> list[tuple[float, float]]:
-    """Middles of the parts of a pixel, x and y in [0, 1]."""
-    middles = [(index + 0.5) / subpixels for index in range(subpixels)]
-    return [(x, y) for y in middles for x in middles]

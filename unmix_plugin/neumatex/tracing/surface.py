@@ -180,21 +180,6 @@ def look_up(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -
     return found[:, :, 0].permute(2, 0, 1).flatten(1)
 
 
-def look_up_twin(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3*C"]:
-    """`look_up` in plain steps."""
-    last = planes.shape[-1] - 1
-    texels = (positions.clamp(-1, 1) + 1) / 2 * last
-    low = texels.floor().clamp(0, last - 1).long()
-    share = texels - low
-    parts = []
-    for plane, (column, row) in zip(planes, PLANE_AXES, strict=True):
-        x, y, u, v = low[:, column], low[:, row], share[:, column], share[:, row]
-        upper = plane[:, y, x] * (1 - u) + plane[:, y, x + 1] * u
-        lower = plane[:, y + 1, x] * (1 - u) + plane[:, y + 1, x + 1] * u
-        parts.append((upper * (1 - v) + lower * v).T)
-    return torch.cat(parts, dim=-1)
-
-
 def encode(positions: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n E"]:
     """Sines and cosines of the position times pi, 2 pi and 4 pi: 18 numbers."""
     angles = torch.cat([positions * (math.pi * 2.0**band) for band in range(_NUM_FREQUENCIES)], dim=-1)
