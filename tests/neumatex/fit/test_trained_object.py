@@ -8,6 +8,7 @@ from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, unev
 from unmix_plugin.errors import ConfigError, SceneError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.neumatex.fit.trained_object import OWN_LIGHT
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.trained.model_scene import EstimatedScene, LightChoice, RelightableScene
 from unmix_plugin.trained.protocol import RenderableScene
 
@@ -116,3 +117,18 @@ def test_estimates_are_independent_and_their_mean_comes_near_the_finished_view(s
 
     assert error(mean["linear_rgb"]) < 0.6 * error(first["linear_rgb"])
     assert error(finished) < error(first["linear_rgb"])
+
+
+def test_each_strip_of_a_picture_has_noise_of_its_own(scene, monkeypatch):
+    """Strips as far above the middle as others are below it, too."""
+    seeds = []
+    light_of_rays = TracedObject.light_of_rays
+
+    def noted(traced, hits, samples, bounces, generator):
+        seeds.append(generator.initial_seed())
+        return light_of_rays(traced, hits, samples, bounces, generator)
+
+    monkeypatch.setattr(TracedObject, "light_of_rays", noted)
+    for row in range(0, 18, 3):
+        scene.look(CAMERA.crop(0, row, 24, 3), 1)
+    assert len(set(seeds)) == len(seeds) == 6

@@ -229,7 +229,7 @@ class TrainedObject:
     def _rendered(self, camera: Cameras, subpixels: int, samples: int, number: int) -> ModelView:
         hits = pixel_hits(self.ray_mesh, camera, 0, subpixels)
         # Another seed for each strip of rows of a picture, always the same for the same one.
-        seed = 7919 * number + round(abs(float(camera.center_px[0, 1]))) % 7907
+        seed = 7919 * number + round(float(camera.center_px[0, 1])) % 7907
         traced = TracedObject(self.ray_mesh, self.environment, self.surface)
         generator = torch.Generator(self.device).manual_seed(seed)
         light = traced.light_of_rays(hits, samples, self.bounces, generator)
