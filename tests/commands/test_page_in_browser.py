@@ -109,7 +109,7 @@ def test_all_layers_differ(opened):
     shown = [picture(opened, layer) for layer in layers]
     assert len(layers) == 7
     opened.evaluate("unmixPage.choose('materials')")
-    areas = opened.evaluate("unmixPage.facts.areas")
+    areas = opened.evaluate("unmixPage.materialAreas")
     texts = [
         float(text.split(": ")[1].split()[0]) for text in opened.locator("#legend .key").all_inner_texts()
     ]
@@ -145,12 +145,12 @@ def test_names_are_text_and_points_are_saved(opened):
     opened.set_viewport_size({"width": 1000, "height": 700})
     opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
     opened.mouse.click(325, 350)
-    opened.wait_for_selector("#points svg", state="attached")
+    opened.wait_for_selector("#chart svg", state="attached")
     assert opened.inner_text("#head h1") == NAME
     assert opened.title() == NAME
     lines = opened.evaluate("unmixPage.csvText()").splitlines()
-    assert lines[0] == "quantity,point 1"
-    assert len(lines) == 1 + 3 + 5 + 8
+    assert lines[0] == 'quantity,"point 1"'
+    assert len(lines) == 1 + 3 + 5 + 6 + 8
     opened.evaluate("unmixPage.state.formula = 'r650 +'")
     opened.evaluate("unmixPage.choose('index')")
     assert "the formula ends too early" in opened.inner_text("#about")

@@ -13,8 +13,7 @@ from tests.trained.camera_scenes import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.page.page import material_areas
-from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.products.page.page import vertex_areas
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, read_measures
 from unmix_plugin.trained.regions import Box, InView, OfMaterial, check_name, polygon_mask
@@ -53,14 +52,10 @@ def test_a_rough_sheet_is_as_large_as_the_flat_one_it_stands_for():
     corner = (np.arange(60)[:, None] * 61 + np.arange(60)).ravel()
     faces = np.concatenate([corner[:, None] + [0, 1, 62], corner[:, None] + [0, 62, 61]])
     sheet = TriangleMesh(np.stack([x.ravel(), y.ravel(), height], axis=1), faces)
-    materials = (x.ravel() > 30).astype(np.uint8)
-    materials[:61] = NOTHING_ID
-    left, right, none = material_areas(sheet.areas(), faces, materials, 3)
-    assert (left, right, none) == (
-        pytest.approx(30.5 * 59.5, rel=0.02),
-        pytest.approx(29.5 * 59.5, rel=0.02),
-        0,
-    )
+    areas = vertex_areas(sheet.areas(), faces, x.size)
+    is_right, is_first_row = x.ravel() > 30, np.arange(x.size) < 61
+    assert areas[~is_first_row & ~is_right].sum() == pytest.approx(30.5 * 59.5, rel=0.02)
+    assert areas[~is_first_row & is_right].sum() == pytest.approx(29.5 * 59.5, rel=0.02)
 
 
 def test_mean_and_spread_are_those_of_the_area(surface):

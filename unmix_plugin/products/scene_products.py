@@ -141,12 +141,15 @@ class Page(Product):
     """Title of the page; the scene's name where none is given."""
     resolution: int = 256
     """Cells along the longest edge of the scene box; fewer where the page would exceed 20 MB."""
+    library: tuple[Path, ...] = ()
+    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
 
     def write(self, job: Job) -> list[Path]:
         """Find the surface, look at every vertex, write the page."""
         from unmix_plugin.products.page.page import export_page
 
-        return export_page(job, self.title, self.resolution)
+        return export_page(job, self.title, self.resolution, self.library)
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,12 @@ class MeasuredSurface:
         inside = points_in(self.scene, region, torch.from_numpy(points).float())
         return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
 
+    def vertex_areas(self, shares: Float64[np.ndarray, "F 3"]) -> Float64[np.ndarray, " V"]:
+        """The area of a region that each vertex stands for, by `shares` of it: of each triangle a third, square units of
+        the world."""
+        weights = shares * (self.areas / 3)[:, None]
+        return np.bincount(self.mesh.faces.ravel(), weights.ravel(), len(self.mesh.vertices))
+
     def measure(self, region: Region, name: str) -> MeasuredRegion:
         """What a region is.
 
@@ -109,7 +115,7 @@ class MeasuredSurface:
             ConfigError: nothing of the surface is in it, or the scene has no such material.
         """
         shares = self.shares(region)
-        weights = shares * (self.areas / 3)[:, None]
+        weights = self.vertex_areas(shares)
         area = float(weights.sum())
         if area <= 0:
             low, high = (self.scene.frame.to_world(self.mesh.vertices).round(3) for _ in range(2))
@@ -118,10 +124,7 @@ class MeasuredSurface:
                 f"{' '.join(f'{x:g}' for x in low.min(axis=0))} and {' '.join(f'{x:g}' for x in high.max(axis=0))} "
                 "of the world"
             )
-        share = (
-            np.bincount(self.mesh.faces.ravel(), weights=weights.ravel(), minlength=len(self.mesh.vertices))
-            / area
-        )
+        share = weights / area
         spectra = self._diffuse.double().numpy()
         mean = share @ spectra
         spread = np.sqrt(share @ (spectra - mean) ** 2)

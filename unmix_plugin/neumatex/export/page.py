@@ -27,7 +27,7 @@ from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.products.page.page import PageContent, colour_map, material_areas, rounded, spectral_facts
+from unmix_plugin.products.page.page import PageContent, rounded, vertex_areas
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
@@ -53,7 +53,7 @@ _TONES, _STOPS = 40, (-12.0, 5.0)
 def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     """What a page shows of an object; its mesh has vertices about as dense as cells of the resolution."""
     mesh = _resampled(scene.mesh, 2.0 / resolution)
-    family, notes, facts = scene.surface.family, [], _no_bands()
+    family, notes, materials = scene.surface.family, [], None
     parameters = scene.surface.parameters(mesh.vertices).cpu()
     arrays: dict[str, np.ndarray] = {}
     if isinstance(family, SpectralFamily) and scene.bands is not None:
@@ -61,11 +61,9 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         shares = family.abundances(parameters)
         flat = torch.ones(len(scene.bands))
         none = torch.zeros(0, len(scene.bands))
-        facts = spectral_facts(Materials(scene.bands, family.endmembers, none, light=flat))
+        materials = Materials(scene.bands, family.endmembers, none, light=flat)
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
-        materials = arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
-        areas = triangles.area(mesh.corners().double().numpy()) / scene.frame.scale**2
-        facts["areas"] = material_areas(areas, mesh.faces.numpy(), materials, shares.shape[1])
+        arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
         family = InColours(family, scene.bands)
     fit = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
     if not isinstance(family, PbrFamily):
@@ -80,7 +78,9 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
     lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
     maps = [_picture(light, scene.bands) for light in lights]
+    areas = triangles.area(mesh.corners().double().numpy()) / scene.frame.scale**2
     arrays |= {
+        "areas": vertex_areas(areas, mesh.faces.numpy(), len(mesh.vertices)),
         "positions": scene.frame.to_world(mesh.vertices.double().numpy()),
         "faces": mesh.faces.long().numpy(),
         "normals": directions_to_world(scene.frame, mesh.normals.numpy()),
@@ -91,13 +91,18 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         "mirrored": _blurred(torch.stack(maps)).numpy().view("<u2"),
         "tones": _tone_table(scene),
     }
-    facts["lights"] = [
-        {"name": name, "factors": [1.0] * len(facts["wavelengths_nm"]), "notes": []}
+    num_bands = 0 if materials is None else len(materials.bands)
+    relit_lights = [
+        {"name": name, "factors": [1.0] * num_bands, "notes": []}
         | {"harmonics": rounded(_projected(picture).numpy())}
         for name, picture in zip(scene.lights, maps, strict=True)
     ]
-    facts |= {"notes": notes, "colour": "with the tones of the pictures; shadows are soft"}
-    facts["relit"] = {"map": [_MAP[1], _MAP[0], _LEVELS], "tones": _TONES, "stops": _STOPS}
+    facts: dict[str, Any] = {
+        "lights": relit_lights,
+        "notes": notes,
+        "colour": "with the tones of the pictures; shadows are soft",
+        "relit": {"map": [_MAP[1], _MAP[0], _LEVELS], "tones": _TONES, "stops": _STOPS},
+    }
     view = next((view for view in scene.views if view.split == "eval"), scene.views[0])
     seen = scene.look(view.camera)
     shown = {"in colour": seen["rgb"], "base colour": linear_to_srgb(seen["base_colour"].clamp(0, 1))}
@@ -105,23 +110,7 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         f"{view.name}, {name}": rgba_png_bytes((255 * values.clamp(0, 1)).round().byte().cpu().numpy())
         for name, values in shown.items()
     }
-    return PageContent(arrays, facts, pictures)
-
-
-def _no_bands() -> dict[str, Any]:
-    """Facts of an object in three colours."""
-    names = (
-        "wavelengths_nm",
-        "edges_nm",
-        "names",
-        "colours",
-        "endmembers",
-        "specular",
-        "rgb",
-        "known",
-        "indices",
-    )
-    return {**{name: [] for name in names}, "light": None, "colour_map": colour_map()}
+    return PageContent(arrays, facts, pictures, materials)
 
 
 def _resampled(mesh: Mesh, cell: float) -> Mesh:

@@ -1,5 +1,8 @@
 // The page's script. Every layer is made here from what each vertex holds: how much of each endmember it sends (scaled
-// abundances), its mixture (abundances), and gloss. `facts` has the spectra; `Kit` is three.js (three.js beside this file).
+// abundances), its mixture (abundances), and gloss. `facts` has the spectra; `Kit` is three.js (three.js beside this file),
+// `Spectra` what can be computed of spectra alone (spectra.js).
+//
+// Notation: V vertices, K endmembers, J specular spectra, B bands.
 (async () => {
   "use strict";
   const $ = (id) => document.getElementById(id);
@@ -22,7 +25,9 @@
   }
 
   // ---- data ---------------------------------------------------------------------------------------------------------
-  const bytes = Uint8Array.from(atob($("data-arrays").textContent), (letter) => letter.charCodeAt(0));
+  const letters = atob($("data-arrays").textContent);
+  const bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < letters.length; i++) bytes[i] = letters.charCodeAt(i);
   $("data-arrays").remove();
   const unzipped = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   const buffer = await new Response(unzipped).arrayBuffer();
@@ -38,6 +43,7 @@
     });
   };
   const [positions, materials, confidence] = ["positions", "materials", "confidence"].map(read);
+  const [areas, keptShares] = ["areas", "regions"].map(read);
   const [scaled, abundances, gloss, tints] = ["scaled", "abundances", "gloss", "tints"].map(read);
   // Of objects whose light can be exchanged: `relit` says how the rest is meant.
   const relit = facts.relit;
@@ -53,6 +59,13 @@
   const tinted = new Set();
   const hidden = new Set();
   let metresPerUnit = facts.metres_per_unit;
+  const DARK_LIGHT = 1e-3; // relative to the brightest band: below, nothing is known of the reflectance
+  const isLit = facts.wavelengths_nm.map((_, b) => !facts.light || facts.light[b] > DARK_LIGHT * Math.max(...facts.light));
+  const UNKNOWN = 65535; // in what is stored of known spectra
+  const stored = read("known");
+  const known = facts.known.map((one, m) => ({
+    ...one, reflectance: Array.from(stored.subarray(m * B, (m + 1) * B), (step) => (step === UNKNOWN ? NaN : step / (UNKNOWN - 1))),
+  }));
 
   // ---- colour -------------------------------------------------------------------------------------------------------
   const toLinear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
@@ -66,7 +79,7 @@
     spectra.map((spectrum) => [0, 1, 2].map((c) => spectrum.reduce((sum, value, b) => sum + value * matrix[b][c], 0)));
   const bandsAsColour = (bands) => facts.wavelengths_nm.map((_, b) => bands.map((band) => (band === b ? 1 : 0)));
 
-  // A spectrum (B) at a vertex's coefficients; `from` is the unit vector to the eye, or null without gloss.
+  // A spectrum (B) at the coefficients of three vertices; `from` is the unit vector to the eye, or null without gloss.
   const spectrumOf = (corners, weights, from) => {
     const spectrum = new Array(B).fill(0);
     corners.forEach((v, corner) => {
@@ -85,69 +98,7 @@
     return Math.max(0, basis.reduce((sum, value, i) => sum + value * gloss[9 * v + i], 0));
   };
   const reflectanceOf = (spectrum) =>
-    facts.light ? spectrum.map((value, b) => (facts.light[b] > 0 ? value / facts.light[b] : NaN)) : spectrum;
-
-  // ---- index formulas: numbers, r800, + - * / ^ **, parentheses, sqrt log exp abs min max ------------------------------
-  const parseFormula = (text) => {
-    const tokens = text.toLowerCase().match(/\d+\.?\d*(?:e[+-]?\d+)?|\.\d+|[a-z_][a-z0-9_.]*|\*\*|\S/g) || [];
-    let at = 0;
-    const fail = (what) => { throw new Error(`${what}; allowed are numbers, r800 (the reflectance at 800 nm), + - * / ^, parentheses, sqrt log exp abs min max`); };
-    const expect = (sign) => tokens[at++] === sign || fail(`${sign} is missing`);
-    const functions = new Map(Object.entries({ sqrt: [Math.sqrt, 1], log: [Math.log, 1], exp: [Math.exp, 1], abs: [Math.abs, 1], min: [Math.min, 2], max: [Math.max, 2] }));
-    const finite = (value) => (Number.isFinite(value) ? value : NaN);
-    const operand = () => {
-      const token = tokens[at++];
-      if (token === undefined) fail("the formula ends too early");
-      if (token === "(") { const inner = sum(); expect(")"); return inner; }
-      if (/^[\d.]/.test(token)) { const value = Number(token); return () => value; }
-      if (/^r\d+(\.\d+)?$/.test(token)) return reflectanceAt(Number(token.slice(1)));
-      if (!functions.has(token)) fail(`${token} is unknown`);
-      const [apply, least] = functions.get(token);
-      expect("(");
-      const values = [sum()];
-      while (tokens[at] === ",") { at++; values.push(sum()); }
-      expect(")");
-      if (least === 1 ? values.length !== 1 : values.length < 2) fail(`${token} takes ${least === 1 ? "one value" : "two values or more"}`);
-      return (r) => finite(apply(...values.map((value) => value(r))));
-    };
-    const power = () => {
-      const base = operand();
-      if (tokens[at] !== "**" && tokens[at] !== "^") return base;
-      at++;
-      const exponent = sign();
-      // The zeros carry what is undefined: alone, NaN ** 0 is 1.
-      return (r) => finite(base(r) ** exponent(r) + 0 * base(r) + 0 * exponent(r));
-    };
-    const sign = () => {
-      if (tokens[at] === "-") { at++; const inner = sign(); return (r) => -inner(r); }
-      return power();
-    };
-    const chain = (next, signs) => () => {
-      let left = next();
-      while (signs.has(tokens[at])) {
-        const [apply, before] = [signs.get(tokens[at++]), left];
-        const right = next();
-        left = (r) => finite(apply(before(r), right(r)));
-      }
-      return left;
-    };
-    const product = chain(sign, new Map([["*", (a, b) => a * b], ["/", (a, b) => a / b]]));
-    const sum = chain(product, new Map([["+", (a, b) => a + b], ["-", (a, b) => a - b]]));
-    const formula = sum();
-    if (at < tokens.length) fail(`${tokens[at]} is not expected there`);
-    return formula;
-  };
-  const usedBands = new Set();
-  const reflectanceAt = (nm) => {
-    const centres = facts.wavelengths_nm;
-    if (nm < facts.edges_nm[0] || nm > facts.edges_nm[B]) throw new Error(`${nm} nm is outside the bands`);
-    let right = centres.findIndex((centre) => centre >= nm);
-    if (right < 0) right = B - 1;
-    const left = centres[right] <= nm || right === 0 ? right : right - 1;
-    [left, right].forEach((band) => usedBands.add(band));
-    const part = left === right ? 0 : (nm - centres[left]) / (centres[right] - centres[left]);
-    return (r) => r[left] + part * (r[right] - r[left]);
-  };
+    facts.light ? spectrum.map((value, b) => (isLit[b] ? value / facts.light[b] : NaN)) : spectrum;
 
   // ---- scene --------------------------------------------------------------------------------------------------------
   const renderer = new Kit.WebGLRenderer({ canvas, context, antialias: true, preserveDrawingBuffer: true });
@@ -176,6 +127,7 @@
   attribute("position", 3, positions);
   geometry.setIndex(new Kit.BufferAttribute(faces, 1));
   const [lightOf, tintOf, shownOf] = [attribute("light", 3), attribute("tint", 3), attribute("shown", 1)];
+  const markOf = attribute("mark", 4); // colour times share, and share, of the region that is shown there
   if (gloss) [0, 3, 6].forEach((first) => attribute(`gloss${first}`, 3, Float32Array.from({ length: 3 * V }, (_, i) => gloss[9 * Math.floor(i / 3) + first + (i % 3)])));
   if (relit) [["normal", normals, 3], ["base", lit, 3], ["polish", polish, 3]].forEach(([name, values, width]) => attribute(name, width, values));
   const volume = (values, sizes, type) => {
@@ -192,26 +144,31 @@
       tones: { value: relit && volume(tones, [relit.tones, relit.tones, relit.tones], Kit.UnsignedByteType) },
     },
     vertexShader: `
-      attribute vec3 light, tint${gloss ? ", gloss0, gloss3, gloss6" : ""}; attribute float shown;
-      uniform float glossy; varying vec3 sent; varying float there;
+      attribute vec3 light, tint${gloss ? ", gloss0, gloss3, gloss6" : ""}; attribute float shown; attribute vec4 mark;
+      uniform float glossy; varying vec3 sent; varying float there; varying vec4 marked;
       ${relit ? "attribute vec3 base, polish; varying vec3 across, eye, head_on, finish;" : ""}
       void main() {
         ${relit ? "across = normal; eye = cameraPosition - position; finish = polish; head_on = mix(vec3(0.04), base, polish.y);" : ""}
         vec3 d = normalize(cameraPosition - position);
         float strength = ${gloss ? `dot(gloss0, vec3(1., d.x, d.y)) + dot(gloss3, vec3(d.z, d.x * d.y, d.y * d.z))
           + dot(gloss6, vec3(d.x * d.z, d.x * d.x - d.y * d.y, 3. * d.z * d.z - 1.))` : "0."};
-        sent = light + glossy * max(strength, 0.) * tint; there = shown;
+        sent = light + glossy * max(strength, 0.) * tint; there = shown; marked = mark;
         gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.);
       }`,
     fragmentShader: `
-      uniform float gain, flat_, glossy, turn; varying vec3 sent; varying float there;
+      uniform float gain, flat_, glossy, turn; varying vec3 sent; varying float there; varying vec4 marked;
       ${relit ? reflecting : ""}
-      void main() {
-        if (there < 0.5) discard;
-        ${relit ? "if (glossy > 0.) { gl_FragColor = vec4(toned((sent + reflected()) * gain), 1.); return; }" : ""}
+      vec3 painted() {
+        ${relit ? "if (glossy > 0.) return toned((sent + reflected()) * gain);" : ""}
         vec3 linear = clamp(sent * gain, 0., 1.);
         vec3 curved = mix(12.92 * linear, 1.055 * pow(max(linear, 1e-6), vec3(1. / 2.4)) - 0.055, step(0.0031308, linear));
-        gl_FragColor = vec4(mix(curved, sent, flat_), 1.);
+        return mix(curved, sent, flat_);
+      }
+      void main() {
+        if (there < 0.5) discard;
+        // Regions have an outline of three pixels where half of the surface is inside.
+        bool isOutline = abs(marked.a - 0.5) < min(1.5 * fwidth(marked.a), 0.499);
+        gl_FragColor = vec4(isOutline ? marked.rgb / max(marked.a, 1e-3) : painted(), 1.);
       }`,
   });
   const object = new Kit.Mesh(geometry, surface);
@@ -253,6 +210,7 @@
     renderer.setClearColor(new Kit.Color(getComputedStyle(document.body).backgroundColor));
     renderer.render(scene, camera);
     drawScaleBar(height);
+    placeLabels();
   };
   addEventListener("resize", redraw);
   new ResizeObserver(redraw).observe($("panel"));
@@ -267,7 +225,7 @@
     const first = facts.cameras[0] ? new Kit.Vector3(...facts.cameras[0].position).sub(new Kit.Vector3(...offset)) : new Kit.Vector3(1, 1, 1);
     camera.fov = 40;
     const narrow = Math.min(1, innerWidth / innerHeight);
-    const distance = sphere.radius / Math.sin((camera.fov * Math.PI) / 360) / narrow;
+    const distance = (1.06 * sphere.radius) / Math.sin((camera.fov * Math.PI) / 360) / narrow;
     lookFrom(first.sub(sphere.center).setLength(distance).add(sphere.center), sphere.center);
   };
   const lookThrough = (index) => {
@@ -362,8 +320,10 @@
   const swatch = (k) => {
     const dot = make("span", { className: "dot" });
     dot.style.background = css(colours[k]);
-    return make("div", { className: "key" }, dot, `${names[k]}: ${unitText(Math.sqrt(facts.areas[k]), 2)}`);
+    return make("div", { className: "key" }, dot, `${names[k]}: ${areaText(materialAreas[k])}`);
   };
+  const materialAreas = new Float64Array(K);
+  if (materials) areas.forEach((area, v) => { if (materials[v] < K) materialAreas[materials[v]] += area; });
 
   const painters = {
     colour: () => { if (relit) return paintRelit(); paintLight(facts.rgb); return facts.colour; },
@@ -390,17 +350,16 @@
     index: () => {
       const known = facts.indices[state.index];
       const text = state.formula || known?.formula || "";
-      usedBands.clear();
-      const formula = parseFormula(text);
+      const formula = Spectra.parseFormula(text, facts.wavelengths_nm, facts.edges_nm);
       const values = new Float32Array(V);
       const reflectance = new Array(B).fill(NaN);
       for (let v = 0; v < V; v++) {
-        for (const b of usedBands) {
+        for (const b of formula.bands) {
           reflectance[b] = 0;
           for (let k = 0; k < K; k++) reflectance[b] += scaled[v * K + k] * facts.endmembers[k][b];
-          if (facts.light) reflectance[b] = facts.light[b] > 0 ? reflectance[b] / facts.light[b] : NaN;
+          if (facts.light) reflectance[b] = isLit[b] ? reflectance[b] / facts.light[b] : NaN;
         }
-        values[v] = formula(reflectance);
+        values[v] = formula.value(reflectance);
       }
       const finite = values.filter(Number.isFinite).sort();
       if (!finite.length) throw new Error("the formula is undefined everywhere");
@@ -473,41 +432,151 @@
       const colour = make("input", { type: "color", value: hex(colours[k]), title: "another colour, in the legend and in true colour" });
       colour.oninput = () => { colours[k] = [1, 3, 5].map((i) => parseInt(colour.value.slice(i, i + 2), 16) / 255); tinted.add(k); paint(); };
       const text = make("input", { type: "text", value: name, maxLength: 100, title: "rename" });
-      text.onchange = () => { names[k] = text.value.trim() || facts.names[k]; showArguments(); paint(); listPoints(); };
-      return make("div", { className: "material" }, shown, colour, text, make("p", { className: "note", textContent: `like ${facts.known[k][0] ?? "nothing known"}`, title: facts.known[k].join(", ") }));
+      text.onchange = () => { names[k] = text.value.trim() || facts.names[k]; showArguments(); paint(); listProbes(); };
+      const like = likeness(facts.endmembers[k]).map((match) => match.text);
+      const note = make("p", { className: "note", textContent: `like ${like[0] ?? "nothing known"}`, title: like.join("\n") });
+      return make("div", { className: "material" }, shown, colour, text, note);
     }));
   };
 
-  // ---- points -------------------------------------------------------------------------------------------------------
-  const points = [];
-  const markColours = ["#e6550d", "#3182bd", "#31a354", "#756bb1", "#d62790", "#8c6d31", "#17a2b8", "#777777"];
-  let isMeasuring = false;
-  const rulerEnds = [];
+  // ---- what is known ------------------------------------------------------------------------------------------------
+  const ALIKE_RAD = 0.1; // a larger angle is no match
+  const likeness = (spectrum) =>
+    Spectra.nearest(reflectanceOf(spectrum), known.map((one) => one.reflectance), 3).map(({ index, angle }) => {
+      const { name, source } = known[index];
+      const text = `${name} (${angle.toFixed(3)} rad${angle > ALIKE_RAD ? ", not alike" : ""}; ${source})`;
+      return { ...known[index], angle, text };
+    });
+
+  // ---- picking ------------------------------------------------------------------------------------------------------
   const raycaster = new Kit.Raycaster();
-  const pick = (x, y) => {
+  // Where a ray meets the shown surface first: { hit, corners, weights } of a triangle, or nothing.
+  const firstHit = () => {
     geometry.boundsTree ??= new Kit.MeshBVH(geometry, { indirect: true });
-    raycaster.setFromCamera(new Kit.Vector2((2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight), camera);
+    raycaster.firstHitOnly = hidden.size === 0;
     for (const hit of raycaster.intersectObject(object)) {
       const corners = [hit.face.a, hit.face.b, hit.face.c];
       const triangle = corners.map((v) => new Kit.Vector3().fromArray(positions, 3 * v));
       const weights = Kit.Triangle.getBarycoord(hit.point, ...triangle, new Kit.Vector3())?.toArray();
-      if (!weights) continue;
-      const mean = (values, width, i) => corners.reduce((sum, v, c) => sum + weights[c] * values[v * width + i], 0);
-      if (mean(shownOf.array, 1, 0) < 0.5) continue;
-      const from = camera.position.clone().sub(hit.point).normalize().toArray();
-      return {
-        place: hit.point.clone(), spectrum: spectrumOf(corners, weights, from),
-        mixture: names.map((_, k) => mean(abundances, K, k)),
-        finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
-      };
+      if (weights && corners.reduce((sum, v, c) => sum + weights[c] * shownOf.array[v], 0) >= 0.5) return { hit, corners, weights };
     }
     return null;
   };
-  const angle = (a, b) => {
-    const dot = (p, q) => p.reduce((sum, value, i) => sum + value * q[i], 0);
-    return Math.acos(Math.min(1, dot(a, b) / Math.sqrt(Math.max(dot(a, a) * dot(b, b), 1e-30))));
+  const pick = (x, y) => {
+    raycaster.setFromCamera(new Kit.Vector2((2 * x) / innerWidth - 1, 1 - (2 * y) / innerHeight), camera);
+    const found = firstHit();
+    if (!found) return null;
+    const { hit, corners, weights } = found;
+    const mean = (values, width, i) => corners.reduce((sum, v, c) => sum + weights[c] * values[v * width + i], 0);
+    const from = camera.position.clone().sub(hit.point).normalize().toArray();
+    return {
+      place: hit.point.clone(), spectrum: spectrumOf(corners, weights, from),
+      mixture: names.map((_, k) => mean(abundances, K, k)),
+      finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
+    };
+  };
+
+  // ---- regions ------------------------------------------------------------------------------------------------------
+  const isInside = (outline, x, y) => {
+    let inside = false;
+    outline.forEach(([x1, y1], i) => {
+      const [x2, y2] = outline.at(i - 1);
+      if (y1 > y !== y2 > y && x < x1 + ((y - y1) / (y2 - y1)) * (x2 - x1)) inside = !inside;
+    });
+    return inside;
+  };
+  const edge = Math.sqrt((2 * areas.reduce((sum, area) => sum + area, 0)) / Math.max(faces.length / 3, 1)); // usual one of a triangle
+  // Which vertices are seen from here within an outline on the screen, 255 each, as regions of the run have them.
+  const sharesInside = (outline) => {
+    const shares = new Uint8Array(V);
+    const [columns, rows] = [0, 1].map((axis) => outline.map((corner) => corner[axis]));
+    const [left, right, top, bottom] = [Math.min(...columns), Math.max(...columns), Math.min(...rows), Math.max(...rows)];
+    const [place, onScreen] = [new Kit.Vector3(), new Kit.Vector3()];
+    for (let v = 0; v < V; v++) {
+      if (shownOf.array[v] < 0.5) continue;
+      place.fromArray(positions, 3 * v);
+      onScreen.copy(place).project(camera);
+      const [x, y] = [((onScreen.x + 1) / 2) * innerWidth, ((1 - onScreen.y) / 2) * innerHeight];
+      if (x < left || x > right || y < top || y > bottom || !isInside(outline, x, y)) continue;
+      raycaster.ray.origin.copy(camera.position);
+      raycaster.ray.direction.copy(place).sub(camera.position).normalize();
+      const found = firstHit();
+      if (!found || found.hit.distance > place.distanceTo(camera.position) - edge) shares[v] = 255;
+    }
+    return shares;
+  };
+  // What a region is, weighted by area; its spectrum is without gloss. Nothing where no surface is in it.
+  const measureRegion = (shares) => {
+    const weights = areas.map((area, v) => (area * shares[v]) / 255);
+    const area = weights.reduce((sum, weight) => sum + weight, 0);
+    if (!(area > 0)) return null;
+    const mean = (values, width, i) => weights.reduce((sum, weight, v) => sum + weight * values[v * width + i], 0) / area;
+    const middle = [0, 1, 2].map((axis) => mean(positions, 3, axis));
+    let [anchor, least] = [0, Infinity];
+    for (let v = 0; v < V; v++) {
+      const distance = Math.hypot(...middle.map((value, axis) => positions[3 * v + axis] - value));
+      if (shares[v] > 127 && distance < least) [anchor, least] = [v, distance];
+    }
+    const { mean: spectrum, spread } = B ? Spectra.mixtureStatistics(weights, scaled, facts.endmembers) : { mean: [], spread: null };
+    return {
+      shares, area, spectrum, spread, anchor: new Kit.Vector3().fromArray(positions, 3 * anchor),
+      mixture: names.map((_, k) => mean(abundances, K, k)),
+      finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
+    };
+  };
+  const paintRegions = () => {
+    markOf.array.fill(0);
+    probes.filter((probe) => probe.isShown && probe.shares).forEach(({ shares, colour }) => {
+      const { r, g, b } = new Kit.Color().setStyle(colour, ""); // as it is on the screen
+      for (let v = 0; v < V; v++) {
+        const share = shares[v] / 255;
+        if (share > 0) markOf.array.set([r * share, g * share, b * share, share], 4 * v);
+      }
+    });
+    markOf.needsUpdate = true;
+  };
+  // Names beside the points and regions that are seen from here.
+  const placeLabels = () => {
+    const [labels, towards] = [$("labels"), new Kit.Vector3()];
+    const shown = probes.filter((probe) => probe.isShown);
+    while (labels.children.length < shown.length) labels.append(make("span"));
+    [...labels.children].forEach((label, i) => {
+      label.hidden = i >= shown.length;
+      if (label.hidden) return;
+      const { name, colour, place, anchor = place } = shown[i];
+      raycaster.ray.origin.copy(camera.position);
+      raycaster.ray.direction.copy(towards.copy(anchor).sub(camera.position).normalize());
+      const found = firstHit();
+      label.hidden = found !== null && found.hit.distance < anchor.distanceTo(camera.position) - edge;
+      const { x, y } = towards.copy(anchor).project(camera);
+      Object.assign(label.style, { left: `${((x + 1) / 2) * innerWidth}px`, top: `${((1 - y) / 2) * innerHeight}px`, borderColor: colour });
+      label.className = place ? "above" : "";
+      label.textContent = name;
+    });
+  };
+
+  // ---- probes: points and regions, each with a spectrum -------------------------------------------------------------
+  const probes = [];
+  const COLOURS = ["#e6550d", "#3182bd", "#31a354", "#756bb1", "#d62790", "#8c6d31", "#17a2b8", "#777777"];
+  const counts = { point: 0, region: 0 };
+  let chosen = null; // the probe whose nearest known spectra are shown
+  const freeColour = () => {
+    const uses = COLOURS.map((colour) => probes.filter((probe) => probe.colour === colour).length);
+    return COLOURS[uses.indexOf(Math.min(...uses))];
+  };
+  const addProbe = (kind, found, fields = {}) => {
+    const points = probes.filter((probe) => !probe.shares);
+    if (kind === "point" && points.length === COLOURS.length) removeProbe(points[0]);
+    const name = fields.name ?? `${kind} ${++counts[kind]}`;
+    chosen = { ...found, name, colour: freeColour(), isShown: true, likeness: B ? likeness(found.spectrum) : [], ...fields };
+    probes.push(chosen);
+  };
+  const removeProbe = (probe) => {
+    probes.splice(probes.indexOf(probe), 1);
+    if (chosen === probe) chosen = probes.at(-1) ?? null;
   };
   const world = (place) => place.toArray().map((value, axis) => value + offset[axis]);
+  const rulerEnds = [];
   const markAt = (place, colour) => {
     const dot = new Kit.Mesh(new Kit.SphereGeometry(sphere.radius / 90, 16, 12), new Kit.MeshBasicMaterial({ color: colour }));
     dot.position.copy(place);
@@ -515,54 +584,134 @@
   };
   const showMarks = () => {
     marks.clear();
-    points.forEach((point) => marks.add(markAt(point.place, point.colour)));
+    probes.filter((probe) => probe.isShown && probe.place).forEach((probe) => marks.add(markAt(probe.place, probe.colour)));
     rulerEnds.forEach((place) => marks.add(markAt(place, "#ffb000")));
     if (rulerEnds.length === 2)
       marks.add(new Kit.Line(new Kit.BufferGeometry().setFromPoints(rulerEnds), new Kit.LineBasicMaterial({ color: "#ffb000", depthTest: false })));
+    paintRegions();
     redraw();
   };
-  const listPoints = () => {
-    $("how").hidden = points.length > 0;
-    const rows = points.map((point, index) => {
-      const dot = make("span", { className: "dot" });
-      dot.style.background = point.colour;
-      const mixture = point.mixture.map((share, k) => [share, k]).filter(([share]) => share >= 0.02).sort((a, b) => b[0] - a[0]);
-      const shares = mixture.slice(0, 4).map(([share, k]) => `${names[k]} ${Math.round(100 * share)} %`).join(", ");
-      const at = `At ${world(point.place).map(shownNumber).join(", ")}.`;
-      const finish = relit ? `base colour ${hex(point.finish.slice(0, 3).map(toDisplay))}, roughness ${point.finish[3].toFixed(2)}, metallicity ${point.finish[4].toFixed(2)}. ` : "";
-      if (!B) return make("div", { className: "key" }, dot, make("span", { textContent: `${index + 1}: ${finish}${at}` }));
-      const nearest = facts.endmembers.map((spectrum, k) => [angle(spectrum, point.spectrum), k]).sort((a, b) => a[0] - b[0])[0];
-      const like = facts.known[nearest[1]][0];
-      const text = `${index + 1}: ${shares || "nothing"}. Nearest: ${names[nearest[1]]}, ${nearest[0].toFixed(3)} rad${like ? `, like ${like}` : ""}. ${finish}${at}`;
-      return make("div", { className: "key" }, dot, make("span", { textContent: text }));
-    });
-    $("points").replaceChildren(...(points.length && B ? [chart()] : []), ...rows);
+  const showProbes = () => { listProbes(); showMarks(); };
+  const describe = (probe) => {
+    const largest = probe.mixture.map((share, k) => [share, k]).filter(([share]) => share >= 0.02).sort((a, b) => b[0] - a[0]);
+    const shares = largest.slice(0, 4).map(([share, k]) => `${names[k]} ${Math.round(100 * share)} %`).join(", ");
+    const [red, green, blue, roughness, metallicity] = probe.finish || [];
+    return [
+      probe.shares && areaText(probe.area), B && (shares || "nothing"),
+      probe.finish && `base colour ${hex([red, green, blue].map(toDisplay))}, roughness ${roughness.toFixed(2)}, metallicity ${metallicity.toFixed(2)}`,
+      probe.place && `at ${world(probe.place).map(shownNumber).join(", ")}`,
+    ].filter(Boolean).join("; ");
   };
-  const chart = () => {
-    const shown = points.map((point) => reflectanceOf(point.spectrum));
-    const [left, right, top, bottom] = [34, 300, 8, 140];
-    const nm = facts.wavelengths_nm;
-    const most = Math.max(1e-6, ...shown.flat().filter(Number.isFinite));
-    const x = (value) => left + ((value - nm[0]) / Math.max(nm[B - 1] - nm[0], 1e-9)) * (right - left);
-    const y = (value) => bottom - (value / most) * (bottom - top);
-    const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-    const draw = (tag, fields, text = "") => {
-      const element = document.createElementNS(svg.namespaceURI, tag);
-      Object.entries(fields).forEach(([name, value]) => element.setAttribute(name, value));
-      element.textContent = text;
-      svg.append(element);
+  const probeRow = (probe) => {
+    const shown = make("input", { type: "checkbox", checked: probe.isShown, title: "show or hide" });
+    shown.onchange = () => { probe.isShown = shown.checked; showProbes(); };
+    const dot = make("span", { className: "dot" });
+    dot.style.background = probe.colour;
+    const name = make("input", { type: "text", value: probe.name, maxLength: 64, title: probe.isKept ? "a region of the run" : "rename", readOnly: probe.isKept });
+    name.onchange = () => { probe.name = name.value.trim() || probe.name; showProbes(); };
+    name.onfocus = () => { if (chosen !== probe) { chosen = probe; listProbes(probe); } };
+    const remove = make("button", { textContent: "×", title: "remove", hidden: Boolean(probe.isKept), onclick: () => { removeProbe(probe); showProbes(); } });
+    const feature = probe.isShown && absorptionOf(probe);
+    const lines = [
+      describe(probe),
+      ...(feature ? [`absorption: depth ${shownNumber(feature.depth)}, centre ${shownNumber(feature.centre)} nm, area ${shownNumber(feature.area)} nm`] : []),
+    ];
+    const notes = lines.map((text) => make("p", { className: "note", textContent: text }));
+    if (probe === chosen)
+      probe.likeness.forEach((match, rank) => {
+        const sample = svgElement("svg", { viewBox: "0 0 22 10", class: "sample" });
+        sample.append(svgElement("line", { x1: 0, x2: 22, y1: 5, y2: 5, stroke: probe.colour, ...knownStyle(rank) }));
+        notes.push(make("p", { className: "note" }, sample, ` like ${match.text}`));
+      });
+    return make("div", { className: probe === chosen ? "probe chosen" : "probe" }, shown, dot, name, remove, ...notes);
+  };
+  const listProbes = (focused) => {
+    $("how").hidden = probes.length > 0;
+    $("curves").hidden = !(B && probes.some((probe) => probe.isShown));
+    $("chart").replaceChildren(...($("curves").hidden ? [] : [chart(curves())]));
+    const newestFirst = [...probes].reverse();
+    $("probes").replaceChildren(...newestFirst.map(probeRow));
+    if (focused) $("probes").children[newestFirst.indexOf(focused)].querySelector("input[type='text']").focus();
+  };
+
+  // ---- curves -------------------------------------------------------------------------------------------------------
+  // The bands of the window that is looked at, in which there is light.
+  const windowBands = () => {
+    const [low, high] = isRemoved() ? [$("low"), $("high")].map((input) => Number(input.value)) : [-Infinity, Infinity];
+    return facts.wavelengths_nm.map((_, b) => b).filter((b) => facts.wavelengths_nm[b] >= low && facts.wavelengths_nm[b] <= high && isLit[b]);
+  };
+  const isRemoved = () => $("curve").value === "continuum removed";
+  const absorptionOf = (probe) => {
+    const bands = windowBands();
+    if (!isRemoved() || bands.length < 3) return null;
+    const reflectance = reflectanceOf(probe.spectrum);
+    return Spectra.absorption(bands.map((b) => reflectance[b]), bands.map((b) => facts.wavelengths_nm[b]));
+  };
+  // What the chart shows: each shown probe, and the known spectra nearest to the chosen one, as bright as it.
+  const curves = () => {
+    const bands = windowBands();
+    const nm = bands.map((b) => facts.wavelengths_nm[b]);
+    const shown = probes.filter((probe) => probe.isShown);
+    const found = shown.map((probe) => ({
+      values: reflectanceOf(probe.spectrum), spread: !isRemoved() && probe.spread && reflectanceOf(probe.spread), colour: probe.colour,
+    }));
+    if (chosen?.isShown)
+      chosen.likeness.forEach(({ reflectance }, rank) => {
+        const factor = Spectra.brightness(reflectanceOf(chosen.spectrum), reflectance);
+        found.push({ values: reflectance.map((value) => value * factor), colour: chosen.colour, style: knownStyle(rank) });
+      });
+    const inWindow = (values) => bands.map((b) => values[b]);
+    // A known spectrum may lack bands: the continuum of those that it has.
+    const removed = (values) => {
+      const there = values.map((value, i) => i).filter((i) => Number.isFinite(values[i]));
+      const ratios = Spectra.continuumRemoved(there.map((i) => values[i]), there.map((i) => nm[i]));
+      return values.map((_, i) => (there.includes(i) ? ratios[there.indexOf(i)] : NaN));
     };
-    svg.setAttribute("viewBox", "0 0 306 172");
+    return {
+      nm, quantity: isRemoved() ? "reflectance over its continuum" : facts.light ? "reflectance" : "radiance, 1 = full scale",
+      lines: found.map((curve) => ({
+        ...curve, values: isRemoved() ? removed(inWindow(curve.values)) : inWindow(curve.values), spread: curve.spread && inWindow(curve.spread),
+      })),
+    };
+  };
+  const svgElement = (tag, fields, text = "") => {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    Object.entries(fields).forEach(([name, value]) => element.setAttribute(name, value));
+    element.textContent = text;
+    return element;
+  };
+  const knownStyle = (rank) => ({ "stroke-width": 1.4, "stroke-dasharray": ["7 2", "3 3", "1 3"][rank] });
+  const chart = ({ nm, quantity, lines }) => {
+    const [left, right, top, bottom] = [34, 300, 8, 140];
+    const upper = lines.flatMap(({ values, spread }) => values.map((value, i) => value + (spread ? spread[i] : 0))).filter(Number.isFinite);
+    const lower = lines.flatMap(({ values }) => values).filter(Number.isFinite);
+    const least = isRemoved() ? Math.min(1, ...lower) : 0;
+    const most = Math.max(isRemoved() ? 1 : 1e-6, ...upper);
+    const range = Math.max(most - least, 1e-9);
+    const x = (value) => left + ((value - nm[0]) / Math.max(nm.at(-1) - nm[0], 1e-9)) * (right - left);
+    const y = (value) => bottom - ((value - least) / range) * (bottom - top);
+    const svg = svgElement("svg", { viewBox: "0 0 306 172" });
+    const draw = (...content) => svg.append(svgElement(...content));
     draw("path", { d: `M${left} ${top}V${bottom}H${right}`, fill: "none", stroke: "currentColor", "stroke-opacity": 0.4 });
-    [0, 0.5, 1].forEach((part) => draw("text", { x: left - 4, y: y(part * most) + 3, "text-anchor": "end" }, (part * most).toPrecision(2)));
-    [0, 0.5, 1].forEach((part) => {
-      const value = nm[0] + part * (nm[B - 1] - nm[0]);
+    const ends = [0, 0.5, 1];
+    ends.forEach((part) => draw("text", { x: left - 4, y: y(least + part * range) + 3, "text-anchor": "end" }, (least + part * range).toPrecision(2)));
+    if (nm.length < 2) {
+      draw("text", { x: (left + right) / 2, y: (top + bottom) / 2, "text-anchor": "middle" }, "fewer than two bands to show");
+      return svg;
+    }
+    ends.forEach((part) => {
+      const value = nm[0] + part * (nm.at(-1) - nm[0]);
       draw("text", { x: x(value), y: bottom + 13, "text-anchor": part === 1 ? "end" : "middle" }, Math.round(value));
     });
-    draw("text", { x: (left + right) / 2, y: bottom + 27, "text-anchor": "middle" }, `wavelength (nm); up: ${facts.light ? "reflectance" : "radiance, 1 = full scale"}`);
-    shown.forEach((values, index) => {
-      const line = values.map((value, b) => (Number.isFinite(value) ? `${x(nm[b]).toFixed(1)},${y(value).toFixed(1)}` : "")).join(" ");
-      draw("polyline", { points: line, fill: "none", stroke: points[index].colour, "stroke-width": 1.8 });
+    draw("text", { x: (left + right) / 2, y: bottom + 27, "text-anchor": "middle" }, `wavelength (nm); up: ${quantity}`);
+    const at = (value, i) => (Number.isFinite(value) ? `${x(nm[i]).toFixed(1)},${y(value).toFixed(1)}` : "");
+    lines.forEach(({ values, spread, colour, style = { "stroke-width": 1.8 } }) => {
+      if (spread) {
+        const above = values.map((value, i) => at(value + spread[i], i));
+        const below = values.map((value, i) => at(Math.max(value - spread[i], 0), i)).reverse();
+        draw("polygon", { points: [...above, ...below].join(" "), fill: colour, "fill-opacity": 0.2 });
+      }
+      draw("polyline", { points: values.map(at).join(" "), fill: "none", stroke: colour, ...style });
     });
     return svg;
   };
@@ -573,39 +722,82 @@
   };
   const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
   const csvText = () => {
-    const head = points.map((_, index) => `point ${index + 1}`);
-    const rows = [["quantity", ...head]];
-    ["x", "y", "z"].forEach((axis, i) => rows.push([axis, ...points.map((point) => world(point.place)[i])]));
-    names.forEach((name, k) => rows.push([quoted(`abundance of ${name}`), ...points.map((point) => point.mixture[k])]));
-    if (relit) ["base colour red", "base colour green", "base colour blue", "roughness", "metallicity"].forEach((what, i) => rows.push([what, ...points.map((point) => point.finish[i])]));
+    const shown = probes.filter((probe) => probe.isShown);
+    const rows = [["quantity", ...shown.map((probe) => quoted(probe.name))]];
+    // What no probe has gets no row.
+    const add = (what, valueOf) => {
+      const values = shown.map((probe) => valueOf(probe) ?? "");
+      if (values.some((value) => value !== "")) rows.push([quoted(what), ...values]);
+    };
+    ["x", "y", "z"].forEach((axis, i) => add(axis, (probe) => probe.place && world(probe.place)[i]));
+    add("area in square units", (probe) => probe.area);
+    if (metresPerUnit !== null) add("area in cm2", (probe) => probe.area && probe.area * 1e4 * metresPerUnit ** 2);
+    names.forEach((name, k) => add(`abundance of ${name}`, (probe) => probe.mixture[k]));
+    ["base colour red", "base colour green", "base colour blue", "roughness", "metallicity"].forEach((what, i) =>
+      add(what, (probe) => probe.finish?.[i]));
+    const bands = windowBands();
+    if (isRemoved() && bands.length >= 3) {
+      const of = `of the absorption from ${facts.wavelengths_nm[bands[0]]} to ${facts.wavelengths_nm[bands.at(-1)]} nm`;
+      ["depth", "centre", "area"].forEach((what) => add(`${what} ${of}`, (probe) => absorptionOf(probe)[what]));
+    }
+    [0, 1, 2].forEach((rank) => {
+      add(`known spectrum ${rank + 1}`, ({ likeness }) => likeness[rank] && quoted(likeness[rank].name));
+      add(`angle to it (rad)`, ({ likeness }) => likeness[rank]?.angle);
+    });
     const what = facts.light ? "reflectance" : "radiance";
-    facts.wavelengths_nm.forEach((nm, b) => rows.push([`${what} at ${nm} nm`, ...points.map((point) => reflectanceOf(point.spectrum)[b])]));
+    facts.wavelengths_nm.forEach((nm, b) => add(`${what} at ${nm} nm`, (probe) => reflectanceOf(probe.spectrum)[b]));
+    facts.wavelengths_nm.forEach((nm, b) =>
+      add(`standard deviation at ${nm} nm`, (probe) => probe.spread && reflectanceOf(probe.spread)[b]));
     return rows.map((row) => row.join(",")).join("\r\n") + "\r\n";
   };
-  $("csv").onclick = () => save("points.csv", new Blob([csvText()], { type: "text/csv" }));
-  $("clear").onclick = () => { points.length = 0; rulerEnds.length = 0; showLength(); listPoints(); showMarks(); };
+  $("csv").onclick = () => save("spectra.csv", new Blob([csvText()], { type: "text/csv" }));
+  $("clear").onclick = () => {
+    probes.filter((probe) => !probe.isKept).forEach(removeProbe);
+    rulerEnds.length = 0;
+    showLength();
+    showProbes();
+  };
+  $("curve").onchange = () => { $("window").hidden = !isRemoved(); listProbes(); };
+  $("low").onchange = $("high").onchange = () => listProbes();
 
   // ---- lengths ------------------------------------------------------------------------------------------------------
-  const unitText = (length, power = 1) => {
-    const square = power === 2 ? "²" : "";
-    if (metresPerUnit === null) return `${shownNumber(length ** power)} world ${length === 1 ? "unit" : "units"}${square}`;
+  const lengthText = (length) => {
+    if (metresPerUnit === null) return `${shownNumber(length)} world ${length === 1 ? "unit" : "units"}`;
     const metres = length * metresPerUnit;
     const [factor, unit] = metres >= 1 ? [1, "m"] : metres >= 0.01 ? [100, "cm"] : [1000, "mm"];
-    return `${shownNumber((metres * factor) ** power)} ${unit}${square}`;
+    return `${shownNumber(metres * factor)} ${unit}`;
+  };
+  const areaText = (area) => {
+    if (metresPerUnit === null) return `${shownNumber(area)} square units`;
+    const square = area * metresPerUnit ** 2;
+    return square >= 1 ? `${shownNumber(square)} m²` : `${shownNumber(1e4 * square)} cm²`;
   };
   const showLength = () => {
     const isWhole = rulerEnds.length === 2;
     $("known").hidden = !isWhole;
-    $("length").textContent = isWhole ? unitText(rulerEnds[0].distanceTo(rulerEnds[1])) : isMeasuring ? "click two points" : "";
+    $("length").textContent = isWhole ? lengthText(rulerEnds[0].distanceTo(rulerEnds[1])) : mode === "ruler" ? "click two points" : "";
   };
-  const measure = (on) => { isMeasuring = on; $("hint").textContent = on ? "Click two points of the object." : ""; $("ruler").setAttribute("aria-pressed", on); if (on) rulerEnds.length = 0; showLength(); showMarks(); };
-  $("ruler").onclick = () => measure(!isMeasuring);
+  // What a click or a stroke is for: a spectrum (no mode), the ruler, or a region.
+  let mode = null;
+  const HINTS = { ruler: "Click two points of the object.", region: "Draw around a part of the object." };
+  const setMode = (name) => {
+    mode = name;
+    $("hint").textContent = HINTS[mode] ?? "";
+    ["ruler", "region"].forEach((one) => $(one).setAttribute("aria-pressed", mode === one));
+    controls.enabled = mode !== "region";
+    if (mode === "ruler") rulerEnds.length = 0;
+    if (mode && innerWidth <= 700 && !$("panel").classList.contains("folded")) fold();
+    showLength();
+    showMarks();
+  };
+  ["ruler", "region"].forEach((name) => { $(name).onclick = () => setMode(mode === name ? null : name); });
   $("true-length").onchange = () => {
     const metres = Number($("true-length").value);
     const length = rulerEnds.length === 2 ? rulerEnds[0].distanceTo(rulerEnds[1]) : 0;
     if (!(metres > 0) || !(length > 0)) { $("length").textContent = "a length must be greater than 0"; return; }
     metresPerUnit = metres / length;
     showLength();
+    listProbes();
     paint();
   };
   const drawScaleBar = (height) => {
@@ -617,33 +809,63 @@
     const length = power * ([5, 2, 1].find((step) => step * power <= widest) ?? 1);
     $("scale").hidden = false;
     $("scale").style.width = `${length / unit / perPixel}px`;
-    $("scale").textContent = unitText(length / unit);
+    $("scale").textContent = lengthText(length / unit);
   };
 
   // ---- hands and keys -----------------------------------------------------------------------------------------------
   let pressed = null;
+  let outline = null; // of a region that is being drawn: columns and rows
+  const drawOutline = () => $("outline").setAttribute("points", (outline ?? []).map((corner) => corner.join(",")).join(" "));
   // A second finger begins a pinch, which picks nothing.
-  canvas.addEventListener("pointerdown", (event) => { pressed = event.isPrimary ? [event.clientX, event.clientY] : null; });
+  canvas.addEventListener("pointerdown", (event) => {
+    pressed = event.isPrimary ? [event.clientX, event.clientY] : null;
+    if (mode !== "region" || event.button) return;
+    outline = pressed && [pressed];
+    canvas.setPointerCapture(event.pointerId);
+    drawOutline();
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const last = outline?.at(-1);
+    if (!last || !event.isPrimary || Math.hypot(event.clientX - last[0], event.clientY - last[1]) < 3) return;
+    outline.push([event.clientX, event.clientY]);
+    drawOutline();
+  });
+  canvas.addEventListener("pointercancel", () => { outline = null; drawOutline(); });
   canvas.addEventListener("pointerup", (event) => {
-    const from = pressed;
-    pressed = null;
+    const [from, drawn] = [pressed, outline];
+    [pressed, outline] = [null, null];
+    drawOutline();
+    if (drawn) { addRegion(drawn); return; }
     if (!from || Math.hypot(event.clientX - from[0], event.clientY - from[1]) > 5 || event.button) return;
     const found = pick(event.clientX, event.clientY);
     if (!found) return;
-    if (isMeasuring) {
+    if (mode === "ruler") {
       if (rulerEnds.length === 2) rulerEnds.length = 0;
       rulerEnds.push(found.place);
       showLength();
+      showMarks();
     } else {
-      if (points.length === markColours.length) points.shift();
-      const free = markColours.find((colour) => !points.some((point) => point.colour === colour));
-      points.push({ ...found, colour: free });
-      listPoints();
-      if ($("panel").classList.contains("folded")) fold();
-      if (innerWidth <= 700) $("points").scrollIntoView();
+      addProbe("point", found);
+      showProbes();
+      openAt($("curves").hidden ? $("probes") : $("curves"));
     }
-    showMarks();
   });
+  const addRegion = (drawn) => {
+    const found = drawn.length > 2 && measureRegion(sharesInside(drawn));
+    if (!found) {
+      $("hint").textContent = "Nothing of the surface is inside: draw around a part of the object.";
+      return;
+    }
+    addProbe("region", found);
+    setMode(null);
+    listProbes();
+    openAt($("curves").hidden ? $("probes") : $("curves"));
+  };
+  // Unfold the panel; where it is small, with an element in sight.
+  const openAt = (element) => {
+    if ($("panel").classList.contains("folded")) fold();
+    if (innerWidth <= 700) element.scrollIntoView();
+  };
   const theme = () => { const root = document.documentElement; root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark"; redraw(); };
   const fold = () => {
     const folded = $("panel").classList.toggle("folded");
@@ -654,7 +876,10 @@
   $("theme").onclick = theme;
   $("fold").onclick = fold;
   const step = (by) => { if (state.layer === "band") { state.band = Math.min(Math.max(state.band + by, 0), B - 1); showArguments(); paint(); } };
-  const keys = { 0: wholeObject, t: theme, p: fold, r: () => measure(!isMeasuring), "[": () => step(-1), "]": () => step(1), Escape: () => $("clear").click() };
+  const keys = {
+    0: wholeObject, t: theme, p: fold, r: () => $("ruler").click(), d: () => $("region").click(), "[": () => step(-1), "]": () => step(1),
+    Escape: () => (mode ? setMode(null) : $("clear").click()),
+  };
   layers.forEach(([layer], index) => (keys[index + 1] = () => choose(layer)));
   addEventListener("keydown", (event) => {
     const isAlt = (event.ctrlKey || event.metaKey || event.altKey) && !event.getModifierState("AltGraph");
@@ -676,7 +901,7 @@
       `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
       facts.light ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
     ] : []),
-    ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
+    ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, D draw a region, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
   ];
   $("facts").replaceChildren(...about.map((text) => make("p", { className: "note", textContent: text })));
   document.querySelector("#head h1").textContent = facts.title;
@@ -686,9 +911,15 @@
   document.body.classList.add("ready");
   listMaterials();
   $("materials").parentElement.hidden = !K;
-  if (!B) $("how").textContent = "Click the object: its material appears here.";
+  if (!B) $("how").textContent = "Click the object, or draw around a part of it: its material appears here.";
+  [$("low").value, $("high").value] = [Math.floor(facts.wavelengths_nm[0]), Math.ceil(facts.wavelengths_nm.at(-1))];
+  facts.regions.forEach((name, r) => {
+    const found = measureRegion(keptShares.subarray(r * V, (r + 1) * V));
+    if (found) addProbe("region", found, { name, isKept: true, isShown: r < COLOURS.length });
+  });
   choose("colour");
+  showProbes();
   wholeObject();
   frame();
-  window.unmixPage = { state, choose, lookThrough, wholeObject, pick, fold, csvText, facts, draw };
+  window.unmixPage = { state, choose, lookThrough, wholeObject, pick, fold, csvText, facts, draw, probes, materialAreas: [...materialAreas] };
 })();

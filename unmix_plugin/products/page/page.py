@@ -5,7 +5,7 @@ The page holds a mesh with the coefficients of every vertex, and the spectra tha
 direction of view, gloss, is a polynomial of second degree in that direction (nine spherical harmonics), fitted to what
 the training cameras see of each vertex.
 
-Notation: `V` vertices, `F` faces, `K` endmembers, `J` specular spectra, `B` bands.
+Notation: `V` vertices, `F` faces, `K` endmembers, `J` specular spectra, `B` bands, `M` known spectra, `R` regions.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import base64
 import gzip
 import io
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,7 +23,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Int64, UInt8
+from jaxtyping import Float, Float64, Int, Int64, UInt8, UInt16
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -30,16 +32,17 @@ from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import draw_abundances
 from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.segmentation import draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-from unmix_plugin.spectral.library.material_library import measured_library
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices
 from unmix_plugin.spectral.materials import Materials
-from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
+from unmix_plugin.trained.measured_surface import MeasuredSurface
+from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
 from unmix_plugin.trained.surface_mesh import TriangleMesh
@@ -48,11 +51,15 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 MOST_BYTES = 20_000_000
 """Of a page: what mail takes, and a phone loads in seconds."""
 
-_COARSER = 0.75
-"""Part of the resolution that is tried next where a page would be too large."""
+MOST_TRIANGLES = 600_000
+"""Of a page: what phones and laptops without a graphics card turn smoothly."""
 _COARSEST = 16
+_MOST_KNOWN = 4000
+"""Spectra of a library: all of ECOSTRESS or of USGS."""
+_UNKNOWN = 65535
 _PICTURE_PX = 320
 
+_SCRIPTS = ("three.js", "spectra.js", "page.js")
 _LIGHTS = ("D65", "D50", "A", "FL2", "FL11", "LED-B3")
 _MOST_CAMERAS = 200
 _CAMERAS = 16
@@ -68,12 +75,14 @@ class PageContent:
     """What a page shows of an object; page.js reads facts and arrays by their names."""
 
     arrays: dict[str, Float[np.ndarray, "..."] | Int[np.ndarray, "..."]]
-    """`positions` (V, 3) in the world and `faces` (F, 3); of each vertex or of anything else, numbers by name."""
+    """`positions` (V, 3) in the world, `faces` (F, 3) and `areas` (V), those of `vertex_areas`; of each vertex or of
+    anything else, more numbers by name."""
     facts: dict[str, Any]
-    """As `spectral_facts` gives them, and more; `notes` are sentences to be said, `areas` are `material_areas`
-    where there are materials."""
+    """What else is to be known, by name; `notes` are sentences to be said."""
     pictures: dict[str, bytes]
     """PNG by caption, for browsers that can't draw in 3-D."""
+    materials: Materials | None = None
+    """Endmembers and the light that they are seen in, where there are bands."""
 
 
 @runtime_checkable
@@ -85,24 +94,32 @@ class ShownAsPage(Protocol):
         ...
 
 
-def export_page(job: Job, title: str, resolution: int) -> list[Path]:
+def export_page(job: Job, title: str, resolution: int, library: Sequence[Path] = ()) -> list[Path]:
     """Find the surface, look at every vertex, and write `page.html`.
 
     Args:
         job: The run and where to write.
         title: Of the page; empty: the scene's name.
-        resolution: Cells along the longest edge of the scene box; fewer where the page would exceed `MOST_BYTES`.
+        resolution: Cells along the longest edge of the scene box; fewer where the page would have more triangles than
+            `MOST_TRIANGLES` or exceed `MOST_BYTES`.
+        library: Known spectra to compare with, as `library_of` takes them.
+    Raises:
+        ConfigError: a library for an object without bands, or too large a one.
+        SpectrumError: a library that can't be read or compared.
     """
     path, scene = job.folder / "page.html", job.loaded.scene
     job.claim([path])
+    known = None if isinstance(scene, ShownAsPage) else _known_spectra(job.materials, library)
     while True:
         if isinstance(scene, ShownAsPage):
             with job.working("looking at the surface"):
                 content = scene.page_content(resolution)
         else:
             content = _mixture_content(job, resolution)
-        page = _page(job, content, title)
-        coarser = int(resolution * _COARSER)
+        known = known or _known_spectra(content.materials, library)
+        page = _page(job, content, known, title)
+        # Triangles, and so bytes, grow with the square of the resolution.
+        coarser = int(0.95 * resolution * math.sqrt(MOST_BYTES / len(page)))
         if len(page) <= MOST_BYTES or coarser < _COARSEST:
             break
         job.say(
@@ -116,9 +133,44 @@ def export_page(job: Job, title: str, resolution: int) -> list[Path]:
     return [write_file(path, page)]
 
 
-def _page(job: Job, content: PageContent, title: str) -> bytes:
+@dataclass(frozen=True)
+class _KnownSpectra:
+    """Reflectances of a library at the bands of a page, without those that can't be compared there."""
+
+    sources: list[dict[str, str]]
+    """Name and source of each."""
+    steps: UInt16[np.ndarray, "M B"]
+    """Of 65534 for its greatest value, which angles don't ask for; `_UNKNOWN` where nothing was measured."""
+
+
+def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _KnownSpectra:
+    if materials is None:
+        if library:
+            raise ConfigError("the object is known in colours, not in bands: leave out --library")
+        return _KnownSpectra([], np.zeros((0, 0), np.uint16))
+    known, light = library_of(library, materials.bands), _light_of(materials)
+    chosen = known.comparable(materials.bands, light)
+    if chosen.sum() > _MOST_KNOWN:
+        raise ConfigError(
+            f"the library has {chosen.sum()} spectra; a page has room for {_MOST_KNOWN}: choose fewer"
+        )
+    reflectances = known.resampled(materials.bands)[chosen]
+    steps = reflectances / np.nanmax(reflectances, axis=1, keepdims=True, initial=1e-9) * (_UNKNOWN - 1)
+    named = [
+        {"name": one.name, "source": one.source}
+        for one, is_in in zip(known.materials, chosen, strict=True)
+        if is_in
+    ]
+    return _KnownSpectra(named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2"))
+
+
+def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
+    return None if materials.light is None else materials.light.cpu().double().numpy()
+
+
+def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> bytes:
     """The whole page."""
-    arrays, layout = _packed(content.arrays)
+    arrays, layout = _packed({**content.arrays, "known": known.steps})
     scale = job.loaded.scale
     root = job.loaded.record.summary.get("root")
     name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
@@ -129,6 +181,9 @@ def _page(job: Job, content: PageContent, title: str) -> bytes:
         "arrays": layout,
         "metres_per_unit": None if scale is None else scale.metres_per_unit,
         "scale": None if scale is None else scale.said,
+        **_spectral_facts(content.materials),
+        "known": known.sources,
+        "regions": [],
         **content.facts,
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
         "cameras": _camera_facts(job.views("all"), job.frame),
@@ -138,11 +193,20 @@ def _page(job: Job, content: PageContent, title: str) -> bytes:
 
 def _mixture_content(job: Job, resolution: int) -> PageContent:
     """Of a scene of mixed materials."""
-    mesh = find_surface(job, resolution)[0]
+    mesh, notes = find_surface(job, resolution)[0], []
+    if len(mesh.faces) > MOST_TRIANGLES:
+        coarser = int(0.95 * resolution * math.sqrt(MOST_TRIANGLES / len(mesh.faces)))
+        notes.append(
+            f"The surface of {len(mesh.faces):,} triangles is made again with {coarser} cells along the longest edge: "
+            f"browsers turn {MOST_TRIANGLES:,} smoothly."
+        )
+        mesh = find_surface(job, coarser)[0]
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
-    areas = mesh.areas() / job.frame.scale**2
-    facts = {"areas": material_areas(areas, mesh.faces, arrays["materials"], len(job.materials.names))}
+    arrays["areas"] = vertex_areas(mesh.areas() / job.frame.scale**2, mesh.faces, len(mesh.vertices))
+    names, shares = _kept_regions(job, mesh, arrays["areas"], notes)
+    if names:
+        arrays["regions"] = shares
     view = [*job.views("eval"), *job.views("all")][0]
     enlarged = _PICTURE_PX / max(view.camera.width, view.camera.height)
     size = [max(1, round(enlarged * side)) for side in (view.camera.width, view.camera.height)]
@@ -151,25 +215,47 @@ def _mixture_content(job: Job, resolution: int) -> PageContent:
         f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
-    return PageContent(arrays, {**spectral_facts(job.materials), **facts, "notes": []}, pictures)
+    return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials)
 
 
-def material_areas(
-    areas: Float[np.ndarray, " F"],
-    faces: Int[np.ndarray, "F 3"],
-    materials: UInt8[np.ndarray, " V"],
-    count: int,
-) -> list[float]:
-    """Of each material, a third of the areas of the triangles at each of its vertices."""
-    return rounded(np.bincount(materials[faces].ravel(), np.repeat(areas / 3, 3), count)[:count])
+def vertex_areas(
+    areas: Float[np.ndarray, " F"], faces: Int[np.ndarray, "F 3"], count: int
+) -> Float64[np.ndarray, " V"]:
+    """Of each vertex, a third of the areas of its triangles."""
+    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), count)
 
 
-def spectral_facts(materials: Materials) -> dict[str, Any]:
-    """Spectra, lights and names, as page.js reads them."""
-    bands, power = materials.bands, None
+def _kept_regions(
+    job: Job, mesh: TriangleMesh, areas: Float64[np.ndarray, " V"], notes: list[str]
+) -> tuple[list[str], UInt8[np.ndarray, "R V"]]:
+    """Names of the regions that are kept with the run, and how much of each vertex is in each, 255 for all of it;
+    notes get what is to be said of regions that can't be shown."""
+    kept = job.loaded.measures.regions
+    names, shares = [], np.zeros((len(kept), len(areas)), np.uint8)
+    if not kept:
+        return names, shares
+    surface = MeasuredSurface(job.scene, mesh)
+    for name, region in kept.items():
+        try:
+            inside = surface.vertex_areas(surface.shares(region))
+        except ConfigError as error:
+            notes.append(f"The region {name} is left out: {error}.")
+            continue
+        if not inside.any():
+            notes.append(f"The region {name} is left out: nothing of the surface is in it.")
+            continue
+        shares[len(names)] = np.round(255 * inside / np.maximum(areas, 1e-30))
+        names.append(name)
+    return names, shares[: len(names)]
+
+
+def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
+    """Spectra, lights and names, as page.js reads them; empty where there are no bands."""
+    if materials is None:
+        names = ("wavelengths_nm", "edges_nm", "names", "colours", "endmembers", "specular", "rgb", "indices")
+        return {**{name: [] for name in names}, "light": None, "colour_map": _colour_map()}
+    bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
-    if materials.light is not None:
-        power = materials.light.cpu().double().numpy()
     lights = [{"name": "the scene's own", "factors": [1.0] * len(bands), "notes": []}]
     for light in _LIGHTS:
         try:
@@ -177,7 +263,6 @@ def spectral_facts(materials: Materials) -> dict[str, Any]:
         except SpectrumError:
             continue  # it does not reach these bands: not offered
         lights.append({"name": light, "factors": rounded(factors), "notes": notes})
-    known = shown_matches(endmembers, bands, power, measured_library())
     return {
         "wavelengths_nm": rounded(bands.centers_nm),
         "edges_nm": rounded(bands.edges_nm),
@@ -189,15 +274,12 @@ def spectral_facts(materials: Materials) -> dict[str, Any]:
         "rgb": rounded(rgb_matrix(bands, torch.float64).numpy()),
         "colour": describe_colour(bands),
         "lights": lights,
-        "known": [
-            [f"{one.match.name} ({one.match.angle_rad:.3f} rad)" for one in matches] for matches in known
-        ],
         "indices": [
             {"name": name, "formula": NAMED_INDICES[name].formula, "title": NAMED_INDICES[name].title}
             | {"range": NAMED_INDICES[name].usual_range}
             for name in available_indices(bands)
         ],
-        "colour_map": colour_map(),
+        "colour_map": _colour_map(),
     }
 
 
@@ -341,7 +423,7 @@ def rounded(values: Float[np.ndarray, "..."]) -> list[Any]:
     )
 
 
-def colour_map() -> list[list[int]]:
+def _colour_map() -> list[list[int]]:
     """Of values from 0 to 1, in 256 steps of 8 bits: viridis."""
     from matplotlib import colormaps
 
@@ -355,8 +437,7 @@ def _fill(facts: dict[str, Any], arrays: str, shown: dict[str, bytes]) -> bytes:
     try:
         loader = PackageLoader("unmix_plugin.products.page", ".")
         environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
-        script = (Path(__file__).parent / "page.js").read_text(encoding="utf-8")
-        library = (Path(__file__).parent / "three.js").read_text(encoding="utf-8")
+        scripts = [(Path(__file__).parent / name).read_text(encoding="utf-8") for name in _SCRIPTS]
     except OSError as error:
         raise ConfigError(
             f"the installation lacks the page's scripts ({error}); install unmix-nerf again"
@@ -365,8 +446,6 @@ def _fill(facts: dict[str, Any], arrays: str, shown: dict[str, bytes]) -> bytes:
     text = json.dumps(facts, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return (
         environment.get_template("page.html")
-        .render(
-            facts=text, arrays=arrays, pictures=pictures, script=script, library=library, title=facts["title"]
-        )
+        .render(facts=text, arrays=arrays, pictures=pictures, scripts=scripts, title=facts["title"])
         .encode()
     )

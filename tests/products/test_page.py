@@ -1,0 +1,265 @@
+"""The page of a ball that is known exactly, drawn in a browser: regions, known spectra, absorptions, large surfaces."""
+
+import csv
+import io
+import json
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import torch
+
+from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
+from tests.products.ball_model import ALL_ROUND, RADIUS, SHADE, ball_scene, cameras_around
+from tests.trained.camera_scenes import FRAME
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.formats.libraries import library_of
+from unmix_plugin.products.page import page
+from unmix_plugin.products.product import Job
+from unmix_plugin.spectral.features import absorption, continuum_removed
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.trained.measures import Measures, Scale
+from unmix_plugin.trained.regions import Box, OfMaterial
+from unmix_plugin.trained.run_views import RunView
+
+MIDDLE = FRAME.to_world(np.zeros(3))
+WORLD_RADIUS = RADIUS / FRAME.scale
+SCALE = Scale(0.1, "as measured")
+NAMES = ('<img src=x onerror="document.title=1">', "lower & half", "=none")
+VIEWS = tuple(
+    RunView(f"view {index}", camera, "eval" if index == 0 else "train")
+    for index, camera in enumerate(cameras_around([(1.0, 0.2, 0.6), *ALL_ROUND]))
+)
+SCENE = ball_scene()
+SCENE = replace(
+    SCENE,
+    frame=FRAME,
+    scale=SCALE,
+    views=VIEWS,
+    materials=replace(SCENE.materials, names=NAMES, light=torch.ones(len(SCENE.bands))),
+)
+
+
+def box(low, high):
+    """In the world; FRAME keeps the vertical, in which the ball's two materials lie above each other."""
+    (a, b, c), (x, y, z) = (MIDDLE + low).tolist(), (MIDDLE + high).tolist()
+    return Box((a, b, c), (x, y, z))
+
+
+REGIONS = {
+    "cap <b>": box([-9.0, -9.0, WORLD_RADIUS / 2], [9.0] * 3),
+    "below": OfMaterial(1),
+    "nowhere": box([8.0] * 3, [9.0] * 3),
+    "of no material": OfMaterial(7),
+}
+
+
+def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48):
+    """The facts of a page, what was said while it was made, and its file."""
+    said: list[str] = []
+    loaded = SimpleNamespace(
+        scene=scene,
+        materials_scene=scene,
+        scale=scene.scale,
+        measures=Measures(None, regions),
+        record=SimpleNamespace(summary={"root": "ball"}),
+        folder=SimpleNamespace(path=Path("ball/unmix-nerf/run")),
+        config=SimpleNamespace(method_name="unmix-nerf"),
+    )
+    job = Job(
+        cast("Any", loaded),
+        folder,
+        True,
+        said.append,
+        lambda _: nullcontext(),
+        lambda _, items: iter(items),
+        cast("Any", None),
+    )
+    (path,) = page.export_page(job, "", resolution, library)
+    facts = json.loads(path.read_text().split('id="data-facts">')[1].split("</script>")[0])
+    return facts, said, path
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    return export(tmp_path_factory.mktemp("page"))
+
+
+def test_regions_that_can_not_be_shown_are_said(exported):
+    facts, said, _ = exported
+    assert facts["regions"] == ["cap <b>", "below"]
+    assert "The region nowhere is left out: nothing of the surface is in it." in said
+    assert any("of no material is left out: the scene has no material 7; it has 3." in text for text in said)
+
+
+def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tmp_path, monkeypatch):
+    bands = SCENE.bands
+    own = tmp_path / "own.csv"
+    spectra = np.random.default_rng(0).random((3, len(bands)))
+    write_spectra_csv(own, SpectraTable(bands, ("a", "b<script>", "c"), spectra))
+    facts, _, _ = export(tmp_path, library=(own,))
+    assert facts["known"] == [{"name": name, "source": "own.csv"} for name in ("a", "b<script>", "c")]
+    with pytest.raises(SpectrumError, match="can't read"):
+        export(tmp_path, library=(tmp_path / "none.csv",))
+    monkeypatch.setattr(page, "_MOST_KNOWN", 2)
+    with pytest.raises(ConfigError, match="the library has 3 spectra; a page has room for 2"):
+        export(tmp_path, library=(own,))
+
+
+def test_a_surface_of_too_many_triangles_is_made_coarser_and_that_is_said(exported, tmp_path, monkeypatch):
+    most = round(1.15 * exported[0]["arrays"]["faces"]["count"] / 3)
+    monkeypatch.setattr(page, "MOST_TRIANGLES", most)
+    facts, said, _ = export(tmp_path, regions={}, resolution=64)
+    assert 0.6 * most < facts["arrays"]["faces"]["count"] / 3 <= most
+    assert any("triangles is made again with" in text for text in said)
+
+
+def test_a_page_that_a_mail_would_not_take_is_made_coarser_and_that_is_said(exported, tmp_path, monkeypatch):
+    fixed = 900_000  # bytes of scripts and library
+    size = exported[2].stat().st_size
+    monkeypatch.setattr(page, "MOST_BYTES", fixed + (size - fixed) // 2)
+    _, said, path = export(tmp_path)
+    assert path.stat().st_size <= page.MOST_BYTES
+    assert any("made again with" in text for text in said)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if not HAS_BROWSER:
+        pytest.skip("needs the package playwright and the program chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as session:
+        found = session.chromium.launch(executable_path=CHROMIUM, args=[FLAGS[1], *SOFTWARE_GL])
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def opened(exported, browser):
+    context = browser.new_context(viewport={"width": 900, "height": 600}, offline=True)
+    shown, said = context.new_page(), []
+    shown.on("console", lambda message: said.append(message.text))
+    shown.on("pageerror", lambda error: said.append(str(error)))
+    shown.goto(exported[2].as_uri())
+    shown.wait_for_function("window.unmixPage")
+    yield shown
+    assert said == []
+    context.close()
+
+
+def probes(opened, *names):
+    """Numbers of the probes of the page."""
+    fields = ", ".join(names)
+    return opened.evaluate(
+        f"unmixPage.probes.map(({{ name, {fields} }}) => ({{ name, {fields} }}))".replace(", }", " }")
+    )
+
+
+def stroke(opened, corners):
+    """Draw around a part of the picture with the mouse."""
+    opened.keyboard.press("d")
+    opened.mouse.move(*corners[0])
+    opened.mouse.down()
+    for corner in [*corners[1:], corners[0]]:
+        opened.mouse.move(*corner, steps=8)
+    opened.mouse.up()
+
+
+@pytest.mark.slow
+def test_kept_regions_are_shown_by_name_with_area_mean_spread_and_mixture(opened):
+    assert opened.locator(".probe input[type=text]").evaluate_all("all => all.map((one) => one.value)") == [
+        "below",
+        "cap <b>",
+    ]
+    cap, below = probes(opened, "area", "spectrum", "spread", "mixture")
+    assert cap["area"] == pytest.approx(np.pi * WORLD_RADIUS**2, rel=0.03)
+    assert below["area"] == pytest.approx(2 * np.pi * WORLD_RADIUS**2, rel=0.04)
+    upper = SHADE * SCENE.materials.endmembers[0].detach().double().numpy()
+    np.testing.assert_allclose(cap["spectrum"], upper, rtol=0.01)
+    np.testing.assert_allclose(cap["mixture"], [1, 0, 0], atol=0.01)
+    assert max(cap["spread"]) < 0.02 * upper.max()
+    assert opened.title() == "ball"
+    assert "cap <b>" in opened.inner_text("#labels")
+
+
+@pytest.mark.slow
+def test_a_region_is_what_is_seen_inside_an_outline_and_is_saved(opened):
+    opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+    everything = [(2, 2), (560, 2), (560, 598), (2, 598)]
+    stroke(opened, everything)
+    (*_, seen) = probes(opened, "area", "mixture")
+    # From three radii away one sees a little less than the half that faces the eye.
+    distance = opened.evaluate("1.06 / Math.sin(20 * Math.PI / 180)")
+    assert seen["area"] == pytest.approx(2 * np.pi * WORLD_RADIUS**2 * (1 - 1 / distance), rel=0.08)
+    opened.locator(".probe input[type=text]").first.fill('my "part", 1')
+    opened.locator(".probe input[type=text]").first.press("Enter")
+    table = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
+    assert table[0] == ["quantity", "cap <b>", "below", 'my "part", 1']
+    rows = {row[0]: row[1:] for row in table}
+    assert float(rows["area in cm2"][2]) == pytest.approx(seen["area"] * 1e4 * 0.1**2)
+    assert float(rows[f"abundance of {NAMES[1]}"][2]) == pytest.approx(seen["mixture"][1])
+    assert len([name for name in rows if name.startswith("standard deviation at")]) == len(SCENE.bands)
+    assert "cm²" in opened.inner_text("#probes")
+    opened.keyboard.press("d")
+    assert opened.inner_text("#hint") == "Draw around a part of the object."
+    opened.keyboard.press("d")
+    stroke(opened, [(3, 3), (12, 3), (12, 12)])
+    assert "Nothing of the surface is inside" in opened.inner_text("#hint")
+
+
+@pytest.mark.slow
+def test_a_click_is_compared_with_the_library_as_the_viewer_compares(opened):
+    opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+    opened.mouse.click(285, 300)
+    (*_, point) = probes(opened, "spectrum", "likeness")
+    expected = library_of(()).nearest(np.array([point["spectrum"]]), SCENE.bands, np.ones(len(SCENE.bands)))
+    assert [match["name"] for match in point["likeness"]] == [match.name for match in expected[0]]
+    np.testing.assert_allclose(
+        [match["angle"] for match in point["likeness"]], [match.angle_rad for match in expected[0]], atol=1e-3
+    )
+    text = opened.inner_text("#probes")
+    assert f"like {expected[0][0].name} ({expected[0][0].angle_rad:.3f} rad" in text
+    assert opened.locator("#chart polyline[stroke-dasharray]").count() == 3
+
+
+@pytest.mark.slow
+def test_features_are_those_of_the_package(opened):
+    rng = np.random.default_rng(1)
+    for count in (3, 5, 40, 300):
+        nm = np.sort(rng.uniform(400, 2500, count))
+        spectra = rng.random((20, count)) * rng.random((20, 1)) + 0.05
+        spectra[0] = 0.3  # no absorption
+        spectra[1, count // 2] = 0.0
+        found = opened.evaluate(
+            "([spectra, nm]) => spectra.map((one) =>"
+            "({ ...Spectra.absorption(one, nm), removed: Spectra.continuumRemoved(one, nm) }))",
+            [spectra.tolist(), nm.tolist()],
+        )
+        values = torch.from_numpy(spectra)
+        np.testing.assert_allclose(
+            [one["removed"] for one in found], continuum_removed(values, nm), atol=1e-9
+        )
+        for measure in ("depth", "centre", "area"):
+            numbers = np.array([one[measure] for one in found], dtype=np.float64)
+            np.testing.assert_allclose(numbers, absorption(values, nm, measure), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_continuum_of_a_window_and_its_absorption_are_a_choice(opened):
+    opened.select_option("#curve", "continuum removed")
+    opened.fill("#low", "480")
+    opened.fill("#high", "620")
+    opened.press("#high", "Enter")
+    (cap, _) = probes(opened, "spectrum")
+    inside = np.array(cap["spectrum"])[1:4]
+    nm = SCENE.bands.centers_nm[1:4]
+    depth = float(absorption(torch.from_numpy(inside), nm, "depth"))
+    assert f"absorption: depth {depth:.3g}"[:22] in opened.inner_text("#probes")
+    rows = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
+    saved = {row[0]: row[1:] for row in rows}["depth of the absorption from 500 to 600 nm"]
+    assert float(saved[0]) == pytest.approx(depth, abs=1e-6)
