@@ -103,8 +103,8 @@ class MeasuredSurface:
         return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
 
     def vertex_areas(self, shares: Float64[np.ndarray, "F 3"]) -> Float64[np.ndarray, " V"]:
-        """The area of a region that each vertex stands for, by `shares` of it: of each triangle a third, square units of
-        the world."""
+        """The area of a region that each vertex stands for, a third of its triangles' (square units of the world), from
+        the region's `shares`."""
         weights = shares * (self.areas / 3)[:, None]
         return np.bincount(self.mesh.faces.ravel(), weights.ravel(), len(self.mesh.vertices))
 
