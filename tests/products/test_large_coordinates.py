@@ -46,10 +46,9 @@ def columns(path):
 
 def test_points_are_where_the_source_says(tmp_path):
     points = seen_surface(SCENE, ALL_ROUND, 6_000).points()
-    near, far = (
-        columns(_write_point_cloud(tmp_path / name, points, 300, SCENE.materials, frame)[0])
-        for name, frame in (("near", FRAME), ("far", FAR))
-    )
+    for name, frame in (("near", FRAME), ("far", FAR)):
+        _write_point_cloud(tmp_path / name, points, 300, SCENE, frame)
+    near, far = columns(tmp_path / "near"), columns(tmp_path / "far")
     assert near.dtype == np.float32
     assert_close(far, source_of(near.astype(np.float64)))
 
@@ -68,7 +67,8 @@ def test_meshes_of_all_formats_are_where_the_source_says(tmp_path):
 
 def test_volumes_are_where_the_source_says(tmp_path):
     grid = GridPoints.over(SCENE.scene_box.aabb, 8)
-    path = _write_volume(tmp_path, SCENE, grid, FAR, range(grid.shape[0]))
+    path = tmp_path / "volume.npz"
+    _write_volume(path, SCENE, grid, FAR, range(grid.shape[0]))
     matrix = np.load(path)["index_to_world"]
     index = np.array([1.0, 2.0, 3.0])
     model = grid.origin.astype(np.float64) + grid.cell * index

@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -21,7 +22,9 @@ from tests.products.ball_model import (
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.mesh import _mesh_paths, _require_sound, _textures, _write_mesh
+from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export_mesh
+from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import world_up
 from unmix_plugin.trained.surface import GridPoints, sample_slice
@@ -169,7 +172,7 @@ def test_the_surface_lies_at_the_density_where_rays_end(seen_all_round):
 def files(outside, tmp_path_factory):
     folder = tmp_path_factory.mktemp("mesh")
     written = _write_mesh(folder, ("ply", "obj", "glb"), outside, SCENE, FRAME, up="z")
-    assert written == _mesh_paths(folder, ("ply", "obj", "glb"))
+    assert written == _mesh_paths(folder, ("ply", "obj", "glb"), None)
     return {path.suffix: path for path in written}
 
 
@@ -306,4 +309,4 @@ def test_a_mesh_without_faces_is_refused():
 )
 def test_impossible_settings_are_refused(density, smoothing, said):
     with pytest.raises(ConfigError, match=said):
-        _require_sound(density, smoothing)
+        export_mesh(MagicMock(spec=Job), Mesh(density=density, smoothing=smoothing))

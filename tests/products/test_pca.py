@@ -1,4 +1,5 @@
 import csv
+import io
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from PIL import Image
 
 from tests.method_factory import make_scene
 from tests.trained.camera_scenes import around
-from unmix_plugin.products.pca import _find_components, _survey_view, _write_components, _write_pca
+from unmix_plugin.products.pca import _find_components, _painted, _survey_view, _table
 from unmix_plugin.trained.evaluation import render_view
 
 SCENE = make_scene()
@@ -37,10 +38,10 @@ def test_spectra_all_alike_explain_nothing():
 
 
 @pytest.mark.parametrize("of", ["spectra", "abundances"])
-def test_a_picture_shows_the_components_of_its_pixels(tmp_path, of):
+def test_a_picture_shows_the_components_of_its_pixels(of):
     components = _find_components([_survey_view(SCENE, CAMERA, of)], of)
     view = render_view(SCENE, CAMERA)
-    with Image.open(_write_pca(tmp_path, "view", view, components)) as picture:
+    with Image.open(io.BytesIO(_painted("view", view, components))) as picture:
         pixels = np.asarray(picture)
     assert pixels.shape == (30, 40, 3)
     values = view.spectra if of == "spectra" else view.shares
@@ -69,10 +70,9 @@ def test_a_view_is_surveyed_where_something_is():
 
 
 @pytest.mark.parametrize(("of", "first"), [("spectra", "450"), ("abundances", "endmember_0")])
-def test_the_table_gives_back_the_colours(tmp_path, of, first):
+def test_the_table_gives_back_the_colours(of, first):
     components = _find_components([_survey_view(SCENE, CAMERA, of)], of)
-    with _write_components(tmp_path, components, SCENE.materials).open() as file:
-        rows = list(csv.reader(file))
+    rows = list(csv.reader(io.StringIO(_table(components, SCENE.materials).decode())))
     body = {row[0]: row[1:] for row in rows[1:]}
     names = list(body)[:-3]
     assert names[0] == first

@@ -1,5 +1,7 @@
 """Points of the surface: cleaned and thinned, with normals and scores, in a file."""
 
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 import torch
@@ -15,11 +17,13 @@ from unmix_plugin.errors import ConfigError, RunError, SpectrumError
 from unmix_plugin.products.point_cloud import (
     _is_outlier,
     _plane_normals,
-    _require_count,
     _require_point_scores,
     _thinned,
     _write_point_cloud,
+    export_point_cloud,
 )
+from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import PointCloud
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -172,8 +176,8 @@ def points():
 
 @pytest.fixture(scope="module")
 def cloud(points, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cloud")
-    path, count = _write_point_cloud(folder, points, 800, SCENE.materials, FRAME)
+    path = tmp_path_factory.mktemp("cloud") / "points.ply"
+    count = _write_point_cloud(path, points, 800, SCENE, FRAME)
     return PlyData.read(path), count
 
 
@@ -231,7 +235,8 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
     write_spectra_csv(tmp_path / "top.csv", SpectraTable(SCENE.bands, ("top",), spectra[:1]))
     asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
     scores = _require_point_scores(asked, SCENE.bands)
-    path, count = _write_point_cloud(tmp_path, points, 300, SCENE.materials, FRAME, scores)
+    path = tmp_path / "points.ply"
+    count = _write_point_cloud(path, points, 300, SCENE, FRAME, scores)
     ply = PlyData.read(path)
     written = [ply["vertex"].properties[index].name for index in (-3, -2, -1)]
     assert written == ["index_1", "index_pri", "target_1"]
@@ -251,11 +256,11 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
 def test_nothing_to_export_is_said(points, tmp_path):
     nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
     with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        _write_point_cloud(tmp_path, nothing, 800, SCENE.materials, FRAME)
+        _write_point_cloud(tmp_path / "points.ply", nothing, 800, SCENE, FRAME)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("count", [0, -3, 10_000_001])
 def test_an_impossible_number_of_points_is_refused(count):
     with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
-        _require_count(count)
+        export_point_cloud(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))

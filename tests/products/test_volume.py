@@ -8,7 +8,7 @@ from tests.method_factory import make_scene
 from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.volume import _volume_path, _write_volume
+from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.trained.surface import GridPoints, sample_densities, sample_slice
 
 SCENE = ball_scene()
@@ -17,9 +17,8 @@ GRID = GridPoints.over(SCENE.scene_box.aabb, 16)
 
 @pytest.fixture(scope="module")
 def volume(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("volume")
-    path = _write_volume(folder, SCENE, GRID, FRAME, range(GRID.shape[0]))
-    assert path == _volume_path(folder)
+    path = tmp_path_factory.mktemp("volume") / "volume.npz"
+    _write_volume(path, SCENE, GRID, FRAME, range(GRID.shape[0]))
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
@@ -99,5 +98,5 @@ def test_a_disk_that_is_full_half_way_leaves_nothing(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(RunError, match=r"volume\.npz: No space left on device"):
-        _write_volume(tmp_path, SCENE, GRID, FRAME, slices())
+        _write_volume(tmp_path / "volume.npz", SCENE, GRID, FRAME, slices())
     assert list(tmp_path.iterdir()) == []

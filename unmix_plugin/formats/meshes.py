@@ -243,7 +243,7 @@ def write_glb(
 
 
 @dataclass(frozen=True)
-class Splats:
+class Gaussians:
     """Gaussians: ellipsoids of matter that fades from their centres."""
 
     positions: Float32[np.ndarray, "P 3"]
@@ -268,7 +268,7 @@ _HARMONIC_0 = 0.28209479177387814
 
 def write_splats_glb(
     path: Path,
-    splats: Splats,
+    splats: Gaussians,
     numbers: Mapping[str, np.ndarray],
     extras: Mapping[str, Any],
     up: Float64[np.ndarray, "3"],
@@ -300,7 +300,7 @@ def write_splats_glb(
 
 
 def write_splats_ply(
-    path: Path, splats: Splats, numbers: Mapping[str, np.ndarray], comments: Sequence[str]
+    path: Path, splats: Gaussians, numbers: Mapping[str, np.ndarray], comments: Sequence[str]
 ) -> Path:
     """Write Gaussians with the property names of the authors' own program (Kerbl et al. 2023), which viewers read:
     logarithms of scales, the logit of the opacity, quaternions w first; `numbers` (P,) come after them."""

@@ -22,20 +22,22 @@ from unmix_plugin.formats.envi import envi_cube_paths, write_envi_cube
 from unmix_plugin.formats.exr import layer_names, write_exr
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Abundances
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import colour_mode
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import PredictedView, as_numpy, picture
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.run_views import ViewChoice
 
 SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 """Colours of abundances, the same in every figure."""
 
 
-def export_abundances(job: Job, choice: ViewChoice, formats: Sequence[str]) -> list[Path]:
+def export_abundances(job: Job, asked: Abundances) -> list[Path]:
     """Write the abundances of views: npy, envi and exr hold the same float32 numbers, png is a figure."""
-    return job.write_views(choice, partial(view_paths, formats), partial(_write_view, formats))
+    return job.write_views(
+        asked.views, partial(view_paths, asked.formats), partial(_write_view, asked.formats)
+    )
 
 
 def _write_view(

@@ -13,15 +13,17 @@ from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.files import array_bytes, write_file
 from unmix_plugin.products.abundances import view_paths
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Cubes
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import PredictedView
-from unmix_plugin.trained.run_views import ViewChoice
 
 
-def export_cubes(job: Job, choice: ViewChoice, formats: Sequence[str]) -> list[Path]:
+def export_cubes(job: Job, asked: Cubes) -> list[Path]:
     """Write the spectra of views."""
-    return job.write_views(choice, partial(view_paths, formats), partial(_write_view, formats))
+    return job.write_views(
+        asked.views, partial(view_paths, asked.formats), partial(_write_view, asked.formats)
+    )
 
 
 def _write_view(

@@ -14,6 +14,7 @@ from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Endmembers
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import Comparison, MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
@@ -24,33 +25,32 @@ _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
 
 
-def export_endmembers(job: Job, library: Sequence[Path], comparison: Comparison) -> list[Path]:
-    """Write table, library and plot, and in the run's own bands the angles to all spectra of a library.
+def export_endmembers(job: Job, asked: Endmembers) -> list[Path]:
+    """Write table, library and plot, and in the run's own bands the angles to all known spectra.
 
-    Args:
-        job: The run and where to write.
-        library: Files of known spectra; none: the built-in ones.
-        comparison: How spectra are compared.
     Raises:
         ConfigError: a library to compare with what another sensor sees.
     """
-    materials, angles = job.materials, job.folder / "angles.csv"
+    materials, folder = job.materials, job.folder
+    paths = _endmember_paths(folder)
     if materials.sensor is not None:
-        if library:
+        if asked.library:
             raise ConfigError(
                 "--library is compared with in the run's own bands; leave out --library or --sensor"
             )
-        job.claim(_endmember_paths(job.folder))
+        job.claim(paths)
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
-        return _write_endmembers(job.folder, materials)
-    known = library_of(library, materials.bands)
-    job.claim([*_endmember_paths(job.folder), angles])
-    if job.scene.light_power is None:
+        _write_endmembers(folder, materials)
+        return paths
+    known, light = library_of(asked.library, materials.bands), job.scene.light_power
+    paths.append(folder / "angles.csv")
+    job.claim(paths)
+    if light is None:
         job.say(LIGHT_UNKNOWN)
-    written = _write_endmembers(job.folder, materials)
-    spectra = materials.endmembers.detach().cpu().double().numpy()
-    table = angles_csv(known, materials.names, spectra, materials.bands, job.scene.light_power, comparison)
-    return [*written, write_file(angles, table)]
+    _write_endmembers(folder, materials)
+    table = materials.table()
+    write_file(paths[-1], angles_csv(known, table.names, table.spectra, table.bands, light, asked.compare))
+    return paths
 
 
 def angles_csv(
@@ -74,33 +74,21 @@ def angles_csv(
 
 
 def _endmember_paths(folder: Path) -> list[Path]:
-    """Files that `_write_endmembers` makes."""
-    return [
-        folder / "endmembers.csv",
-        *envi_library_paths(folder / "endmembers"),
-        folder / "endmembers.png",
-    ]
+    names = [folder / "endmembers.csv", folder / "endmembers.png"]
+    return [names[0], *envi_library_paths(folder / "endmembers"), names[1]]
 
 
-def _write_endmembers(folder: Path, materials: Materials) -> list[Path]:
+def _write_endmembers(folder: Path, materials: Materials) -> None:
     """Write the endmembers as CSV (wavelength in nm, a column a spectrum), ENVI spectral library and plot."""
     table_path, *_, plot_path = _endmember_paths(make_folder(folder))
     spectra = materials.endmembers.detach().cpu().numpy().astype(np.float32)
     about = f"endmembers: {materials.quantity}, 1 = full scale"
     write_envi_library(folder / "endmembers", spectra, materials.bands, materials.names, about)
     write_spectra_csv(table_path, materials.table())
-    write_file(plot_path, _draw_endmembers(materials))
-    return _endmember_paths(folder)
-
-
-def _draw_endmembers(materials: Materials) -> bytes:
-    """The spectra in the endmembers' colours."""
     under = "reflectance" if materials.quantity == "reflectance" else "radiance under the scene's light"
     labels = ("wavelength (nm)", f"{under} (1 = full scale)")
-    spectra = materials.endmembers.detach().cpu().numpy()
-    return draw_spectra(
-        spectra, materials.bands.centers_nm, materials.names, endmember_colours(materials), labels
-    )
+    colours = endmember_colours(materials)
+    write_file(plot_path, draw_spectra(spectra, materials.bands.centers_nm, materials.names, colours, labels))
 
 
 def draw_spectra(

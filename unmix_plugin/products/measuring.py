@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.products import scene_products as products
 from unmix_plugin.products.product import Job
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.measures import (
@@ -18,17 +19,9 @@ from unmix_plugin.trained.measures import (
 from unmix_plugin.trained.run_views import find_view
 
 
-def set_scale(
-    job: Job, points: tuple[str, str] | None, distance_m: float | None, metres_per_unit: float | None
-) -> list[Path]:
-    """Keep the scale of a run, or say what is kept where nothing is given.
-
-    Args:
-        job: The run.
-        points: Two points, as the command line has them.
-        distance_m: Between them, metres.
-        metres_per_unit: Instead of both: metres in a unit of the world.
-    """
+def set_scale(job: Job, asked: products.Scale) -> list[Path]:
+    """Keep the scale of a run, or say what is kept where nothing is given."""
+    points, distance_m, metres_per_unit = asked.points, asked.distance, asked.metres_per_unit
     if points is None and distance_m is None and metres_per_unit is None:
         job.say(describe_scale(job.loaded.scale))
         return []

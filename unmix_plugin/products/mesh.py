@@ -23,6 +23,7 @@ from unmix_plugin.formats.files import grey_png_bytes, indexed_png_bytes, rgba_p
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
@@ -33,42 +34,31 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 _MOST_SMOOTHING = 8.0
 
 
-def export_mesh(
-    job: Job,
-    formats: Sequence[str],
-    resolution: int,
-    density: float | None,
-    smoothing: float,
-    keeps_unseen: bool,
-    up: Literal["y", "z"] = "y",
-    texture_size: int | None = 0,
-) -> list[Path]:
-    """Sample the density, march through it, trim and colour the surface.
-
-    Args:
-        job: The run and where to write.
-        formats: Of `ply`, `glb`, `obj`.
-        resolution: Cells along the longest edge of the scene box.
-        density: Per world unit at which the surface lies; None: that at which rays end.
-        smoothing: Standard deviation of the blur, cells.
-        keeps_unseen: Whether surfaces that no camera sees stay.
-        up: What is up in GLB; `z` turns nothing.
-        texture_size: Texels along the edges of the textures of GLB and OBJ; 0: none, None: as many as the charts need.
-    """
-    _require_sound(density, smoothing)
+def export_mesh(job: Job, asked: Mesh) -> list[Path]:
+    """Sample the density, march through it, trim and colour the surface."""
+    density, smoothing, formats, texture_size = (
+        asked.density,
+        asked.smoothing,
+        asked.formats,
+        asked.texture_size,
+    )
+    if density is not None and not 0 < density < math.inf:
+        raise ConfigError(f"--density is {density:g}; it must be greater than 0")
+    if not 0 <= smoothing <= _MOST_SMOOTHING:
+        raise ConfigError(f"--smoothing is {smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} cells")
     if texture_size is None and importlib.util.find_spec("xatlas") is None:
         texture_size = 0
         job.say("no textures, since xatlas is not installed: GLB and OBJ have colours of vertices")
     names = job.materials.names if texture_size != 0 and {"glb", "obj"} & set(formats) else None
     job.claim(_mesh_paths(job.folder, formats, names))
-    mesh, threshold = find_surface(job, resolution, density, smoothing, keeps_unseen)
+    mesh, threshold = find_surface(job, asked.resolution, density, smoothing, asked.unseen == "keep")
     textures = None
     if names is not None:
         with job.working("making textures"):
             textures = _textures(job.scene, mesh, texture_size)
         job.say(f"textures of {textures.size} x {textures.size} texels")
     with job.working("making the mesh"):
-        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, up, textures)
+        written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, asked.up, textures)
     job.say(
         f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
         f"at a density of {threshold * job.frame.scale:.4g} per world unit"
@@ -98,7 +88,7 @@ def find_surface(
     )
 
 
-def _mesh_paths(folder: Path, formats: Sequence[str], textured: Sequence[str] | None = None) -> list[Path]:
+def _mesh_paths(folder: Path, formats: Sequence[str], textured: Sequence[str] | None) -> list[Path]:
     """Files that `_write_mesh` makes; `textured` are the names of the materials if there are textures."""
     paths = [path for kind in formats for path in _paths(folder, kind)]
     if textured is not None and "obj" in formats:
@@ -168,14 +158,6 @@ def _unwrapped(mesh: TriangleMesh, sizes: Sequence[int]) -> tuple[Atlas, int]:
         with suppress(ConfigError):
             return unwrap(mesh.vertices, mesh.faces, size), size
     return unwrap(mesh.vertices, mesh.faces, sizes[-1]), sizes[-1]
-
-
-def _require_sound(density: float | None, smoothing: float) -> None:
-    """Refuse impossible settings."""
-    if density is not None and not 0 < density < math.inf:
-        raise ConfigError(f"--density is {density:g}; it must be greater than 0")
-    if not 0 <= smoothing <= _MOST_SMOOTHING:
-        raise ConfigError(f"--smoothing is {smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} cells")
 
 
 def _write_mesh(

@@ -19,10 +19,11 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.pictures import over_neutral
 from unmix_plugin.formats.files import csv_bytes, rgba_png_bytes, write_file
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Pca
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.evaluation import PredictedView, as_numpy
-from unmix_plugin.trained.run_views import ViewChoice, resized_views
+from unmix_plugin.trained.run_views import resized_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PcaOf = Literal["spectra", "abundances"]
@@ -34,17 +35,16 @@ _LEAST_EXPLAINED = 1e-6
 """Part of the variance that a component has to explain to be shown."""
 
 
-def export_pca(job: Job, of: _PcaOf, choice: ViewChoice) -> list[Path]:
+def export_pca(job: Job, asked: Pca) -> list[Path]:
     """Find the components of all views, then paint each."""
-    views, scene = resized_views(job.views(choice)), job.scene
-    job.claim([*(_pca_path(job.folder, view.name) for view in views), _components_path(job.folder)])
-    seen = [_survey_view(scene, view.camera, of) for view in job.follow("finding components", views)]
-    components = _find_components(seen, of)
-    written = [
-        _write_pca(job.folder, view.name, job.render(view), components)
-        for view in job.follow("rendering views", views)
-    ]
-    return [*written, _write_components(job.folder, components, job.materials)]
+    views, table = resized_views(job.views(asked.views)), job.folder / "components.csv"
+    paths = [job.folder / f"{view.name}.png" for view in views]
+    job.claim([*paths, table])
+    seen = [_survey_view(job.scene, one.camera, asked.of) for one in job.follow("finding components", views)]
+    components = _find_components(seen, asked.of)
+    for view, path in zip(job.follow("rendering views", views), paths, strict=True):
+        write_file(path, _painted(view.name, job.render(view), components))
+    return [*paths, write_file(table, _table(components, job.materials))]
 
 
 @dataclass(frozen=True)
@@ -81,18 +81,8 @@ def _find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Com
     return _Components(of, colours, (first, second, third))
 
 
-def _pca_path(folder: Path, name: str) -> Path:
-    """The file that `_write_pca` makes for a view."""
-    return folder / f"{name}.png"
-
-
-def _components_path(folder: Path) -> Path:
-    """The file that `_write_components` makes."""
-    return folder / "components.csv"
-
-
-def _write_pca(folder: Path, name: str, view: PredictedView, components: _Components) -> Path:
-    """Write a view's components as red, green and blue, fading into grey where nothing is; a pixel a pixel."""
+def _painted(name: str, view: PredictedView, components: _Components) -> bytes:
+    """A view's components as red, green and blue, fading into grey where nothing is; a PNG, a pixel a pixel."""
     values = view.spectra if components.of == "spectra" else view.shares
     colours = as_numpy(components.colours(values.double()))
     painted = over_neutral(colours, as_numpy(view.accumulation))
@@ -100,11 +90,11 @@ def _write_pca(folder: Path, name: str, view: PredictedView, components: _Compon
         f"{name}: three principal components of the {components.of}, each from its 1st to its 99th percentile"
     )
     pixels = np.round(255 * np.clip(painted, 0, 1)).astype(np.uint8)
-    return write_file(_pca_path(folder, name), rgba_png_bytes(pixels, what))
+    return rgba_png_bytes(pixels, what)
 
 
-def _write_components(folder: Path, components: _Components, materials: Materials) -> Path:
-    """Write what red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
+def _table(components: _Components, materials: Materials) -> bytes:
+    """What red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
     component; then the values that become 0 and 1, and the part of the variance that each component explains.
     """
     colours = components.colours
@@ -119,4 +109,4 @@ def _write_components(folder: Path, components: _Components, materials: Material
         ("explained variance", components.explained),
     ):
         rows.append([name, "", *(f"{value:.9g}" for value in row)])
-    return write_file(_components_path(folder), csv_bytes(rows))
+    return csv_bytes(rows)

@@ -20,15 +20,16 @@ from torch import Tensor
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.meshes import write_ply
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import PointCloud
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.materials import Materials, seen_reflectance
-from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.trained.reflectance_maps import ReflectanceMap, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
 from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
+from unmix_plugin.trained.trained_scene import TrainedScene
 
 _OUTLIER_NEIGHBOURS = 8
 _OUTLIER_FACTOR = 4.0
@@ -171,52 +172,37 @@ _RAYS_PER_POINT = 5
 _COUNT_BOUNDS = (1, 10_000_000)
 
 
-def export_point_cloud(job: Job, num_points: int, outputs: Sequence[str]) -> list[Path]:
+def export_point_cloud(job: Job, asked: PointCloud) -> list[Path]:
     """Look through all cameras of the run, clean and thin what they see."""
-    count, materials = _require_count(num_points), job.materials
-    scores = _require_point_scores(outputs, materials.bands, materials.is_lit)
+    (low, high), count, materials = _COUNT_BOUNDS, asked.num_points, job.materials
+    if not low <= count <= high:
+        raise ConfigError(f"--num-points is {count}; choose {low} to {high}")
+    scores = _require_point_scores(asked.outputs, materials.bands, materials.is_lit)
     for score in scores:
         find_output(score.output, materials)  # which refuses libraries through another sensor
-    job.claim([_point_cloud_path(job.folder)])
+    path = job.folder / "points.ply"
+    job.claim([path])
     surface = job.surface(_RAYS_PER_POINT * count)
     with job.working("cleaning and thinning the points"):
-        path, written = _write_point_cloud(
-            job.folder, surface.points(), count, materials, job.frame, scores, job.scene.scale
-        )
+        written = _write_point_cloud(path, surface.points(), count, job.scene, job.frame, scores)
     job.say(counted(written, "point"))
     return [path]
 
 
-def _point_cloud_path(folder: Path) -> Path:
-    """The file that `_write_point_cloud` makes."""
-    return folder / "points.ply"
-
-
-def _require_count(num_points: int) -> int:
-    """The number of points asked for."""
-    low, high = _COUNT_BOUNDS
-    if not low <= num_points <= high:
-        raise ConfigError(f"--num-points is {num_points}; choose {low} to {high}")
-    return num_points
-
-
 def _write_point_cloud(
-    folder: Path,
+    path: Path,
     points: SurfacePoints,
     num_points: int,
-    materials: Materials,
+    scene: TrainedScene,
     frame: Normalisation,
     scores: Sequence[_PointScore] = (),
-    scale: Scale | None = None,
-) -> tuple[Path, int]:
-    """Write `points.ply`, binary, in world coordinates.
+) -> int:
+    """Write at most so many points, binary, in world coordinates, and say how many.
 
     x y z (float32, float64 where coordinates are large), nx ny nz (float32), red green blue (uint8, sRGB of the diffuse
     spectrum), material (uint8), every abundance and every score (float32).
-
-    Returns:
-        The file, and how many points are in it.
     """
+    materials = scene.materials
     points = points.select(torch.from_numpy(~_is_outlier(points.positions.numpy())))
     if len(points) == 0:
         raise RunError(
@@ -227,7 +213,7 @@ def _write_point_cloud(
     normals = _plane_normals(positions, -points.directions.double().numpy(), chosen)
     kept = points.select(torch.from_numpy(chosen))
     diffuse = kept.diffuse(materials)
-    looks = SurfaceAppearance(materials, kept.abundances, diffuse, scale)
+    looks = SurfaceAppearance(materials, kept.abundances, diffuse, scene.scale)
     world = positions_for_files(frame.to_world(positions[chosen]))
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {
@@ -238,4 +224,5 @@ def _write_point_cloud(
     }
     comments = looks.comments("surface points of an unmix-nerf run")
     comments += [score.comment(materials) for score in scores]
-    return write_ply(_point_cloud_path(folder), vertices, comments=comments), len(chosen)
+    write_ply(path, vertices, comments=comments)
+    return len(chosen)

@@ -24,7 +24,7 @@ class Abundances(ViewProduct):
         """Render the views and write the abundances of each."""
         from unmix_plugin.products.abundances import export_abundances
 
-        return export_abundances(job, self.views, self.formats)
+        return export_abundances(job, self)
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Cubes(ViewProduct):
         """Render the views and write the spectra of each."""
         from unmix_plugin.products.cubes import export_cubes
 
-        return export_cubes(job, self.views, self.formats)
+        return export_cubes(job, self)
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Endmembers(Product):
         """Write table, library, plot and angles."""
         from unmix_plugin.products.endmembers import export_endmembers
 
-        return export_endmembers(job, self.library, self.compare)
+        return export_endmembers(job, self)
 
 
 @dataclass(frozen=True)
@@ -92,16 +92,7 @@ class Mesh(Product):
         """Sample the density, march through it, trim and colour the surface."""
         from unmix_plugin.products.mesh import export_mesh
 
-        return export_mesh(
-            job,
-            self.formats,
-            self.resolution,
-            self.density,
-            self.smoothing,
-            self.unseen == "keep",
-            self.up,
-            self.texture_size,
-        )
+        return export_mesh(job, self)
 
 
 @dataclass(frozen=True)
@@ -168,7 +159,7 @@ class Pca(Product):
         """Find the components of all views, then paint each."""
         from unmix_plugin.products.pca import export_pca
 
-        return export_pca(job, self.of, self.views)
+        return export_pca(job, self)
 
 
 @dataclass(frozen=True)
@@ -188,7 +179,7 @@ class PointCloud(Product):
         """Look through all cameras of the run, clean and thin what they see."""
         from unmix_plugin.products.point_cloud import export_point_cloud
 
-        return export_point_cloud(job, self.num_points, self.outputs)
+        return export_point_cloud(job, self)
 
 
 @dataclass(frozen=True)
@@ -292,7 +283,7 @@ class Scale(RunWork):
         """Find the points, set the scale."""
         from unmix_plugin.products.measuring import set_scale
 
-        return set_scale(job, self.points, self.distance, self.metres_per_unit)
+        return set_scale(job, self)
 
 
 @dataclass(frozen=True)
@@ -306,7 +297,7 @@ class Segmentation(ViewProduct):
         """Render the views and write the materials of each."""
         from unmix_plugin.products.segmentation import export_segmentation
 
-        return export_segmentation(job, self.views)
+        return export_segmentation(job, self)
 
 
 @dataclass(frozen=True)
@@ -337,8 +328,7 @@ class Spectrum(Product):
         """Probe the place and write what is there."""
         from unmix_plugin.products.spectrum import export_spectrum
 
-        place = (self.view, self.pixel, self.point, self.region)
-        return export_spectrum(job, place, self.data, self.library, self.compare)
+        return export_spectrum(job, self)
 
 
 @dataclass(frozen=True)
@@ -359,7 +349,7 @@ class Splats(Product):
         """Find the surface and make a Gaussian of each of its vertices."""
         from unmix_plugin.products.splats import export_splats
 
-        return export_splats(job, self.formats, self.resolution, self.up)
+        return export_splats(job, self)
 
 
 @dataclass(frozen=True)
@@ -376,7 +366,7 @@ class Volume(Product):
         """Sample the field, slice by slice."""
         from unmix_plugin.products.volume import export_volume
 
-        return export_volume(job, self.resolution)
+        return export_volume(job, self)
 
 
 PRODUCTS: tuple[RunWork, ...] = (

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,22 +11,22 @@ from torch import Tensor
 
 from unmix_plugin.figures.pictures import NEUTRAL, Picture, TitledPicture, draw_panels
 from unmix_plugin.figures.plotting import Colour
-from unmix_plugin.formats.files import array_bytes, indexed_png_bytes, write_file
+from unmix_plugin.formats.files import array_bytes, csv_bytes, indexed_png_bytes, write_file
 from unmix_plugin.products.abundances import colour_panel
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Segmentation
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import PredictedView
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.trained.run_views import ViewChoice
 
 
-def export_segmentation(job: Job, choice: ViewChoice) -> list[Path]:
+def export_segmentation(job: Job, asked: Segmentation) -> list[Path]:
     """Write scores, figure and ids of views, and the legend of the ids."""
     path, legend = job.folder / "legend.csv", _legend_bytes(job.materials)
     if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same
         job.claim([path])
-    written = job.write_views(choice, _view_paths, _write_view)
+    written = job.write_views(asked.views, _view_paths, _write_view)
     if job.processes.is_first:
         write_file(path, legend)
     return [*written, path]
@@ -50,13 +48,10 @@ def _write_view(folder: Path, view: str, rendered: PredictedView, materials: Mat
 
 def _legend_bytes(materials: Materials) -> bytes:
     """What the ids mean as CSV: `id,name,red,green,blue`, sRGB of the palette as 0 to 255."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["id", "name", "red", "green", "blue"])
     palette = np.round(255 * _id_palette(dict(enumerate(endmember_colours(materials))))).astype(int)
-    for index, name in [*enumerate(materials.names), (NOTHING_ID, "nothing")]:
-        writer.writerow([index, name, *palette[index]])
-    return text.getvalue().encode()
+    named = [*enumerate(materials.names), (NOTHING_ID, "nothing")]
+    rows = [[index, name, *palette[index]] for index, name in named]
+    return csv_bytes([["id", "name", "red", "green", "blue"], *rows])
 
 
 def _scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:

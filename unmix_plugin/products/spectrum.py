@@ -22,7 +22,7 @@ from unmix_plugin.formats.files import NOT_PORTABLE, make_folder, safe_name, wri
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measured_surface
-from unmix_plugin.spectral.library.material_library import Comparison
+from unmix_plugin.products.scene_products import Spectrum
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import describe_scale
@@ -42,23 +42,9 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 _MOST_BARS = 12
 
 
-def export_spectrum(
-    job: Job,
-    place: tuple[str | None, str | None, str | None, str | None],
-    data: Path | None,
-    library: Sequence[Path],
-    comparison: Comparison,
-) -> list[Path]:
-    """Probe a place and write what is there.
-
-    Args:
-        job: The run and where to write.
-        place: View and pixel, a point, or a region, as the command line has them.
-        data: Scene folder, where it is no longer where the run was trained on it.
-        library: Files of reflectances to compare with too.
-        comparison: How spectra are compared.
-    """
-    view_name, pixel_text, point_text, region = place
+def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
+    """Probe a place and write what is there."""
+    view_name, pixel_text, point_text, region = asked.view, asked.pixel, asked.point, asked.region
     measured = spread = None
     others = (view_name, pixel_text, point_text)
     if region is not None and others == (None, None, None):
@@ -66,10 +52,8 @@ def export_spectrum(
         kept = job.loaded.measures.region(region)
         job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
         found = measured_surface(job).measure(kept, region)
-        probe, spread = (
-            Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None),
-            found.spread,
-        )
+        probe = Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None)
+        spread = found.spread
         facts: dict[str, Any] = {"region": region, "area_square_units": found.area}
         job.say(f"{region}: {found.said(job.materials.names, job.scene.scale)}")
     elif region is not None:
@@ -91,20 +75,20 @@ def export_spectrum(
         probe = job.scene.probe(view.camera, column, row)
         facts = {"view": view.name, "pixel": [column, row]}
         title = f"{view.name}, column {column}, row {row}"
-        measured = _measured(job, view, (column, row), data)
+        measured = _measured(job, view, (column, row), asked.data)
     else:
         raise ConfigError(
             "give a pixel with --view and --pixel, a point with --point, or a region with --region"
         )
     light, matches = job.scene.light_power, []
-    known = library_of(library, job.materials.bands)
+    known = library_of(asked.library, job.materials.bands)
     if light is None:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
         job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
     else:
         spectra, bands = probe.spectra["predicted"][None], job.materials.bands
-        [matches] = shown_matches(spectra, bands, light, known, comparison=comparison)
+        [matches] = shown_matches(spectra, bands, light, known, asked.compare)
     probed = _ProbedPlace(title, facts, probe, measured, matches, spread)
     written = _write_spectrum(job.folder, name, probed, job.scene)
     if spread is not None:
@@ -148,7 +132,6 @@ class _ProbedPlace:
 
 
 def _spectrum_paths(folder: Path, name: str) -> list[Path]:
-    """Files that `_write_spectrum` makes."""
     return [folder / f"{name}.{kind}" for kind in ("csv", "json", "png")]
 
 

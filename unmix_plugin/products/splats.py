@@ -8,18 +8,17 @@ Notation: `V` vertices, one Gaussian each.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
 
-from unmix_plugin.formats.meshes import Splats, least_turns, write_splats_glb, write_splats_ply
+from unmix_plugin.formats.meshes import Gaussians, least_turns, write_splats_glb, write_splats_ply
 from unmix_plugin.products.mesh import find_surface, gltf_content, say_units
 from unmix_plugin.products.product import Job
-from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.products.scene_products import Splats
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_at
 from unmix_plugin.trained.surface_mesh import TriangleMesh
@@ -31,38 +30,30 @@ _OPACITY = 0.98
 _WHAT = "surface of an unmix-nerf run as Gaussians"
 
 
-def export_splats(
-    job: Job, formats: Sequence[str], resolution: int, up: Literal["y", "z"] = "y"
-) -> list[Path]:
-    """Find the surface and make a Gaussian of each of its vertices.
-
-    Args:
-        job: The run and where to write.
-        formats: Of `glb`, `ply`.
-        resolution: Pieces along the longest edge of the scene box.
-        up: `y`: up is +y in GLB and -y in PLY, as their viewers expect; `z`: coordinates of the world.
-    """
-    paths = {kind: job.folder / f"splats.{kind}" for kind in formats}
+def export_splats(job: Job, asked: Splats) -> list[Path]:
+    """Find the surface and make a Gaussian of each of its vertices."""
+    paths = {kind: job.folder / f"splats.{kind}" for kind in asked.formats}
     job.claim(list(paths.values()))
-    mesh, _ = find_surface(job, resolution)
+    mesh, _ = find_surface(job, asked.resolution)
     scene, frame = job.scene, job.frame
     with job.working("looking at the surface's points"):
         normals = mesh.normals
         seen = look_at(
             scene, torch.from_numpy(mesh.vertices).float(), torch.from_numpy(-normals).float()
         ).map(lambda packed: packed.cpu() / packed[:, :1].clamp(min=1e-6).cpu())
-        looks = _as_seen(job, seen)
+        materials = job.materials.to("cpu")  # gloss from straight above included
+        looks = SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     positions, numbers, extras = gltf_content(world, looks, _WHAT)
     widths = _WIDTH * np.sqrt(_vertex_areas(world))
-    splats = Splats(
+    splats = Gaussians(
         positions,
         least_turns(np.eye(3)[2:], directions_to_world(frame, normals)).astype(np.float32),
         np.stack([widths, widths, _THICKNESS * widths], axis=1).astype(np.float32),
         looks.srgb.astype(np.float32),
         _OPACITY,
     )
-    axis = world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0])
+    axis = world_up(scene.views, frame) if asked.up == "y" else np.array([0.0, 1.0, 0.0])
     written = []
     if "glb" in paths:
         written.append(write_splats_glb(paths["glb"], splats, numbers, extras, axis))
@@ -71,7 +62,7 @@ def export_splats(
         comments = looks.comments(_WHAT)
         if "offset" in extras:
             comments.append(f"less the offset {extras['offset']}, since coordinates are large")
-        if up == "y":
+        if asked.up == "y":
             splats = _turned(splats, axis)
             comments.append("turned so that -y is up; --up z keeps the axes of the world")
         written.append(write_splats_ply(paths["ply"], splats, own, comments))
@@ -79,12 +70,6 @@ def export_splats(
     if "glb" in paths:
         say_units(job, "splats.glb")
     return written
-
-
-def _as_seen(job: Job, seen: Coefficients) -> SurfaceAppearance:
-    """The looks of the vertices, gloss from straight above included."""
-    materials = job.materials.to("cpu")
-    return SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), job.scene.scale)
 
 
 def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
@@ -95,15 +80,13 @@ def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
     return np.maximum(areas, 0.01 * np.mean(areas))
 
 
-def _turned(splats: Splats, up: Float[np.ndarray, "3"]) -> Splats:
+def _turned(splats: Gaussians, up: Float[np.ndarray, "3"]) -> Gaussians:
     """The same with `up` turned to -y."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_quat(least_turns(up, np.array([0.0, -1.0, 0.0])))
-    return Splats(
-        turn.apply(splats.positions).astype(np.float32),
-        (turn * Rotation.from_quat(splats.rotations)).as_quat().astype(np.float32),
-        splats.scales,
-        splats.srgb,
-        splats.opacity,
+    return replace(
+        splats,
+        positions=turn.apply(splats.positions).astype(np.float32),
+        rotations=(turn * Rotation.from_quat(splats.rotations)).as_quat().astype(np.float32),
     )

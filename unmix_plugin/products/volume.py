@@ -13,6 +13,7 @@ import numpy as np
 
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Volume
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import affine_to_world
 from unmix_plugin.trained.surface import GridPoints, sample_slice
@@ -22,30 +23,25 @@ _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
 
 
-def export_volume(job: Job, resolution: int) -> list[Path]:
+def export_volume(job: Job, asked: Volume) -> list[Path]:
     """Sample the field, slice by slice."""
-    grid = GridPoints.over(job.scene.scene_box.aabb, resolution)
-    job.claim([_volume_path(job.folder)])
-    slices = job.follow("sampling the field", range(grid.shape[0]))
-    return [_write_volume(job.folder, job.scene, grid, job.frame, slices)]
-
-
-def _volume_path(folder: Path) -> Path:
-    """The file that `_write_volume` makes."""
-    return folder / "volume.npz"
+    grid, path = GridPoints.over(job.scene.scene_box.aabb, asked.resolution), job.folder / "volume.npz"
+    job.claim([path])
+    _write_volume(path, job.scene, grid, job.frame, job.follow("sampling the field", range(grid.shape[0])))
+    return [path]
 
 
 def _write_volume(
-    folder: Path, scene: TrainedScene, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
-) -> Path:
-    """Write `volume.npz`, of which one slice is in memory at a time, and all densities.
+    path: Path, scene: TrainedScene, grid: GridPoints, frame: Normalisation, slices: Iterable[int]
+) -> None:
+    """Write a volume, of which one slice is in memory at a time, and all densities.
 
     Arrays: `density` (X, Y, Z) float32 per world unit; `abundances` (X, Y, Z, K) float32, summing to 1; both are 0 in
     cells that are never rendered. `index_to_world` (4, 4) float64 leads from (i, j, k, 1) to world points, of which a
     unit is `metres_per_unit` long (NaN where unknown).
     `endmember_names`, `endmembers` (K, B) float32 and `wavelengths_nm` (B,) say what the abundances are of.
     """
-    path, materials = _volume_path(folder), scene.materials
+    materials = scene.materials
     density = np.zeros(grid.shape, dtype=np.float32)
     others = {
         "index_to_world": affine_to_world(frame, grid.origin.astype(np.float64), grid.cell),
@@ -71,4 +67,3 @@ def _write_volume(
         for name, values in {"density": density, **others}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, values, allow_pickle=False)
-    return path
