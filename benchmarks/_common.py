@@ -225,7 +225,7 @@ def quiet_trainer(words: Sequence[str]) -> Trainer:
     from unmix_plugin.engine.training.trainer import Trainer
 
     with open(os.devnull, "w") as nowhere:  # noqa: PTH123 - a device, not a path
-        return Trainer(parse(list(words)), console=Console(file=nowhere, quiet=True))
+        return Trainer(parse(list(words))[0], console=Console(file=nowhere, quiet=True))
 
 
 def json_lines(path: Path) -> list[dict[str, Any]]:

@@ -108,7 +108,7 @@ def measure_replacing(subject: Subject, folder: Path) -> dict[str, Any]:
     """Mean spectral angle of the endmember's pixels to each material that it is replaced by."""
     import torch
 
-    from unmix_plugin.editing import FileSpectrum, Recipe, Replace
+    from unmix_plugin.editing import Recipe, Replace
     from unmix_plugin.spectral.metrics import spectral_angle
 
     scene = subject.scene
@@ -120,7 +120,7 @@ def measure_replacing(subject: Subject, folder: Path) -> dict[str, Any]:
         if material == subject.material:
             continue
         target = torch.tensor(scene.endmembers[material] * scene.illuminant, device=subject.trained.device)
-        recipe = Recipe((Replace(subject.endmember, FileSpectrum(folder / "endmembers.csv", name)),))
+        recipe = Recipe((Replace(subject.endmember, None, folder / "endmembers.csv", name),))
         for found, shown in ((angles, subject.edited(recipe)), (before, subject.trained)):
             pixels = subject.pixels(shown, "spectral", PURE_SHARE).double()
             found[name] = float(spectral_angle(pixels, target.expand_as(pixels)).mean())
@@ -160,7 +160,7 @@ def measure_relighting(run: Path, folder: Path, device: str) -> dict[str, float]
     import numpy as np
     import torch
 
-    from unmix_plugin.editing import Light, relight
+    from unmix_plugin.editing import Light, Recipe, edit_scene
     from unmix_plugin.spectral.metrics import psnr
     from unmix_plugin.trained.open_run import load_run
 
@@ -168,7 +168,7 @@ def measure_relighting(run: Path, folder: Path, device: str) -> dict[str, float]
     trained = loaded.materials_scene
     day, lamp = (built_in_scene(loaded, folder / name, name) for name in ("D50", "A"))
     assert lamp.illuminant is not None
-    relit = relight(trained, Light("A"))
+    relit = edit_scene(trained, Recipe(illuminant=Light("A")))
     assert trained.light is not None
     assert relit.light is not None
     # The generator scales every lamp to a greatest power of 1, edits keep white as bright as it was.

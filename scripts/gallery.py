@@ -29,7 +29,7 @@ from scipy.optimize import linear_sum_assignment
 
 from unmix_plugin import Cameras, Light, MaterialView, Recipe, TrainedScene, edit_scene, open_run, train
 from unmix_plugin.commands.export import export
-from unmix_plugin.editing import LibrarySpectrum, Operation, Remove, Rename, Replace, Retint
+from unmix_plugin.editing import Operation, Remove, Rename, Replace, Retint
 from unmix_plugin.engine.geometry.camera_paths import orbit
 from unmix_plugin.figures.pictures import ColourScale, paint
 from unmix_plugin.scenes.demo.scene import make_demo_scene
@@ -328,7 +328,7 @@ def make_edits(studio: Studio) -> None:
     recipes: list[tuple[str, tuple[Operation, ...]]] = [
         ("as it was taken", ()),
         ("cobalt recoloured", (Retint("cobalt", (0.85, 0.55, 0.1)),)),
-        ("wood replaced", (Replace("wood", LibrarySpectrum("checker/foliage")),)),
+        ("wood replaced", (Replace("wood", "checker/foliage"),)),
         ("cream removed", (Remove(("cream",)),)),
     ]
     row = [

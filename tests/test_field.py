@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField, cells_of_finest_level, direction_features, rows_of_level
+from unmix_plugin.field import UnmixField, _cells_of_finest_level, _rows_of_level, direction_features
 from unmix_plugin.settings import UnmixFieldConfig
 
 PIXELS = (0.02, 0.01, 0.006, 0.0045, 0.003, 0.001)
@@ -111,14 +111,14 @@ def test_direction_features_are_orthogonal_over_the_sphere():
 
 def test_the_finest_level_follows_the_size_of_a_pixel():
     sharp, blurred = (
-        cells_of_finest_level(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
+        _cells_of_finest_level(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
     )
     assert (sharp, blurred) == (400, 100)
 
 
 def test_levels_have_more_rows_where_a_scene_is_many_pixels_large():
     config = UnmixFieldConfig()
-    sizes = [rows_of_level(config, cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
+    sizes = [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
     assert sizes[0] == 16
     assert sizes[-1] == 19
     assert sizes == sorted(sizes)
@@ -127,7 +127,7 @@ def test_levels_have_more_rows_where_a_scene_is_many_pixels_large():
 
 def test_an_asked_for_number_of_rows_is_kept_whatever_the_scene():
     config = UnmixFieldConfig(log2_rows_per_level=12)
-    found = [rows_of_level(config, cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
+    found = [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
     assert set(found) == {12}
 
 

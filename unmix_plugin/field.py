@@ -141,13 +141,13 @@ class UnmixField(CoefficientField):
         self.num_endmembers, self.num_specular = num_endmembers, num_specular
         self.num_encoded = config.num_levels * config.features_per_level
         self.log_initial_density = math.log(initial_density)
-        finest_resolution = cells_of_finest_level(config, scene_box, pixel_size) * (2 if is_unbounded else 1)
+        finest_resolution = _cells_of_finest_level(config, scene_box, pixel_size) * (2 if is_unbounded else 1)
         self.layout = HashGridLayout(
             config.num_levels,
             config.features_per_level,
             config.coarsest_resolution,
             finest_resolution,
-            rows_of_level(config, finest_resolution),
+            _rows_of_level(config, finest_resolution),
         )
         self.register_buffer("aabb", scene_box.aabb.clone())
         self.is_unbounded = is_unbounded
@@ -207,7 +207,7 @@ class UnmixField(CoefficientField):
         if self.level_weights is not None:
             encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
         features = in_parts(self.density_network, encoded)
-        return bounded_exp(features[:, 0] + self.log_initial_density), features
+        return _bounded_exp(features[:, 0] + self.log_initial_density), features
 
     def get_outputs(
         self,
@@ -263,19 +263,19 @@ class UnmixField(CoefficientField):
         return (factors[:1] * factors[1:]).t()
 
 
-def bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
+def _bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
     """exp, clamped in value only: a point that grew too dense can still become less dense."""
     return (raw + (raw.clamp(max=_LARGEST_LOG_DENSITY) - raw).detach()).exp()
 
 
-def cells_of_finest_level(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
+def _cells_of_finest_level(config: UnmixFieldConfig, scene_box: SceneBox, pixel_size: float) -> int:
     """Cells along the scene box's longest edge; `pixel_size` is as `UnmixField` takes it."""
     wanted = math.ceil(config.cells_per_pixel * float(scene_box.size.max()) / pixel_size)
     cells = choose(config.finest_resolution, min(wanted, LARGEST_RESOLUTION))
     return max(config.coarsest_resolution, cells)
 
 
-def rows_of_level(config: UnmixFieldConfig, finest_resolution: int) -> int:
+def _rows_of_level(config: UnmixFieldConfig, finest_resolution: int) -> int:
     """Log2 of the rows that a level may have, where the finest has so many cells along the longest edge.
 
     A surface passes through as many cells as it has area, so the rows that large scenes need grow with the square of

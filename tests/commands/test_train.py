@@ -53,7 +53,7 @@ def test_a_run_holds_its_settings_its_scene_a_checkpoint_and_its_endmembers(trai
 
 
 def test_the_words_of_the_contract_work_right_after_the_method(tmp_path):
-    config = parse(
+    config, _ = parse(
         f"unmix-nerf --data {tmp_path} --output-dir out --max-num-iterations 5 --max-seconds 7.5 --seed 3 --device cpu "
         "--pipeline.model.num-endmembers 7".split()
     )
@@ -65,17 +65,17 @@ def test_the_words_of_the_contract_work_right_after_the_method(tmp_path):
 
 def test_settings_that_most_people_need_have_short_names(tmp_path):
     argv = f"unmix-nerf --endmembers 4 --endmember-init file --endmember-file {tmp_path} --value-scale 4095"
-    config = parse([*argv.split(), "--invalid-pixels", "mask"])
+    config, _ = parse([*argv.split(), "--invalid-pixels", "mask"])
     assert isinstance(config.pipeline.model, UnmixModelConfig)
     assert isinstance(config.pipeline.datamanager, HyperspectralDataManagerConfig)
     model, scene = config.pipeline.model, config.pipeline.datamanager.scene
     assert (model.num_endmembers, model.endmember_init, model.endmember_file) == (4, "file", tmp_path)
     assert (scene.value_scale, scene.invalid_pixels) == (4095.0, "mask")
-    assert parse(["unmix-nerf", "--pipeline.model.num-endmembers", "4"]).pipeline.model == replace(
-        parse(["unmix-nerf"]).pipeline.model, num_endmembers=4
+    assert parse(["unmix-nerf", "--pipeline.model.num-endmembers", "4"])[0].pipeline.model == replace(
+        parse(["unmix-nerf"])[0].pipeline.model, num_endmembers=4
     )
-    assert parse(["neumatex", "--endmembers", "4"]).pipeline.model == replace(
-        parse(["neumatex"]).pipeline.model, num_endmembers=4
+    assert parse(["neumatex", "--endmembers", "4"])[0].pipeline.model == replace(
+        parse(["neumatex"])[0].pipeline.model, num_endmembers=4
     )
 
 
@@ -103,7 +103,7 @@ def test_help_shows_the_common_options_and_help_all_the_others_too():
     ],
 )
 def test_a_limit_given_alone_is_the_only_limit(words, iterations, seconds):
-    config = parse(["unmix-nerf", *words.split()])
+    config, _ = parse(["unmix-nerf", *words.split()])
     assert (config.max_num_iterations, config.max_seconds) == (iterations, seconds)
 
 
@@ -270,7 +270,7 @@ def test_training_from_python_takes_the_names_of_the_flags_and_gives_the_scene_o
     words = [f"--{name}={value}" for name, value in given.items()]
     config = load_config(path)
     assert config == replace(
-        parse(["unmix-nerf", "--data", str(trained.scene), "--output-dir", str(tmp_path), *words]),
+        parse(["unmix-nerf", "--data", str(trained.scene), "--output-dir", str(tmp_path), *words])[0],
         load_run=path,
         pipeline=config.pipeline,
     )

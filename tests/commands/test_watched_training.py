@@ -12,7 +12,7 @@ from tests.commands.watching import START_S, address, looking, started, visited
 from tests.systems import needs_posix
 from tests.viewer_page import Page
 from unmix_plugin.commands import train as train_module
-from unmix_plugin.commands.train import parse_all, train
+from unmix_plugin.commands.train import parse, train
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.viewer import server
@@ -111,10 +111,10 @@ def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
 def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):
     words = ["unmix-nerf", "--data", str(tmp_path)]
     monkeypatch.setattr(train_module.sys, "stdout", io.StringIO())
-    assert not parse_all(words)[1].enabled
+    assert not parse(words)[1].enabled
     monkeypatch.setattr(train_module.sys, "stdout", Terminal())
-    assert parse_all(words)[1].enabled
-    assert not parse_all([*words, "--viewer.no-enabled"])[1].enabled
+    assert parse(words)[1].enabled
+    assert not parse([*words, "--viewer.no-enabled"])[1].enabled
 
 
 class Terminal:
@@ -126,7 +126,7 @@ class Terminal:
 
 def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
     words = ["unmix-nerf", "--data", str(trained.scene), "--viewer.host", "::1", "--viewer.share", "0.2"]
-    config, viewing = parse_all([*words, "--max-seconds", "7"])
+    config, viewing = parse([*words, "--max-seconds", "7"])
     assert (viewing.host, viewing.share, viewing.port, viewing.token) == ("::1", 0.2, 7007, None)
     assert (config.max_seconds, config.max_num_iterations) == (7.0, None)
     assert "viewer" not in (trained.run / "config.json").read_text()

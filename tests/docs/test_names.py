@@ -10,7 +10,7 @@ from tests.docs.pages import ROOT, text_of
 from unmix_plugin.commands.demo import demo
 from unmix_plugin.commands.demo_scene import write_demo_scene
 from unmix_plugin.commands.eval import evaluate
-from unmix_plugin.commands.export import PRODUCTS, export, own_products
+from unmix_plugin.commands.export import PRODUCTS, _own_products, export
 from unmix_plugin.commands.image import image
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
@@ -51,7 +51,7 @@ def flags():
     asked += [
         (train, [method, "--help-all"]) for method in ("unmix-nerf", "unmix-nerf-published", "neumatex")
     ]
-    own, _ = own_products(frozenset())
+    own, _ = _own_products(frozenset())
     products = [*(product.name for product in PRODUCTS), *own]
     asked += [(export, [name, "--help"]) for name in products]
     return {

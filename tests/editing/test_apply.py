@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene, recipe, rendered, tensors_of
 from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, make_scene
-from unmix_plugin.editing import Light, Recipe, Remove, Scale, changes_geometry, edit_scene, relight
+from unmix_plugin.editing import Light, Recipe, Remove, Scale, changes_geometry, edit_scene
 from unmix_plugin.editing.apply import (
     _LitReflectance,
     _retinted,
@@ -252,12 +252,12 @@ def test_another_light_multiplies_every_spectrum_by_the_same_ratio():
 
 def test_a_relit_scene_knows_its_light_so_that_reflectance_stays():
     scene = lit_scene()
-    result = relight(scene, Light("D65"))
+    result = edit_scene(scene, Recipe(illuminant=Light("D65")))
     before = scene.materials.endmembers.detach() / torch.tensor(LIGHT)
     assert result.light is not None
     assert_close(result.materials.endmembers / result.light, before)
     assert_close(
-        rendered(relight(result, Light("A"))),
+        rendered(edit_scene(result, Recipe(illuminant=Light("A")))),
         rendered(edited(scene, light="A")),
         rtol=1e-4,
         atol=1e-5,
@@ -451,7 +451,9 @@ def test_an_invisible_light_cannot_be_as_bright_as_before(tmp_path):
 
 def test_a_scene_relit_by_a_light_that_ends_among_its_bands_renders_and_says_which_are_black():
     scene = lit_scene()
-    short = relight(scene, Light("ISO 7589 Sensitometric Printer"))  # known up to 560 nm
+    short = edit_scene(
+        scene, Recipe(illuminant=Light("ISO 7589 Sensitometric Printer"))
+    )  # known up to 560 nm
     [note] = short.notes
     assert "2 of 5 bands, 450-650 nm (600 to 650 nm): black there" in note
     view = short.render(CAMERAS[0], ["spectral", "rgb", "index:r650", "index:r500"])

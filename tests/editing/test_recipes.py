@@ -10,10 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from unmix_plugin.editing import (
-    FileSpectrum,
     Gloss,
     Isolate,
-    LibrarySpectrum,
     Light,
     Recipe,
     Remove,
@@ -57,8 +55,8 @@ several = st.lists(endmembers, min_size=1, max_size=3).map(tuple)
 paths = names.map(lambda name: Path("/spectra") / name)
 edits_to_be = st.one_of(
     st.builds(partial, st.just(Swap), endmembers, endmembers),
-    st.builds(partial, st.just(Replace), endmembers, st.builds(LibrarySpectrum, names), st.booleans()),
-    st.builds(partial, st.just(Replace), endmembers, st.builds(FileSpectrum, paths, st.none() | names)),
+    st.builds(partial, st.just(Replace), endmembers, names, extrapolate=st.booleans()),
+    st.builds(partial, st.just(Replace), endmembers, st.none(), paths, st.none() | names),
     st.builds(partial, st.just(Retint), endmembers, colours, st.sampled_from(["picture", "spectrum"])),
     st.builds(partial, st.just(Scale), endmembers, factors),
     st.builds(partial, st.sampled_from([Remove, Isolate]), several),
@@ -82,8 +80,8 @@ def test_every_edit_is_read_in_order_with_its_line(tmp_path):
     assert recipe.illuminant == Light("D65")
     assert recipe.operations == (
         Swap("red", 3),
-        Replace(2, LibrarySpectrum("ColorChecker/red")),
-        Replace("clay", FileSpectrum(tmp_path / "paints.csv", "ochre"), extrapolate=True),
+        Replace(2, "ColorChecker/red"),
+        Replace("clay", None, tmp_path / "paints.csv", "ochre", extrapolate=True),
         Retint(4, (0x33 / 255, 0x66 / 255, 0xCC / 255)),
         Retint(5, (0.1, 0.25, 1.0), "spectrum"),
         Scale(0, 1.5),
@@ -115,7 +113,7 @@ def test_files_lie_beside_the_recipe_that_names_them(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     recipe = read_recipe(Path("recipes/edits.yml"))
     assert recipe.illuminant == Light(folder / "lamp.csv")
-    assert recipe.operations == (Replace(0, FileSpectrum(folder / "paint.csv")),)
+    assert recipe.operations == (Replace(0, file=folder / "paint.csv"),)
     assert recipe.source == "recipes/edits.yml"
 
 
@@ -170,8 +168,8 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits:\n- rename: {endmember: 1, name: 7}", "name must be text; found '7'; put it in quotes"),
         ("edits:\n- rename: {endmember: 1, name: '7'}", "starts with a letter; found '7'"),
         ("edits:\n- gloss: {endmember: 1}", "gloss needs scale or colour"),
-        ("edits:\n- replace: {endmember: 1}", "replace takes either library"),
-        ("edits:\n- replace: {endmember: 1, library: a, file: b}", "replace takes either library"),
+        ("edits:\n- replace: {endmember: 1}", "replace: give either library or file"),
+        ("edits:\n- replace: {endmember: 1, library: a, file: b}", "replace: give either library or file"),
         (
             "edits:\n- replace: {endmember: 1, library: a, spectrum: b}",
             "line 2: replace: spectrum goes with file, not with library",

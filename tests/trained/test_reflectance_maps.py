@@ -6,8 +6,8 @@ import torch
 from torch.testing import assert_close
 
 from tests.method_factory import CAMERA, WAVELENGTHS_NM, make_scene
-from unmix_plugin.editing.apply import relight
-from unmix_plugin.editing.recipe import Light
+from unmix_plugin.editing.apply import edit_scene
+from unmix_plugin.editing.recipe import Light, Recipe
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.render.files import choose_formats
@@ -77,7 +77,7 @@ def test_an_index_of_a_view_is_that_of_its_reflectance():
 def test_outputs_of_reflectance_do_not_change_with_the_light(target, method):
     """ACE divides by covariances of almost nothing: what rounding leaves there is a thousandth."""
     scene = make_scene(light=LIGHT)
-    lit = relight(scene, Light("A"))
+    lit = edit_scene(scene, Recipe(illuminant=Light("A")))
     assert lit.light is not None
     assert not np.allclose(lit.light, LIGHT)
     for name in (INDEX, f"target:{method}:{target}"):

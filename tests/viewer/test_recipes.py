@@ -5,7 +5,6 @@ import pytest
 from unmix_plugin.editing import (
     Gloss,
     Isolate,
-    LibrarySpectrum,
     Light,
     Recipe,
     Remove,
@@ -90,7 +89,7 @@ edits:
         Swap(1, 0),
         Remove((1, 2)),
         Gloss(None, 0.5),
-        Replace(0, LibrarySpectrum("memory colours/carrot")),
+        Replace(0, "memory colours/carrot"),
     )
 
 

@@ -11,7 +11,7 @@ from unmix_plugin.engine.configs import DeviceName
 
 
 @dataclass(frozen=True)
-class DemoOptions:
+class _DemoOptions:
     """Train on the built-in scene, evaluate the run, export abundance maps and a page in 3-D, say where they are."""
 
     seconds: float = 45.0
@@ -24,7 +24,7 @@ class DemoOptions:
 
 def demo(arguments: list[str]) -> None:
     """Parse the arguments, do what the commands do, say what to look at."""
-    options = tyro.cli(DemoOptions, prog="unmix-demo", args=arguments)
+    options = tyro.cli(_DemoOptions, prog="unmix-demo", args=arguments)
 
     from unmix_plugin.commands.eval import evaluate
     from unmix_plugin.commands.export import export

@@ -15,7 +15,7 @@ from unmix_plugin.errors import ConfigError
 
 
 @dataclass(frozen=True)
-class DemoSceneOptions:
+class _DemoSceneOptions:
     """Write a small ray-traced scene with true labels, abundances and endmembers."""
 
     directory: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
@@ -43,7 +43,7 @@ class DemoSceneOptions:
 
 def write_demo_scene(arguments: list[str]) -> None:
     """Parse the arguments, write the scene or the capture, say what is where."""
-    options = tyro.cli(DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
+    options = tyro.cli(_DemoSceneOptions, prog="unmix-demo-scene", args=arguments)
     if options.raw and options.place != "table":
         raise ConfigError(f"--raw writes the table alone, not --place {options.place}; leave one of them out")
     if options.markers and not options.raw:
@@ -54,7 +54,7 @@ def write_demo_scene(arguments: list[str]) -> None:
         _write_scene(options)
 
 
-def _write_scene(options: DemoSceneOptions) -> None:
+def _write_scene(options: _DemoSceneOptions) -> None:
     from unmix_plugin.scenes.demo.scene import (
         DEFAULT_BANDS,
         DEFAULT_SIZE,
@@ -92,7 +92,7 @@ def _write_scene(options: DemoSceneOptions) -> None:
     print(f"train on it: unmix-train unmix-nerf --data {folder}")
 
 
-def _write_capture(options: DemoSceneOptions) -> None:
+def _write_capture(options: _DemoSceneOptions) -> None:
     from unmix_plugin.captures.demo import (
         MARKER_FAMILY,
         MARKER_SIZE,
@@ -137,7 +137,7 @@ def _write_capture(options: DemoSceneOptions) -> None:
     )
 
 
-def _numbers(options: DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:
+def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:
     """Size, bands and views, as asked, or the defaults."""
     asked = (options.size, options.bands, options.views)
     return tuple(default if value is None else value for value, default in zip(asked, defaults, strict=True))

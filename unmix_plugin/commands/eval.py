@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class EvalOptions:
+class _EvalOptions:
     """Measure a trained run on its evaluation views: metrics.json, a table, and prediction beside truth as pictures.
 
     They are written to `eval/` in the run folder, in place of an earlier evaluation; those of an edited run to a folder
@@ -59,7 +59,7 @@ def evaluate(argv: list[str]) -> None:
             not there.
         SpectrumError: there is no such light.
     """
-    options = tyro.cli(EvalOptions, prog="unmix-eval", args=argv)
+    options = tyro.cli(_EvalOptions, prog="unmix-eval", args=argv)
 
     from unmix_plugin.engine.processes import joined, start_together
 
@@ -68,7 +68,7 @@ def evaluate(argv: list[str]) -> None:
         _evaluate(options, processes)
 
 
-def _evaluate(options: EvalOptions, processes: Processes) -> None:
+def _evaluate(options: _EvalOptions, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run
 
     console = CommandConsole(quiet=not processes.is_first)
@@ -112,7 +112,7 @@ def _compare(console: Console, runs: list[ComparedRun]) -> None:
 
 
 def _evaluate_run(
-    path: Path, options: EvalOptions, console: Console, processes: Processes, *, show: bool
+    path: Path, options: _EvalOptions, console: Console, processes: Processes, *, show: bool
 ) -> ComparedRun | None:
     """Measure one run and write what was found into its folder; None in all processes but the first."""
     from functools import partial
@@ -134,7 +134,7 @@ def _evaluate_run(
             loaded = load_pipeline(path, options.device, options.data)
         scene, folder, factors = _materials_scene(loaded, recipe is not None), loaded.run.eval, None
         if scene is not None and recipe is not None:
-            factors = None if recipe.illuminant is None else light_factors(scene, recipe)
+            factors = None if recipe.illuminant is None else light_factors(scene, recipe)[0]
             scene = edit_scene(scene, recipe)
             for note in scene.notes:
                 print(note)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class OwnProduct:
+class _OwnProduct:
     """A product that only some methods have."""
 
     product: RunProduct
@@ -45,14 +45,14 @@ class OwnProduct:
             )
 
 
-def own_products(taken: frozenset[str]) -> tuple[dict[str, OwnProduct], list[BrokenPlugin]]:
+def _own_products(taken: frozenset[str]) -> tuple[dict[str, _OwnProduct], list[BrokenPlugin]]:
     """What methods bring, by the product's name, and what had to be skipped.
 
     Args:
         taken: Names of products that are there already.
     """
     methods, _ = discover_methods()
-    found: dict[str, OwnProduct] = {}
+    found: dict[str, _OwnProduct] = {}
     broken: list[BrokenPlugin] = []
     for method_name, method in methods.items():
         # A third party's module may fail in any way at all; the products of others stay.
@@ -68,7 +68,7 @@ def own_products(taken: frozenset[str]) -> tuple[dict[str, OwnProduct], list[Bro
                 reason = f"another product has the name {product.name} already"
                 broken.append(BrokenPlugin(method_name, reason))
                 continue
-            found[product.name] = OwnProduct(product, (*(known.methods if known else ()), method_name))
+            found[product.name] = _OwnProduct(product, (*(known.methods if known else ()), method_name))
     return found, broken
 
 
@@ -86,7 +86,7 @@ def export(argv: list[str]) -> None:
         SpectrumError: a spectrum or a light that is unknown or does not cover the bands, or a sensor that sees nothing
             in them.
     """
-    own, broken = own_products(frozenset(product.name for product in PRODUCTS))
+    own, broken = _own_products(frozenset(product.name for product in PRODUCTS))
     for plugin in broken:
         print(plugin, file=sys.stderr)
     offered = sorted((*PRODUCTS, *(one.product for one in own.values())), key=lambda one: one.name)
@@ -105,7 +105,7 @@ def export(argv: list[str]) -> None:
         _write(product, own, processes)
 
 
-def _write(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -> None:
+def _write(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -> None:
     if not isinstance(product, ViewProduct) and processes.count > 1:
         raise ConfigError(f"unmix-export {product.name} runs in one process; start it once")
     with processes.together():
@@ -120,7 +120,7 @@ def _write(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -
         print(f"{counted(len(written), 'file')} written to {folder}")
 
 
-def _open(product: RunWork, own: dict[str, OwnProduct], processes: Processes) -> Job:
+def _open(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -> Job:
     """Load the run that a product is of."""
     from functools import partial
 

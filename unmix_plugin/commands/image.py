@@ -23,7 +23,7 @@ _CONFIDENT = 0.9
 
 
 @dataclass(frozen=True)
-class ImageOptions:
+class _ImageOptions:
     """Find the materials of one spectral image: spectra, abundances and how far to trust them, as files and figures."""
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -63,7 +63,7 @@ def image(argv: list[str]) -> None:
             library.
         RunError: the results can't be written.
     """
-    options = tyro.cli(ImageOptions, prog="unmix-image", args=argv)
+    options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
     from unmix_plugin.captures.calibration.calibration import find_missing, is_srgb, stated_values
     from unmix_plugin.captures.readers.opening import open_spectral_file
@@ -132,7 +132,7 @@ def _fractions(cube: np.ndarray, mask: np.ndarray, count: int) -> NoiseFractions
     return minimum_noise_fractions(numbers, torch.from_numpy(mask), count) if count else None
 
 
-def _library(options: ImageOptions, wavelengths: np.ndarray | None) -> MaterialLibrary | None:
+def _library(options: _ImageOptions, wavelengths: np.ndarray | None) -> MaterialLibrary | None:
     from unmix_plugin.formats.libraries import library_of
     from unmix_plugin.spectral.bands import Bands
 
@@ -145,7 +145,7 @@ def _library(options: ImageOptions, wavelengths: np.ndarray | None) -> MaterialL
     return library_of(options.library, Bands.of(wavelengths))
 
 
-def _reading(options: ImageOptions) -> ReadOptions:
+def _reading(options: _ImageOptions) -> ReadOptions:
     return ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
 
 

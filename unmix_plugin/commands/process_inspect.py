@@ -22,7 +22,7 @@ _SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evi
 
 
 @dataclass(frozen=True)
-class InspectOptions:
+class _InspectOptions:
     """Say what files of instruments hold: size, type, bands, wavelengths with their evidence, poses.
 
     Nothing but headers and one row of each image is read. Exit status 2 if a file is refused.
@@ -48,7 +48,7 @@ def inspect_command(arguments: list[str]) -> int:
     Raises:
         ConfigError: no file is named.
     """
-    options = tyro.cli(InspectOptions, prog="unmix-process inspect", args=arguments)
+    options = tyro.cli(_InspectOptions, prog="unmix-process inspect", args=arguments)
     if not options.files:
         raise ConfigError("no file is named; expected unmix-process inspect FILE...")
     reading = ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RenderOptions:
+class _RenderOptions:
     """Render views of a trained run: spectra, pictures, maps and videos, from the run folder alone."""
 
     run: Path | None = None
@@ -95,7 +95,7 @@ def render(argv: list[str]) -> None:
         SceneError: the environment map is missing, damaged or unusable.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
-    options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
+    options = tyro.cli(_RenderOptions, prog="unmix-render", args=argv)
     request = _camera_request(options)
 
     from unmix_plugin.engine.processes import joined, start_together
@@ -105,7 +105,7 @@ def render(argv: list[str]) -> None:
         _render_run(options, request, processes)
 
 
-def _render_run(options: RenderOptions, request: CameraRequest, processes: Processes) -> None:
+def _render_run(options: _RenderOptions, request: CameraRequest, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, say, working
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
@@ -124,7 +124,7 @@ def _render_run(options: RenderOptions, request: CameraRequest, processes: Proce
     _render(options, loaded, cameras, outputs, console, processes)
 
 
-def _camera_request(options: RenderOptions) -> CameraRequest:
+def _camera_request(options: _RenderOptions) -> CameraRequest:
     from unmix_plugin.errors import ConfigError
     from unmix_plugin.products.render.cameras import CameraRequest
 
@@ -145,7 +145,7 @@ def _camera_request(options: RenderOptions) -> CameraRequest:
     )
 
 
-def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
+def _relit(loaded: LoadedRun, options: _RenderOptions) -> LoadedRun:
     """The run in the environment asked for."""
     from dataclasses import replace
 
@@ -163,7 +163,7 @@ def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
 
 
 def _render(
-    options: RenderOptions,
+    options: _RenderOptions,
     loaded: LoadedRun,
     cameras: RenderCameras,
     outputs: tuple[FormattedOutput, ...],
@@ -223,7 +223,7 @@ def _render(
 
 
 def _camera_files(
-    folder: Path, options: RenderOptions, cameras: RenderCameras, frame: Normalisation
+    folder: Path, options: _RenderOptions, cameras: RenderCameras, frame: Normalisation
 ) -> dict[Path, bytes]:
     """The file of the cameras; none of a map, which no camera file can hold."""
     from unmix_plugin.formats.files import safe_name

@@ -46,16 +46,7 @@ class _Given:
     max_seconds: str | None = None
 
 
-def parse(argv: Sequence[str]) -> TrainerConfig:
-    """The settings of a training, without how it is shown: see `parse_all`.
-
-    Raises:
-        ConfigError, RunError: as there.
-    """
-    return parse_all(argv)[0]
-
-
-def parse_all(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
+def parse(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
     """All settings: the method's defaults, or those of the run to go on with, changed by the arguments.
 
     A limit given alone is the only one: with `--max-seconds` the method's number of iterations does not end training,
@@ -143,7 +134,7 @@ def train(argv: list[str]) -> None:
             print(f"  {name:{width}}  {method.description}")
         print(f"\n{_PROGRAM} METHOD --help lists the common options of a method, --help-all all of them.")
         return
-    config, viewing = parse_all(argv)
+    config, viewing = parse(argv)
 
     from unmix_plugin.engine.processes import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole

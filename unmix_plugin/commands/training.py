@@ -57,7 +57,7 @@ def train(
     if scene is not None and settings.setdefault("data", scene) != scene:
         raise ConfigError(f"the scene is {scene}, and data is {settings['data']}: give one of them")
     first = first_config(find_method(method), None if load_run is None else Path(load_run))
-    config = with_settings(first, settings)
+    config = _with_settings(first, settings)
     if config.machine.num_devices > 1:
         raise ConfigError("machine.num_devices is for unmix-train: one Python process trains on one device")
     console = ProgressConsole()
@@ -101,7 +101,7 @@ def with_limits_given(config: TrainerConfig, *, steps: bool, seconds: bool) -> T
     return config
 
 
-def with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> TrainerConfig:
+def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> TrainerConfig:
     """The settings changed by name, as the command line names them; hyphens and underscores are alike.
 
     Raises:

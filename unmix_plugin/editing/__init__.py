@@ -3,15 +3,13 @@
 They act on endmembers, densities and gloss, never on pixels, so they look the same in every view.
 """
 
-from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_scene, relight
+from unmix_plugin.editing.apply import assumption_of_light, changes_geometry, edit_scene
 from unmix_plugin.editing.edited_field import sample_seen
 from unmix_plugin.editing.recipe import (
     Colour,
     Endmember,
-    FileSpectrum,
     Gloss,
     Isolate,
-    LibrarySpectrum,
     Light,
     Operation,
     Recipe,
@@ -27,10 +25,8 @@ from unmix_plugin.editing.recipe_files import read_recipe, recipe_from_yaml, rec
 __all__ = [
     "Colour",
     "Endmember",
-    "FileSpectrum",
     "Gloss",
     "Isolate",
-    "LibrarySpectrum",
     "Light",
     "Operation",
     "Recipe",
@@ -46,6 +42,5 @@ __all__ = [
     "read_recipe",
     "recipe_from_yaml",
     "recipe_to_yaml",
-    "relight",
     "sample_seen",
 ]

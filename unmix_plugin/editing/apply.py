@@ -40,10 +40,8 @@ from torch import Tensor
 from unmix_plugin.editing.edited_field import EditedField, MaterialState, appearance_of, sample_seen
 from unmix_plugin.editing.recipe import (
     Colour,
-    FileSpectrum,
     Gloss,
     Isolate,
-    LibrarySpectrum,
     Light,
     Operation,
     Recipe,
@@ -211,7 +209,7 @@ def _swap(state: MaterialState, edit: Swap, _: str) -> None:
 def _replace(state: MaterialState, edit: Replace, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_REPLACED, index, where)
-    library, name = _library_of(edit.spectrum)
+    library, name = _library_of(edit)
     library.find(name)
     try:
         reflectance = library.reflectance(name, state.bands, "hold" if edit.extrapolate else "refuse")
@@ -224,17 +222,18 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
     state.spectra[index] = reflectance * state.light
 
 
-def _library_of(spectrum: LibrarySpectrum | FileSpectrum) -> tuple[MaterialLibrary, str]:
+def _library_of(edit: Replace) -> tuple[MaterialLibrary, str]:
     """Where a reflectance is looked up, and its name there."""
-    if isinstance(spectrum, LibrarySpectrum):
-        return measured_library(), spectrum.library
-    library = MaterialLibrary(tuple(read_library(spectrum.file)))
+    if edit.library is not None:
+        return measured_library(), edit.library
+    assert edit.file is not None
+    library = MaterialLibrary(tuple(read_library(edit.file)))
     names = list(library.names)
-    if spectrum.spectrum is None and len(names) > 1:
+    if edit.spectrum is None and len(names) > 1:
         raise SpectrumError(
-            f"{spectrum.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"
+            f"{edit.file} has {len(names)} spectra ({', '.join(names[:5])}, ...); choose one with spectrum"
         )
-    return library, spectrum.spectrum or names[0]
+    return library, edit.spectrum or names[0]
 
 
 def _retint(state: MaterialState, edit: Retint, where: str) -> None:
@@ -359,7 +358,7 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
             _HANDLERS[type(operation)](state, operation, where)
         except UnmixError as error:
             raise ConfigError(f"{where}: {error}") from error
-    factors, told = _light_factors(scene, recipe)
+    factors, told = light_factors(scene, recipe)
     specular_spectra, gloss = _specular(state)
     materials = replace(
         scene.materials,
@@ -380,15 +379,6 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     return replace(scene, field=field, materials=materials, notes=tuple(notes))
 
 
-def relight(scene: TrainedScene, light: Light) -> TrainedScene:
-    """The scene in another light.
-
-    Raises:
-        ConfigError: the light is unknown, or does not cover the bands.
-    """
-    return edit_scene(scene, Recipe(illuminant=light))
-
-
 def changes_geometry(recipe: Recipe) -> bool:
     """Whether the edited scene has to be rendered again; otherwise coefficients of the unedited one serve with its
     materials."""
@@ -405,16 +395,13 @@ def assumption_of_light(scene: TrainedScene, recipe: Recipe) -> str | None:
     return "the scene does not say what light it was recorded in: taken as flat (CIE illuminant E)"
 
 
-def light_factors(scene: TrainedScene, recipe: Recipe) -> Float64[np.ndarray, " B"]:
-    """What radiance measured in the scene's light is multiplied with, to be as in the recipe's.
+def light_factors(scene: TrainedScene, recipe: Recipe) -> tuple[Float64[np.ndarray, " B"], list[str]]:
+    """What radiance measured in the scene's light is multiplied with, to be as in the recipe's, and what of that a user
+    has to be told.
 
     Raises:
         ConfigError: the light is unknown, or covers no band.
     """
-    return _light_factors(scene, recipe)[0]
-
-
-def _light_factors(scene: TrainedScene, recipe: Recipe) -> tuple[Float64[np.ndarray, " B"], list[str]]:
     if recipe.illuminant is None:
         return np.ones(len(scene.bands)), []
     try:

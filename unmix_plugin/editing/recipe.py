@@ -54,33 +54,25 @@ class Swap(Operation):
 
 
 @dataclass(frozen=True)
-class LibrarySpectrum:
-    """A measured reflectance that comes with the program."""
-
-    library: str
-    """Name in `spectral.library`: in full, or its last part if that is unique."""
-
-
-@dataclass(frozen=True)
-class FileSpectrum:
-    """A reflectance in a file of the user's."""
-
-    file: Path
-    """A library of any kind that `--library` takes."""
-    spectrum: str | None = None
-    """Which spectrum of the file; None if it has only one."""
-
-
-@dataclass(frozen=True)
 class Replace(Operation):
     """An endmember becomes another material: that one's reflectance in the scene's light."""
 
     kind = "replace"
-
     endmember: Endmember
-    spectrum: LibrarySpectrum | FileSpectrum
+    library: str | None = None
+    """A measured reflectance that comes with the program: its name in full, or its last part if that is unique."""
+    file: Path | None = None
+    """One of a file of the user's: a library of any kind that `--library` takes."""
+    spectrum: str | None = None
+    """Which spectrum of the file; None if it has only one."""
     extrapolate: bool = False
     """Hold the outermost values in bands that the measured reflectance does not reach."""
+
+    def __post_init__(self) -> None:
+        if (self.library is None) == (self.file is None):
+            raise ConfigError("give either library or file")
+        if self.library is not None and self.spectrum is not None:
+            raise ConfigError("spectrum goes with file, not with library")
 
 
 @dataclass(frozen=True)

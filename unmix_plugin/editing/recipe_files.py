@@ -8,16 +8,15 @@
       - retint: {endmember: 4, colour: '#3366cc'}
       - remove: [5, 6]
 
-The fields of each edit's dataclass say what can be written, of what type, and what may be left out. A field whose type
-is a union of dataclasses stands for the fields of one of them: those of `Replace.spectrum` are written as `library`, or
-as `file` and `spectrum`. Of YAML only single plain values are ever constructed.
+The fields of each edit's dataclass say what can be written, of what type, and what may be left out. Of YAML only single
+plain values are ever constructed.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection
-from dataclasses import MISSING, Field, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from types import NoneType, UnionType
@@ -162,36 +161,11 @@ def _read_list(node: yaml.Node, kind: type[Operation], folder: Path) -> Operatio
 
 def _read_fields(node: yaml.Node, kind: type[_T], what: str, folder: Path) -> _T:
     """A dataclass from a mapping of its fields."""
-    own = {one.name: one for one in _fields(kind) if not _options(kind, one.name)}
-    unions = {one.name: _options(kind, one.name) for one in _fields(kind) if one.name not in own}
-    optional = [name for name, one in own.items() if one.default is not MISSING]
-    other = [one.name for options in unions.values() for option in options for one in _fields(option)]
-    parts = _mapping(node, what, [name for name in own if name not in optional], [*other, *optional])
-    values: dict[str, Any] = {
-        name: _read_value(_types(kind)[name], parts[name], name, folder) for name in own if name in parts
-    }
-    for name, options in unions.items():
-        values[name] = _read_option(node, parts, options, what, folder)
-    return kind(**values)
-
-
-def _read_option(
-    node: yaml.Node, parts: dict[str, yaml.Node], options: list[type], what: str, folder: Path
-) -> Any:
-    """The one of several dataclasses whose first field is there."""
-    keys = {option: [one.name for one in _fields(option)] for option in options}
-    chosen = [option for option in options if keys[option][0] in parts]
-    if len(chosen) != 1:
-        raise _NodeError(node, f"{what} takes either {' or '.join(names[0] for names in keys.values())}")
-    [kind] = chosen
-    for option in options:
-        for name in [one for one in keys[option] if one in parts and one not in keys[kind]]:
-            first, other = keys[option][0], keys[kind][0]
-            raise _NodeError(parts[name], f"{what}: {name} goes with {first}, not with {other}")
+    optional = [one.name for one in _fields(kind) if one.default is not MISSING]
+    required = [one.name for one in _fields(kind) if one.default is MISSING]
+    parts = _mapping(node, what, required, optional)
     types = _types(kind)
-    return kind(
-        **{key: _read_value(types[key], parts[key], key, folder) for key in keys[kind] if key in parts}
-    )
+    return kind(**{name: _read_value(types[name], part, name, folder) for name, part in parts.items()})
 
 
 def _read_value(hint: Any, node: yaml.Node, what: str, folder: Path) -> Any:
@@ -219,22 +193,15 @@ def _types(kind: type) -> dict[str, Any]:
     return {one.name: found[one.name] for one in _fields(kind)}
 
 
-def _options(kind: type, name: str) -> list[Any]:
-    """The dataclasses that a field may hold; none for a plain value."""
-    return [option for option in get_args(_types(kind)[name]) if is_dataclass(option)]
-
-
 def _written(value: Any) -> dict[str, Any]:
     """A dataclass as a mapping that reads as the same; what has its default is left out."""
     found: dict[str, Any] = {}
     always = value.needs_one_of[:1] if isinstance(value, Operation) else ()
     for one in _fields(type(value)):
         part = getattr(value, one.name)
-        if _options(type(value), one.name):
-            found |= _written(part)
-        elif part == one.default and one.name not in always:
+        if part is None or (part == one.default and one.name not in always):
             continue
-        elif _types(type(value))[one.name] == Colour and all(round(255 * x) / 255 == x for x in part):
+        if _types(type(value))[one.name] == Colour and all(round(255 * x) / 255 == x for x in part):
             found[one.name] = css_colour(part)  # which is exact
         else:
             found[one.name] = (

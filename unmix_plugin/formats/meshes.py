@@ -178,22 +178,6 @@ def write_obj(
     return [write_file(obj_path, text.getvalue().encode("utf-8")), library_path]
 
 
-@dataclass(frozen=True)
-class TexturedMesh:
-    """Triangles with texture coordinates, and the pictures that these point into."""
-
-    positions: Float32[np.ndarray, "P 3"]
-    normals: Float32[np.ndarray, "P 3"]
-    """Unit vectors."""
-    uv: Float32[np.ndarray, "P 2"]
-    """u to the right, v downwards."""
-    faces: Int[np.ndarray, "F 3"]
-    base_colour_png: bytes
-    """sRGB."""
-    metallic_roughness_png: bytes
-    """Linear: green is roughness, blue metallicity."""
-
-
 def write_glb(
     path: Path,
     positions: Float32[np.ndarray, "P 3"],
@@ -257,7 +241,7 @@ class Gaussians:
     """At every centre, (0, 1)."""
 
     @property
-    def constant_harmonics(self) -> Float32[np.ndarray, "P 3"]:
+    def _constant_harmonics(self) -> Float32[np.ndarray, "P 3"]:
         """The colour as coefficients of the harmonic of degree 0."""
         return ((self.srgb - 0.5) / _HARMONIC_0).astype(np.float32)
 
@@ -292,7 +276,7 @@ def write_splats_glb(
         f"{own}:ROTATION": splats.rotations,
         f"{own}:SCALE": splats.scales,
         f"{own}:OPACITY": opacity,
-        f"{own}:SH_DEGREE_0_COEF_0": splats.constant_harmonics,
+        f"{own}:SH_DEGREE_0_COEF_0": splats._constant_harmonics,
         **numbers,
     }
     how = {own: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
@@ -307,7 +291,7 @@ def write_splats_ply(
     logit = np.full(len(splats.positions), np.log(splats.opacity / (1 - splats.opacity)), dtype=np.float32)
     vertices = {
         **{name: splats.positions[:, axis] for axis, name in enumerate("xyz")},
-        **{f"f_dc_{axis}": splats.constant_harmonics[:, axis] for axis in range(3)},
+        **{f"f_dc_{axis}": splats._constant_harmonics[:, axis] for axis in range(3)},
         "opacity": logit,
         **{f"scale_{axis}": np.log(splats.scales[:, axis]) for axis in range(3)},
         **{f"rot_{index}": splats.rotations[:, axis] for index, axis in enumerate((3, 0, 1, 2))},
@@ -316,15 +300,19 @@ def write_splats_ply(
     return write_ply(path, vertices, comments=comments)
 
 
-def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]) -> Path:
-    """Write a mesh with its material, pictures included.
+def write_textured_glb(
+    path: Path,
+    positions: Float32[np.ndarray, "P 3"],
+    normals: Float32[np.ndarray, "P 3"],
+    uv: Float32[np.ndarray, "P 2"],
+    faces: Int[np.ndarray, "F 3"],
+    base_colour_png: bytes,
+    metallic_roughness_png: bytes,
+    extras: Mapping[str, Any],
+) -> Path:
+    """Write a mesh with its material, a picture of sRGB colours and a linear one, green roughness, blue metallicity.
 
-    Args:
-        path: File; its folder is made.
-        mesh: What to write.
-        extras: As those of `write_glb`.
-    Raises:
-        RunError: the disk is full or refuses.
+    The other arguments are as those of `write_glb`.
     """
     material = {
         "name": "material",
@@ -336,9 +324,9 @@ def write_textured_glb(path: Path, mesh: TexturedMesh, extras: Mapping[str, Any]
             "roughnessFactor": 1.0,
         },
     }
-    attributes = {"POSITION": mesh.positions, "NORMAL": mesh.normals, "TEXCOORD_0": mesh.uv}
-    pictures = {"base_colour": mesh.base_colour_png, "metallic_roughness": mesh.metallic_roughness_png}
-    return _write_glb(path, attributes, mesh.faces, [material], pictures, extras)
+    attributes = {"POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uv}
+    pictures = {"base_colour": base_colour_png, "metallic_roughness": metallic_roughness_png}
+    return _write_glb(path, attributes, faces, [material], pictures, extras)
 
 
 def _write_glb(

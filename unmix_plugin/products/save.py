@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, choose_formats, still_at
+from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, choose_formats, still
 from unmix_plugin.products.render.job import channel_names, take_survey
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.trained.outputs import MaterialView
@@ -52,6 +52,6 @@ def save(view: MaterialView, name: str, path: str | Path) -> Path:
         COVERAGE: view.coverage.cpu().numpy(),
         name: view[name].cpu().numpy(),
     }
-    with still_at(path, formatted, setting) as add:
+    with still(path, formatted, setting) as add:
         add(Rows(0, values))
     return path

@@ -144,7 +144,7 @@ def read_measures(run: RunFolder) -> Measures:
         raise RunError(f"{path} is damaged: {error}; remove it, and measure again") from error
 
 
-def write_measures(run: RunFolder, measures: Measures) -> Path:
+def _write_measures(run: RunFolder, measures: Measures) -> Path:
     """Keep measures with a run, in place of those before.
 
     Raises:
@@ -159,7 +159,7 @@ def write_measures(run: RunFolder, measures: Measures) -> Path:
 
 def keep_scale(run: RunFolder, scale: Scale) -> Path:
     """Set the scale of a run, in place of the one before; the file."""
-    return write_measures(run, replace(read_measures(run), scale=scale))
+    return _write_measures(run, replace(read_measures(run), scale=scale))
 
 
 def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
@@ -176,7 +176,7 @@ def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
         regions[name] = region
     if len(regions) > MOST_REGIONS:
         raise ConfigError(f"a run keeps at most {MOST_REGIONS} regions; remove one first")
-    return write_measures(run, replace(measures, regions=regions))
+    return _write_measures(run, replace(measures, regions=regions))
 
 
 def scale_between(first: Sequence[float], second: Sequence[float], distance_m: float) -> Scale:

@@ -360,11 +360,6 @@ FAMILIES: dict[str, _Family] = {
 """By the part of the name before the colon."""
 
 
-def _output_names() -> tuple[str, ...]:
-    """Every name, with an example of each output that takes an argument."""
-    return (*OUTPUTS, *(family.example for family in FAMILIES.values()))
-
-
 def find_output(name: str, materials: Materials) -> MaterialOutput:
     """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
 
@@ -377,7 +372,8 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
     prefix, _, argument = name.partition(":")
     family = FAMILIES.get(prefix)
     if family is None:
-        raise no_output(name, [*OUTPUTS, *FAMILIES], _output_names())
+        examples = [family.example for family in FAMILIES.values()]
+        raise no_output(name, [*OUTPUTS, *FAMILIES], [*OUTPUTS, *examples])
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
     return family.make(name, argument, materials)

@@ -80,7 +80,7 @@ def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
     values = np.arange(12, dtype=np.float32).reshape(3, 4)
     for limit, is_big in ((48, False), (47, True)):
         monkeypatch.setattr(files, "_LARGEST_TIFF", limit)
-        with files.still(depth, "v", setting) as sink:
+        with files.still(files.still_paths(setting.folder, depth, "v")[0], depth, setting) as sink:
             sink(files.Rows(0, {"depth": values}))
         with tifffile.TiffFile(tmp_path / "depth" / "v.tif") as file:
             assert file.is_bigtiff == is_big

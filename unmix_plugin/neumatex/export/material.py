@@ -18,7 +18,7 @@ from torch import Tensor
 
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.files import make_folder, rgba_png_bytes, write_file
-from unmix_plugin.formats.meshes import TexturedMesh, write_textured_glb
+from unmix_plugin.formats.meshes import write_textured_glb
 from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
@@ -218,7 +218,7 @@ def _write_glb(
         world = world - extras["offset"]
     normals = directions_to_world(frame, mesh.normals.cpu().double().numpy())[chosen]
     geometry = (world.astype(np.float32), normals.astype(np.float32), baked.atlas.uv, baked.atlas.faces)
-    return write_textured_glb(path, TexturedMesh(*geometry, *pictures), extras)
+    return write_textured_glb(path, *geometry, *pictures, extras)
 
 
 def _report_bytes(

@@ -145,7 +145,7 @@ def choose_formats(
     chosen = [scene.output(name) for name in names]
     wanted: list[_Format] = [_format(name) for name in dict.fromkeys(formats)]
     if "tif" in wanted:
-        require_tifffile()
+        _require_tifffile()
     owners: dict[str, str] = {}
     for output in chosen:
         name = file_name(output)
@@ -178,7 +178,7 @@ def choose_formats(
     return tuple(found)
 
 
-def require_tifffile() -> Any:
+def _require_tifffile() -> Any:
     """tifffile, which only captures need otherwise.
 
     Raises:
@@ -216,7 +216,7 @@ class Rows:
     values: dict[str, np.ndarray]
     """Outputs by name, (h, W, ...) float32, ids uint8; `accumulation` and `coverage` are always there."""
 
-    def filled_by(self, output: Output) -> np.ndarray:
+    def _filled_by(self, output: Output) -> np.ndarray:
         """(h, W) float32, [0, 1]: how much of each pixel an output fills: light also comes from the sky."""
         return self.values[COVERAGE if output.kind in LIGHT_KINDS | {"channels"} else "accumulation"]
 
@@ -258,19 +258,8 @@ def video_path(folder: Path, formatted: FormattedOutput) -> Path:
 
 
 @contextmanager
-def still(formatted: FormattedOutput, view_name: str, setting: RenderSetting) -> Iterator[RowsSink]:
-    """Context that gives a sink for the rows of one view; at its end the files are there.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    with still_at(still_paths(setting.folder, formatted, view_name)[0], formatted, setting) as sink:
-        yield sink
-
-
-@contextmanager
-def still_at(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> Iterator[RowsSink]:
-    """The same in a file of any name; of ENVI's two, that of the header.
+def still(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> Iterator[RowsSink]:
+    """Context that gives a sink for the rows of one view; at its end the file is there; of ENVI's two, the header.
 
     Raises:
         RunError: the disk is full or refuses.
@@ -311,13 +300,13 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
         band = round(progress * (len(names) - 1))
         canvas = Canvas(_layout(output, setting), 3, [names[band]])
         yield lambda rows: canvas.put(
-            rows.first, opaque_band(rows.values[output.name][..., band], rows.filled_by(output))
+            rows.first, opaque_band(rows.values[output.name][..., band], rows._filled_by(output))
         )
     else:
         canvas = _canvas(output, setting, 3)
         yield lambda rows: canvas.put(
             rows.first,
-            opaque_tiles(output, rows.values[output.name], rows.filled_by(output), setting.palette),
+            opaque_tiles(output, rows.values[output.name], rows._filled_by(output), setting.palette),
         )
     add(canvas.pixels)
 
@@ -356,7 +345,7 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
 
     yield add
     buffer, info = io.BytesIO(), setting.map_info
-    with require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
+    with _require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
             planes,
             photometric="minisblack",
@@ -384,7 +373,7 @@ def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
         values = rows.values[output.name].reshape(-1, width, len(planes))
         place = slice(rows.first, rows.first + len(values))
         planes[:, place] = np.moveaxis(values, -1, 0)
-        opacity[place] = rows.filled_by(output)
+        opacity[place] = rows._filled_by(output)
         if to_rgb is not None:
             preview[:, place] = np.moveaxis(np.clip(np.clip(values, 0, None) @ to_rgb, 0, 1), -1, 0)
 
@@ -414,7 +403,7 @@ def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
         return
     canvas = _canvas(output, setting, 4)
     yield lambda rows: canvas.put(
-        rows.first, transparent_tiles(output, rows.values[output.name], rows.filled_by(output), palette)
+        rows.first, transparent_tiles(output, rows.values[output.name], rows._filled_by(output), palette)
     )
     write_file(path, rgba_png_bytes(canvas.pixels, palette.describe(output)))
 
@@ -429,7 +418,7 @@ def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsS
     def add(rows: Rows) -> None:
         values = rows.values[output.name]
         for band, radiance in enumerate(np.moveaxis(values, -1, 0)):
-            painted = opaque_band(radiance, rows.filled_by(output))
+            painted = opaque_band(radiance, rows._filled_by(output))
             frames[band, rows.first : rows.first + len(values)] = painted[:, :, 0]
 
     yield add

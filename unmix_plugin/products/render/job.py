@@ -295,8 +295,10 @@ class RenderJob:
         views = self._cameras.views
         progress = index / max(1, len(views) - 1)
         self._view.enter_context(self._processes.together())
+        paths = [still_paths(self._setting.folder, one, views[index].name)[0] for one in self._still]
         self._sinks = [
-            self._view.enter_context(still(one, views[index].name, self._setting)) for one in self._still
+            self._view.enter_context(still(path, one, self._setting))
+            for path, one in zip(paths, self._still, strict=True)
         ]
         self._sinks += [
             self._view.enter_context(

@@ -312,7 +312,7 @@ NAMED_INDICES: dict[str, _NamedIndex] = {
 
 
 @dataclass(frozen=True)
-class SpectralIndex:
+class _SpectralIndex:
     """An index on spectra of one sampling: call it on reflectance."""
 
     name: str
@@ -337,7 +337,7 @@ class SpectralIndex:
         return self.formula.evaluate(lambda nm: _reflectance_at(nm, reflectance, self.bands), reflectance)
 
 
-def parse_index(text: str, bands: Bands) -> SpectralIndex:
+def parse_index(text: str, bands: Bands) -> _SpectralIndex:
     """The index that a name (`ndvi`) or a formula (`(r800-r670)/(r800+r670)`) means on these bands.
 
     Raises:
@@ -364,7 +364,7 @@ def parse_index(text: str, bands: Bands) -> SpectralIndex:
     centres = _listed(float(bands.centers_nm[index]) for index in sorted(used))
     title = f"{named.title}, {named.formula} ({named.source})" if named else f"formula {formula.text}"
     what = f"{' '.join(title.split())}; from the bands at {centres} nm"
-    return SpectralIndex(name, what, named.usual_range if named else None, bands, formula)
+    return _SpectralIndex(name, what, named.usual_range if named else None, bands, formula)
 
 
 def available_indices(bands: Bands) -> list[str]:

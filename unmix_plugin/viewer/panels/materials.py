@@ -11,9 +11,7 @@ import torch
 from jaxtyping import Float
 
 from unmix_plugin.editing import (
-    FileSpectrum,
     Gloss,
-    LibrarySpectrum,
     Light,
     Recipe,
     Rename,
@@ -216,8 +214,9 @@ class MaterialsPanel:
         chosen = self._chosen_known()
         if chosen is None:
             raise ConfigError("choose a known material first")
-        spectrum = LibrarySpectrum(chosen.name) if chosen.origin is None else FileSpectrum(*chosen.origin)
-        self._change(Replace(self._index, spectrum, extrapolate=True))
+        library = chosen.name if chosen.origin is None else None
+        file, spectrum = chosen.origin or (None, None)
+        self._change(Replace(self._index, library, file, spectrum, extrapolate=True))
 
     def _type_name(self) -> None:
         self._named = self._index
