@@ -90,6 +90,8 @@ def image(argv: list[str]) -> None:
     print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
+    for note in opened.notes:
+        print(f"note: {note}")
     if is_srgb(opened):
         print("the picture is taken as sRGB and brought to linear light")
     if left_out := opened.shape[2] - num_bands:

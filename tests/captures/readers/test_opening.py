@@ -219,6 +219,14 @@ def test_the_table_has_every_number_that_values_depend_on(tmp_path, capsys):
     assert "map info UTM, 1, 1, 500000, 4500000, 2, 2, 33, North, WGS-84" in out
 
 
+def test_options_that_change_nothing_are_said(header, capsys):
+    assert inspect_command([str(header), "--dataset", "cube", "--axes", "byx"]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "--dataset does nothing: the format envi leaves no choice" in out
+    assert "--axes does nothing" in out
+    assert "--size" not in out
+
+
 def test_no_file_is_an_error():
     with pytest.raises(ConfigError, match="no file is named"):
         inspect_command([])

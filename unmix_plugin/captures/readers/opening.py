@@ -101,6 +101,7 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
             raise CaptureError(f"{path}: the image has no pixels: {size}")
         if opened.dtype.kind not in "iuf":
             raise CaptureError(f"{path}: the image holds {opened.dtype.name}; expected real numbers")
+        opened = replace(opened, notes=(*opened.notes, *_unused(options, opened)))
         given = options.wavelengths_nm
         if given is None:
             return opened
@@ -112,6 +113,18 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         raise
     except Exception as error:
         raise unreadable(path, error) from error
+
+
+def _unused(options: ReadOptions, opened: SpectralFile) -> list[str]:
+    """Notes of options that change nothing in a file of this kind."""
+    of_arrays = ("npy", "torch", "matlab", "hdf5", "netcdf")
+    used_by = {"dataset": (*of_arrays, "exr"), "axes": (*of_arrays, "tiff"), "size": of_arrays}
+    unused = [name for name, readers in used_by.items() if opened.reader not in readers]
+    return [
+        f"--{name} does nothing: the format {opened.reader} leaves no choice"
+        for name in unused
+        if getattr(options, name) is not None
+    ]
 
 
 def _opened(path: Path, options: ReadOptions) -> SpectralFile:
