@@ -43,6 +43,9 @@ GIVEN = "given by the user"
 _LARGEST_DIFFERENCE_NM = 0.1
 """Between the same bands of files of one capture."""
 _PARTLY_KNOWN = "only some of the files give wavelengths"
+_PARTLY_LINEAR = (
+    "only some of the files of one view state gains or a scale: numbers of the others are taken as stored"
+)
 _KEPT_BYTES = 2**28
 _kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
 _lock = threading.Lock()
@@ -298,6 +301,7 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         warnings=(
             *dict.fromkeys(warning for part in parts for warning in part.warnings),
             *(f"{what} differ between the files of one view and are not used" for what in differing),
+            *([_PARTLY_LINEAR] if len({part.linear is None for part in parts}) > 1 else []),
         ),
         sources=tuple(source for part in parts for source in part.files),
     )

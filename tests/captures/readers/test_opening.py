@@ -88,6 +88,10 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     mixed = stack_bands([*parts, unknown], tmp_path).bands
     assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
     assert (alike.scale, alike.metadata) == (3.0, {"scale": 3.0})
+    assert (alike.warnings, "only some of the files of one view state gains" in stack.warnings[0]) == (
+        (),
+        True,
+    )
 
 
 def test_what_a_library_raises_while_reading_is_an_error_of_the_file(tmp_path):
