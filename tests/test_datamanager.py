@@ -149,7 +149,7 @@ def test_the_number_of_rays_can_be_changed(scene_folder):
     ("settings", "message"),
     [
         ({"subpixels": 0}, "subpixels of 1 to 8"),
-        ({"grid_resolution": 4}, "grid-resolution of 8 to 512 or auto"),
+        ({"grid_resolution": 4}, "grid-resolution of 8 to 512"),
     ],
 )
 def test_impossible_settings_are_refused(settings, message):

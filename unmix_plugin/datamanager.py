@@ -153,7 +153,7 @@ class HyperspectralDataManager(DataManager):
             "has_alpha": self.scene.has_alpha,
             "is_unbounded": self.scene.is_unbounded,
             "has_backdrop": self.scene.has_backdrop,
-            "grid_resolution": self._grid_resolution,
+            "grid_resolution": self.options.grid_resolution,
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
@@ -204,7 +204,7 @@ class HyperspectralDataManager(DataManager):
         foreground = self._foreground
         if foreground is None or self.scene.is_unbounded:
             return None
-        hull = carve(self.scene, self._grid_resolution, foreground, cameras)
+        hull = carve(self.scene, self.options.grid_resolution, foreground, cameras)
         is_right = share_explained(self.scene, hull, foreground, cameras) >= _FAIRLY_EXPLAINED
         return torch.from_numpy(hull) if is_right else None
 
@@ -273,7 +273,7 @@ class HyperspectralDataManager(DataManager):
     def _carved(self) -> tuple[Bool[np.ndarray, "R R R"], str | None]:
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
         foreground = self._foreground
-        hull = self._surfaces.carved(carve(self.scene, self._grid_resolution, foreground))
+        hull = self._surfaces.carved(carve(self.scene, self.options.grid_resolution, foreground))
         if foreground is None or self.scene.is_unbounded:
             return hull, None
         return hull, mask_warning(self.scene, foreground)
@@ -309,10 +309,6 @@ class HyperspectralDataManager(DataManager):
     def _num_train_pixels(self) -> int:
         sizes = [self.train_cameras.size(index) for index in range(len(self.train_cameras))]
         return sum(width * height for width, height in sizes)
-
-    @property
-    def _grid_resolution(self) -> int:
-        return choose(self.options.grid_resolution, self._preset.grid_resolution)
 
     def _exposure(self, sensor: int, opaque: Float[np.ndarray, "P b"]) -> float:
         """By opaque pixels of a sensor, but not by those that show a backdrop."""

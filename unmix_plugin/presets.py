@@ -19,7 +19,6 @@ Auto = Literal["auto"]
 class AlphaPreset:
     """Values of the settings that are left at `auto`, by their names."""
 
-    grid_resolution: int
     single_ray_until: float
     initial_opacity: float
     """Empty space between cameras and walls must start almost clear."""
@@ -41,7 +40,6 @@ class AlphaPreset:
 
 
 WITH_ALPHA = AlphaPreset(
-    grid_resolution=128,
     single_ray_until=0.4,
     initial_opacity=0.05,
     smallest_weight=4e-3,
@@ -56,7 +54,6 @@ WITH_ALPHA = AlphaPreset(
     specular_endmembers=False,
 )
 WITHOUT_ALPHA = AlphaPreset(
-    grid_resolution=128,
     single_ray_until=0.8,
     initial_opacity=0.01,
     smallest_weight=4e-3,

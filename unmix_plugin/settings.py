@@ -81,9 +81,8 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     single_ray_until: Ours[float | Auto] = "auto"
     """Part of the training in which a pixel has a single ray: coarse shape needs many pixels, not exact ones. Auto is
     0.4 with alpha or before a backdrop, otherwise 0.8."""
-    grid_resolution: Ours[int | Auto] = "auto"
-    """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty. Auto is
-    128."""
+    grid_resolution: Ours[int] = 128
+    """Cells along an edge of the occupancy grid, from which space is carved that the views show to be empty."""
     trust_alpha: bool = False
     """Believe alpha even where the light of a pixel contradicts it."""
     mend_values: bool = True
@@ -105,8 +104,7 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
             "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
             "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
             or 0 <= self.single_ray_until <= 1,
-            "grid-resolution of 8 to 512 or auto": self.grid_resolution == "auto"
-            or 8 <= self.grid_resolution <= 512,
+            "grid-resolution of 8 to 512": 8 <= self.grid_resolution <= 512,
             "target-components of at least 1, auto or none": isinstance(self.target_components, str)
             or self.target_components >= 1,
         }

@@ -129,6 +129,13 @@ def test_views_fed_one_by_one_count_as_one_scene(seed):
     assert int(tally.confusion.sum()) == int((true != 255).sum())
 
 
+def test_ids_that_share_no_pixel_with_a_material_are_not_matched_to_it():
+    """They would be shown in its colour, under its name."""
+    scores = scored(labels(0, 0, 0, 2), labels(0, 0, 1, 255), 3, 2)
+    assert scores.matching == {0: 0}
+    assert (scores.miou, scores.accuracy) == (pytest.approx(1 / 3), pytest.approx(2 / 3))
+
+
 def test_one_matching_serves_all_views():
     # Each view alone would be perfect under its own matching; the scene as a whole is half wrong.
     tally = SegmentationTally(2, 2)

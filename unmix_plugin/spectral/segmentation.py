@@ -64,7 +64,7 @@ class SegmentationScores:
     accuracy: float
     """Share of labelled pixels whose matched id is right."""
     matching: dict[int, int]
-    """Predicted id -> true material."""
+    """Predicted id -> true material; without pairs that have no pixel in common, which stand for nothing."""
     iou: dict[int, float]
     """Intersection over union of each true material that occurs."""
 
@@ -117,7 +117,7 @@ class SegmentationTally:
             miou=float(matched_iou.mean()),
             macro_f1=float((2 * matched_hits / matched_either).mean()),
             accuracy=float(matched_hits.sum() / num_true.sum()),
-            matching={int(p): int(present[c]) for p, c in zip(pred, column, strict=True)},
+            matching={int(p): int(present[c]) for p, c in zip(pred, column, strict=True) if hits[p, c] > 0},
             iou={int(m): float(value) for m, value in zip(present, matched_iou, strict=True)},
         )
 
