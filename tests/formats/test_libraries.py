@@ -175,6 +175,23 @@ def test_values_that_a_header_marks_as_ignored_are_gaps(tmp_path):
     np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
 
 
+def test_bands_that_a_header_marks_as_bad_are_gaps_and_gains_are_refused(tmp_path):
+    path, _ = written_by_spectral(tmp_path, bbl=[1, 0, 1])
+    np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
+    with path.with_suffix(".hdr").open("a") as header:
+        header.write("data offset values = { -0.1 }\n")
+    with pytest.raises(SpectrumError, match="'data offset values' can't be applied to spectra"):
+        read_library(path)
+
+
+def test_libraries_of_a_folder_are_found_whatever_the_suffix_of_their_numbers(tmp_path):
+    path, _ = written_by_spectral(tmp_path)
+    count = len(library_of([tmp_path]).materials)
+    path.with_suffix(".sli").rename(path.with_suffix(""))
+    (tmp_path / "image.hdr").write_text("ENVI\nfile type = ENVI Standard\n")
+    assert len(library_of([tmp_path]).materials) == count
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its file open
 def test_a_text_of_ecostress_is_read_as_spectral_python_reads_it(tmp_path):
     path = written(tmp_path, "maple.spectrum.txt", ECOSTRESS)

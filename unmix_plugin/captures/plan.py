@@ -105,7 +105,8 @@ def make_plan(
             f"a backdrop was found that all views share, {', '.join(each.in_words for each in found)}, and is cut out: "
             "look at contact-sheet.png; --mask none keeps it"
         )
-    said += [*_notes_on_pictures([view.cube for view in views]), *views[0].cube.notes]
+    said += _notes_on_pictures([view.cube for view in views])
+    said += dict.fromkeys(note for view in views for note in view.cube.notes)
     opened = [file for file in (references.dark, references.white) if file is not None]
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     if scale != 1.0 and options.scale is None and all(sensor.is_absolute for sensor in sensors.values()):

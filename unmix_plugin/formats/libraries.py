@@ -106,9 +106,20 @@ def _libraries_in(folder: Path) -> list[Path]:
     kinds = [f".{suffix}" for suffix in LIBRARY_SUFFIXES if suffix != "hdr"]  # each .sli has its own
     found = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in kinds]
     found = [path for path in found if not _BESIDE_SPECTRA.search(path.name)]
+    with_numbers = {path.stem for path in found if path.suffix.lower() == ".sli"}
+    headers = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".hdr"]
+    found += [path for path in headers if path.stem not in with_numbers and _is_library(path)]
     if not found:
         raise SpectrumError(f"{folder}: no library in this folder ({', '.join(kinds)})")
     return found
+
+
+def _is_library(header_path: Path) -> bool:
+    """Whether the numbers beside a header, whatever their suffix, are spectra."""
+    try:
+        return "library" in read_header(header_path).get("file type", "").lower()
+    except ValueError:
+        return False
 
 
 _BESIDE_SPECTRA = re.compile(r"ancillary|wavelengths|bandpass|readme", re.IGNORECASE)
@@ -183,7 +194,7 @@ def _read_csv(path: Path) -> _Table:
 
 def _read_envi(path: Path) -> _Table:
     """Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
-    `reflectance scale factor` (values are divided by it) and `data ignore value`."""
+    `reflectance scale factor` (values are divided by it), `data ignore value`, and `bbl`, whose bad bands are gaps."""
     header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
     header = read_header(header_path)
     layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
@@ -200,6 +211,15 @@ def _read_envi(path: Path) -> _Table:
         if "data ignore value" in header:
             ignored = np.array(_number(header, "data ignore value")).astype(layout.dtype)
             values[stored.reshape(values.shape) == ignored] = np.nan
+    for key, usual in (("gain", 1.0), ("offset", 0.0)):
+        if any(float(number) != usual for number in header_items(header, f"data {key} values")):
+            raise ValueError(
+                f"'data {key} values' can't be applied to spectra; write the library with its values"
+            )
+    good = [float(number) for number in header_items(header, "bbl")] or [1.0] * num_bands
+    if len(good) != num_bands:
+        raise ValueError(f"'bbl' has {len(good)} marks for {num_bands} bands")
+    values[:, np.array(good) == 0] = np.nan
     unit = header.get("wavelength units", "").strip()
     factor = nm_per_unit(unit or "nm")
     if factor is None:
