@@ -178,8 +178,7 @@ def test_values_that_a_header_marks_as_ignored_are_gaps(tmp_path):
 def test_bands_that_a_header_marks_as_bad_are_gaps_and_gains_are_refused(tmp_path):
     path, _ = written_by_spectral(tmp_path, bbl=[1, 0, 1])
     np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
-    with path.with_suffix(".hdr").open("a") as header:
-        header.write("data offset values = { -0.1 }\n")
+    written_by_spectral(tmp_path, data_offset_values="{ -0.1 }")
     with pytest.raises(SpectrumError, match="'data offset values' can't be applied to spectra"):
         read_library(path)
 
