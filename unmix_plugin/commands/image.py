@@ -78,7 +78,8 @@ def image(argv: list[str]) -> None:
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
     refuse_to_overwrite(paths, options.overwrite)
-    opened = open_spectral_file(options.file, _reading(options))
+    reading = ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
+    opened = open_spectral_file(options.file, reading)
     bands, wavelengths = _good_bands(opened)
     stored = opened.read(bands=bands)
     mask = ~find_missing(stored, opened)
@@ -145,10 +146,6 @@ def _library(options: _ImageOptions, wavelengths: np.ndarray | None) -> Material
             f"{options.file}: its wavelengths are not known, so no spectrum of a library can be compared"
         )
     return library_of(options.library, Bands.of(wavelengths))
-
-
-def _reading(options: _ImageOptions) -> ReadOptions:
-    return ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
 
 
 def _good_bands(opened: SpectralFile) -> tuple[np.ndarray, np.ndarray | None]:
