@@ -91,6 +91,8 @@ def image(argv: list[str]) -> None:
     print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
+    if "geo_reference" in opened.metadata:
+        print("note: the maps do not keep the geo-reference of a TIFF; their pixels are those of the file")
     for note in opened.notes:
         print(f"note: {note}")
     if is_srgb(opened):

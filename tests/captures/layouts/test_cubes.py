@@ -174,3 +174,15 @@ def test_references_that_views_share_are_read_once(tmp_path, monkeypatch):
     prepared = sensor.prepare_sensor("", views, options, sensor.References(views=tuple(views)))
     assert len(prepared.calibration.own) == 3
     assert opened == [made.root / "dark.hdr"]
+
+
+def test_numbers_that_no_header_describes_are_named(tmp_path):
+    capture = make_capture(tmp_path / "capture", views=3)
+    assert not find_cubes(capture.root, PLAIN).warnings
+    (capture.root / "view_01.hdr").unlink()
+    (capture.root / "view_07.fits").write_bytes(b"SIMPLE")
+    found = find_cubes(capture.root, PLAIN)
+    assert [view.name for view in found.views] == ["view_00", "view_02"]
+    assert found.warnings == (
+        "left out, as no header beside them says what they hold: view_01.raw, view_07.fits",
+    )

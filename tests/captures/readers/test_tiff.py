@@ -319,6 +319,12 @@ def test_labels_of_imagej_and_names_of_pages_are_wavelengths(tmp_path):
     np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "b.tif")), NM)
 
 
+def test_a_geo_reference_is_told(tmp_path):
+    tags = [(33550, "d", 3, (2.0, 2.0, 0.0), True), (33922, "d", 6, (0.0, 0.0, 0.0, 5e5, 4.5e6, 0.0), True)]
+    assert written(tmp_path, CUBE, extratags=tags).metadata["geo_reference"] == "GeoTIFF"
+    assert "geo_reference" not in written(tmp_path, CUBE).metadata
+
+
 def test_the_orientation_of_a_page_is_told(tmp_path):
     assert written(tmp_path, CUBE, extratags=[(274, "H", 1, 6, True)]).metadata["orientation"] == 6
     assert "orientation" not in written(tmp_path, CUBE, extratags=[(274, "H", 1, 1, True)]).metadata

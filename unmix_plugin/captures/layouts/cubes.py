@@ -23,7 +23,7 @@ from pathlib import Path
 
 from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.poses.pose_set import natural_order
-from unmix_plugin.captures.readers.envi import described_image
+from unmix_plugin.captures.readers.envi import described_image, header_beside
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, name_some
@@ -32,6 +32,10 @@ from unmix_plugin.formats.files import safe_name
 _CUBE_SUFFIXES = frozenset(
     {".hdr", ".npy", ".npz", ".tif", ".tiff", ".exr", ".mat", ".h5", ".hdf5", ".he5", ".nc", ".nc4", ".pt"}
 )
+_NUMBERS = frozenset(
+    {".img", ".dat", ".raw", ".bil", ".bip", ".bsq", ".bin", ".cube", ".hyspex", ".fits", ".zip", ".gz"}
+)
+"""Of files that may be views whose header is lost, or of a kind that is not read."""
 _PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _BAND_SUFFIXES = _PICTURE_SUFFIXES | {".tif", ".tiff", ".exr"}
 _WORD = r"(?:ref(?:erence)?|frame|field|current|calibration)"
@@ -132,7 +136,11 @@ def _capture_of_groups(
                 view = replace(view, **{kind: open_spectral_file(own, replace(options, wavelengths_nm=None))})
                 references[kind] += 1
         views.append(view)
-    return Capture("cubes", root, tuple(views), notes=_notes(references, len(views), left_out, take_results))
+    notes = _notes(references, len(views), left_out, take_results)
+    there = [path for folder in folders for path in _visible_files(folder)]
+    lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
+    warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
+    return Capture("cubes", root, tuple(views), notes=notes, warnings=warnings)
 
 
 def _notes(

@@ -46,6 +46,8 @@ from unmix_plugin.spectral.bands import nm_per_unit
 if TYPE_CHECKING:
     from tifffile import TiffFile, TiffPage
 
+_GEO_TAGS = (33922, 34264)
+"""ModelTiepoint and ModelTransformation."""
 _COLOURS = (2, 6)
 """RGB and YCbCr."""
 _NO_NUMBERS = {
@@ -116,6 +118,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         stated = _from_gdal(items) or _from_description(first) or _from_description(top)
         stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
         no_data = _number(str(first.tags.valueof(_GDAL_NODATA) or ""))
+        on_map = any(tag in first.tags for tag in _GEO_TAGS)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
     axes, axis_warnings = "yxb", ()
@@ -143,7 +146,10 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         + band_warnings
         + exposure_warnings
         + _not_decoded(first, bands),
-        metadata={name: value for name, value in tags.items() if value} | exposure | _orientation(tags),
+        metadata={name: value for name, value in tags.items() if value}
+        | exposure
+        | _orientation(tags)
+        | ({"geo_reference": "GeoTIFF"} if on_map else {}),
     )
 
 
