@@ -144,7 +144,7 @@ def _pose(angle: float) -> list[list[float]]:
 
 def _start(root: Path, until: int) -> Start:
     """Start the command, and kill it when so many views are written."""
-    command = [sys.executable, "-c", "from unmix_plugin.commands.process import main; main()", "cubes"]
+    command = [sys.executable, "-c", "from unmix_plugin.commands import scripts; scripts.process()", "cubes"]
     command += ["--data", str(root / "capture"), "--output-dir", str(root / "scene"), "--mask", "black"]
     command += ["--poses", "transforms.json", "--max-noise", "10"]
     command += ["--white", str(root / "capture/white.hdr"), "--dark", str(root / "capture/dark.hdr")]

@@ -89,7 +89,7 @@ class SpectraCanvas:
         return write_spectral_exr(path, self.spectra, bands, self.linear_rgb, self.coverage, about, quantity)
 
 
-_LAUNCH = "from unmix_plugin.commands.render import main; main()"
+_LAUNCH = "from unmix_plugin.commands import scripts; scripts.render()"
 _LONGEST_MESSAGE, _LINES_KEPT = 1000, 100
 _WAIT_S = 10.0
 _PROGRESS = re.compile(r"rendering: (\d+) of ([1-9]\d*) done")
