@@ -7,6 +7,7 @@ command with its flags, and the public Python names. Links between them are made
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import re
 import shutil
@@ -36,6 +37,19 @@ COMMANDS = {
     "unmix-demo-scene": ("demo_scene", "write_demo_scene", ("",)),
 }
 """Module, function, and the words after which flags differ."""
+ROOMS = {
+    "captures": "Captures: `unmix-process`, `unmix-image`",
+    "engine": "Runs and training: every command",
+    "trained": "Views, regions and cameras: `unmix-render`, `unmix-export`, `unmix-eval`",
+    "products": "Products: `unmix-export`, `unmix-render`",
+    "formats": "Files of spectra, meshes and videos",
+    "spectral": "Spectra, colours, indices and unmixing",
+    "editing": "Recipes: `--edits`",
+    "viewer": "The page in the browser: `unmix-view`, `unmix-train`",
+    "neumatex": "The method neumatex",
+    "commands": "Words of commands",
+}
+"""Parts of the package whose messages are listed, and who says them; those of scenes have a table by hand."""
 
 
 def main() -> None:
@@ -64,6 +78,7 @@ def main() -> None:
     _write(folder / "results/index.md", _results_index(sorted((folder / "results").glob("*.md"))))
     names = [_write_command(folder / "reference/commands", name) for name in COMMANDS]
     _write(folder / "reference/commands/index.md", _commands_index(names))
+    _write(folder / "reference/messages.md", _messages_page(ROOT / "unmix_plugin"))
     _write(folder / "reference/python-api.md", _python_page())
     _write(folder / "reference/engine-api.md", _engine_page())
     _write(folder / "index.md", _front_page((folder / "index.md").read_text(encoding="utf-8")))
@@ -96,6 +111,7 @@ def _front_page(text: str) -> str:
     made = {
         "Reference": [
             ("reference/commands/index", "commands", "every command with all its flags, made from the code"),
+            ("reference/messages", "messages", "what errors say, and what to do"),
             (
                 "reference/python-api",
                 "Python names",
@@ -170,6 +186,50 @@ def _python_page() -> str:
     for name in mistakes:
         parts += _autodoc(f"unmix_plugin.errors.{name}", getattr(errors, name), False)
     return "\n".join(parts)
+
+
+def _messages_page(package: Path) -> str:
+    """The messages of users' errors that also say what is expected or what to do, as the code has them."""
+    kinds = {
+        name
+        for name, one in vars(errors).items()
+        if isinstance(one, type) and issubclass(one, errors.UnmixError)
+    }
+    parts = [
+        "# Messages",
+        "",
+        "What commands say of files, settings and runs that they can't use, with exit code 2; `...` stands for names",
+        "and numbers. Search this page for words of your message. Faults of a scene folder have",
+        "[a table of their own](scene-folder.md#when-a-scene-is-refused).",
+        "",
+    ]
+    for room, title in ROOMS.items():
+        said = dict.fromkeys(
+            pair
+            for path in sorted((package / room).rglob("*.py"))
+            for pair in messages_in(path.read_text(encoding="utf-8"), kinds)
+        )
+        rows = [f"| {what} | {advice} |" for what, advice in said]
+        parts += [f"## {title}", "", "| the message says | expected, or what to do |", "|---|---|", *rows, ""]
+    return "\n".join(parts)
+
+
+def messages_in(code: str, kinds: set[str]) -> Iterator[tuple[str, str]]:
+    """What each message in a module says, and what it expects or advises, as cells of a table."""
+    for call in ast.walk(ast.parse(code)):
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in kinds):
+            continue
+        for text in call.args[:1]:
+            pieces = text.values if isinstance(text, ast.JoinedStr) else [text]
+            words = [str(one.value) if isinstance(one, ast.Constant) else "..." for one in pieces]
+            what, _, advice = re.sub(r"^(\.\.\.:? )+", "", "".join(words)).partition("; ")
+            if len(re.sub(r"\W", "", what)) > 8 and re.search(r"\w", advice):
+                yield _cell(what), _cell(advice)
+
+
+def _cell(text: str) -> str:
+    """Any text in a table of Markdown, as it is."""
+    return re.sub(r"([\\`*_{}\[\]<>#|~$])", r"\\\1", " ".join(text.split()))
 
 
 def _engine_page() -> str:

@@ -4,12 +4,13 @@ import os
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
 
 from scripts.check_site import faults_of
-from scripts.stage_site import COMMANDS
+from scripts.stage_site import COMMANDS, messages_in
 from tests.docs.pages import ROOT, text_of
 
 PAGE = "<html><head><script src='{load}'></script></head><body><article><a href='{link}'>x</a></article></body></html>"
@@ -18,6 +19,16 @@ PAGE = "<html><head><script src='{load}'></script></head><body><article><a href=
 def test_every_command_has_a_page():
     section = text_of("pyproject.toml").split("[project.scripts]")[1].split("\n\n")[0]
     assert sorted(COMMANDS) == sorted(re.findall(r"^(unmix-[a-z-]+) =", section, re.MULTILINE))
+
+
+def test_a_message_is_listed_by_what_it_says_and_what_to_do():
+    code = """
+        raise ConfigError(f"{path}: --pixel {text} is {number:g} wide; give a_number above 0 | less")
+        raise ConfigError("no advice at all in this one")
+        raise KeyError("this is no user's error; so it is left out")
+    """
+    found = list(messages_in(textwrap.dedent(code), {"ConfigError"}))
+    assert found == [("--pixel ... is ... wide", r"give a\_number above 0 \| less")]
 
 
 def words_of(page: Path) -> str:
@@ -39,6 +50,7 @@ def test_it_builds_and_has_every_command_and_every_public_name(tmp_path):
     commands = tmp_path / "html/reference/commands"
     assert "--max-seconds FLOAT" in words_of(commands / "unmix-train.html")
     assert "--unseen {drop,keep}" in words_of(commands / "unmix-export.html")
+    assert "weights in other formats are not read" in words_of(tmp_path / "html/reference/messages.html")
     names = (tmp_path / "html/reference/python-api.html").read_text()
     assert 'id="unmix_plugin.TrainedScene.probe"' in names
 
