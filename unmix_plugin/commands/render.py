@@ -55,6 +55,9 @@ class _RenderOptions:
     pixel_size: float | None = None
     """Of maps: edge of a pixel in metres, or in units of the world where the run has no scale; None: about that of the
     scene's views."""
+    epsg: int | None = None
+    """Of maps from above: EPSG code of the projected coordinate system in metres that geo-referenced poses are in, as
+    32632 for UTM zone 32N; it is written into the files."""
     frames: int | None = None
     """Number of cameras of orbit or interpolate; None: 120."""
     fps: float | None = None
@@ -142,6 +145,7 @@ def _camera_request(options: _RenderOptions) -> CameraRequest:
         options.frames,
         options.fps,
         options.pixel_size,
+        options.epsg,
     )
 
 

@@ -74,6 +74,23 @@ def test_an_envi_header_says_the_same(folder):
     assert (float(left), float(top)) == tie[3:5]
 
 
+def test_a_coordinate_system_that_is_known_is_written():
+    [utm, national] = (
+        choose_cameras(SCENE, CameraRequest("map", pixel_size=1.0, epsg=code), SCALE).map_info
+        for code in (32632, 25832)
+    )
+    assert utm is not None
+    assert national is not None
+    directory = np.array(utm.geotiff[2][3]).reshape(-1, 4)
+    assert {tuple(key) for key in directory[1:]} >= {(1024, 0, 1, 1), (3072, 0, 1, 32632)}
+    assert utm.envi["map info"][0] == "UTM"
+    assert utm.envi["map info"][7:] == [32, "North", "WGS-84", "units=Meters"]
+    assert (3072, 0, 1, 25832) in {tuple(key) for key in np.array(national.geotiff[2][3]).reshape(-1, 4)}
+    assert national.envi["map info"][0] == "Arbitrary"
+    with pytest.raises(ConfigError, match="--epsg needs a world in metres"):
+        choose_cameras(SCENE, CameraRequest("map", epsg=32632), None)
+
+
 def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
     setting = files.RenderSetting(tmp_path, (4, 3), Palette.of(None, {}), None, {}, None)
     [depth] = choose_formats(["depth"], ["tif"], SCENE, False)
@@ -106,6 +123,9 @@ def test_without_a_scale_units_are_those_of_the_world():
             "--cameras map has one view of the size that --pixel-size gives",
         ),
         (CameraRequest("orbit", pixel_size=0.1), "--pixel-size is for --cameras map"),
+        (CameraRequest("orbit", epsg=32632), "--epsg is for --cameras map"),
+        (CameraRequest("map", epsg=4326), "--epsg 4326 is no projected coordinate system"),
+        (CameraRequest("map:east", epsg=32632), "--epsg is for maps from above"),
     ],
 )
 def test_what_makes_no_map_is_refused(request_, message):

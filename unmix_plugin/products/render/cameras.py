@@ -23,6 +23,8 @@ _CAMERA_CHOICES = (*_DATASET_CAMERAS, *_PATH_CAMERAS)
 _USUAL_FRAMES = 120
 _MOST_FRAMES = 100_000
 _GREATEST_DOWNSCALE = 1000
+_PROJECTED_CODES = (1024, 32_766)
+"""EPSG codes that a GeoTIFF's key of a projected system takes; those of 4000 to 4999 are geographic or geocentric."""
 _LEAST_PATH_HEIGHT = 512
 """Rows of videos along a path that is made here, unless a size is asked for."""
 
@@ -45,6 +47,8 @@ class CameraRequest:
     """Of videos; None: as in the file, or a default for each kind of video."""
     pixel_size: float | None = None
     """Of a map: edge of a pixel, metres or units of the world; None: that of the scene's views."""
+    epsg: int | None = None
+    """Of a map from above: code of the coordinate system of the world; None: unknown."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,8 @@ def choose_cameras(
     kind, _, direction = request.source.partition(":")
     if kind == "map":
         return _map(scene, request, scale, direction or "top")
+    if request.epsg is not None:
+        raise ConfigError(f"--epsg is for --cameras map; --cameras {request.source} has no map coordinates")
     if request.pixel_size is not None:
         raise ConfigError(
             f"--pixel-size is for --cameras map; --cameras {request.source} has pixels of its own"
@@ -129,8 +135,25 @@ def _map(
             "--cameras map has one view of the size that --pixel-size gives; leave out other options of views"
         )
     camera, info = map_camera(scene, scale, direction, request.pixel_size)
+    if request.epsg is not None:
+        info = _in_coordinate_system(info, request.epsg, scale, direction)
     name = re.sub(r"[^\w-]+", "_", f"map_{direction}")
     return RenderCameras((RunView(name, camera),), False, None, info)
+
+
+def _in_coordinate_system(info: MapInfo, epsg: int, scale: Scale | None, direction: str) -> MapInfo:
+    if not _PROJECTED_CODES[0] <= epsg <= _PROJECTED_CODES[1] or epsg // 1000 == 4:
+        raise ConfigError(
+            f"--epsg {epsg} is no projected coordinate system; expected a code such as 32632 (UTM zone 32N)"
+        )
+    if direction != "top":
+        raise ConfigError(f"--epsg is for maps from above; map:{direction} has no east and north")
+    if scale is None or scale.metres_per_unit != 1:
+        raise ConfigError(
+            "--epsg needs a world in metres, as geo-referenced poses have; this run's has another or an unknown scale: "
+            "leave --epsg out"
+        )
+    return replace(info, epsg=epsg)
 
 
 def _path(name: str, cameras: Cameras) -> RenderCameras:

@@ -37,6 +37,8 @@ _DIRECTIONS = {
 """From where one looks, in the world; the first is what `map` alone means."""
 _USUAL_PIXELS = 512
 """Along the longest side, where nothing says how large pixels are."""
+_UTM_HALVES = {326: "North", 327: "South"}
+"""Hundreds of the EPSG codes of WGS 84 / UTM, whose zones ENVI headers know by number."""
 _OUTSIDE = 1.01
 """Where rays start, in half diagonals of the scene box from its middle."""
 
@@ -82,17 +84,24 @@ class MapInfo:
     """Edge of a pixel."""
     is_metric: bool
     """Whether coordinates are metres."""
+    epsg: int | None = None
+    """EPSG code of the projected coordinate system; None where it is unknown."""
 
     @property
     def envi(self) -> dict[str, Any]:
         """Entries of an ENVI header; pixels are counted from 1, whose corner (1, 1) is that of the first pixel."""
         units = f"units={'Meters' if self.is_metric else 'Unknown'}"
-        return {"map info": ["Arbitrary", 1.0, 1.0, self.left, self.top, self.pixel, self.pixel, units]}
+        place = [1.0, 1.0, self.left, self.top, self.pixel, self.pixel]
+        half, zone = divmod(self.epsg or 0, 100)
+        if half in _UTM_HALVES and 1 <= zone <= 60:
+            return {"map info": ["UTM", *place, zone, _UTM_HALVES[half], "WGS-84", units]}
+        return {"map info": ["Arbitrary", *place, units]}
 
     @property
     def geotiff(self) -> list[tuple[int, int, int, Any, bool]]:
         """Tags of a GeoTIFF as tifffile takes them: pixel scale, tie point, keys."""
-        citation = (
+        known = None if self.epsg is None else f"EPSG:{self.epsg}|"
+        citation = known or (
             "unmix-nerf map, local metres|" if self.is_metric else "unmix-nerf map, units of the scene|"
         )
         keys = [
@@ -100,7 +109,9 @@ class MapInfo:
             (1025, 0, 1, 1),  # GTRasterType: a pixel is an area
             (1026, 34737, len(citation), 0),  # GTCitation
         ]
-        if self.is_metric:
+        if self.epsg is not None:
+            keys += [(3072, 0, 1, self.epsg)]  # ProjectedCRS
+        elif self.is_metric:
             keys += [(3072, 0, 1, 32767), (3074, 0, 1, 32767), (3076, 0, 1, 9001)]  # user-defined, metres
         directory = [1, 1, 1, len(keys), *(number for key in keys for number in key)]
         return [
