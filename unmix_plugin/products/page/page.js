@@ -486,6 +486,12 @@
     return inside;
   };
   const edge = Math.sqrt((2 * areas.reduce((sum, area) => sum + area, 0)) / Math.max(faces.length / 3, 1)); // usual one of a triangle
+  const isSeen = (place) => {
+    raycaster.ray.origin.copy(camera.position);
+    raycaster.ray.direction.copy(place).sub(camera.position).normalize();
+    const found = firstHit();
+    return !found || found.hit.distance > place.distanceTo(camera.position) - edge;
+  };
   // Which vertices are seen from here within an outline on the screen, 255 each, as regions of the run have them.
   const sharesInside = (outline) => {
     const shares = new Uint8Array(V);
@@ -498,10 +504,7 @@
       onScreen.copy(place).project(camera);
       const [x, y] = [((onScreen.x + 1) / 2) * innerWidth, ((1 - onScreen.y) / 2) * innerHeight];
       if (x < left || x > right || y < top || y > bottom || !isInside(outline, x, y)) continue;
-      raycaster.ray.origin.copy(camera.position);
-      raycaster.ray.direction.copy(place).sub(camera.position).normalize();
-      const found = firstHit();
-      if (!found || found.hit.distance > place.distanceTo(camera.position) - edge) shares[v] = 255;
+      if (isSeen(place)) shares[v] = 255;
     }
     return shares;
   };
@@ -512,14 +515,14 @@
     if (!(area > 0)) return null;
     const mean = (values, width, i) => weights.reduce((sum, weight, v) => sum + weight * values[v * width + i], 0) / area;
     const middle = [0, 1, 2].map((axis) => mean(positions, 3, axis));
-    let [anchor, least] = [0, Infinity];
-    for (let v = 0; v < V; v++) {
-      const distance = Math.hypot(...middle.map((value, axis) => positions[3 * v + axis] - value));
-      if (shares[v] > 127 && distance < least) [anchor, least] = [v, distance];
-    }
+    // Where its name may stand: first near the middle, then anywhere, since parts of it may be hidden.
+    const inside = Array.from(shares.keys()).filter((v) => shares[v] > 0);
+    const fromMiddle = (v) => Math.hypot(...middle.map((value, axis) => positions[3 * v + axis] - value));
+    const nearest = inside.reduce((best, v) => (fromMiddle(v) < fromMiddle(best) ? v : best));
+    const anywhere = Array.from({ length: 15 }, (_, i) => inside[Math.floor(((i + 0.5) / 15) * inside.length)]);
     const { mean: spectrum, spread } = B ? Spectra.mixtureStatistics(weights, scaled, facts.endmembers) : { mean: [], spread: null };
     return {
-      shares, area, spectrum, spread, anchor: new Kit.Vector3().fromArray(positions, 3 * anchor),
+      shares, area, spectrum, spread, anchors: [nearest, ...anywhere].map((v) => new Kit.Vector3().fromArray(positions, 3 * v)),
       mixture: names.map((_, k) => mean(abundances, K, k)),
       finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
     };
@@ -537,18 +540,15 @@
   };
   // Names beside the points and regions that are seen from here.
   const placeLabels = () => {
-    const [labels, towards] = [$("labels"), new Kit.Vector3()];
+    const labels = $("labels");
     const shown = probes.filter((probe) => probe.isShown);
     while (labels.children.length < shown.length) labels.append(make("span"));
     [...labels.children].forEach((label, i) => {
-      label.hidden = i >= shown.length;
-      if (label.hidden) return;
-      const { name, colour, place, anchor = place } = shown[i];
-      raycaster.ray.origin.copy(camera.position);
-      raycaster.ray.direction.copy(towards.copy(anchor).sub(camera.position).normalize());
-      const found = firstHit();
-      label.hidden = found !== null && found.hit.distance < anchor.distanceTo(camera.position) - edge;
-      const { x, y } = towards.copy(anchor).project(camera);
+      const { name, colour, place, anchors = [place] } = shown[i] ?? { anchors: [] };
+      const anchor = anchors.find(isSeen);
+      label.hidden = !anchor;
+      if (!anchor) return;
+      const { x, y } = anchor.clone().project(camera);
       Object.assign(label.style, { left: `${((x + 1) / 2) * innerWidth}px`, top: `${((1 - y) / 2) * innerHeight}px`, borderColor: colour });
       label.className = place ? "above" : "";
       label.textContent = name;
