@@ -27,12 +27,15 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
+from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.products.page.page import vertex_areas
 from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+from unmix_plugin.trained.measures import keep_region
 from unmix_plugin.trained.open_run import load_run, open_run
+from unmix_plugin.trained.regions import Box
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SMALL = {
@@ -447,6 +450,24 @@ def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):
     kept.write_text(kept.read_text().replace('"icon"', "[1]"))
     ended = run(export, *words("report", "--run", solid_copy, "--overwrite"))
     assert (ended.status, "report.json is damaged" in ended.err) == (2, True)
+
+
+def test_a_report_shows_the_regions_that_are_kept_and_says_which_it_cannot(solid_copy):
+    names = load_run(solid_copy, "cpu").materials_scene.materials.names
+    far = Box((90.0, 90.0, 90.0), (91.0, 91.0, 91.0))
+    everything = Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0))
+    for name, region in (("all of it", everything), ("far away", far)):
+        keep_region(RunFolder(solid_copy), name, region)
+    assert run(export, *words("report", "--run", solid_copy)).status == 0
+    page = (solid_copy / "exports" / "report" / "report.html").read_text()
+    assert_self_contained(page)
+    section = page.partition('<section id="regions">')[2].partition("</section>")[0]
+    assert re.search(r"<h3>all of it <span class=.note.>[0-9.]+ square units", section)
+    assert "mean spectrum of the region all of it" in section
+    shares = [float(share) for share in re.findall(r'<td class="number">([0-9.]+)</td>', section)]
+    assert (len(shares), sum(shares)) == (len(names), pytest.approx(1, abs=0.01))
+    assert "Not shown: the region far away has nothing of the surface in it" in page
+    assert "far away" not in section
 
 
 def test_a_report_quotes_the_figures_that_eval_found(solid_copy, tmp_path, monkeypatch):

@@ -240,8 +240,18 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.look_from(0.3)
         page.click(0.5, 0.5)
         page.wait_until(lambda: "The view has changed, so the outline begins here" in page.texts)
-        page.set("remove the region", True)
-        page.wait_until(lambda: options() == ["none: choose one"])
+        page.set("shape", "polygon")
+        page.wait_until(lambda: "Tick the box" in page.texts)
+        for count, place in enumerate(((0.5, 0.4), (0.6, 0.6), (0.45, 0.6)), 1):
+            page.click(*place)
+            page.wait_until(lambda count=count: f"Corners: {count}." in page.texts)
+        page.set("region name", "wedge")
+        page.set("keep the region", True)
+        page.wait_until(lambda: options() == ["none: choose one", "middle part", "wedge"])
+        for name in ("wedge", "middle part"):
+            page.set("region", name)
+            page.set("remove the region", True)
+            page.wait_until(lambda name=name: name not in options())
         assert read_measures(source.run).regions == {}
 
 

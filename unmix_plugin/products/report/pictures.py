@@ -24,6 +24,8 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import match_endmembers
 from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, as_numpy, picture
+from unmix_plugin.trained.measured_surface import MeasuredRegion
+from unmix_plugin.trained.measures import Scale, describe_area
 from unmix_plugin.trained.run_materials import endmember_colours, shown_matches
 
 SHOWN_VIEWS = 3
@@ -226,6 +228,31 @@ def material_cards(
         chart = LineChart(lines, "wavelength (nm)", materials.quantity, from_zero=True, size=(480.0, 240.0))
         cards.append(_MaterialCard(name, colours[index], float(proportions[index]), chart, matches))
     return cards
+
+
+@dataclass(frozen=True)
+class _RegionCard:
+    """What is shown of a region that is kept with the run."""
+
+    name: str
+    area: str
+    chart: LineChart
+    shares: Sequence[tuple[str, Float[np.ndarray, "3"], float]]
+    """Materials with their colours and abundances, the largest first."""
+
+
+def region_card(name: str, found: MeasuredRegion, materials: Materials, scale: Scale | None) -> _RegionCard:
+    """A card for a region: its mean spectrum with one standard deviation to either side, and what it is made of."""
+    nm, ink, grey = materials.bands.centers_nm, "#1c2024", "#7a838b"
+    lines = [
+        ChartLine(nm, found.mean - found.spread, "mean less standard deviation", grey, 1.5, "dashed"),
+        ChartLine(nm, found.mean + found.spread, "mean and standard deviation", grey, 1.5, "dashed"),
+        ChartLine(nm, found.mean, "mean", ink, 3.0),
+    ]
+    chart = LineChart(lines, "wavelength (nm)", materials.quantity, from_zero=True, size=(480.0, 240.0))
+    entries = zip(materials.names, endmember_colours(materials), found.abundances.tolist(), strict=True)
+    shares = sorted(entries, key=lambda entry: -entry[2])
+    return _RegionCard(name, describe_area(found.area, scale), chart, shares)
 
 
 def _partners(

@@ -29,6 +29,7 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.regions import measured_surface
 from unmix_plugin.products.report import pictures
 from unmix_plugin.products.report.pictures import (
     ERROR_SCALE,
@@ -88,8 +89,27 @@ def export_report(
     views = _look(job, chosen, scene)
     if len(chosen) < len(job.loaded.record.eval_cameras):
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
+    regions = _region_cards(job, notes)
     with job.working("laying out the report"):
-        return [_write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes, said)]
+        return [
+            _write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes, said, regions)
+        ]
+
+
+def _region_cards(job: Job, notes: list[str]) -> list[Any]:
+    """What is shown of the regions that are kept with the run; `notes` get those of which there is nothing."""
+    kept, cards = job.loaded.measures.regions, []
+    if not kept:
+        return []
+    surface = measured_surface(job)
+    for name, region in kept.items():
+        try:
+            found = surface.measure(region, name)
+        except ConfigError as error:  # noqa: PERF203 - said, and the others are shown
+            notes.append(f"Not shown: {error}.")
+        else:
+            cards.append(pictures.region_card(name, found, job.materials, job.scene.scale))
+    return cards
 
 
 def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
@@ -132,6 +152,7 @@ def _write_report(
     stored_figures: dict[str, Any] | None,
     notes: Sequence[str],
     about: Mapping[str, str],
+    regions: Sequence[Any] = (),
 ) -> Path:
     """Write `report.html`; without `stored_figures`, with those of `views` if they were compared."""
     materials, light = views.materials, loaded.materials_scene.light_power
@@ -152,6 +173,7 @@ def _write_report(
             "notes": notes,
             "facts": _scene_facts(loaded, materials, about),
             "cards": cards,
+            "regions": regions,
             "quantity": materials.quantity,
             "num_known": len(library.names),
             "light_unknown": LIGHT_UNKNOWN if light is None else None,
