@@ -16,6 +16,7 @@ from tests.captures.layouts.data_sets import (
     write_real,
 )
 from unmix_plugin.captures.layouts.nespof import _open_intensity, _open_opacity, find_nespof, find_nespof_real
+from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 
@@ -167,3 +168,12 @@ def test_a_spoilt_real_capture_is_refused(tmp_path, spoil, message):
     spoil(tmp_path / "exr")
     with pytest.raises(CaptureError, match=message):
         find_nespof_real(tmp_path, PLAIN)
+
+
+@pytest.mark.parametrize("place", [9, 17, 40])
+def test_a_damaged_header_is_told_and_ends_no_process(tmp_path, place):
+    """The library crashed, or raised SystemError: seed 1, cases 336, 437 and 1950 of benchmarks/fuzz_commands.py."""
+    path = tmp_path / "450.exr"
+    path.write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0channels\0chlist\0\x25\0\0\0" + b"\xff" * place)
+    with pytest.raises(CaptureError, match=r"450\.exr can't be read as OpenEXR"):
+        channel_names(path)

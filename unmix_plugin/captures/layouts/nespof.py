@@ -26,6 +26,7 @@ import numpy as np
 from unmix_plugin.captures.layouts.registry import FoundFiles, view_names
 from unmix_plugin.captures.layouts.transforms import make_capture, read_frames
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
     BandTable,
@@ -133,7 +134,7 @@ def _stack_intensities(files: dict[float, Path], options: ReadOptions) -> Spectr
 def _open_intensity(path: Path) -> SpectralFile:
     """The first Stokes component, (H, W, 1): by its name, otherwise by the number of channels. Raises CaptureError: the
     file can't be read, or which channel is s0 can't be told."""
-    names = _channels(path)
+    names = channel_names(path)
     named = [name for name in names if "s0" in name.lower().split(".")]
     if not named and len(names) == 16:
         named = [names[4]]
@@ -148,7 +149,7 @@ def _open_intensity(path: Path) -> SpectralFile:
 
 def _open_opacity(path: Path) -> SpectralFile | None:
     """The alpha channel, (H, W, 1), in [0, 1]; None where there is none."""
-    channel = _opacity_channel(_channels(path))
+    channel = _opacity_channel(channel_names(path))
     return None if channel is None else open_spectral_file(path, ReadOptions(channel))
 
 
@@ -162,13 +163,3 @@ def _opacity_channel(names: list[str]) -> str | None:
     if named:
         return named[0]
     return names[-1] if len(names) == 5 else None
-
-
-def _channels(path: Path) -> list[str]:
-    """Names of the channels in the order of the file."""
-    import OpenEXR
-
-    try:
-        return list(OpenEXR.InputFile(str(path)).header()["channels"])
-    except (OSError, RuntimeError, ValueError, TypeError) as error:
-        raise CaptureError(f"{path} can't be read as OpenEXR ({error}); copy it again") from error

@@ -149,6 +149,20 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     )
 
 
+def channel_names(path: Path) -> list[str]:
+    """Names of the channels in the order of the file, read without the library, which damaged headers end.
+
+    Raises:
+        CaptureError: the header is damaged.
+    """
+    with path.open("rb") as file:
+        begin = file.read(_HEADER_BYTES)
+    try:
+        return [channel.name for channel in _list_channels(begin, [False])]
+    except ValueError as error:
+        raise CaptureError(f"{path} can't be read as OpenEXR ({error}); copy it again") from error
+
+
 def _window(header: dict[str, Any], key: str) -> Int[np.ndarray, "2 2"]:
     """Column and row of a rectangle's first pixel, and those behind its last."""
     first, last = (np.asarray(corner, np.int64) for corner in header[key])
