@@ -243,12 +243,24 @@ def test_a_lamp_is_a_table_or_a_name_with_its_greatest_band_1(tmp_path):
     np.testing.assert_allclose(read_lamp(str(envi), BANDS), [0.25, 0.5, 1, 0.75])
 
 
+def test_lines_of_a_lamp_between_bands_count_and_its_own_rounded_bands_are_taken_as_they_are(tmp_path):
+    lines = "400,1\n579,1\n580,101\n581,1\n800,1\n"
+    found = read_lamp(_csv(tmp_path / "lines.csv", f"wavelength,power\n{lines}"), BANDS)
+    np.testing.assert_allclose(
+        found, [0.5, 1, 0.5, 0.5]
+    )  # a triangle of area 100 nm in a band of 100 nm over 1
+    rounded = read_lamp(
+        _csv(tmp_path / "lamp.csv", "wavelength,power\n450.0004,1\n550,4\n650,1\n750,1\n"), BANDS
+    )
+    np.testing.assert_allclose(rounded, [0.25, 1, 0.25, 0.25])
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("wavelength,power\n500,1\n800,1\n", "do not reach"),
         ("wavelength,a,b\n400,1,1\n800,1,1\n", "one spectrum; found 2"),
-        ("wavelength,power\n400,0\n460,0\n800,1\n", "no power at 450 nm"),
+        ("wavelength,power\n400,0\n500,0\n800,1\n", "no power at 450 nm"),
     ],
 )
 def test_lamps_that_tell_nothing_of_some_band_are_refused(tmp_path, text, expected):

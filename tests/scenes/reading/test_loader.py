@@ -26,8 +26,6 @@ from unmix_plugin.scenes.reading.faults import find_named
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
-from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import illuminant_power
 
 
 def test_every_part_of_a_scene_is_what_was_written(tmp_path):
@@ -68,8 +66,9 @@ def test_lines_of_a_lamp_between_bands_count_in_the_light_of_a_scene_as_in_a_lig
     path.write_text("wavelength,power\n450,1\n559,1\n560,101\n561,1\n680,1\n")
     light = load_scene(folder.root).illuminant
     assert light is not None
-    np.testing.assert_allclose(light, illuminant_power(path, Bands.of([450, 520, 600, 680])))
-    assert light[1] > 1.5 * light[0]  # 560 nm is where the intervals of the bands at 520 and 600 nm meet
+    # 560 nm is where the intervals of the bands at 520 and 600 nm meet, which are 75 and 80 nm wide: each has half of a
+    # triangle of 100 nm over 1.
+    np.testing.assert_allclose(light, np.array([1, 1 + 50 / 75, 1 + 50 / 80, 1]) / (1 + 50 / 75))
 
 
 def test_endmember_columns_follow_the_materials_by_name(tmp_path):

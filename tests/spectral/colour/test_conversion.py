@@ -25,6 +25,7 @@ from unmix_plugin.spectral.colour.conversion import (
     xyz_matrix,
 )
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
+from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra_csv, write_spectra_csv
 
 visible = st.lists(st.floats(385, 775), min_size=4, max_size=60, unique_by=lambda x: round(x, 1)).map(
     lambda values: Bands.of(sorted([*values, 455.03, 545.03, 615.03]))
@@ -240,6 +241,22 @@ def test_a_light_that_is_given_at_the_bands_is_taken_as_it_is(tmp_path):
     path = tmp_path / "lines.csv"
     path.write_text("wavelength,power\n450,1\n500,10\n550,2\n")
     np.testing.assert_allclose(illuminant_power(path, Bands.of([450, 500, 550])), [0.1, 1.0, 0.2])
+
+
+@pytest.mark.parametrize("name", ["D50", "FL2"])
+def test_a_light_that_is_written_at_its_bands_and_read_again_is_the_same(tmp_path, name):
+    bands = Bands.of(np.linspace(400, 700, 48))
+    power = illuminant_power(name, bands)
+    write_spectra_csv(tmp_path / "lamp.csv", SpectraTable(bands, ("power",), power[None]))
+    np.testing.assert_allclose(illuminant_power(tmp_path / "lamp.csv", bands), power, rtol=1e-8)
+
+
+def test_wavelengths_that_a_table_rounds_are_not_out_of_its_reach(tmp_path):
+    bands = Bands.of(np.linspace(1000, 2500, 48) + 1 / 3)
+    spectra = np.linspace(0.1, 1, 48)[None]
+    write_spectra_csv(tmp_path / "table.csv", SpectraTable(bands, ("power",), spectra))
+    read = read_spectra_csv(tmp_path / "table.csv").resampled(bands)
+    np.testing.assert_allclose(read.spectra, spectra, rtol=1e-6)
 
 
 def test_a_light_linear_in_wavelength_is_sampled_at_band_centres(tmp_path):

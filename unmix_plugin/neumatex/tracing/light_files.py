@@ -25,7 +25,7 @@ from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.limits import MOST_TABLE_BYTES, allow_decoded, read_bounded
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light
+from unmix_plugin.spectral.colour.conversion import illuminant_power, parse_light, power_in_bands
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
@@ -182,7 +182,7 @@ def _read_old_row(data: bytes, start: int, row: np.ndarray) -> int:
 
 
 def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
-    """A lamp's relative power in each band, greatest 1.
+    """A lamp's relative power in each band, greatest 1; of tables as of names it is the mean over the band's interval.
 
     Args:
         lamp: Path of a table with one spectrum, a .csv (`wavelength,power`) or an ENVI spectral library; or the name
@@ -198,10 +198,13 @@ def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
     library = MaterialLibrary(tuple(read_library(path)))
     if len(library.names) != 1:
         raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(library.names)}: {library.names}")
+    [table] = library.materials
     try:
-        power = library.reflectance(library.names[0], bands)
+        library.reflectance(table.name, bands)  # refuses bands in which the lamp was not measured
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
+    known = np.isfinite(table.reflectance)
+    power = power_in_bands(table.reflectance[known], Bands(table.bands.centers_nm[known]), bands)
     return _lit_everywhere(power, lamp, bands)
 
 

@@ -92,7 +92,7 @@ def illuminant_names() -> tuple[str, ...]:
 def illuminant_power(
     light: str | Path, bands: Bands, beyond: Literal["refuse", "hold"] = "refuse"
 ) -> Float64[np.ndarray, " B"]:
-    """Relative power of a light in each band, greatest 1; what is given at the bands themselves is taken as it is.
+    """Relative power of a light in each band, greatest 1, as `power_in_bands` finds it.
 
     Args:
         light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
@@ -103,15 +103,38 @@ def illuminant_power(
             all bands (the message says by how much) or that is zero there.
     """
     source, power = _table(light)
-    if beyond == "refuse":
-        try:
-            resample_spectra(power, source, bands)
-        except SpectrumError as error:
-            raise SpectrumError(f"light {light}: {error}") from error
-    means = power if source == bands else _band_means(power, source, bands)
+    try:
+        means = power_in_bands(power, source, bands, beyond)
+    except SpectrumError as error:
+        raise SpectrumError(f"light {light}: {error}") from error
     if not means.max() > 0:
         raise SpectrumError(f"light {light} has no power in any of {bands}; choose one that shines there")
     return means / means.max()
+
+
+def power_in_bands(
+    power: Float64[np.ndarray, " N"],
+    source: Bands,
+    bands: Bands,
+    beyond: Literal["refuse", "hold"] = "refuse",
+) -> Float64[np.ndarray, " B"]:
+    """A light's mean power in each band, from a table: that of the line through it over the band's interval, exactly.
+
+    A table at the centres of the bands, but for rounding, has such means already and is taken as it is.
+
+    Args:
+        power: At the centres of `source`.
+        beyond: As that of `illuminant_power`.
+    Raises:
+        SpectrumError: the table does not reach all centres; the message says by how much.
+    """
+    if len(source) == len(bands) and (abs(source.centers_nm - bands.centers_nm) <= TOLERANCE_NM).all():
+        return power
+    if beyond == "refuse":
+        resample_spectra(power, source, bands)
+    edges = bands.edges_nm
+    [integrals] = integrals_up_to(edges, power[None], source.centers_nm)
+    return np.diff(integrals) / np.diff(edges)
 
 
 def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:
@@ -139,13 +162,6 @@ def _read(path: Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
             f"{path}: a light has two columns, wavelength and power; found {len(table.names) + 1}"
         )
     return table.bands, table.spectra[0]
-
-
-def _band_means(power: Float64[np.ndarray, " N"], source: Bands, bands: Bands) -> Float64[np.ndarray, " B"]:
-    """Means of the piecewise linear function through the table over each band's interval, exactly."""
-    edges = bands.edges_nm
-    [integrals] = integrals_up_to(edges, power[None], source.centers_nm)
-    return np.diff(integrals) / np.diff(edges)
 
 
 @lru_cache(maxsize=1)

@@ -20,8 +20,9 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 from unmix_plugin.spectral.bands import Bands, require_nanometres
 
-TOLERANCE_NM = 1e-6
-"""Reach beyond the data that counts as rounding, not as extrapolation."""
+TOLERANCE_NM = 1e-3
+"""What tables lose of wavelengths by rounding them: centres that differ by no more are the same, and a reach beyond the
+data by no more is not extrapolation."""
 
 
 @dataclass(frozen=True)
