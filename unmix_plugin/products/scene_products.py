@@ -343,7 +343,7 @@ class Splats(Product):
     resolution: int = 256
     """Pieces along the longest edge of the scene box."""
     up: Literal["y", "z"] = "y"
-    """z: coordinates stay those of the scene's world."""
+    """z: axes stay those of the scene's world."""
 
     def write(self, job: Job) -> list[Path]:
         """Find the surface and make a Gaussian of each of its vertices."""

@@ -7,6 +7,7 @@ import trimesh
 from torch.testing import assert_close
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.tracing import mesh as reading
 from unmix_plugin.neumatex.tracing.mesh import mesh_of, read_mesh
 from unmix_plugin.neumatex.tracing.rays import RayMesh, closest_twin
@@ -34,6 +35,16 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
     assert len(mesh.faces) == 24
     assert_close(mesh.vertices.max(dim=0).values, torch.tensor([3.5, 1.0, 1.0]))
     assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]))
+
+
+def test_our_own_gltf_in_metres_comes_back_in_units_of_the_world(tmp_path):
+    box = trimesh.creation.box()
+    positions, normals = (np.array(a, dtype=np.float32) for a in (box.vertices + 2.0, box.vertex_normals))
+    colours, extras = np.ones_like(positions), {"metres_per_unit": 0.05}
+    up = np.array([0.0, 0.0, 1.0])
+    write_glb(tmp_path / "mesh.glb", positions, normals, colours, np.array(box.faces), {}, extras, up)
+    mesh = read_mesh(tmp_path / "mesh.glb").with_y_upwards()
+    assert_close(mesh.vertices, torch.from_numpy(positions))
 
 
 def test_normals_of_the_file_are_kept(tmp_path):

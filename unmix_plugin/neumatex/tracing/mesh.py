@@ -1,13 +1,15 @@
 """A triangle mesh with shading normals, read from glTF, OBJ and PLY files and checked.
 
 Coordinates are taken as they are, as those of the cameras' world: a file whose axes were exchanged on export (many
-programs write glTF with +y up) has to be exported without that.
+programs write glTF with +y up) has to be exported without that. Only metres of our own glTF are taken back to units of
+the world, whose length its extras say.
 
 Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.placement import METRES_RANGE
 
 MAX_TRIANGLES = 5_000_000
 """More are refused: the tree over them and the memory of a training would not fit common machines."""
@@ -91,7 +94,7 @@ def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
 
 
 def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
-    """The triangles of a file in world coordinates, all objects of its scene graph in one mesh.
+    """The triangles of a file in units of the world, all objects of its scene graph in one mesh.
 
     A closed mesh whose triangles face inwards is turned outwards.
 
@@ -135,11 +138,22 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
-    parts = [(scene.geometry[name], np.asarray(transform)) for transform, name in placed]
+    parts = [
+        (scene.geometry[name], _without_metres(np.asarray(transform), scene.geometry[name].metadata))
+        for transform, name in placed
+    ]
     parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
     if not parts:
         raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
     return parts
+
+
+def _without_metres(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
+    """A mesh's transform to the units of its world, where it says how many metres one has, as `write_glb` does."""
+    metres = extras.get("metres_per_unit")
+    if not isinstance(metres, int | float) or not METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
+        return transform
+    return np.diag([1 / metres] * 3 + [1.0]) @ transform
 
 
 def _placed(loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
