@@ -12,7 +12,7 @@ from __future__ import annotations
 import glob
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -260,7 +260,7 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     candidates = dict.fromkeys(base.with_name(base.name + suffix) for suffix in suffixes)
     if base.suffix:  # x.raw.hdr beside x.RAW
         candidates |= {base.with_suffix(base.suffix.upper()): None}
-    found = [path for path in candidates if path.is_file() and path != header_path]
+    found = _distinct_files(path for path in candidates if path != header_path)
     # Any other file of this name will do if it has just the size.
     others = (
         [] if found or needed_bytes == 0 else sorted(header_path.parent.glob(f"{glob.escape(base.name)}.*"))
@@ -280,6 +280,15 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
             "others away"
         )
     return chosen
+
+
+def _distinct_files(paths: Iterable[Path]) -> list[Path]:
+    """Those that are files, each once: disks that ignore case have one file under `x.img` and `x.IMG`."""
+    found: list[Path] = []
+    for path in paths:
+        if path.is_file() and not any(path.samefile(other) for other in found):
+            found.append(path)
+    return found
 
 
 def envi_cube_paths(path_without_suffix: Path) -> list[Path]:

@@ -425,6 +425,14 @@ def test_of_two_files_of_the_right_size_the_one_named_after_the_interleave_is_me
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "cube.img").read(), ENVI_CUBE)
 
 
+def test_two_names_of_one_file_of_numbers_are_one_file(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq")
+    (tmp_path / "cube").rename(tmp_path / "cube.img")
+    if not (tmp_path / "cube.IMG").exists():  # as on a disk that ignores case
+        (tmp_path / "cube.IMG").hardlink_to(tmp_path / "cube.img")
+    np.testing.assert_array_equal(open_spectral_file(header).read(), ENVI_CUBE)
+
+
 def test_a_key_that_says_two_things_is_refused(tmp_path):
     bands = "wavelength = {400, 500, 600, 700}\n"
     write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", bands + "sensor type = a\nsensor type = b\n" + bands)
