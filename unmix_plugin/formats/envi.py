@@ -246,11 +246,11 @@ def _count(header: Mapping[str, str], key: str, default: str = "", least: int = 
 
 
 def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
-    """The file of numbers that a header describes; of several the first that is large enough.
+    """The file of numbers that a header describes; of several the one of that size, else the first that is larger.
 
     Args:
         header_path: Of the header.
-        needed_bytes: Least size.
+        needed_bytes: Size of what it describes.
         first: Suffix that is preferred: of several files of that size it tells which one is meant.
     Raises:
         ValueError: there is none, or several could be it.
@@ -272,12 +272,13 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
             f"no file of numbers beside this header; expected {usual} (.dat, .raw, .bil, .bip, .bsq, ...) in the same "
             "folder"
         )
-    chosen = next((path for path in found if path.stat().st_size >= needed_bytes), found[0])
-    alike = [path.name for path in found if path.stat().st_size == needed_bytes > 0]
+    alike = [path for path in found if path.stat().st_size == needed_bytes > 0]
+    large = [path for path in found if path.stat().st_size >= needed_bytes]
+    chosen = [*alike, *large, *found][0]
     if len(alike) > 1 and chosen.suffix.lower() != first:
+        names = " and ".join(path.name for path in alike)
         raise ValueError(
-            f"{' and '.join(alike)} could each be what it describes; name the one that is meant, or move the "
-            "others away"
+            f"{names} could each be what it describes; name the one that is meant, or move the others away"
         )
     return chosen
 

@@ -433,6 +433,12 @@ def test_two_names_of_one_file_of_numbers_are_one_file(tmp_path):
     np.testing.assert_array_equal(open_spectral_file(header).read(), ENVI_CUBE)
 
 
+def test_a_file_of_just_the_size_goes_before_a_larger_one_of_any_suffix(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bil")
+    (tmp_path / "cube.bil").write_bytes(bytes(2 * ENVI_CUBE.nbytes))
+    np.testing.assert_array_equal(open_spectral_file(header).read(), ENVI_CUBE)
+
+
 def test_a_key_that_says_two_things_is_refused(tmp_path):
     bands = "wavelength = {400, 500, 600, 700}\n"
     write_envi(tmp_path / "cube.hdr", ENVI_CUBE, "bsq", bands + "sensor type = a\nsensor type = b\n" + bands)
