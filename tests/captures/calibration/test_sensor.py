@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.sensor import _BandChoice, _drop_found, _find_saturation, _noise_shares
+from unmix_plugin.captures.calibration.calibration import open_reference
+from unmix_plugin.captures.calibration.sensor import (
+    _BandChoice,
+    _clipped_bands,
+    _drop_found,
+    _find_saturation,
+    _noise_shares,
+    sampled_rows,
+)
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -76,6 +84,24 @@ def test_a_wavelength_is_used_once():
 def test_the_end_of_the_detector_is_a_plateau(top: int | None, expected: float):
     counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top or 60000).astype(np.uint16)
     assert _find_saturation([file_of(counts)], np.arange(6))[0] == expected
+
+
+def test_numbers_of_missing_pixels_are_not_the_end_of_the_detector():
+    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).astype(np.uint16)
+    counts[::3] = 65535
+    file = file_of(counts, valid_range=(0.0, 10000.0))
+    assert _find_saturation([file], np.arange(6))[0] == 4095.0
+
+
+def test_missing_pixels_of_a_white_do_not_count_as_saturated():
+    counts = GENERATOR.integers(2900, 3100, (16, 8, 3)).astype(np.uint16)
+    counts[1:4, :, 2] = 4095
+    counts[::8] = 65535
+    white = open_reference(file_of(counts, no_data=65535.0), "white reference", file_of(counts))
+    np.testing.assert_array_equal(_clipped_bands(white, 65535.0), [False, False, True])
+    counts[sampled_rows(16)] = 65535  # nothing is left to look at
+    white = open_reference(file_of(counts, no_data=65535.0), "white reference", file_of(counts))
+    assert not _clipped_bands(white, 65535.0).any()
 
 
 def test_a_band_that_is_stuck_does_not_count_as_saturated():

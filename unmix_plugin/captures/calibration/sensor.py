@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.calibration.calibration import (
     Calibration,
     Raster,
     Reference,
+    find_missing,
     is_srgb,
     open_reference,
     panel_reference,
@@ -28,7 +29,7 @@ from unmix_plugin.captures.calibration.calibration import (
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.exposure import Exposures, compare_exposures
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import MOST_WIDTH, CaptureView, SpectralFile
+from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
 from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError, ConfigError, counted, name_some
 
@@ -382,9 +383,7 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
     if not len(bands):
         return None, "none: every band has one value only"
     for file, row in product(files, rows):
-        stored = file.read(slice(row, row + 1), bands).ravel()
-        if file.no_data is not None:
-            stored = stored[stored != file.no_data]
+        stored = _stored_pixels(file, row, bands).ravel()
         counts += np.bincount(stored.astype(np.int64) - low, minlength=len(counts))
     top = int(np.flatnonzero(counts)[-1]) if counts.any() else 0
     below = counts[max(0, top - max(1, (top + low) // 50)) : top]
@@ -394,6 +393,12 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
         return float(number), f"{at_top} sampled values are {number}, none is greater"
     limit = float(np.iinfo(dtype).max)
     return limit, f"no plateau below the end of {dtype.name}; the greatest sampled value is {number}"
+
+
+def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "N b"]:
+    """Stored numbers of the pixels of a row that have a measurement."""
+    stored = file.read(slice(row, row + 1), bands)
+    return stored[~find_missing(stored, file)]
 
 
 def _lit_bands(
@@ -423,8 +428,9 @@ def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarra
     is_clipped = (white.stored_mean >= _NEAR_TOP * saturation).mean(axis=(0, 1)) > _MOST_CLIPPED
     if white.is_view or white.file.dtype.kind not in "iu":
         return is_clipped
-    rows = [white.file.read(slice(row, row + 1))[0] for row in sampled_rows(white.file.shape[0])]
-    stored = np.concatenate(rows)
+    stored = np.concatenate([_stored_pixels(white.file, row) for row in sampled_rows(white.file.shape[0])])
+    if not len(stored):
+        return is_clipped
     ends = [2**bits - 1 for bits in _DETECTOR_BITS if 2**bits - 1 == stored.max()]
     return is_clipped | (np.isin(stored, ends).mean(axis=0) > _MOST_CLIPPED)
 
