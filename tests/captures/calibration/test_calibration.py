@@ -196,6 +196,23 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
         open_reference(file_of(light, no_data=65535.0), "white reference", file_of(light))
 
 
+def test_a_dark_frame_of_zeros_is_measured_where_zero_means_no_data_too():
+    counts = np.random.default_rng(0).integers(0, 2, (LINES, SAMPLES, NUM)).astype(np.uint16)
+    counts[:, :3] = 0
+    dark = open_reference(file_of(counts, no_data=0.0), "dark frame", file_of(counts))
+    np.testing.assert_allclose(dark.mean[0], counts.mean(axis=0), rtol=1e-6)
+    with pytest.raises(CaptureError, match="has columns without a measurement"):
+        open_reference(file_of(counts, no_data=0.0), "white reference", file_of(counts))
+
+
+def test_what_a_reference_lacks_is_told_by_all_of_its_bands():
+    lines, columns = np.indices((LINES, SAMPLES))
+    light = np.full((LINES, SAMPLES, 5), 1000, np.uint16)
+    light[: LINES // 2, :, :4] = (2000 * ((lines + columns) % 2))[: LINES // 2, :, None]
+    white = open_reference(file_of(light, no_data=0.0), "white reference", file_of(light))
+    assert not white.is_per_pixel
+
+
 def test_a_panel_is_what_was_measured_of_its_rectangle():
     counts, _ = _cube()
     counts[2:4, 3] = 65535

@@ -109,9 +109,13 @@ def open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Referen
 
     A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
     camera that takes whole images), and by the mean of its lines otherwise (a line camera). Pixels without a
-    measurement are left out of it. Raises CaptureError: other bands than the cubes, other units, or a column without
-    a measurement.
+    measurement are left out of it, where 0 in a dark frame is one whatever its header says. Raises CaptureError: other
+    bands than the cubes, other units, or a column without a measurement.
     """
+    if (
+        what == "dark frame" and file.no_data == 0
+    ):  # software writes one no-data value into all headers of a capture
+        file = replace(file, no_data=None)
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(
@@ -170,17 +174,23 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
     """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
     height, width, bands = file.shape
     total, count = np.zeros((width, bands)), np.zeros((width, bands))
+    missing = np.zeros((height, width), bool)
     step = max(1, _BLOCK_VALUES // (width * bands))
     for first in range(0, height, step):
-        values = _measured(file, slice(first, min(first + step, height)))
+        lines = slice(first, min(first + step, height))
+        stored = file.read(lines)
+        missing[lines] = find_missing(stored, file)
+        values = stated_values(file, stored, lines)
+        values[missing[lines]] = np.nan
         total += np.nansum(values, axis=0, dtype=np.float64)
         count += np.isfinite(values).sum(axis=0)
     mean = total / np.where(count > 0, count, np.nan)
     judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
     every, patterns = slice(0, height), []
     for band in judged:
-        values = _measured(file, every, np.array([band]))[..., 0]
-        patterns.append(_pattern(np.nan_to_num(values - mean[:, band])))
+        index = np.array([band])
+        values = stated_values(file, file.read(every, index), every, index)[..., 0]
+        patterns.append(_pattern(np.nan_to_num(np.where(missing, 0.0, values - mean[:, band]))))
     return mean[None].astype(np.float32), float(np.median(patterns))
 
 
