@@ -166,9 +166,22 @@ def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     findings = process(capture.root, tmp_path / "scene", **references, white_reflectance="0.02")
     scale = json.loads((tmp_path / "scene" / "process.json").read_text())["decisions"]["scale"]["calibrated"]
     assert scale != 1
-    assert findings[0].startswith(f"values are reflectance divided by {scale:g}, as ")
+    assert findings[0].startswith(f"values (reflectance) were divided by {scale:g}, as ")
     kept = process(capture.root, tmp_path / "kept", **references, white_reflectance="0.02", scale=1.0)
     assert not any("divided by" in finding for finding in kept)
+
+
+@pytest.mark.parametrize("factor", [None, 10])
+def test_numbers_without_a_stated_meaning_are_divided_without_a_warning(tmp_path: Path, factor):
+    capture = make_capture(tmp_path / "capture")
+    for name, values in capture.reflectance.items():
+        header = {"reflectance scale factor": factor}
+        write_cube(capture.root, name, (900 * values).astype(np.float32), header=header)
+    findings = process(capture.root, tmp_path / "scene")
+    assert (
+        json.loads((tmp_path / "scene" / "process.json").read_text())["decisions"]["scale"]["calibrated"] > 1
+    )
+    assert any("divided by" in finding for finding in findings) == (factor is not None)
 
 
 def test_views_come_in_the_order_of_their_numbers(tmp_path: Path):

@@ -109,10 +109,11 @@ def make_plan(
     said += dict.fromkeys(note for view in views for note in view.cube.notes)
     opened = [file for file in (references.dark, references.white) if file is not None]
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
-    if scale != 1.0 and options.scale is None and all(sensor.is_absolute for sensor in sensors.values()):
+    if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
+        units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
         warned.append(
-            f"values are {next(iter(sensors.values())).unit} divided by {scale:g}, as too many are above 1 or all are "
-            f"small: multiply what is exported by {scale:g}, or keep them with --scale 1"
+            f"values ({units}) were divided by {scale:g}, as more than 1 % are above 1 or nearly all are small: "
+            f"multiply exported spectra by {scale:g}, or keep values with --scale 1, which cuts off those above 1"
         )
     each = [(view.name, file) for view in views for file in (view.cube, view.dark, view.white)]
     each += [(file.path.name, file) for file in opened]

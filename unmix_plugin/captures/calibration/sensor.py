@@ -127,6 +127,9 @@ class Sensor:
     warnings: tuple[str, ...] = ()
     """What may make values wrong, one sentence each."""
 
+    is_stated: bool = False
+    """Whether a white reference or the files say what 1 is, which dividing values loses."""
+
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
         """Bands of the scene."""
@@ -211,6 +214,7 @@ def prepare_sensor(
         lamp,
         tuple(notes),
         (*warnings, *exposures.warnings),
+        bool(whites) or (model is None and _states_one(first)),
     )
 
 
@@ -303,6 +307,11 @@ def _each_view(
     return [only if file is None else file for file in files]
 
 
+def _states_one(file: SpectralFile) -> bool:
+    linear = file.linear
+    return linear is not None and (linear.scale is not None or "reflectance" in linear.evidence)
+
+
 def _unit(file: SpectralFile) -> str:
     if is_srgb(file):
         return "linear light of pictures in sRGB"
@@ -312,7 +321,7 @@ def _unit(file: SpectralFile) -> str:
     if file.linear is None:
         return "relative radiance"
     if file.linear.scale is not None:
-        return "values divided by the scale factor of the files"
+        return "stored numbers divided by the scale factor of the files"
     return f"stored numbers times a gain plus an offset ({file.linear.evidence})"
 
 
