@@ -26,6 +26,7 @@ from tests.captures.layouts.rig_flight import (
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -115,6 +116,12 @@ def test_what_is_evaluated_lies_in_the_middle_of_a_flight(count, evaluated):
     names = [f"IMG_{number:04d}" for number in range(count)]
     splits = _splits_of(names)
     assert [number for number, name in enumerate(names) if splits[name] == "eval"] == evaluated
+
+
+def test_splits_do_not_depend_on_the_order_in_which_releases_come():
+    names = ["shot_1", "shot_01", "Shot_1", "shot_001"]
+    in_order = ["Shot_1", "shot_001", "shot_01", "shot_1"]
+    assert sorted(names, key=natural_order) == in_order == sorted(in_order, key=natural_order)
 
 
 def _beside_green(content, frames, release):

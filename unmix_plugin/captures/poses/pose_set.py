@@ -137,13 +137,14 @@ def path_text(text: str) -> str:
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers in names by their size.
+    """A key that sorts numbers in names by their size; no two names have one.
 
     >>> sorted(["view_10", "view_9"], key=natural_order)
     ['view_9', 'view_10']
     """
     parts = re.split(r"(\d+)", name.lower())
-    return [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
+    keys = [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
+    return [*keys, (-2, name)]
 
 
 def make_pose_set(
