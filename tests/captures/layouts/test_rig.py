@@ -71,7 +71,12 @@ def test_every_file_is_a_view_of_its_lens_and_release(flight):
 def test_what_is_left_out_or_ignored_is_said(flight):
     notes = " ".join(find_rig(flight, PLAIN).notes)
     assert "1 colour picture left out" in notes
-    assert "EXIF's orientation of 40 files is ignored" in notes
+
+
+def test_an_orientation_that_is_ignored_is_said_once(scene):
+    report = (scene / "report.txt").read_text()
+    assert report.count("EXIF's orientation") == 1
+    assert "EXIF's orientation of 40 of 40 pictures is ignored" in report
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)

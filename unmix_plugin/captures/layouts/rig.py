@@ -134,13 +134,11 @@ def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[Ca
 def _notes(
     opened: Sequence[_BandFile], bands: Sequence[_BandFile], paths: Iterable[Path], releases: Sequence[str]
 ) -> list[str]:
-    """What was left out or ignored, and what is incomplete."""
+    """What was left out, and what is incomplete."""
     notes = []
     thermal = sum(item.file.shape[2] == 1 and _is_thermal(item.file) for item in opened)
     colour = sum(item.file.shape[2] > 1 for item in opened)
     colour += sum(path.suffix.lower() in _COLOUR_SUFFIXES for path in paths)
-    exif = [item.file.metadata.get("exif") or {} for item in bands]
-    turned = sum((exif_number(values, "Orientation") or 1) > 1 for values in exif)
     counts = Counter(releases)
     incomplete = [release for release, count in counts.items() if count < max(counts.values())]
     if thermal:
@@ -153,9 +151,6 @@ def _notes(
     if colour:
         pictures = f"{counted(colour, 'colour picture')} left out"
         notes.append(f"{pictures}: nothing says what their channels measure")
-    if turned:
-        ignored = f"EXIF's orientation of {counted(turned, 'file')} is ignored"
-        notes.append(f"{ignored}: poses and lenses refer to the stored raster")
     if incomplete:
         notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
     return notes
