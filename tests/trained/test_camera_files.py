@@ -72,6 +72,12 @@ def test_frames_are_read_in_the_scenes_own_world(tmp_path):
     torch.testing.assert_close(camera.center_px, torch.tensor([[48.0, 30.0]]))
 
 
+def test_names_that_would_give_one_file_are_numbered(tmp_path):
+    entries = [{"name": name, "transform_matrix": POSE.tolist()} for name in ("leaf a", "leaf  a", "stem")]
+    found = read_camera_file(written(tmp_path, frames(frames=entries)), FRAME)
+    assert [view.name for view in found.views] == ["0_leaf_a", "1_leaf_a", "2_stem"]
+
+
 def test_frames_may_be_in_model_space_and_are_a_path_if_they_have_a_speed(tmp_path):
     found = read_camera_file(written(tmp_path, frames(space="model", fps=12.5)), FRAME)
     np.testing.assert_allclose(found.views[0].camera.camera_to_world[0], POSE[:3], atol=1e-6)

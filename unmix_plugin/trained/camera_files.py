@@ -264,7 +264,8 @@ def _needed_number(values: dict[str, Any], key: str, where: Path | str) -> float
 
 
 def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
-    """`name` of the frames, otherwise the name of their picture or cube, otherwise numbers."""
+    """`name` of the frames, otherwise the name of their picture or cube, otherwise numbers; names that would give one
+    file are numbered."""
     numbers = [f"frame_{index:04d}" for index in range(len(entries))]
     for key in ("name", "file_path", "hyperspectral_file_path"):
         values = [entry.get(key) for entry in entries]
@@ -274,6 +275,8 @@ def _names(entries: Sequence[dict[str, Any]], path: Path) -> list[str]:
         names = [safe_name(stem) for stem in stems]
         if len({name.casefold() for name in names}) == len(names):
             return names
-        if key == "name":
+        if key == "name" and len(set(stems)) < len(stems):
             raise ConfigError(f"{path}: two frames have one name")
+        if key == "name":
+            return [safe_name(f"{index}_{name}") for index, name in enumerate(names)]
     return numbers
