@@ -16,6 +16,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import spectral.io.envi as envi
+import torch
 from PIL import Image
 from plyfile import PlyData
 
@@ -387,6 +388,44 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exp
     assert facts["material"] == max(facts["abundances"], key=facts["abundances"].get)
     assert len(facts["library"]) == 3
     assert min(picture_size(base.with_suffix(".png"))) > 300
+
+
+def test_a_place_has_mean_and_spread_of_what_the_views_measured_that_see_it(solid, tmp_path, monkeypatch):
+    words = [
+        "spectrum",
+        "--view",
+        0,
+        "--pixel",
+        "8,8",
+        "--run",
+        solid.run,
+        "--output",
+        tmp_path,
+        "--overwrite",
+    ]
+    assert (
+        "fewer than two training views see the place" in run(export, *words).out
+    )  # only the hull stands yet
+    monkeypatch.setattr("unmix_plugin.products.spectrum._SAME_PLACE_PX", np.inf)
+    monkeypatch.setattr("unmix_plugin.products.spectrum._WHOLE", 0.0)
+    assert run(export, *words).status == 0
+    loaded, scene = load_run(solid.run, "cpu"), load_scene(solid.scene, SceneOptions())
+    facts = json.loads((tmp_path / "eval_002_x8_y8.json").read_text())
+    place = torch.from_numpy(loaded.scene.frame.to_model(np.array(facts["world_position"]))).float()
+    spectra = []
+    for row, index in enumerate(scene.train_indices):
+        coords, depths = loaded.record.train_cameras.project(place[None], row)
+        x, y = coords[0].floor().long().tolist()
+        if depths[0] > 0 and 0 <= x < 16 and 0 <= y < 16:
+            spectra.append(scene.cube(index)[y, x].astype(float))
+    assert facts["measured_in_views"] == len(spectra) >= 2
+    with (tmp_path / "eval_002_x8_y8.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name, expected in (
+        ("mean over views", np.mean(spectra, axis=0)),
+        ("standard deviation over views", np.std(spectra, axis=0, ddof=1)),
+    ):
+        np.testing.assert_allclose([float(row[name]) for row in rows], expected, atol=1e-6)
 
 
 def test_a_view_goes_by_its_number_too_and_a_point_by_its_coordinates(solid, tmp_path):

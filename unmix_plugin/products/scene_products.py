@@ -303,8 +303,8 @@ class Segmentation(ViewProduct):
 @dataclass(frozen=True)
 class Spectrum(Product):
     """Spectrum of a pixel (--view 3 --pixel 120,80), of a point of space (--point=0.1,-0.2,0.5) or of a kept region
-    (--region NAME, with its standard deviation): predicted, and of a pixel measured where the scene folder is found, as
-    CSV and plot; abundances and nearest known materials as JSON."""
+    (--region NAME, with its standard deviation): predicted, and measured where the scene folder is found, with the
+    spread over training views, as CSV and plot; abundances and nearest known materials as JSON."""
 
     name = "spectrum"
 

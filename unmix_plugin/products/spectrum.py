@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from unmix_plugin.errors import ConfigError
@@ -23,6 +24,7 @@ from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measured_surface
 from unmix_plugin.products.scene_products import Spectrum
+from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import describe_scale
@@ -40,12 +42,16 @@ from unmix_plugin.trained.run_views import RunView, find_view
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _MOST_BARS = 12
+_SAME_PLACE_PX = 2.0
+"""How far from a place a view may end, in its pixels, so that it is taken to see it."""
+_WHOLE = 0.95
+"""Alpha from which a pixel shows one thing."""
 
 
 def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
     """Probe a place and write what is there."""
     view_name, pixel_text, point_text, region = asked.view, asked.pixel, asked.point, asked.region
-    measured = spread = None
+    measured = over_views = spread = None
     others = (view_name, pixel_text, point_text)
     if region is not None and others == (None, None, None):
         title, name = f"region {region}", safe_name(f"region_{region}", NOT_PORTABLE)
@@ -65,6 +71,7 @@ def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
         probe = job.scene.probe_point(point[0], point[1], point[2])
         facts = {"point": point}
         title = f"point {', '.join(f'{value:g}' for value in point)}"
+        over_views = _over_views(job, _scene_of(job, asked.data), probe)
     elif point_text is None and view_name is not None and pixel_text is not None:
         if not re.fullmatch(r"\s*\d+\s*,\s*\d+\s*", pixel_text):
             raise ConfigError(f"--pixel {pixel_text} is not a column and a row from 0, such as 120,80")
@@ -75,7 +82,8 @@ def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
         probe = job.scene.probe(view.camera, column, row)
         facts = {"view": view.name, "pixel": [column, row]}
         title = f"{view.name}, column {column}, row {row}"
-        measured = _measured(job, view, (column, row), asked.data)
+        scene = _scene_of(job, asked.data)
+        measured, over_views = _measured(job, scene, view, (column, row)), _over_views(job, scene, probe)
     else:
         raise ConfigError(
             "give a pixel with --view and --pixel, a point with --point, or a region with --region"
@@ -89,7 +97,7 @@ def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
     else:
         spectra, bands = probe.spectra["predicted"][None], job.materials.bands
         [matches] = shown_matches(spectra, bands, light, known, asked.compare)
-    probed = _ProbedPlace(title, facts, probe, measured, matches, spread)
+    probed = _ProbedPlace(title, facts, probe, measured, matches, spread, over_views)
     written = _write_spectrum(job.folder, name, probed, job.scene)
     if spread is not None:
         mean = probe.spectra["predicted"][None].astype(np.float32)
@@ -97,21 +105,78 @@ def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
     return written
 
 
-def _measured(
-    job: Job, view: RunView, pixel: tuple[int, int], data: Path | None
-) -> Float[np.ndarray, " B"] | None:
-    """What the scene has in a pixel, in the light asked for."""
+def _scene_of(job: Job, data: Path | None) -> Scene | None:
+    """The scene folder, for what was measured."""
     with job.working("looking for the scene"):
         scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, data)
-    names = [] if scene is None else [frame.name for frame in scene.frames]
-    if scene is None or view.name not in names:
-        job.say("the scene folder was not found: no measured spectrum; give it with --data")
-        return None
-    if not scene.sensor_of(names.index(view.name)).sees_all_bands:
-        job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+    if scene is None:
+        job.say("the scene folder was not found: no measured spectra; give it with --data")
+    return scene
+
+
+def _measured(
+    job: Job, scene: Scene | None, view: RunView, pixel: tuple[int, int]
+) -> Float[np.ndarray, " B"] | None:
+    """What the scene has in a pixel, in the light asked for."""
+    index = None if scene is None else _with_all_bands(scene).get(view.name)
+    if scene is None or index is None:
+        if scene is not None:
+            job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
         return None
     recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
-    return relit(scene.cube(names.index(view.name))[pixel[1], pixel[0]], recorded, light)
+    return relit(scene.cube(index)[pixel[1], pixel[0]], recorded, light)
+
+
+def _with_all_bands(scene: Scene) -> dict[str, int]:
+    """Views that sensors of all bands took: their numbers by name."""
+    frames = enumerate(scene.frames)
+    return {frame.name: index for index, frame in frames if scene.sensor_of(index).sees_all_bands}
+
+
+@dataclass(frozen=True)
+class _OverViews:
+    """What training views measured of one place."""
+
+    spectra: Float[np.ndarray, "N B"]
+    """In the light of the prediction, one of each view that sees it."""
+
+    @property
+    def mean(self) -> Float[np.ndarray, " B"]:
+        """Over the views."""
+        return self.spectra.mean(axis=0)
+
+    @property
+    def spread(self) -> Float[np.ndarray, " B"]:
+        """Standard deviation over the views: noise, gloss, light that moves, and what poses or the surface are off."""
+        return self.spectra.std(axis=0, ddof=1)
+
+
+def _over_views(job: Job, scene: Scene | None, probe: Probe) -> _OverViews | None:
+    """What the training views that see a probed place measured of it; None where fewer than two do."""
+    if scene is None or probe.position is None or probe.opacity < OCCUPIED_ACCUMULATION:
+        return None
+    place, numbers = torch.from_numpy(probe.position).float(), _with_all_bands(scene)
+    recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
+    spectra = []
+    for view in job.follow("looking at the place", job.views("train")):
+        index, camera = numbers.get(view.name), view.camera.to("cpu")
+        coords, depths = camera.project(place[None], 0)
+        (column, row), (width, height) = coords[0].floor().long().tolist(), camera.size(0)
+        if index is None or depths[0] <= 0 or not (0 <= column < width and 0 <= row < height):
+            continue
+        seen = job.scene.probe(camera, column, row)
+        pixel = float(depths[0] / camera.focal_px[0].min())
+        if seen.position is None or seen.opacity < OCCUPIED_ACCUMULATION:
+            continue
+        alpha = scene.alpha(index)
+        is_whole = scene.valid_mask(index)[row, column] and (alpha is None or alpha[row, column] >= _WHOLE)
+        if is_whole and np.linalg.norm(seen.position - probe.position) <= _SAME_PLACE_PX * pixel:
+            measured = scene.cube(index, (slice(row, row + 1), slice(column, column + 1)))[0, 0]
+            spectra.append(relit(measured, recorded, light).astype(np.float64))
+    if len(spectra) < 2:
+        job.say("fewer than two training views see the place: no spread over views")
+        return None
+    return _OverViews(np.stack(spectra))
 
 
 @dataclass(frozen=True)
@@ -129,6 +194,8 @@ class _ProbedPlace:
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
     spread: Float[np.ndarray, " B"] | None = None
     """Standard deviation, of a region."""
+    over_views: _OverViews | None = None
+    """What training views measured."""
 
 
 def _spectrum_paths(folder: Path, name: str) -> list[Path]:
@@ -136,7 +203,8 @@ def _spectrum_paths(folder: Path, name: str) -> list[Path]:
 
 
 def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: TrainedScene) -> list[Path]:
-    """Write NAME.csv (`wavelength,predicted,...`, `measured` where it is known), NAME.json (where the place is, its
+    """Write NAME.csv (`wavelength,predicted,...`, `measured` and mean and standard deviation over views where they are
+    known), NAME.json (where the place is, its
     opacity, abundances and nearest known materials) and NAME.png, a plot.
     """
     materials = scene.materials
@@ -144,6 +212,9 @@ def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: Trained
     columns = dict(place.probe.spectra)
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
+    if place.over_views is not None:
+        columns["mean over views"] = place.over_views.mean
+        columns["standard deviation over views"] = place.over_views.spread
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     table = SpectraTable(materials.bands, tuple(columns), np.stack(list(columns.values())))
@@ -169,6 +240,10 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
         lines.fill_between(
             wavelengths, mean - place.spread, mean + place.spread, color="0.85", label="± 1 std. dev."
         )
+    if place.over_views is not None:
+        mean, spread = place.over_views.mean, place.over_views.spread
+        label = f"{len(place.over_views.spectra)} training views, ± 1 std. dev."
+        lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
         lines.plot(wavelengths, shown.spectrum, linestyle=style, linewidth=1.3, label=label)
@@ -209,6 +284,7 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         **place.facts,
         "world_position": None if position is None else position.tolist(),
         "opacity": probe.opacity,
+        "measured_in_views": None if place.over_views is None else len(place.over_views.spectra),
         "material": max(shares, key=lambda name: shares[name]) if is_something else None,
         "abundances": shares,
         "library": [match_json(shown.match) for shown in place.matches],
