@@ -100,7 +100,15 @@ def in_config(path):
     (path / "config.json").write_text(json.dumps(values))
 
 
+def as_before_format_6(path):
+    values = json.loads((path / "config.json").read_text())
+    values["format_version"] = 5
+    values["config"]["pipeline"]["datamanager"]["grid_resolution"] = "auto"
+    (path / "config.json").write_text(json.dumps(values))
+
+
 SPOILT = {
+    "settings of an older version": (as_before_format_6, "format 5, written by an older version"),
     "tensors of NaN": (spoilt_tensors(float("nan")), "has values that are not finite"),
     "tensors of infinity": (spoilt_tensors(float("inf")), "has values that are not finite"),
     "piped config.json": (piped("config.json"), "config.json missing"),
