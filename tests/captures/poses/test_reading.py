@@ -159,6 +159,10 @@ def test_focal_lengths_in_degrees_and_as_a_matrix(tmp_path):
         frame["intrinsic_matrix"] = matrix
     lens = lens_of(read(tmp_path, content))
     assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
+    for frame in content["frames"]:
+        frame |= {"fl_x": None, "cy": None}
+    lens = lens_of(read(tmp_path, content))
+    assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
     matrix[0][1] = 2
     with pytest.raises(CaptureError, match="skew 2; expected focal lengths above 0 and no skew"):
         read(tmp_path, content)

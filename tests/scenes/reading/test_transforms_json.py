@@ -7,7 +7,9 @@ import pytest
 
 from tests.scenes.scene_factory import SceneFolder, fault_of, make_scene, set_frame
 from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.scenes.reading.transforms_json import read_lens
 
 
 @pytest.fixture
@@ -28,6 +30,19 @@ def test_a_file_in_place_of_the_folder_is_named(folder):
 def test_an_absent_transforms_json_is_named(folder):
     (folder.root / "transforms.json").unlink()
     assert "transforms.json: is not in the scene folder" in fault_of(folder)
+
+
+def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):
+    params = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
+    content = {"fl_x": 500.0, "camera_model": "OPENCV_FISHEYE", "distortion_params": params, "w": 64}
+    faults = Faults(tmp_path)
+    expected = read_lens(content, {}, "frame 0", faults)
+    assert expected is not None
+    assert expected.model == "OPENCV_FISHEYE"
+    assert read_lens(content, dict.fromkeys(content), "frame 0", faults) == expected
+    read_lens({**content, "k6": 0.1}, {"k6": None}, "frame 0", faults)
+    with pytest.raises(SceneError, match="'k6' is set"):
+        faults.raise_if_any()
 
 
 @pytest.mark.parametrize(

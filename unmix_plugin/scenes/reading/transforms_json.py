@@ -108,19 +108,19 @@ def read_lens(
         None, with noted faults, if a number is impossible.
     """
     noted_before = faults.noted
-    for message in refused_keys(content, frame, is_scene):
-        faults.add(where, message)
     own, common = (
-        _read_intrinsic_matrix(one.get("intrinsic_matrix"), where, faults) | one for one in (frame, content)
+        _read_intrinsic_matrix(one.get("intrinsic_matrix"), where, faults)
+        | {key: value for key, value in one.items() if value is not None}
+        for one in (frame, content)
     )
-    has_angle, has_focal = (
-        any(own.get(key) is not None for key in keys) for keys in (_ANGLE_KEYS, _FOCAL_KEYS)
-    )
+    for message in refused_keys(common, own, is_scene):
+        faults.add(where, message)
+    has_angle, has_focal = (any(key in own for key in keys) for keys in (_ANGLE_KEYS, _FOCAL_KEYS))
     if has_angle and not has_focal:  # which the focal length of others would go before
         common = {key: value for key, value in common.items() if key not in _FOCAL_KEYS}
 
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
-        source = own if own.get(key) is not None else common
+        source = own if key in own else common
         value = source.get(key)
         number, owner = read_number(value), FILE_NAME if source is common else where
         if value is not None and (number is None or abs(number) > _GREATEST_PX):
@@ -144,7 +144,7 @@ def read_lens(
         for angle, field in zip(angles, fields, strict=True)
     )
     bending = [read(key, -_GREATEST_PX, _GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
-    listed = frame.get("distortion_params", content.get("distortion_params"))
+    listed = own.get("distortion_params", common.get("distortion_params"))
     if listed is not None:
         bending = [read_number(value) for value in listed] if isinstance(listed, list) else []
         are_sound = all(number is not None and abs(number) <= _GREATEST_PX for number in bending)
@@ -155,7 +155,7 @@ def read_lens(
         return None
     width, height = (None if side is None else int(side) for side in sides)
     k1, k2, k3, k4, p1, p2 = (number or 0.0 for number in bending)
-    model = _read_model(content, frame, where, faults)
+    model = _read_model(common | own, where, faults)
     if faults.noted > noted_before:
         return None
     return Intrinsics(
@@ -163,11 +163,11 @@ def read_lens(
     )
 
 
-def _read_model(content: dict[str, Any], frame: dict[str, Any], where: str, faults: Faults) -> Any:
+def _read_model(lens: dict[str, Any], where: str, faults: Faults) -> Any:
     """The lens model: `camera_model`, or instant-ngp's `is_fisheye`; a fault where they contradict each other."""
-    model = frame.get("camera_model", content.get("camera_model"))
+    model = lens.get("camera_model")
     model = model.upper() if isinstance(model, str) else model
-    if frame.get("is_fisheye", content.get("is_fisheye")):
+    if lens.get("is_fisheye"):
         if model not in (None, "OPENCV_FISHEYE"):
             faults.add(where, f"'is_fisheye' is true and camera_model {describe(model)}; drop one of them")
         return "OPENCV_FISHEYE"
@@ -200,7 +200,7 @@ def read_intrinsics(
     model = "OPENCV" if lens is None else lens.model
     if model not in _SUPPORTED_MODELS:
         faults.add(
-            where if "camera_model" in frame else FILE_NAME,
+            where if frame.get("camera_model") is not None else FILE_NAME,
             f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
             "unmix-process brings such pictures into an OPENCV lens",
         )
