@@ -319,6 +319,24 @@ def test_a_full_cache_is_told_as_one_with_a_way_out(tmp_path, monkeypatch):
         demo_scene_path(tmp_path / "cache")
 
 
+@pytest.mark.parametrize(
+    ("said", "reason"),
+    [
+        ("encoder error -2 when writing image file", "the disk is full (encoder error -2"),
+        ("cannot write mode F as PNG", ": cannot write mode F as PNG;"),
+    ],
+)
+@pytest.mark.usefixtures("small_default")
+def test_only_what_says_so_is_called_a_full_disk(tmp_path, monkeypatch, said, reason):
+    def fail(*_):
+        raise OSError(said)
+
+    monkeypatch.setattr(np, "save", fail)
+    with pytest.raises(SceneError) as refused:
+        demo_scene_path(tmp_path / "cache")
+    assert reason in str(refused.value)
+
+
 def test_without_a_home_folder_the_demo_scene_says_how_to_name_one(monkeypatch):
     def fail():
         raise RuntimeError("Could not determine home directory.")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -145,9 +146,13 @@ def written_once(
     return target
 
 
+_DISK_FULL = re.compile(r"\d+ requested and \d+ written|encoder error")
+"""What numpy and Pillow say of a full disk, without the system's own words."""
+
+
 def _why(error: OSError) -> str:
-    """What went wrong with a file; numpy and Pillow have numbers of their own for a full disk."""
-    return error.strerror or f"the disk is full ({error})"
+    """What went wrong with a file."""
+    return error.strerror or (f"the disk is full ({error})" if _DISK_FULL.search(str(error)) else str(error))
 
 
 def demo_cameras(size: int, views: int, angle_deg: float = _VIEW_ANGLE_DEG) -> Cameras:
