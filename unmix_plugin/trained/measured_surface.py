@@ -118,10 +118,10 @@ class MeasuredSurface:
         weights = self.vertex_areas(shares)
         area = float(weights.sum())
         if area <= 0:
-            low, high = (self.scene.frame.to_world(self.mesh.vertices).round(3) for _ in range(2))
+            world = self.scene.frame.to_world(self.mesh.vertices).round(3)
             raise ConfigError(
                 f"the region {name} has nothing of the surface in it, which lies between "
-                f"{' '.join(f'{x:g}' for x in low.min(axis=0))} and {' '.join(f'{x:g}' for x in high.max(axis=0))} "
+                f"{' '.join(f'{x:g}' for x in world.min(axis=0))} and {' '.join(f'{x:g}' for x in world.max(axis=0))} "
                 "of the world"
             )
         share = weights / area
