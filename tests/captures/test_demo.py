@@ -223,7 +223,7 @@ def test_estimated_poses_are_those_of_the_truth(tmp_path, monkeypatch):
     assert loaded.placement.is_identity, "exports come out in the upright world of transforms.json"
     report = (scene / "report.txt").read_text()
     assert "- bands left out: 400 nm, 509.091 nm (marked as bad in the file)\n" in report
-    assert "- bands left out: 618.182 nm (noisy)\n" in report
+    assert "- bands left out: 618.182 nm (the white reference is saturated there)\n" in report
     assert "- saturation: from 65535 (" in report
 
 
