@@ -25,9 +25,9 @@ from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.measured_surface import MeasuredSurface
-from unmix_plugin.trained.measures import read_measures
+from unmix_plugin.trained.measures import keep_region, read_measures
 from unmix_plugin.trained.model_scene import ModelScene
-from unmix_plugin.trained.regions import InView
+from unmix_plugin.trained.regions import Box, InView
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.rendering.painting import BACKGROUNDS
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
@@ -253,6 +253,18 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
             page.set("remove the region", True)
             page.wait_until(lambda name=name: name not in options())
         assert read_measures(source.run).regions == {}
+
+
+def test_numbers_of_a_region_go_when_one_is_chosen_that_cannot_be_measured(tmp_path):
+    source = make_source(tmp_path, initial_opacity=0.6)
+    keep_region(source.run, "all of it", Box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0)))
+    keep_region(source.run, "far away", Box((50.0, 50.0, 50.0), (51.0, 51.0, 51.0)))
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        page.set("region", "all of it")
+        page.wait_until(lambda: " square units</td>" in page.texts)
+        page.set("region", "far away")
+        page.wait_until(lambda: any("far away has nothing" in text for _, text in page.notices))
+        assert " square units</td>" not in page.texts
 
 
 def test_depth_comes_with_objects_and_goes_with_them(viewer):

@@ -146,10 +146,10 @@ class RegionsPanel:
         self._show_chosen()
 
     def _show_chosen(self) -> None:
+        self._show(None)  # numbers of another region never stand under this name while it is measured
         regions, name = self._session.services.regions, str(self._chosen.value)
         region = regions.kept.get(name)
         if region is None:
-            self._show(None)
             return
         found = regions.measured(region)
         if found is None:
