@@ -25,7 +25,8 @@ class RunRegions:
 
     def __init__(self, maker: PictureMaker) -> None:
         self._maker, self._source = maker, maker.source
-        self._lock = threading.Lock()
+        self._measuring, self._keeping = threading.Lock(), threading.Lock()
+        """Apart, since finding the surface takes minutes, in which regions are kept and removed all the same."""
         self._surface: MeasuredSurface | None = None
         self._measured: dict[str, MeasuredRegion] = {}
         """By what a region is, as JSON: names may be given anew."""
@@ -51,7 +52,7 @@ class RunRegions:
             RunError: no camera of the run sees a surface.
         """
         self._source.require_final("measure regions")
-        with self._lock:
+        with self._measuring:
             surface = self._surface = self._surface or self._find_surface(show)
             show(f"measuring {name}")
             with self._turn():
@@ -65,7 +66,7 @@ class RunRegions:
         Raises:
             ConfigError: the name can't be one, or there are too many.
         """
-        with self._lock:
+        with self._keeping:
             keep_region(self._source.run, name, region)
 
     def _find_surface(self, show: Callable[[str], None]) -> MeasuredSurface:
