@@ -125,10 +125,28 @@ def test_names_of_areas_of_materials_are_refused():
         check_name("material leaf")
 
 
-@pytest.mark.parametrize("name", ["", " ", "../x", "a/b", ".x", "a\nb", "x" * 65])
-def test_names_that_no_file_can_have_are_refused(name):
+@pytest.mark.parametrize(
+    "name",
+    ["", " ", "../x", "a/b", ".x", "leaf.", "a\nb", "con", "x" * 65, "=1+1", "+x", "-x", "@SUM(A1)"],
+)
+def test_names_that_no_file_can_have_or_that_tables_take_for_formulas_are_refused(name):
     with pytest.raises(ConfigError, match="can't be the name of a region"):
         check_name(name)
+
+
+def test_names_that_differ_in_capitals_are_refused_since_some_systems_take_their_files_for_one(tmp_path):
+    run = RunFolder(tmp_path)
+    for material in (0, 1):
+        keep_region(run, "Leaf", OfMaterial(material))
+    with pytest.raises(ConfigError, match="'leaf' can't be the name of a region: 'Leaf' is one"):
+        keep_region(run, "leaf", OfMaterial(0))
+    with pytest.raises(ConfigError, match="no region 'leaf'"):
+        keep_region(run, "leaf", None)
+    assert read_measures(run).regions == {"Leaf": OfMaterial(1)}
+
+
+def test_letters_with_accents_are_the_same_however_they_are_composed():
+    assert check_name(" e\u0301pave (2) ") == "\u00e9pave (2)"
 
 
 @pytest.mark.parametrize(
@@ -137,6 +155,7 @@ def test_names_that_no_file_can_have_are_refused(name):
         [],
         {"../x": {"kind": "material", "material": 0}},
         {"x": {"kind": "sphere"}},
+        {name: {"kind": "material", "material": 0} for name in ("x", "X")},
         {"x": {"kind": "material", "material": -1}},
         {"x": {"kind": "box", "low": [0, 0, 0], "high": [1, 1]}},
         {"x": {"kind": "box", "low": [0, 0, 0], "high": [1, 0, 1]}},

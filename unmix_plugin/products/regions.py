@@ -83,7 +83,7 @@ def change_regions(job: Job, name: str | None, removed: str | None, asked: Regio
         return [keep_region(job.loaded.folder, removed, None)]
     if name is None or removed is not None:
         raise ConfigError("give --add NAME with what the region is, or --remove NAME alone")
-    name, region = check_name(name), _requested(job, asked)
+    name, region = check_name(name, job.loaded.measures.regions), _requested(job, asked)
     found = measured_surface(job).measure(region, name)
     path = keep_region(job.loaded.folder, name, region)
     job.say(f"{name}: {found.said(job.materials.names, job.scene.scale)}")

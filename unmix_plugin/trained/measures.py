@@ -168,7 +168,8 @@ def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
     Raises:
         ConfigError: the name can't be one, there are too many regions, or there is none to remove.
     """
-    name, measures = check_name(name), read_measures(run)
+    measures = read_measures(run)
+    name = check_name(name, () if region is None else measures.regions)
     if region is None:
         measures.region(name)
     regions = {key: kept for key, kept in measures.regions.items() if key != name}
@@ -250,7 +251,7 @@ def _scale_from_json(values: Any) -> Scale | None:
 def _regions_from_json(values: Any) -> dict[str, Region]:
     if len(values) > MOST_REGIONS:
         raise ValueError(f"{len(values)} regions, more than {MOST_REGIONS}")
-    return {check_name(name): region_from_json(region) for name, region in values.items()}
+    return {check_name(name, values): region_from_json(region) for name, region in values.items()}
 
 
 def _path(run: RunFolder) -> Path:

@@ -5,7 +5,8 @@ Notation: `H x W` pixels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -14,6 +15,7 @@ from jaxtyping import Bool
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import NOT_PORTABLE, safe_name
 
 MOST_REGIONS = 256
 """That are kept with a run."""
@@ -70,23 +72,32 @@ class InView:
 Region: TypeAlias = Box | OfMaterial | InView
 
 
-def check_name(name: str) -> str:
+def check_name(name: str, others: Iterable[str] = ()) -> str:
     """A name for a region, without spaces around it.
 
+    Args:
+        others: Names of the run's regions, whose files the new one's must not replace on any system; the same name
+            may be among them.
     Raises:
-        ConfigError: it can't be one, or not that of a file.
+        ConfigError: it can't be one, not that of a file, tables take it for a formula, or another differs in capitals.
     """
-    name = name.strip()
+    name = unicodedata.normalize("NFC", name.strip())
     if (
         not 0 < len(name) <= _LONGEST_NAME
-        or not name.isprintable()
-        or set(name) & set('/\\:,"<>|?*')
-        or name[0] == "."
+        or name != safe_name(name, NOT_PORTABLE)
+        or "," in name
+        or name[0] in "=+-@"
     ):
         raise ConfigError(
-            f"{name[:80]!r} can't be the name of a region; expected 1 to {_LONGEST_NAME} letters, digits, "
-            "spaces, - or _"
+            f"{name[:80]!r} can't be the name of a region; expected a name that a file can have on every system: 1 to "
+            f"{_LONGEST_NAME} letters, digits, spaces, - or _, the first a letter or digit"
         )
+    for other in others:
+        if other != name and other.casefold() == name.casefold():
+            raise ConfigError(
+                f"{name!r} can't be the name of a region: {other!r} is one, and some systems take names of files that "
+                "differ in capitals for the same"
+            )
     if name.startswith("material "):
         raise ConfigError(
             f"{name!r} can't be the name of a region: exports name areas of materials so; choose one that does not "

@@ -103,11 +103,11 @@ class RegionsPanel:
         self._draw()
 
     def _keep(self) -> None:
-        name, camera, outline = check_name(text(self._name.value)), self._camera, self._outline
+        regions, camera, outline = self._session.services.regions, self._camera, self._outline
+        name = check_name(text(self._name.value), regions.kept)
         if camera is None or len(outline) < 3:
             raise ConfigError("draw a region first: two corners of a box, or three or more of a polygon")
         region = InView.of_mask(camera, polygon_mask(outline, camera.size(0)))
-        regions = self._session.services.regions
 
         def keep() -> None:
             regions.keep(name, region)
