@@ -216,9 +216,8 @@ DEMO_KINDS = {"velvet": _velvet, "car paint": _car_paint, "coated wood": _coated
 def demo_surface() -> LayeredSurface:
     """The materials of the built-in object."""
     rng = np.random.default_rng([2, 0])
-    rng.choice(
-        _NUM_KINDS, size=len(DEMO_KINDS), replace=False
-    )  # draws the kinds, in the order that they have above
+    # Thrown away: the kinds are fixed now, and without this draw all that follow, and so the object, would be others.
+    rng.choice(_NUM_KINDS, size=len(DEMO_KINDS), replace=False)
     return LayeredSurface(DEMO_KINDS, rng)
 
 
