@@ -48,7 +48,7 @@ _OUT_OF_MEMORY = (
 
 _MEMORY_ADVICE = (
     "Close other programs; use fewer, smaller or more coarsely binned images; lower "
-    "--pipeline.model.eval-num-rays-per-chunk in training; or take a machine with more memory"
+    "--pipeline.model.eval-num-rays-per-chunk in training of unmix-nerf; or take a machine with more memory"
 )
 
 

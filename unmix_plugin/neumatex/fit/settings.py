@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
+import tyro
 
 from unmix_plugin.engine import Common, ModelConfig, Target, config_from_json, short
 from unmix_plugin.errors import require
@@ -107,6 +108,8 @@ class NeumatexModelConfig(ModelConfig):
     """What is fitted, and how it is rendered meanwhile."""
 
     _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 32_768
+    """No flag: pictures are traced in parts of a size of their own."""
     material: Annotated[MaterialName, Common] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
     metallicity), or for pictures of many bands spectral (a mixture of endmember reflectances under a grey gloss)."""
