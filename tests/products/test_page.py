@@ -1,6 +1,8 @@
 """The page of a ball that is known exactly, drawn in a browser: regions, known spectra, absorptions, large surfaces."""
 
+import base64
 import csv
+import gzip
 import io
 import json
 from contextlib import nullcontext
@@ -12,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
 from tests.products.ball_model import ALL_ROUND, RADIUS, SHADE, ball_scene, cameras_around
@@ -118,13 +121,51 @@ def test_a_surface_of_too_many_triangles_is_made_coarser_and_that_is_said(export
     assert any("triangles is made again with" in text for text in said)
 
 
-def test_a_page_that_a_mail_would_not_take_is_made_coarser_and_that_is_said(exported, tmp_path, monkeypatch):
+def test_a_page_keeps_both_limits_and_each_surface_is_made_once(exported, tmp_path, monkeypatch):
+    tried: list[int] = []
+    found = page.find_surface
+    monkeypatch.setattr(page, "find_surface", lambda job, cells: tried.append(cells) or found(job, cells))
+    most = round(1.15 * exported[0]["arrays"]["faces"]["count"] / 3)
     fixed = 900_000  # bytes of scripts and library
     size = exported[2].stat().st_size
+    monkeypatch.setattr(page, "MOST_TRIANGLES", most)
     monkeypatch.setattr(page, "MOST_BYTES", fixed + (size - fixed) // 2)
-    _, said, path = export(tmp_path)
+    facts, said, path = export(tmp_path, resolution=64)
+    assert facts["arrays"]["faces"]["count"] / 3 <= most
     assert path.stat().st_size <= page.MOST_BYTES
-    assert any("made again with" in text for text in said)
+    assert len(tried) == 3  # as asked, for the triangles, for the bytes
+    assert sorted(set(tried), reverse=True) == tried
+    again = [text for text in said if "made again with" in text]
+    assert [f"{cells} cells" in text for cells, text in zip(tried[1:], again, strict=True)] == [True, True]
+    (note,) = [note for note in facts["notes"] if "cells" in note]
+    assert f"as fine as {tried[-1]} cells along the longest edge, not 64: browsers turn {most:,}" in note
+
+
+def test_a_page_that_can_not_be_small_enough_is_said_to_be_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "MOST_BYTES", 1000)
+    _, said, path = export(tmp_path, regions={})
+    assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
+
+
+def test_areas_are_as_good_on_small_triangles_as_on_large_ones():
+    areas = np.array([1e-6] * 6 + [1.0])
+    positions = np.arange(21.0).reshape(7, 3)
+    text, layout = page._packed({"positions": positions, "faces": np.array([[0, 1, 2]]), "areas": areas})
+    how = layout["areas"]
+    stored = gzip.decompress(base64.b64decode(text))
+    found = np.frombuffer(stored, how["type"], how["count"], how["start"])
+    np.testing.assert_allclose(found, areas, rtol=1e-3)
+
+
+def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
+    light = torch.ones(len(SCENE.bands))
+    light[2] = 1e-4
+    lit = replace(SCENE.materials, light=light)
+    assert (
+        page._spectral_facts(lit)["is_lit"]
+        == lit.is_lit.tolist()
+        == [band != 2 for band in range(len(light))]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +242,7 @@ def test_a_region_is_what_is_seen_inside_an_outline_and_is_saved(opened):
     table = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
     assert table[0] == ["quantity", "cap <b>", "below", 'my "part", 1']
     rows = {row[0]: row[1:] for row in table}
+    assert len(rows) == len(table)
     assert float(rows["area in cm2"][2]) == pytest.approx(seen["area"] * 1e4 * 0.1**2)
     assert float(rows[f"abundance of {NAMES[1]}"][2]) == pytest.approx(seen["mixture"][1])
     assert len([name for name in rows if name.startswith("standard deviation at")]) == len(SCENE.bands)
@@ -263,3 +305,87 @@ def test_the_continuum_of_a_window_and_its_absorption_are_a_choice(opened):
     rows = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
     saved = {row[0]: row[1:] for row in rows}["depth of the absorption from 500 to 600 nm"]
     assert float(saved[0]) == pytest.approx(depth, abs=1e-6)
+
+
+LOOK_AWAY = """() => {
+  const { cameras } = unmixPage.facts;
+  const away = { ...cameras[0], axes: cameras[0].axes.map((axis, i) => axis.map((part) => (i === 1 ? part : -part))) };
+  unmixPage.lookThrough(cameras.push(away) - 1);
+  unmixPage.draw();
+}"""
+
+
+@pytest.mark.slow
+def test_what_lies_behind_the_eye_is_in_no_region_and_has_no_label(opened):
+    opened.evaluate(LOOK_AWAY)
+    assert not opened.locator("#labels span:not([hidden])").count()
+    stroke(opened, [(2, 2), (560, 2), (560, 598), (2, 598)])
+    assert "Nothing of the surface is inside" in opened.inner_text("#hint")
+
+
+@pytest.mark.slow
+def test_names_are_text_in_a_table_and_one_is_changed_after_the_other(opened):
+    opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
+    for place in ((285, 300), (285, 340)):
+        opened.mouse.click(*place)
+    for row, name in ((1, "=1+1"), (0, "@second")):
+        opened.locator(".probe input[type=text]").nth(row).click()
+        opened.keyboard.press("Control+a")
+        opened.keyboard.type(name)
+    opened.keyboard.press("Enter")
+    table = list(csv.reader(io.StringIO(opened.evaluate("unmixPage.csvText()"))))
+    assert table[0][-2:] == ["_=1+1", "_@second"]
+    opened.evaluate("unmixPage.draw()")
+    assert "=1+1" in opened.inner_text("#labels")
+
+
+def shape_in_colour(shape, away):
+    """What a page shows of triangles without bands, that are looked at from `away`."""
+    positions = FRAME.to_world(np.array(shape.vertices))
+    areas = trimesh.triangles.area(positions[shape.faces])
+    content = page.PageContent(
+        {
+            "positions": positions,
+            "faces": np.array(shape.faces),
+            "areas": page.vertex_areas(areas, shape.faces, len(positions)),
+        },
+        {"lights": [{"name": "white", "factors": [], "notes": []}], "notes": [], "colour": "grey"},
+        {},
+    )
+    (camera,) = cameras_around([away])
+    views = (RunView("from there", camera, "train"),)
+    return SimpleNamespace(page_content=lambda _: content, views=views, frame=FRAME, scale=SCALE)
+
+
+def plate():
+    """A square much thinner than its triangles are long."""
+    return trimesh.creation.box((1.0, 1.0, 0.02)).subdivide_to_size(0.1)
+
+
+def sheet():
+    """The upper side of a square."""
+    shape: Any = plate()
+    shape.update_faces(shape.face_normals[:, 2] > 0.5)
+    shape.remove_unreferenced_vertices()
+    return shape
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "away"),
+    [
+        (plate(), (0.3, 0.2, 1.0)),
+        (sheet(), (0.3, 0.2, 1.0)),
+        (sheet(), (0.3, 0.2, -1.0)),
+    ],
+    ids=["plate", "sheet", "sheet from its back"],
+)
+def test_one_side_of_something_thin_is_seen(shape, away, browser, tmp_path):
+    _, _, path = export(tmp_path, shape_in_colour(shape, away), {})
+    opened = browser.new_page(viewport={"width": 900, "height": 600})
+    opened.goto(path.as_uri())
+    opened.wait_for_function("window.unmixPage")
+    stroke(opened, [(2, 2), (560, 2), (560, 598), (2, 598)])
+    (seen,) = probes(opened, "area")
+    opened.close()
+    assert seen["area"] == pytest.approx(1 / FRAME.scale**2, rel=0.08)

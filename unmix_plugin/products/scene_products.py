@@ -131,7 +131,8 @@ class Page(Product):
     title: str = ""
     """Title of the page; the scene's name where none is given."""
     resolution: int = 256
-    """Cells along the longest edge of the scene box; fewer where the page would exceed 20 MB."""
+    """Cells along the longest edge of the scene box; fewer where the page would have more than 600,000 triangles or
+    exceed 20 MB."""
     library: tuple[Path, ...] = ()
     """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
     ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""

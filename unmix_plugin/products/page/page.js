@@ -31,7 +31,7 @@
   $("data-arrays").remove();
   const unzipped = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   const buffer = await new Response(unzipped).arrayBuffer();
-  const types = { u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, i4: Int32Array };
+  const types = { u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, i4: Int32Array, f4: Float32Array };
   const read = (name) => {
     const how = facts.arrays[name];
     if (!how) return null;
@@ -59,8 +59,7 @@
   const tinted = new Set();
   const hidden = new Set();
   let metresPerUnit = facts.metres_per_unit;
-  const DARK_LIGHT = 1e-3; // relative to the brightest band: below, nothing is known of the reflectance
-  const isLit = facts.wavelengths_nm.map((_, b) => !facts.light || facts.light[b] > DARK_LIGHT * Math.max(...facts.light));
+  const isLit = facts.is_lit; // nothing is known of the reflectance in other bands
   const UNKNOWN = 65535; // in what is stored of known spectra
   const stored = read("known");
   const known = facts.known.map((one, m) => ({
@@ -450,6 +449,8 @@
 
   // ---- picking ------------------------------------------------------------------------------------------------------
   const raycaster = new Kit.Raycaster();
+  // Of what vertices hold, the mean at a point of a triangle.
+  const meanOf = ({ corners, weights }, values, width, i) => corners.reduce((sum, v, c) => sum + weights[c] * values[v * width + i], 0);
   // Where a ray meets the shown surface first: { hit, corners, weights } of a triangle, or nothing.
   const firstHit = () => {
     geometry.boundsTree ??= new Kit.MeshBVH(geometry, { indirect: true });
@@ -467,10 +468,10 @@
     const found = firstHit();
     if (!found) return null;
     const { hit, corners, weights } = found;
-    const mean = (values, width, i) => corners.reduce((sum, v, c) => sum + weights[c] * values[v * width + i], 0);
+    const mean = (values, width, i) => meanOf(found, values, width, i);
     const from = camera.position.clone().sub(hit.point).normalize().toArray();
     return {
-      place: hit.point.clone(), spectrum: spectrumOf(corners, weights, from),
+      place: hit.point.clone(), corners, weights, spectrum: spectrumOf(corners, weights, from),
       mixture: names.map((_, k) => mean(abundances, K, k)),
       finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
     };
@@ -485,26 +486,47 @@
     });
     return inside;
   };
-  const edge = Math.sqrt((2 * areas.reduce((sum, area) => sum + area, 0)) / Math.max(faces.length / 3, 1)); // usual one of a triangle
-  const isSeen = (place) => {
-    raycaster.ray.origin.copy(camera.position);
-    raycaster.ray.direction.copy(place).sub(camera.position).normalize();
+  // Of vertices: those that light needs, or those of the triangles around.
+  let across = normals;
+  const normalsOf = () => {
+    if (across) return across;
+    const bare = new Kit.BufferGeometry().setAttribute("position", geometry.getAttribute("position")).setIndex(geometry.index);
+    bare.computeVertexNormals();
+    return (across = bare.getAttribute("normal").array);
+  };
+  const onScreen = new Kit.Vector3();
+  // Column and row of a place, or nothing where no picture has it: behind the eye, or too near to it.
+  const pixelOf = (place) => {
+    const { x, y, z } = onScreen.copy(place).project(camera);
+    return Math.abs(z) > 1 ? null : [((x + 1) / 2) * innerWidth, ((1 - y) / 2) * innerHeight];
+  };
+  const atVertex = (v) => ({ place: new Kit.Vector3().fromArray(positions, 3 * v), corners: [v], weights: [1] });
+  // Is a point of the surface seen from here? What a ray meets before it is the point itself where it is nearer to it
+  // than a triangle is long, there or here, and both show the same side: backs of thin parts don't.
+  const isSeen = (point) => {
+    const { origin, direction } = raycaster.ray;
+    origin.copy(camera.position);
+    direction.copy(point.place).sub(origin);
+    const distance = direction.length();
+    direction.normalize();
     const found = firstHit();
-    return !found || found.hit.distance > place.distanceTo(camera.position) - edge;
+    if (!found || found.hit.distance > (1 - 1e-6) * distance) return true;
+    const edge = Math.sqrt(Math.min(meanOf(point, areas, 1, 0), meanOf(found, areas, 1, 0)));
+    if (found.hit.distance < distance - edge) return false;
+    const facing = (one) => direction.toArray().reduce((sum, part, axis) => sum + part * meanOf(one, normalsOf(), 3, axis), 0);
+    return facing(point) * facing(found) > 0;
   };
   // Which vertices are seen from here within an outline on the screen, 255 each, as regions of the run have them.
   const sharesInside = (outline) => {
     const shares = new Uint8Array(V);
     const [columns, rows] = [0, 1].map((axis) => outline.map((corner) => corner[axis]));
     const [left, right, top, bottom] = [Math.min(...columns), Math.max(...columns), Math.min(...rows), Math.max(...rows)];
-    const [place, onScreen] = [new Kit.Vector3(), new Kit.Vector3()];
     for (let v = 0; v < V; v++) {
       if (shownOf.array[v] < 0.5) continue;
-      place.fromArray(positions, 3 * v);
-      onScreen.copy(place).project(camera);
-      const [x, y] = [((onScreen.x + 1) / 2) * innerWidth, ((1 - onScreen.y) / 2) * innerHeight];
-      if (x < left || x > right || y < top || y > bottom || !isInside(outline, x, y)) continue;
-      if (isSeen(place)) shares[v] = 255;
+      const vertex = atVertex(v);
+      const [x, y] = pixelOf(vertex.place) ?? [NaN, NaN];
+      if (!(x >= left && x <= right && y >= top && y <= bottom) || !isInside(outline, x, y)) continue;
+      if (isSeen(vertex)) shares[v] = 255;
     }
     return shares;
   };
@@ -522,7 +544,7 @@
     const anywhere = Array.from({ length: 15 }, (_, i) => inside[Math.floor(((i + 0.5) / 15) * inside.length)]);
     const { mean: spectrum, spread } = B ? Spectra.mixtureStatistics(weights, scaled, facts.endmembers) : { mean: [], spread: null };
     return {
-      shares, area, spectrum, spread, anchors: [nearest, ...anywhere].map((v) => new Kit.Vector3().fromArray(positions, 3 * v)),
+      shares, area, spectrum, spread, anchors: [nearest, ...anywhere].map(atVertex),
       mixture: names.map((_, k) => mean(abundances, K, k)),
       finish: relit && [...[0, 1, 2].map((c) => mean(base, 3, c)), mean(polish, 3, 0), mean(polish, 3, 1)],
     };
@@ -544,12 +566,12 @@
     const shown = probes.filter((probe) => probe.isShown);
     while (labels.children.length < shown.length) labels.append(make("span"));
     [...labels.children].forEach((label, i) => {
-      const { name, colour, place, anchors = [place] } = shown[i] ?? { anchors: [] };
-      const anchor = anchors.find(isSeen);
+      const { name, colour, place, anchors = [shown[i]] } = shown[i] ?? { anchors: [] };
+      const anchor = anchors.find((one) => pixelOf(one.place) && isSeen(one));
       label.hidden = !anchor;
       if (!anchor) return;
-      const { x, y } = anchor.clone().project(camera);
-      Object.assign(label.style, { left: `${((x + 1) / 2) * innerWidth}px`, top: `${((1 - y) / 2) * innerHeight}px`, borderColor: colour });
+      const [x, y] = pixelOf(anchor.place);
+      Object.assign(label.style, { left: `${x}px`, top: `${y}px`, borderColor: colour });
       label.className = place ? "above" : "";
       label.textContent = name;
     });
@@ -608,7 +630,9 @@
     const dot = make("span", { className: "dot" });
     dot.style.background = probe.colour;
     const name = make("input", { type: "text", value: probe.name, maxLength: 64, title: probe.isKept ? "a region of the run" : "rename", readOnly: probe.isKept });
-    name.onchange = () => { probe.name = name.value.trim() || probe.name; showProbes(); };
+    // The click that ends this may be one into another name: nothing of the list is made anew.
+    name.onchange = () => { probe.name = name.value = name.value.trim() || probe.name; redraw(); };
+    name.onkeydown = (event) => { if (event.key === "Enter") name.blur(); };
     name.onfocus = () => { if (chosen !== probe) { chosen = probe; listProbes(probe); } };
     const remove = make("button", { textContent: "×", title: "remove", hidden: Boolean(probe.isKept), onclick: () => { removeProbe(probe); showProbes(); } });
     const feature = probe.isShown && absorptionOf(probe);
@@ -720,7 +744,7 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   };
-  const quoted = (text) => `"${text.replaceAll('"', '""')}"`;
+  const quoted = (text) => `"${text.replace(/^[=+@-]/, "_$&").replaceAll('"', '""')}"`; // no formula in a spreadsheet
   const csvText = () => {
     const shown = probes.filter((probe) => probe.isShown);
     const rows = [["quantity", ...shown.map((probe) => quoted(probe.name))]];
@@ -742,7 +766,7 @@
     }
     [0, 1, 2].forEach((rank) => {
       add(`known spectrum ${rank + 1}`, ({ likeness }) => likeness[rank] && quoted(likeness[rank].name));
-      add(`angle to it (rad)`, ({ likeness }) => likeness[rank]?.angle);
+      add(`angle to known spectrum ${rank + 1} (rad)`, ({ likeness }) => likeness[rank]?.angle);
     });
     const what = facts.light ? "reflectance" : "radiance";
     facts.wavelengths_nm.forEach((nm, b) => add(`${what} at ${nm} nm`, (probe) => reflectanceOf(probe.spectrum)[b]));

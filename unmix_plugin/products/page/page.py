@@ -110,23 +110,35 @@ def export_page(job: Job, title: str, resolution: int, library: Sequence[Path] =
     path, scene = job.folder / "page.html", job.loaded.scene
     job.claim([path])
     known = None if isinstance(scene, ShownAsPage) else _known_spectra(job.materials, library)
+    asked, before = resolution, math.inf
     while True:
         if isinstance(scene, ShownAsPage):
             with job.working("looking at the surface"):
                 content = scene.page_content(resolution)
         else:
-            content = _mixture_content(job, resolution)
+            content, resolution = _mixture_content(job, resolution)
         known = known or _known_spectra(content.materials, library)
+        if resolution < asked:
+            content.facts["notes"].append(
+                f"The surface is as fine as {resolution} cells along the longest edge, not {asked}: browsers turn "
+                f"{MOST_TRIANGLES:,} triangles smoothly, and a mail takes {MOST_BYTES / 1e6:g} MB."
+            )
         page = _page(job, content, known, title)
-        # Triangles, and so bytes, grow with the square of the resolution.
-        coarser = int(0.95 * resolution * math.sqrt(MOST_BYTES / len(page)))
-        if len(page) <= MOST_BYTES or coarser < _COARSEST:
+        if len(page) <= MOST_BYTES:
+            break
+        # No resolution shrinks scripts, library, pictures and tables of light.
+        count = len(content.arrays["positions"])
+        surface = {k: v for k, v in content.arrays.items() if k == "faces" or count in v.shape}
+        shrinking = len(_packed(surface)[0])
+        coarser = _coarser(resolution, (MOST_BYTES - len(page) + shrinking) / shrinking)
+        if coarser < _COARSEST or len(page) >= before:
+            job.say(f"the page has {len(page) / 1e6:.1f} MB, more than a mail takes")
             break
         job.say(
             f"a page of {len(content.arrays['faces'])} triangles would have {len(page) / 1e6:.1f} MB, more than the "
             f"{MOST_BYTES / 1e6:g} MB that a mail takes: made again with {coarser} cells along the longest edge"
         )
-        resolution = coarser
+        resolution, before = coarser, len(page)
     for note in content.facts["notes"]:
         job.say(note)
     job.say(f"{len(content.arrays['faces'])} triangles, {len(page) / 1e6:.1f} MB")
@@ -191,16 +203,21 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
     return _fill(facts, arrays, content.pictures)
 
 
-def _mixture_content(job: Job, resolution: int) -> PageContent:
-    """Of a scene of mixed materials."""
+def _coarser(resolution: int, part: float) -> int:
+    """The resolution for a part of the triangles, and so of the bytes: both grow with its square."""
+    return int(0.95 * resolution * math.sqrt(max(part, 0.0)))
+
+
+def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
+    """Of a scene of mixed materials, and the resolution that `MOST_TRIANGLES` leave."""
     mesh, notes = find_surface(job, resolution)[0], []
-    if len(mesh.faces) > MOST_TRIANGLES:
-        coarser = int(0.95 * resolution * math.sqrt(MOST_TRIANGLES / len(mesh.faces)))
-        notes.append(
-            f"The surface of {len(mesh.faces):,} triangles is made again with {coarser} cells along the longest edge: "
-            f"browsers turn {MOST_TRIANGLES:,} smoothly."
+    while len(mesh.faces) > MOST_TRIANGLES:
+        resolution = _coarser(resolution, MOST_TRIANGLES / len(mesh.faces))
+        job.say(
+            f"the surface of {len(mesh.faces):,} triangles is made again with {resolution} cells along the longest "
+            f"edge: browsers turn {MOST_TRIANGLES:,} smoothly"
         )
-        mesh = find_surface(job, coarser)[0]
+        mesh = find_surface(job, resolution)[0]
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
     arrays["areas"] = vertex_areas(mesh.areas() / job.frame.scale**2, mesh.faces, len(mesh.vertices))
@@ -215,7 +232,7 @@ def _mixture_content(job: Job, resolution: int) -> PageContent:
         f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
-    return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials)
+    return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials), resolution
 
 
 def vertex_areas(
@@ -253,7 +270,7 @@ def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
     """Spectra, lights and names, as page.js reads them; empty where there are no bands."""
     if materials is None:
         names = ("wavelengths_nm", "edges_nm", "names", "colours", "endmembers", "specular", "rgb", "indices")
-        return {**{name: [] for name in names}, "light": None, "colour_map": _colour_map()}
+        return {**{name: [] for name in names}, "light": None, "is_lit": [], "colour_map": _colour_map()}
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
     lights = [{"name": "the scene's own", "factors": [1.0] * len(bands), "notes": []}]
@@ -266,6 +283,7 @@ def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
     return {
         "wavelengths_nm": rounded(bands.centers_nm),
         "edges_nm": rounded(bands.edges_nm),
+        "is_lit": materials.is_lit.tolist(),
         "names": list(materials.names),
         "colours": rounded(endmember_colours(materials)),
         "endmembers": rounded(endmembers),
@@ -373,8 +391,8 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
     """All arrays as one text (base64 of gzip), and for each where it lies and how its numbers are got back.
 
     Positions have 16 bits over their box; shares and brightness 8 bits of their square root, as an eye sees them; what
-    may be negative 16 bits of its column's largest; whole numbers stay. Each corner of a triangle is stored as its
-    difference from the one before.
+    may be negative 16 bits of its column's largest; areas, which differ by orders of magnitude and are summed, 32 bits;
+    whole numbers stay. Each corner of a triangle is stored as its difference from the one before.
     """
     arrays = dict(arrays)
     positions, faces = arrays.pop("positions"), arrays.pop("faces")
@@ -390,6 +408,8 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
     for name, values in arrays.items():
         if values.dtype.kind in "iu":
             parts[name] = (values, {})
+        elif name == "areas":
+            parts[name] = (values.astype("<f4"), {})
         elif values.min(initial=0) < 0:
             largest = np.maximum(np.abs(values).max(axis=0), 1e-9)
             # A few vertices may have far more gloss than all others: 16 bits serve both.
