@@ -251,7 +251,8 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         for name in ("wedge", "middle part"):
             page.set("region", name)
             page.set("remove the region", True)
-            page.wait_until(lambda name=name: name not in options())
+            page.wait_until(lambda name=name: ("region removed", name) in page.notices)
+            assert name not in options()
         assert read_measures(source.run).regions == {}
 
 
