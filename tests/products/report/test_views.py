@@ -59,6 +59,7 @@ OTHERS = {
     "notes": ["so & so"],
     "facts": [("<b>", "</dl>")],
     "cards": [],
+    "regions": [],
     "quantity": "radiance",
     "num_known": 0,
     "light_unknown": None,
