@@ -118,13 +118,19 @@ def _measured(
     job: Job, scene: Scene | None, view: RunView, pixel: tuple[int, int]
 ) -> Float[np.ndarray, " B"] | None:
     """What the scene has in a pixel, in the light asked for."""
-    index = None if scene is None else _with_all_bands(scene).get(view.name)
-    if scene is None or index is None:
-        if scene is not None:
-            job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+    if scene is None:
         return None
-    recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
-    return relit(scene.cube(index)[pixel[1], pixel[0]], recorded, light)
+    index = _with_all_bands(scene).get(view.name)
+    if index is None:
+        job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+        return None
+    return _read_pixel(job, scene, index, *pixel)
+
+
+def _read_pixel(job: Job, scene: Scene, index: int, column: int, row: int) -> Float[np.ndarray, " B"]:
+    """What a view has in a pixel, in the light asked for."""
+    spectrum = scene.cube(index, (slice(row, row + 1), slice(column, column + 1)))[0, 0]
+    return relit(spectrum, job.loaded.record.summary.get("illuminant"), job.scene.light_power)
 
 
 def _with_all_bands(scene: Scene) -> dict[str, int]:
@@ -156,7 +162,6 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> _OverViews | Non
     if scene is None or probe.position is None or probe.opacity < OCCUPIED_ACCUMULATION:
         return None
     place, numbers = torch.from_numpy(probe.position).float(), _with_all_bands(scene)
-    recorded, light = job.loaded.record.summary.get("illuminant"), job.scene.light_power
     spectra = []
     for view in job.follow("looking at the place", job.views("train")):
         index, camera = numbers.get(view.name), view.camera.to("cpu")
@@ -165,14 +170,14 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> _OverViews | Non
         if index is None or depths[0] <= 0 or not (0 <= column < width and 0 <= row < height):
             continue
         seen = job.scene.probe(camera, column, row)
-        pixel = float(depths[0] / camera.focal_px[0].min())
+        near = _SAME_PLACE_PX * float(depths[0] / camera.focal_px[0].min())
         if seen.position is None or seen.opacity < OCCUPIED_ACCUMULATION:
             continue
+        if np.linalg.norm(seen.position - probe.position) > near or not scene.valid_mask(index)[row, column]:
+            continue
         alpha = scene.alpha(index)
-        is_whole = scene.valid_mask(index)[row, column] and (alpha is None or alpha[row, column] >= _WHOLE)
-        if is_whole and np.linalg.norm(seen.position - probe.position) <= _SAME_PLACE_PX * pixel:
-            measured = scene.cube(index, (slice(row, row + 1), slice(column, column + 1)))[0, 0]
-            spectra.append(relit(measured, recorded, light).astype(np.float64))
+        if alpha is None or alpha[row, column] >= _WHOLE:
+            spectra.append(_read_pixel(job, scene, index, column, row).astype(np.float64))
     if len(spectra) < 2:
         job.say("fewer than two training views see the place: no spread over views")
         return None
