@@ -29,7 +29,6 @@ from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.engine import registry
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.products.page.page import vertex_areas
 from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -37,7 +36,7 @@ from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.measures import keep_region
 from unmix_plugin.trained.open_run import load_run, open_run
 from unmix_plugin.trained.regions import Box
-from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
 SMALL = {
     "cubes": ["--formats", "envi", "exr", "npy"],

@@ -28,6 +28,7 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectr
 from unmix_plugin.trained.measures import Measures, Scale
 from unmix_plugin.trained.regions import Box, OfMaterial
 from unmix_plugin.trained.run_views import RunView
+from unmix_plugin.trained.surface_mesh import vertex_areas
 
 MIDDLE = FRAME.to_world(np.zeros(3))
 WORLD_RADIUS = RADIUS / FRAME.scale
@@ -347,7 +348,7 @@ def shape_in_colour(shape, away):
         {
             "positions": positions,
             "faces": np.array(shape.faces),
-            "areas": page.vertex_areas(areas, shape.faces, len(positions)),
+            "areas": vertex_areas(areas, shape.faces, len(positions)),
         },
         {"lights": [{"name": "white", "factors": [], "notes": []}], "notes": [], "colour": "grey"},
         {},

@@ -13,11 +13,10 @@ from tests.trained.camera_scenes import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.page.page import vertex_areas
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, read_measures
 from unmix_plugin.trained.regions import Box, InView, OfMaterial, check_name, polygon_mask
-from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
 SCENE = replace(ball_scene(), frame=FRAME)
 WORLD_RADIUS = RADIUS / FRAME.scale

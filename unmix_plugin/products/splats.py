@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from trimesh import triangles
 
 from unmix_plugin.formats.meshes import Gaussians, least_turns, write_splats_glb, write_splats_ply
 from unmix_plugin.products.mesh import find_surface, gltf_content, say_units
@@ -21,7 +22,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Splats
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files, world_up
 from unmix_plugin.trained.surface import SurfaceAppearance, look_at
-from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
 _WIDTH = 0.75
 """Standard deviation along the surface, relative to the square root of the vertex's area."""
@@ -74,9 +75,7 @@ def export_splats(job: Job, asked: Splats) -> list[Path]:
 
 def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
     """Of each vertex a third of the area of its triangles, at least a hundredth of the mean."""
-    a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
-    shares = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
-    areas = sum(np.bincount(corner, weights=shares, minlength=len(mesh.vertices)) for corner in mesh.faces.T)
+    areas = vertex_areas(triangles.area(mesh.vertices[mesh.faces]), mesh.faces, len(mesh.vertices))
     return np.maximum(areas, 0.01 * np.mean(areas))
 
 

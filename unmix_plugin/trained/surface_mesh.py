@@ -97,6 +97,13 @@ class TriangleMesh:
         return np.maximum((np.cross(b - a, c - a) * along).sum(axis=1) / 2, 0.0)
 
 
+def vertex_areas(
+    areas: Float[np.ndarray, " F"], faces: Int[np.ndarray, "F 3"], count: int
+) -> Float64[np.ndarray, " V"]:
+    """Of each vertex, a third of the areas of its triangles."""
+    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), count)
+
+
 def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     """Density per model unit at which the surface lies, from the densities where rays end."""
     densities = sample_densities(scene, ends.positions)

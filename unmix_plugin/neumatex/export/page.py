@@ -27,12 +27,13 @@ from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import alpha_of, frames, to_world
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.products.page.page import PageContent, rounded, vertex_areas
+from unmix_plugin.products.page.page import PageContent, rounded
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.run_views import directions_to_world
+from unmix_plugin.trained.surface_mesh import vertex_areas
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.trained_object import TrainedObject

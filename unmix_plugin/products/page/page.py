@@ -45,7 +45,7 @@ from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
-from unmix_plugin.trained.surface_mesh import TriangleMesh
+from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 MOST_BYTES = 20_000_000
@@ -233,13 +233,6 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
     return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials), resolution
-
-
-def vertex_areas(
-    areas: Float[np.ndarray, " F"], faces: Int[np.ndarray, "F 3"], count: int
-) -> Float64[np.ndarray, " V"]:
-    """Of each vertex, a third of the areas of its triangles."""
-    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), count)
 
 
 def _kept_regions(
