@@ -195,9 +195,7 @@ class Line:
 class Chart:
     """Lines over wavelength or over anything else; hidden while it has none."""
 
-    def __init__(
-        self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)", y_label: str = "radiance"
-    ) -> None:
+    def __init__(self, gui: viser.GuiApi, title: str, y_label: str, x_label: str = "wavelength (nm)") -> None:
         self._gui, self._x_label, self._y_label = gui, x_label, y_label
         self._handle: viser.GuiUplotHandle | None = None
         self._place = gui.add_folder(title, visible=False)

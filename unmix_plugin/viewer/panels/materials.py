@@ -96,7 +96,7 @@ class MaterialsPanel:
         self._chosen = self._gui.add_dropdown("endmember", names)
         self._on(self._chosen, self._choose)
         self._add_changes(names)
-        self._chart = Chart(self._gui, "spectra under the light")
+        self._chart = Chart(self._gui, "spectra under the light", session.materials().quantity)
         with self._gui.add_folder("recipes"):
             self._text = self._gui.add_text("recipe", "", multiline=True, disabled=True)
             self._recipe_name = self._gui.add_text("save as", "recipe")

@@ -162,8 +162,8 @@ class ProbePanel:
         self._chosen.on_update(session.guarded(self._show_chosen))
         self._text = gui.add_html(paragraph(_INVITATION))
         self._bars = gui.add_html("")
-        self._chart = Chart(gui, "spectrum")
-        self._comparison = Chart(gui, "all probes")
+        quantity = session.materials().quantity
+        self._chart, self._comparison = (Chart(gui, title, quantity) for title in ("spectrum", "all probes"))
         session.add_button("save as CSV", self._save)
         session.add_button("forget all", self._forget, is_minor=True)
 

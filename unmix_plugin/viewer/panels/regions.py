@@ -52,7 +52,7 @@ class RegionsPanel:
         self._chosen = gui.add_dropdown("region", _NO_REGION)
         self._chosen.on_update(session.guarded(self._show_chosen))
         self._found, self._bars = gui.add_html(""), gui.add_html("")
-        self._chart = Chart(gui, "mean spectrum", y_label=session.materials().quantity)
+        self._chart = Chart(gui, "mean spectrum", session.materials().quantity)
         session.add_button("remove the region", self._remove, is_minor=True)
         session.guarded(lambda: self._list(_NO_REGION[0]))()
 

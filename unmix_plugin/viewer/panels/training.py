@@ -39,7 +39,7 @@ class TrainingPanel:
             hint="Of the device's time, while someone moves.",
         )
         self._share.on_update(session.guarded(self._change_share))
-        self._loss, self._psnr = (Chart(gui, title, "step", title) for title in ("loss", "PSNR (dB)"))
+        self._loss, self._psnr = (Chart(gui, title, title, "step") for title in ("loss", "PSNR (dB)"))
         self._tick()
         session.on_tick.append(self._tick)
 
