@@ -23,8 +23,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Float64, Int
 
-from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.lens_models import Points
+from unmix_plugin.captures.poses.lens import Lens, Points
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera
 
 _LONGEST_SIDE_PX = 320

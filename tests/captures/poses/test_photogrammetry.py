@@ -22,7 +22,6 @@ from tests.captures.poses.pose_factory import (
     world_to_camera,
     write_json,
 )
-from unmix_plugin.captures.poses.lens import project_opencv
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 
@@ -66,7 +65,7 @@ def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
     x, y, squared = 0.3, -0.2, 0.13
     bent_x = x * (1 + 0.1 * squared) + 0.01 * (squared + 2 * x**2) + 2 * 0.02 * x * y
     bent_y = y * (1 + 0.1 * squared) + 0.02 * (squared + 2 * y**2) + 2 * 0.01 * x * y
-    mine = project_opencv(np.array([[x, y]]), lens.focal_px, lens.center_px, lens.radial, lens.tangential)
+    mine = lens.pixels_of(np.array([[x, y]]))
     np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
 
 

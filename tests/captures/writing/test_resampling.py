@@ -9,8 +9,7 @@ from PIL import Image
 from tests.captures.capture_factory import write_cube, write_poses
 from unmix_plugin.captures.calibration.calibration import CalibratedRows
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.poses.lens import Lens, fit_lens
-from unmix_plugin.captures.poses.lens_models import Points, project_fisheye, project_ftheta
+from unmix_plugin.captures.poses.lens import Lens, Points, bend_fisheye, bend_ftheta, fit_lens
 from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.writing.resampling import Resampling
 
@@ -20,7 +19,7 @@ WIDTH, HEIGHT = 128, 96
 def fisheye(degrees: float):
     """An equidistant lens that spans so much across the picture."""
     focal = WIDTH / 2 / np.radians(degrees / 2)
-    return lambda ideal: project_fisheye(ideal, (focal, focal), (64.0, 48.0), (0.02, -0.01)), focal
+    return lambda ideal: bend_fisheye(ideal, 0.02, -0.01) * focal + (64.0, 48.0), focal
 
 
 def radial_about_a_centre_of_its_own(ideal: Points) -> Points:
@@ -31,7 +30,7 @@ def radial_about_a_centre_of_its_own(ideal: Points) -> Points:
 
 
 def ftheta(ideal: Points) -> Points:
-    return project_ftheta(ideal, (62.0, 50.0), (0.0, 0.015, 0.0, 4e-7), 160.0)
+    return bend_ftheta(ideal, 160.0, 0.0, 0.015, 0.0, 4e-7) / 0.015 + (62.0, 50.0)
 
 
 LENSES = {

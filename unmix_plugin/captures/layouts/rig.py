@@ -28,8 +28,7 @@ import numpy as np
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
 from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.layouts.transforms import Split
-from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
-from unmix_plugin.captures.poses.lens_models import Points
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
 from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile

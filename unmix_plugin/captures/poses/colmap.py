@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses import lens_models
-from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses import lens as models
+from unmix_plugin.captures.poses.lens import Lens, bent_lens
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -37,39 +36,29 @@ _PLACES = ("sparse", "colmap", "colmap/sparse", "sparse/*", "colmap/sparse/*", "
 """Where under a folder a model is looked for first."""
 _DEEPEST = 6
 """Folders below the one that is given in which a model is looked for: hloc writes colmap/sparse/0/models/1."""
-_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3),
-    1: ("PINHOLE", 4),
-    2: ("SIMPLE_RADIAL", 4),
-    3: ("RADIAL", 5),
-    4: ("OPENCV", 8),
-    5: ("OPENCV_FISHEYE", 8),
-    6: ("FULL_OPENCV", 12),
-    7: ("FOV", 5),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5),
-    10: ("THIN_PRISM_FISHEYE", 12),
-    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    12: ("SIMPLE_DIVISION", 4),
-    13: ("DIVISION", 5),
-    14: ("SIMPLE_FISHEYE", 3),
-    15: ("FISHEYE", 4),
-    16: ("EUCM", 6),
-    17: ("EQUIRECTANGULAR", 2),
+_MODELS: dict[str, tuple[int, models.Bend | None]] = {
+    "SIMPLE_PINHOLE": (3, None),
+    "PINHOLE": (4, None),
+    "SIMPLE_RADIAL": (4, None),
+    "RADIAL": (5, None),
+    "OPENCV": (8, None),
+    "OPENCV_FISHEYE": (8, models.bend_fisheye),
+    "FULL_OPENCV": (12, models.bend_opencv),
+    "FOV": (5, models.bend_fov),
+    "SIMPLE_RADIAL_FISHEYE": (4, models.bend_fisheye),
+    "RADIAL_FISHEYE": (5, models.bend_fisheye),
+    "THIN_PRISM_FISHEYE": (12, models.bend_thin_prism),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (16, models.bend_fisheye_624),
+    "SIMPLE_DIVISION": (4, models.bend_division),
+    "DIVISION": (5, models.bend_division),
+    "SIMPLE_FISHEYE": (3, models.bend_fisheye),
+    "FISHEYE": (4, models.bend_fisheye),
+    "EUCM": (6, models.bend_eucm),
+    "EQUIRECTANGULAR": (2, models.bend_equirectangular),
 }
-"""Name and number of parameters by COLMAP's number."""
-_PARAMETER_COUNTS = dict(_MODELS.values())
-_FISHEYES = {"OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"}
-_ONE_FOCAL = {name for name in _PARAMETER_COUNTS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
-_BENT: dict[str, Callable[[lens_models.Points, Sequence[float]], lens_models.Points]] = {
-    "FOV": lambda ideal, terms: lens_models.bend_fov(ideal, *terms),
-    "THIN_PRISM_FISHEYE": lens_models.bend_thin_prism,
-    "RAD_TAN_THIN_PRISM_FISHEYE": lens_models.bend_fisheye_624,
-    "SIMPLE_DIVISION": lambda ideal, terms: lens_models.bend_division(ideal, *terms),
-    "DIVISION": lambda ideal, terms: lens_models.bend_division(ideal, *terms),
-    "EUCM": lambda ideal, terms: lens_models.bend_eucm(ideal, *terms),
-}
-"""Models that bend ideal points, which focal length and centre bring to pixels."""
+"""Number of parameters, and what bends ideal points where the lens is not of our kind, in the order of COLMAP's numbers
+from 0."""
+_ONE_FOCAL = {name for name in _MODELS if name.startswith("SIMPLE_")} | {"RADIAL", "RADIAL_FISHEYE"}
 _CAMERA, _IMAGE, _POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
 _OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
 _LONGEST_NAME = 4096
@@ -170,35 +159,16 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
     if not np.isfinite(parameters).all() or not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{where} is {width} x {height} with {parameters}; expected numbers above 0")
     if model == "EQUIRECTANGULAR":
-        start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        return fit_lens(
-            lambda ideal: lens_models.project_equirectangular(ideal, *parameters), start, model, where
-        )
+        across, down = parameters
+        parameters = (across / (2 * np.pi), down / np.pi, across / 2, down / 2)
     fx, fy, cx, cy, *terms = (parameters[0], *parameters) if model in _ONE_FOCAL else parameters
     if min(fx, fy) <= 0:
         raise CaptureError(f"{where} has the focal length {min(fx, fy):g}; expected pixels above 0")
-    focal, center = (fx, fy), (cx, cy)
-    start = Lens(width, height, focal, center)
-    if model in _FISHEYES:
-        fisheye = partial(lens_models.project_fisheye, focal_px=focal, center_px=center, terms=tuple(terms))
-        return fit_lens(fisheye, start, model, where)
-    if model in _BENT:
-        bend = _BENT[model]
-        return fit_lens(lambda ideal: bend(ideal, terms) * focal + center, start, model, where)
-    k1, k2, p1, p2, k3, *below = (*terms, *[0.0] * (8 - len(terms)))
-    lens = Lens(width, height, focal, center, (k1, k2, p1, p2), (k3, 0.0))
-    if not any(below):
-        return lens, None
-
-    def full_opencv(ideal: lens_models.Points) -> lens_models.Points:
-        squared = (ideal**2).sum(axis=1, keepdims=True)
-        origin = (0.0, 0.0)
-        bent = lens_models.project_opencv(ideal, (1.0, 1.0), origin, (k1, k2, k3))
-        slanted = lens_models.project_opencv(ideal, (1.0, 1.0), origin, (), (p1, p2)) - ideal
-        divisor = 1.0 + sum(k * squared ** (power + 1) for power, k in enumerate(below))
-        return (bent / divisor + slanted) * focal + center
-
-    return fit_lens(full_opencv, start, model, where)
+    start, bend = Lens(width, height, (fx, fy), (cx, cy)), _MODELS[model][1]
+    if bend is None or (bend is models.bend_opencv and not any(terms[5:])):
+        k1, k2, p1, p2, k3 = (*terms, *[0.0] * 5)[:5]
+        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0)), None
+    return bent_lens(bend, terms, start, model, where)
 
 
 def _binary_cameras(path: Path) -> dict[int, _Camera]:
@@ -206,10 +176,10 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
     cameras = {}
     for _ in range(reader.count(_CAMERA.size, "cameras")):
         number, model, width, height = reader.take(_CAMERA)
-        if model not in _MODELS:
-            known = f"{min(_MODELS)} to {max(_MODELS)}"
+        if not 0 <= model < len(_MODELS):
+            known = f"0 to {len(_MODELS) - 1}"
             raise CaptureError(f"{path}: a camera has the model number {model}; COLMAP's are {known}")
-        name, length = _MODELS[model]
+        name, (length, _) = list(_MODELS.items())[model]
         cameras[number] = _Camera(name, width, height, reader.take(struct.Struct(f"<{length}d")))
     return cameras
 
@@ -275,7 +245,7 @@ class _Reader:
 def _text_cameras(path: Path) -> dict[int, _Camera]:
     def parse(line: str) -> tuple[int, _Camera]:
         number, model, width, height, *parameters = line.split()
-        if len(parameters) != _PARAMETER_COUNTS[model]:
+        if len(parameters) != _MODELS[model][0]:
             raise ValueError
         return int(number), _Camera(model, int(width), int(height), tuple(map(float, parameters)))
 

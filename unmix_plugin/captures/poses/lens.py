@@ -1,24 +1,32 @@
-"""The lens of a camera. Lenses of models that we do not have are replaced by one of ours: by the nearest, where that is
-as good as the same, otherwise by one that pictures are resampled into while they are written.
+"""The lens of a camera, and what the models of other programs do to ideal points. Lenses of models that we do not have
+are replaced by one of ours: by the nearest, where that is as good as the same, otherwise by one that pictures are
+resampled into while they are written.
 
-Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down.
+Notation: `P` points; ideal coordinates are x/z, y/z before the camera, +x right, +y down. Models bend them, so that 1
+is one focal length; focal length and centre bring bent points to pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from unmix_plugin.captures.poses.lens_models import Points, Project, project_opencv
 from unmix_plugin.errors import CaptureError
+
+Points = Float64[np.ndarray, "P 2"]
+Project: TypeAlias = Callable[[Points], Points]
+"""From ideal coordinates to pixels."""
+Bend: TypeAlias = Callable[..., Points]
+"""From ideal coordinates, and the numbers of a model, to bent ones."""
 
 
 @dataclass(frozen=True)
-class FileLens:
+class _FileLens:
     """The lens that the pixels of a file were taken through, of a model that scenes do not have."""
 
     model: str
@@ -54,7 +62,7 @@ class Lens:
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
     higher_radial: tuple[float, float] = (0.0, 0.0)
     """k3, k4: radial terms of the sixth and eighth power."""
-    resampled_from: FileLens | None = None
+    resampled_from: _FileLens | None = None
     """Where the file has another one: its pixels are to be brought into this lens."""
 
     @property
@@ -62,14 +70,9 @@ class Lens:
         """k1 to k4."""
         return (*self.distortion[:2], *self.higher_radial)
 
-    @property
-    def tangential(self) -> tuple[float, float]:
-        """p1, p2."""
-        return self.distortion[2:]
-
     def pixels_of(self, ideal: Points) -> Points:
         """Where ideal points are seen."""
-        return project_opencv(ideal, self.focal_px, self.center_px, self.radial, self.tangential)
+        return _brown(ideal, self.radial, self.distortion[2:]) * self.focal_px + self.center_px
 
     def ideal_of(self, pixels: Points) -> Points | None:
         """The inverse of `pixels_of`; None where the distortion folds."""
@@ -105,16 +108,10 @@ class Lens:
         from_file = self.resampled_from
         if from_file is not None:
             from_file = replace(from_file, project=_Cut(from_file.project, corner, scale))
+        (fx, fy), (cx, cy), (across, down) = self.focal_px, self.center_px, scale
+        focal, center = (fx * across, fy * down), ((cx - corner[0]) * across, (cy - corner[1]) * down)
         return replace(
-            self,
-            width=width,
-            height=height,
-            focal_px=(self.focal_px[0] * scale[0], self.focal_px[1] * scale[1]),
-            center_px=(
-                (self.center_px[0] - corner[0]) * scale[0],
-                (self.center_px[1] - corner[1]) * scale[1],
-            ),
-            resampled_from=from_file,
+            self, width=width, height=height, focal_px=focal, center_px=center, resampled_from=from_file
         )
 
 
@@ -157,7 +154,7 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         if not _folds(lens):
             nearest = f"no OPENCV lens comes nearer than {worst:.2g} px"
             note = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
-            return replace(lens, resampled_from=FileLens(model, project, note)), note
+            return replace(lens, resampled_from=_FileLens(model, project, note)), note
     found = _widest_pinhole(project, start)
     if found is None:
         raise CaptureError(
@@ -170,7 +167,12 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         f"{np.degrees(np.arctan(corner)):.0f} degrees from the axis to its corners; {outside:.0%} of the picture lies "
         "outside and is left out"
     )
-    return replace(pinhole, resampled_from=FileLens(model, project, note)), note
+    return replace(pinhole, resampled_from=_FileLens(model, project, note)), note
+
+
+def bent_lens(bend: Bend, terms: Sequence[float], start: Lens, model: str, where: str) -> tuple[Lens, str]:
+    """The same as `fit_lens` of a model that bends ideal points, with focal length and centre of the start."""
+    return fit_lens(lambda ideal: bend(ideal, *terms) * start.focal_px + start.center_px, start, model, where)
 
 
 def _nearest_opencv(pixels: Points, ideal: Points, start: Lens) -> tuple[Lens, float]:
@@ -184,7 +186,7 @@ def _nearest_opencv(pixels: Points, ideal: Points, start: Lens) -> tuple[Lens, f
     def errors(values: np.ndarray) -> np.ndarray:
         return (lens_of(values).pixels_of(ideal) - pixels).ravel()
 
-    first = np.array([*start.focal_px, *start.center_px, *start.tangential, *start.radial])
+    first = np.array([*start.focal_px, *start.center_px, *start.distortion[2:], *start.radial])
     scales = np.array([*start.focal_px, *start.focal_px, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1])
     found = least_squares(errors, first, x_scale=scales).x
     return lens_of(found), float(np.linalg.norm(errors(found).reshape(-1, 2), axis=1).max())
@@ -216,9 +218,8 @@ def _widest_pinhole(project: Project, start: Lens) -> tuple[Lens, float] | None:
 def require_unfolded(lens: Lens, where: str) -> None:
     """Refuse a lens that maps two directions to one pixel of its image. Raises CaptureError: it does."""
     if _folds(lens):
-        raise CaptureError(
-            f"{where}: the distortion {[*lens.radial, *lens.tangential]} folds the image's corners over; {_CALIBRATE}"
-        )
+        terms = [*lens.radial, *lens.distortion[2:]]
+        raise CaptureError(f"{where}: the distortion {terms} folds the image's corners over; {_CALIBRATE}")
 
 
 @lru_cache
@@ -261,3 +262,131 @@ def _is_sound(project: Project, ideal: Points) -> Bool[np.ndarray, " P"]:
     with np.errstate(all="ignore"):
         determinant = np.linalg.det(np.stack(list(_slopes(project, ideal)), axis=-1))
         return np.isfinite(determinant) & (determinant > 0)
+
+
+# Models of other programs: what each does to ideal points.
+
+
+def bend_opencv(
+    ideal: Points, k1: float, k2: float, p1: float, p2: float, k3: float = 0.0, *below: float
+) -> Points:
+    """OpenCV's lens with three radial terms, and three more in the denominator (COLMAP's FULL_OPENCV)."""
+    squared = (ideal**2).sum(axis=1)
+    ratio = _series(squared, (k1, k2, k3)) / _series(squared, below)
+    return ideal * ratio[:, None] + _tangential(ideal, (p1, p2))
+
+
+def equidistant(ideal: Points) -> Points:
+    """Ideal points moved along their radius to the angle from the axis, radians."""
+    radius = np.linalg.norm(ideal, axis=1)
+    return ideal * _ratio(np.arctan(radius), radius)[:, None]
+
+
+def bend_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
+    """An equidistant lens bent as OpenCV bends a perspective one: with terms of theta^2, theta^4, ... (OPENCV_FISHEYE),
+    and with tangential ones (Metashape's fisheye)."""
+    return _brown(equidistant(ideal), radial, tangential)
+
+
+def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:
+    """COLMAP's THIN_PRISM_FISHEYE: k1, k2, p1, p2, k3, k4, sx1, sy1."""
+    k3, k4, across, down = more
+    bent = bend_fisheye(ideal, k1, k2, k3, k4, tangential=(p1, p2))
+    return bent + _prism(equidistant(ideal), (across, 0.0, down, 0.0))
+
+
+def bend_fisheye_624(ideal: Points, *terms: float) -> Points:
+    """Project Aria's fisheye: six radial terms, two tangential and four of a thin prism, which act on bent points.
+
+    FISHEYE624 of nerfstudio, RAD_TAN_THIN_PRISM_FISHEYE of COLMAP.
+    """
+    bent = bend_fisheye(ideal, *terms[:6])
+    return bent + _tangential(bent, (terms[7], terms[6])) + _prism(bent, terms[8:])
+
+
+def bend_opensfm_624(ideal: Points, *terms: float) -> Points:
+    """OpenSfM's fisheye62 and fisheye624: the same terms, all of which act on the points of an equidistant lens."""
+    return bend_fisheye(ideal, *terms[:6], tangential=terms[6:8]) + _prism(equidistant(ideal), terms[8:])
+
+
+def bend_fov(ideal: Points, omega: float) -> Points:
+    """Source: Devernay & Faugeras 2001, Straight lines have to be straight; COLMAP's FOV."""
+    radius = np.linalg.norm(ideal, axis=1)
+    if abs(omega) < 1e-9:
+        return ideal
+    steep = 2.0 * np.tan(omega / 2.0)
+    return ideal * _ratio(np.arctan(radius * steep) / omega, radius, steep / omega)[:, None]
+
+
+def bend_division(ideal: Points, term: float) -> Points:
+    """Source: Fitzgibbon 2001, Simultaneous linear estimation of multiple view geometry and lens distortion; NaN
+    beyond the edge of the model."""
+    with np.errstate(invalid="ignore"):
+        return ideal * (2.0 / (1.0 + np.sqrt(1.0 - 4.0 * term * (ideal**2).sum(axis=1))))[:, None]
+
+
+def bend_eucm(ideal: Points, alpha: float, beta: float) -> Points:
+    """Source: Khomutenko et al. 2016, An enhanced unified camera model."""
+    lengths = np.sqrt(beta * (ideal**2).sum(axis=1) + 1.0)
+    return ideal / (alpha * lengths + 1.0 - alpha)[:, None]
+
+
+def bend_dual(ideal: Points, transition: float, *radial: float) -> Points:
+    """OpenSfM's dual: between a perspective lens (1) and an equidistant one (0)."""
+    return _brown(transition * ideal + (1.0 - transition) * equidistant(ideal), radial)
+
+
+def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
+    """instant-ngp's ftheta: the angle from the axis is a polynomial of the distance from the centre in pixels, radians
+    over pixels to the power of their number. The focal length is 1 / p1 pixels.
+
+    Distances are looked for up to `reach_px`; beyond, and where the polynomial falls, NaN.
+    """
+    polyval, slopes = np.polynomial.polynomial.polyval, np.polynomial.polynomial.polyder(terms)
+    distances = np.linspace(0.0, reach_px, 4096)
+    angles = polyval(distances, terms)
+    rising = int(np.argmax(np.append(np.diff(angles) <= 0.0, True))) + 1
+    radius = np.linalg.norm(ideal, axis=1)
+    wanted = np.arctan(radius)
+    found = np.interp(wanted, angles[:rising], distances[:rising], right=np.nan)
+    for _ in range(3):  # from the table to rounding
+        found = found + (wanted - polyval(found, terms)) / polyval(found, slopes)
+    return ideal * _ratio(found * terms[1], radius)[:, None]
+
+
+def bend_equirectangular(ideal: Points) -> Points:
+    """A picture of all directions, the axis in its middle: longitude across, latitude down, radians."""
+    x, y = ideal.T
+    return np.column_stack([np.arctan(x), np.arctan2(y, np.hypot(x, 1.0))])
+
+
+def _brown(points: Points, radial: Sequence[float], tangential: Sequence[float] = (0.0, 0.0)) -> Points:
+    """Points with radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
+    return points * _series((points**2).sum(axis=1), radial)[:, None] + _tangential(points, tangential)
+
+
+def _series(squared: Float64[np.ndarray, " P"], terms: Sequence[float]) -> Float64[np.ndarray, " P"]:
+    """1 + k1 s + k2 s^2 + ..."""
+    return np.polynomial.polynomial.polyval(squared, (1.0, *terms))
+
+
+def _tangential(points: Points, terms: Sequence[float]) -> Points:
+    """What OpenCV's p1, p2 add."""
+    (x, y), (p1, p2) = points.T, terms
+    squared = x**2 + y**2
+    across = 2 * p1 * x * y + p2 * (squared + 2 * x**2)
+    return np.column_stack([across, 2 * p2 * x * y + p1 * (squared + 2 * y**2)])
+
+
+def _prism(points: Points, terms: Sequence[float]) -> Points:
+    """A thin prism's s0 r^2 + s1 r^4 across and s2 r^2 + s3 r^4 down."""
+    s0, s1, s2, s3 = terms
+    squared = (points**2).sum(axis=1)
+    return np.column_stack([s0 * squared + s1 * squared**2, s2 * squared + s3 * squared**2])
+
+
+def _ratio(
+    values: Float64[np.ndarray, " P"], radius: Float64[np.ndarray, " P"], at_axis: float = 1.0
+) -> Float64[np.ndarray, " P"]:
+    """Values over radius, with the limit on the axis."""
+    return np.divide(values, radius, out=np.full_like(radius, at_axis), where=radius > 1e-12)

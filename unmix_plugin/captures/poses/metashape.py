@@ -10,15 +10,20 @@ which are OpenCV's p2, p1.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses import lens_models
-from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses.lens import (
+    Lens,
+    Points,
+    bend_equirectangular,
+    bend_fisheye,
+    bent_lens,
+    fit_lens,
+)
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -141,33 +146,29 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
     width, height = size
     if kind == "spherical":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        project = partial(lens_models.project_equirectangular, width=width, height=height)
-        around, said = fit_lens(project, start, "Metashape spherical", where)
+        around, said = bent_lens(bend_equirectangular, (), start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
-    values = {
-        tag: number_of(calibration, tag, where) for tag in ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
-    }
+    tags = ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
+    values = {tag: number_of(calibration, tag, where) for tag in tags}
     f_x = number_of(calibration, "fx", where, values["f"] + values["b1"])
     f_y = number_of(calibration, "fy", where, values["f"])
     skew = number_of(calibration, "skew", where, values["b2"])
     if min(f_x, f_y) <= 0:
         raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
-    focal, center = (f_x, f_y), (width / 2 + values["cx"], height / 2 + values["cy"])
-    radial = tuple(values[key] for key in _RADIAL)
-    tangential = (values["p2"], values["p1"])
+    center, tangential = (width / 2 + values["cx"], height / 2 + values["cy"]), (values["p2"], values["p1"])
+    start, (k1, k2, k3, k4) = Lens(width, height, (f_x, f_y), center), [values[key] for key in _RADIAL]
+    frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
     if kind == "frame" and not skew:
-        bends = (radial[0], radial[1], *tangential), (radial[2], radial[3])
-        return Lens(width, height, focal, center, *bends), []
+        return frame, []
 
-    def bent_and_skewed(ideal: lens_models.Points) -> lens_models.Points:
+    def bent_and_skewed(ideal: Points) -> Points:
+        bent = frame.pixels_of(ideal)
         if kind == "fisheye":
-            bent = lens_models.bend_brown_fisheye(ideal, radial, tangential)
-        else:
-            bent = lens_models.project_opencv(ideal, (1.0, 1.0), (0.0, 0.0), radial, tangential)
-        return bent * focal + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))]) + center
+            bent = bend_fisheye(ideal, k1, k2, k3, k4, tangential=tangential) * (f_x, f_y) + center
+        return bent + np.column_stack([skew * (bent[:, 1] - center[1]) / f_y, np.zeros(len(bent))])
 
     model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"
-    fitted, note = fit_lens(bent_and_skewed, Lens(width, height, focal, center), model, where)
+    fitted, note = fit_lens(bent_and_skewed, start, model, where)
     return fitted, [f"sensor {name}: {note}"]
 
 

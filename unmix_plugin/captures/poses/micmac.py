@@ -12,8 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses.lens import Lens, fit_lens
-from unmix_plugin.captures.poses.lens_models import Points
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,

@@ -12,17 +12,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses import lens_models
-from unmix_plugin.captures.poses.lens import Lens, fit_lens
+from unmix_plugin.captures.poses import lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
-_FISHEYES = ("fisheye", "fisheye_opencv")
-_SIX_TERMS = ("fisheye62", "fisheye624")
-_SPHERICAL = ("spherical", "equirectangular")
-_KNOWN = (*_PLAIN, *_FISHEYES, *_SIX_TERMS, "dual", *_SPHERICAL)
+_SPHERICAL = (lens.bend_equirectangular, "")
+_FISHEYE = (lens.bend_fisheye, "k1 k2 k3 k4")
+_SIX_TERMS = (lens.bend_opensfm_624, "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3")
+_BENT: dict[str, tuple[lens.Bend, str]] = {
+    **dict.fromkeys(("fisheye", "fisheye_opencv"), _FISHEYE),
+    **dict.fromkeys(("fisheye62", "fisheye624"), _SIX_TERMS),
+    "dual": (lens.bend_dual, "transition k1 k2"),
+    **dict.fromkeys(("spherical", "equirectangular"), _SPHERICAL),
+}
+"""Types of projection that are not ours: what bends ideal points, and its numbers."""
 
 
 def is_reconstruction(content: Any) -> bool:
@@ -39,7 +44,7 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
     best = max(parts, key=lambda part: len(part["shots"]), default={})
     notes = [f"{len(parts)} reconstructions; the one with the most shots was read"] if len(parts) > 1 else []
     shots: dict[str, Any] = best.get("shots", {})
-    lenses: dict[str, Lens] = {}
+    lenses: dict[str, lens.Lens] = {}
     raw, loose = [], []
     for name, shot in shots.items():
         where = f"{path}: shot {name}"
@@ -93,7 +98,7 @@ def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
     return np.column_stack([Rotation.from_rotvec(vectors[0]).as_matrix(), vectors[1]])
 
 
-def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
+def _lens_opensfm(camera: Any, where: str) -> tuple[lens.Lens, str | None]:
     values = camera if isinstance(camera, dict) else {}
     numbers = {key: read_number(value) for key, value in values.items()}
 
@@ -103,37 +108,22 @@ def _lens_opensfm(camera: Any, where: str) -> tuple[Lens, str | None]:
 
     width, height = int(number("width")), int(number("height"))
     kind = values.get("projection_type", "perspective")
-    usual = 1 / (2 * np.pi) if kind in _SPHERICAL else 0.0
+    bend, keys = _BENT.get(kind, (None, "")) if isinstance(kind, str) else (None, "")
+    usual = 1 / (2 * np.pi) if bend is lens.bend_equirectangular else 0.0
     focal = number("focal_x", number("focal", usual))
     focal = focal, number("focal_y", focal)
     if not (0 < width < 1e6 and 0 < height < 1e6) or min(focal) <= 0:
         raise CaptureError(f"{where}: width, height or focal length is missing or not above 0")
-    if kind not in _KNOWN:
-        raise CaptureError(f"{where} is {describe(kind)}; expected one of {', '.join(_KNOWN)}")
+    if bend is None and kind not in _PLAIN:
+        raise CaptureError(f"{where} is {describe(kind)}; expected one of {', '.join((*_PLAIN, *_BENT))}")
     side = max(width, height)
-    focal = (side * focal[0], side * focal[1])
     center = (width / 2 + side * number("c_x"), height / 2 + side * number("c_y"))
-    radial = tuple(number(key) for key in ("k1", "k2", "k3", "k4"))
-    tangential = (number("p1"), number("p2"))
-    if kind in _PLAIN:
-        return Lens(width, height, focal, center, (radial[0], radial[1], *tangential), (radial[2], 0.0)), None
-    keys = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s0", "s1", "s2", "s3")
-    terms, transition = [number(key) for key in keys], number("transition", 1.0)
-
-    def project(ideal: lens_models.Points) -> lens_models.Points:
-        if kind in _FISHEYES:
-            return lens_models.project_fisheye(ideal, focal, center, radial)
-        if kind in _SPHERICAL:
-            middle = np.array([(width - side) / 2, height / 2 - side / 4])
-            return lens_models.project_equirectangular(ideal, side, side / 2) + middle
-        bent = (
-            lens_models.bend_dual(ideal, transition, radial[:2])
-            if kind == "dual"
-            else lens_models.bend_opensfm_624(ideal, terms)
-        )
-        return bent * focal + center
-
-    return fit_lens(project, Lens(width, height, focal, center), kind, where)
+    start = lens.Lens(width, height, (side * focal[0], side * focal[1]), center)
+    if bend is None:
+        k1, k2, k3, p1, p2 = map(number, ("k1", "k2", "k3", "p1", "p2"))
+        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0)), None
+    terms = [number(key, 1.0 if key == "transition" else 0.0) for key in keys.split()]
+    return lens.bent_lens(bend, terms, start, kind, where)
 
 
 def _points(content: dict[str, Any], where: str) -> SparsePoints | None:

@@ -13,9 +13,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.captures.poses import lens_models
+from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
-from unmix_plugin.captures.poses.lens import Lens, fit_lens, require_unfolded
+from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_unfolded
 from unmix_plugin.captures.poses.metashape import read_metashape
 from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
@@ -192,7 +192,11 @@ def _read_llff(path: Path) -> PoseSet:
 _NAME_KEYS = ("file_path", "hyperspectral_file_path", "name")
 """Of a frame: the first that is there names its image."""
 _PLAIN_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
-_RESAMPLED_MODELS = ("OPENCV_FISHEYE", "FISHEYE624", "EQUIRECTANGULAR")
+_BENT_MODELS: dict[str, models.Bend] = {
+    "OPENCV_FISHEYE": models.bend_fisheye,
+    "FISHEYE624": models.bend_fisheye_624,
+    "EQUIRECTANGULAR": models.bend_equirectangular,
+}
 _NUM_TERMS_624 = 12
 
 
@@ -357,34 +361,24 @@ def _make_lens(
     """The lens, None without a focal length, and a note if it is not exactly the one of the file."""
     width, height = size
     x, y = given.center_px
-    center = (width / 2 if x is None else x, height / 2 if y is None else y)
-    focal = given.focal_at(*size)
-    if model == "ftheta" and len(terms) > 1 and terms[1] > 0:
-        focal = (1.0 / terms[1], 1.0 / terms[1])
-    if model == "EQUIRECTANGULAR":
+    center, focal = (width / 2 if x is None else x, height / 2 if y is None else y), given.focal_at(*size)
+    bend: models.Bend | None = _BENT_MODELS.get(model) if isinstance(model, str) else None
+    if model == "ftheta":
+        bend, focal, terms = models.bend_ftheta, (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
+    elif bend is models.bend_equirectangular:
         focal = (width / (2 * math.pi), height / math.pi)
+    elif bend is models.bend_fisheye:
+        terms = (*given.distortion[:2], *given.higher_radial)
     if focal is None:
         return None, None
     if model in _PLAIN_MODELS:
         return Lens(*size, focal, center, given.distortion, given.higher_radial), None
-    if model not in (*_RESAMPLED_MODELS, "ftheta"):
+    if bend is None:
         raise CaptureError(
             f"{where}: camera_model {describe(model)} is not known; expected one of "
-            f"{', '.join((*_PLAIN_MODELS, *_RESAMPLED_MODELS))}: undistort the images first"
+            f"{', '.join((*_PLAIN_MODELS, *_BENT_MODELS))}: undistort the images first"
         )
-
-    def project(ideal: lens_models.Points) -> lens_models.Points:
-        if model == "ftheta":
-            return lens_models.project_ftheta(ideal, center, terms, math.hypot(*size))
-        if model == "EQUIRECTANGULAR":
-            return lens_models.project_equirectangular(ideal, width, height)
-        if model == "FISHEYE624":
-            return lens_models.bend_fisheye_624(ideal, terms) * focal + center
-        return lens_models.project_fisheye(
-            ideal, focal, center, (*given.distortion[:2], *given.higher_radial)
-        )
-
-    return fit_lens(project, Lens(*size, focal, center), model, where)
+    return bent_lens(bend, terms, Lens(*size, focal, center), model, where)
 
 
 def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:
