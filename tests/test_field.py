@@ -65,7 +65,7 @@ def test_only_the_specular_part_depends_on_direction():
     )
     assert_close(up["scaled_abundances"], down["scaled_abundances"])
     assert (up["specular_coefficients"] - down["specular_coefficients"]).abs().max() > 1e-3
-    assert ((up["specular_coefficients"] > 0) & (up["specular_coefficients"] < 1)).all()
+    assert (up["specular_coefficients"] > 0).all()
 
 
 def test_where_the_light_moves_shading_depends_on_direction_and_abundances_do_not():
@@ -85,6 +85,22 @@ def test_the_view_dependent_part_of_a_dark_scene_starts_as_much_darker():
         evaluate(make_field(exposure=exposure))[1]["specular_coefficients"] for exposure in (1.0, 100.0)
     )
     assert 30 < (bright / dark).median() < 100
+
+
+def test_a_lamp_can_be_so_bright_that_a_small_part_of_a_pixel_saturates_it():
+    field = make_field()
+    first = evaluate(field)[1]["specular_coefficients"].median()
+    assert 0.02 < first < 0.1
+    positions = torch.zeros(1, 3)
+    _, features = field.get_density(positions)
+    direction = torch.tensor([[0.0, 0.0, 1.0]])
+    optimizer = torch.optim.Adam(field.specular_network.parameters(), lr=0.05)
+    for _ in range(200):
+        brightness = field.get_outputs(positions, direction, features.detach())["specular_coefficients"]
+        optimizer.zero_grad()
+        (brightness - 4).square().sum().backward()
+        optimizer.step()
+    assert_close(brightness, torch.full((1, 2), 4.0), atol=0.1, rtol=0)
 
 
 def test_without_a_specular_part_there_are_no_coefficients():

@@ -2,7 +2,7 @@
 
 Notation: `S` samples, `K` endmembers, `J` specular coefficients (spectra of a dictionary, or bands). A hash grid and a
 small network give density and features g(x); heads on g give abundances a = softmax(logits / T), scales s in (0, 1) and
-specular coefficients in (0, 1) that already carry the tint h.
+specular coefficients in (0, 8) that already carry the tint h.
 
 Source: Perez et al. 2025, UnMix-NeRF, section 3; the coefficients replace the paper's spectra a sample, see model.py.
 """
@@ -41,7 +41,10 @@ _ROWS_PER_CELL_OF_A_FACE = 1 / 3
 _FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
 NUM_FEATURES = 15
 """Geometry features that the heads see."""
-_SPECULAR_BIAS = -3.0
+_BRIGHTEST_GLOSS = 8.0
+"""Of lamps and their mirror images, in the brightness at which a sensor saturates: those that fill a small part of a
+pixel saturate all of it."""
+_SPECULAR_BIAS = -3.0 - math.log(_BRIGHTEST_GLOSS)
 """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
 
 
@@ -260,7 +263,7 @@ class UnmixField(CoefficientField):
         factors = torch.sigmoid(
             rows_of_outputs(self.specular_network, features, seen) + self.specular_bias / 2
         )
-        return (factors[:1] * factors[1:]).t()
+        return (_BRIGHTEST_GLOSS * factors[:1] * factors[1:]).t()
 
 
 def _bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:

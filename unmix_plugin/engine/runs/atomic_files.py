@@ -188,7 +188,7 @@ def _sync(path: Path, flags: int) -> None:
         os.close(descriptor)
 
 
-RUN_FORMAT = 6
+RUN_FORMAT = 7
 """Version of everything in a run folder; raised when an older version of this package could not read it."""
 
 _LARGEST_INTEGER = 2**63
