@@ -33,11 +33,14 @@ def cosine_directions(uniforms):
     return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=-1)
 
 
-class Lambert:
+class Lambert(MaterialFamily):
     """Albedo in three colours."""
 
     num_parameters = 3
     num_colours = 3
+
+    def _mixture(self, parameters, wo):
+        raise NotImplementedError  # it draws in a way of its own
 
     def evaluate(self, parameters, wi, wo):
         above = (wi[:, 2:] > 0) & (wo[:, 2:] > 0)
@@ -53,11 +56,14 @@ class Lambert:
         return parameters
 
 
-class Glossy:
+class Glossy(MaterialFamily):
     """Lambert, and a Phong lobe of exponent 1 + 60 p about the mirrored direction; parameters albedo, strength, p."""
 
     num_parameters = 5
     num_colours = 3
+
+    def _mixture(self, parameters, wo):
+        raise NotImplementedError  # it draws in a way of its own
 
     def _lobe(self, parameters, wi, wo):
         exponent = 1 + 60 * parameters[:, 4]

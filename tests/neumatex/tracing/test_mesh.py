@@ -10,7 +10,36 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.tracing import mesh as reading
 from unmix_plugin.neumatex.tracing.mesh import mesh_of, read_mesh
-from unmix_plugin.neumatex.tracing.rays import RayMesh, closest_twin
+from unmix_plugin.neumatex.tracing.rays import Hits, RayMesh
+
+
+def closest_twin(mesh, origins, directions):
+    """The same as `RayMesh.closest` in plain PyTorch: every ray against every triangle, in double precision.
+
+    Source: Moeller and Trumbore 1997, Fast, Minimum Storage Ray/Triangle Intersection.
+    """
+    a, b, c = mesh.corners().double().unbind(dim=1)
+    o, d = origins.double()[:, None], directions.double()[:, None]
+    across = torch.linalg.cross(d, (c - a)[None])
+    determinants = ((b - a) * across).sum(dim=-1)
+    inverse = torch.where(determinants == 0, torch.inf, 1 / determinants)
+    from_a = o - a
+    second = (from_a * across).sum(dim=-1) * inverse
+    along = torch.linalg.cross(from_a, (b - a).expand_as(from_a))
+    third = (d * along).sum(dim=-1) * inverse
+    distances = ((c - a) * along).sum(dim=-1) * inverse
+    inside = (second >= 0) & (third >= 0) & (second + third <= 1) & (distances > 0) & (distances < 1e30)
+    distances, triangles = torch.where(inside, distances, 1e30).min(dim=1)
+    found = distances < 1e30
+    chosen = triangles[:, None]
+    second, third = (values.gather(1, chosen)[:, 0] for values in (second, third))
+    barycentric = torch.stack([1 - second - third, second], dim=-1)
+    return Hits(
+        found,
+        torch.where(found, triangles, -1),
+        torch.where(found[:, None], barycentric, 0.0).float(),
+        distances.float(),
+    )
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])

@@ -23,6 +23,7 @@ from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.microfacet import LobeMixture
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.surface import Surface
 from unmix_plugin.products.atlas import Atlas, Texels, texels_of, unwrap
@@ -251,7 +252,7 @@ def _report_bytes(
     return json.dumps(content, indent=1).encode()
 
 
-class InColours:
+class InColours(MaterialFamily):
     """A spectral family as an eye sees it in light of a flat spectrum: the same materials in three colours."""
 
     num_colours = 3
@@ -260,7 +261,9 @@ class InColours:
         self._family = family
         self._matrix = rgb_matrix(bands).to(family.endmembers)
         self.num_parameters = family.num_parameters
-        self.sample, self.density = family.sample, family.density
+
+    def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
+        return self._family._mixture(parameters, wo)
 
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -39,26 +38,34 @@ NUM_GLOSS = 2
 _DIELECTRIC_F0 = 0.04
 
 
-@runtime_checkable
-class MaterialFamily(Protocol):
-    """Reflectances with a common set of parameters, each parameter in [0, 1]; differentiable by the parameters."""
+class MaterialFamily(ABC):
+    """Reflectances with a common set of parameters, each in [0, 1]; differentiable by the parameters.
 
-    @property
-    def num_parameters(self) -> int:
-        """P."""
-        ...
+    Directions are drawn from a cosine lobe and visible GGX normals.
+    """
 
-    @property
-    def num_colours(self) -> int:
-        """C."""
-        ...
+    PARAMETERS: tuple[str, ...]
+    """Their names."""
+    num_parameters: int
+    """P."""
+    num_colours: int
+    """C."""
 
+    @abstractmethod
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
         """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
-        ...
 
+    @abstractmethod
+    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
+
+    @abstractmethod
+    def _mixture(self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "3 N"]) -> LobeMixture:
+        """The lobes of each point, seen along a direction."""
+
+    @torch.no_grad()
     def sample(
         self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
@@ -67,40 +74,6 @@ class MaterialFamily(Protocol):
         Args:
             uniforms: Independent numbers in [0, 1).
         """
-        ...
-
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
-        """Probability density of `sample`, 1/sr; no gradient."""
-        ...
-
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
-        ...
-
-
-@runtime_checkable
-class DecodableFamily(MaterialFamily, Protocol):
-    """A family whose parameters are decoded by a network, once for all directions at a point."""
-
-    @property
-    def decoded_family(self) -> MaterialFamily:
-        """The same reflectances by decoded parameters, which need no network."""
-        ...
-
-    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
-        """Parameters of `decoded_family`; differentiable."""
-        ...
-
-
-class _LobeFamily(ABC):
-    """A `MaterialFamily` whose directions are drawn from a cosine lobe and visible GGX normals."""
-
-    @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
 
@@ -108,15 +81,21 @@ class _LobeFamily(ABC):
     def density(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, " N"]:
+        """Probability density of `sample`, 1/sr; no gradient."""
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
-    @abstractmethod
-    def _mixture(self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "3 N"]) -> LobeMixture:
-        """The lobes of each point, seen along a direction."""
+    @property
+    def decoded_family(self) -> MaterialFamily:
+        """The same reflectances by the parameters that `decoded` gives, without a network for each direction."""
+        return self
+
+    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
+        """Parameters of `decoded_family`, once for all directions at a point; differentiable."""
+        return parameters
 
 
-class StackFamily(_LobeFamily):
+class StackFamily(MaterialFamily):
     """Layers over a diffuse base: the first three parameters are its linear colour, and all of them give the layers."""
 
     num_colours = 3
@@ -189,7 +168,7 @@ class LayeredFamily(StackFamily):
         )
 
 
-class PbrFamily(_LobeFamily):
+class PbrFamily(MaterialFamily):
     """Metallic-roughness materials. Parameters: base colour (0 to 2, linear), roughness (3), metallicity (4).
 
     As published they may reflect up to twice the light at grazing angles, where the diffuse part does not know how much
@@ -227,7 +206,7 @@ class PbrFamily(_LobeFamily):
         return LobeMixture.of_albedos(alpha_of(roughness), diffuse[0], specular)
 
 
-class SpectralFamily(_LobeFamily):
+class SpectralFamily(MaterialFamily):
     """A diffuse base that is a mixture of endmember reflectances, and a grey gloss above it.
 
     Parameters: abundances (0 to K - 1, at least 0, sum 1), roughness (K), specular level (K + 1). With abundances a,
@@ -249,27 +228,10 @@ class SpectralFamily(_LobeFamily):
         """
         self.endmembers = endmembers
         self.gains = endmembers.new_ones(len(endmembers)) if gains is None else gains
-
-    @property
-    def num_endmembers(self) -> int:
-        """K."""
-        return self.endmembers.shape[0]
-
-    @property
-    def num_parameters(self) -> int:
-        """K + 2."""
-        return self.num_endmembers + NUM_GLOSS
-
-    @property
-    def num_colours(self) -> int:
-        """B."""
-        return self.endmembers.shape[1]
-
-    @property
-    def PARAMETERS(self) -> tuple[str, ...]:  # noqa: N802 - as the other families call it
-        """Names of the parameters."""
-        shares = tuple(f"abundance {index}" for index in range(self.num_endmembers))
-        return (*shares, "roughness", "specular level")
+        self.num_endmembers, self.num_colours = endmembers.shape
+        shares = (f"abundance {index}" for index in range(self.num_endmembers))
+        self.PARAMETERS = (*shares, "roughness", "specular level")
+        self.num_parameters = len(self.PARAMETERS)
 
     def abundances(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N K"]:
         """Share of each endmember."""

@@ -175,11 +175,9 @@ class NeuralFamily(StackFamily):
 
     @property
     def decoded_family(self) -> _DecodedFamily:
-        """The family of what `decoded` gives: the same reflectances, without a network for each direction."""
         return _DecodedFamily()
 
     def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
-        """Parameters of `decoded_family`; differentiable."""
         return torch.cat([parameters[:, :3], self.decoder.numbers(parameters[:, 3:]).T], -1)
 
     @torch.no_grad()

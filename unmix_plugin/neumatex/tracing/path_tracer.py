@@ -19,7 +19,7 @@ Randomization of Number Theoretic Methods for Multiple Integration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -27,10 +27,11 @@ from torch import Tensor
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import MaterialFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
 from unmix_plugin.neumatex.tracing.rays import Hits, PixelHits, RayMesh, SurfacePoints, pixel_hits
-from unmix_plugin.neumatex.tracing.surface import Surface, decoded_once
+from unmix_plugin.neumatex.tracing.surface import Surface
 
 _PATHS_AT_ONCE = 1 << 18
 """Paths of one call for a picture, which bounds the memory."""
@@ -64,6 +65,14 @@ class TracedObject:
     environment: Environment
     surface: Surface
 
+    @property
+    def _family(self) -> MaterialFamily:
+        """With which light is worked out, at what `_parameters` gives."""
+        return self.surface.family.decoded_family
+
+    def _parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        return self.surface.family.decoded(self.surface.parameters(positions))
+
     def seen(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> SeenPoints:
         """What rays of unit directions meet first."""
         with torch.no_grad():
@@ -92,13 +101,13 @@ class TracedObject:
         """
         num_colours = self.environment.num_colours
         assert num_colours == self.surface.family.num_colours
-        world, device = replace(self, surface=decoded_once(self.surface)), to_eye.device
+        device = to_eye.device
         numbers = _SamplePoints.draw(len(to_eye), samples, bounces + 1, generator, device)
-        vertices = _first_vertices(world, points, to_eye, samples)
+        vertices = _first_vertices(self, points, to_eye, samples)
         radiance = torch.zeros(len(to_eye), num_colours, device=device)
         for depth in range(bounces + 1):
             drawn = numbers.of(vertices.paths, depth)
-            lights, vertices = _shade(world, vertices, drawn, is_last=depth == bounces)
+            lights, vertices = _shade(self, vertices, drawn, is_last=depth == bounces)
             for paths, found in lights:
                 radiance = radiance.index_add(0, paths // samples, found)
         return radiance / samples
@@ -183,7 +192,7 @@ class _Vertices:
 
 def _first_vertices(world: TracedObject, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
     # Materials are looked up once a point, not once a sample.
-    parameters, axes = world.surface.parameters(points.positions), frames(points.normals)
+    parameters, axes = world._parameters(points.positions), frames(points.normals)
     wo = to_local(axes, to_eye)
     rows = torch.arange(len(to_eye), device=to_eye.device).repeat_interleave(samples)
     throughput = torch.ones(len(rows), world.environment.num_colours, device=to_eye.device)
@@ -196,7 +205,7 @@ def _shade(
 ) -> tuple[list[_Light], _Vertices]:
     """Direct light at vertices by both strategies, and the vertices that the paths reach next."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
-    wi = world.surface.family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
+    wi = world._family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
     directions = to_world(vertices.axes, wi)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
@@ -221,7 +230,7 @@ def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float
     rows = (vertices.front(directions, cosines) & (density > 0)).nonzero()[:, 0]
     rows = rows[~world.ray_mesh.blocked(vertices.points.positions[rows], directions[rows])]
     vertices, directions, density = vertices.select(rows), directions[rows], density[rows]
-    family, wi = world.surface.family, to_local(vertices.axes, directions)
+    family, wi = world._family, to_local(vertices.axes, directions)
     reflectance = family.evaluate(vertices.parameters, wi, vertices.wo)
     other = family.density(vertices.parameters.detach(), wi, vertices.wo)
     factor = (cosines[rows] * _power_heuristic(density, other) / density)[:, None]
@@ -233,7 +242,7 @@ def _carried(
     world: TracedObject, vertices: _Vertices, wi: Float[Tensor, "M 3"]
 ) -> tuple[Float[Tensor, "M C"], Float[Tensor, " M"]]:
     """Throughput behind a reflection into directions that the material drew, and their density."""
-    family = world.surface.family
+    family = world._family
     density = family.density(vertices.parameters.detach(), wi, vertices.wo)
     usable = torch.isfinite(density) & (density > 0)
     factor = torch.where(usable, wi[:, 2] / density, 0.0)[:, None]
@@ -254,7 +263,7 @@ def _reached(
 ) -> _Vertices:
     """The next vertices of paths that met the mesh."""
     points = world.ray_mesh.points(hits, directions)
-    axes, parameters = frames(points.normals), world.surface.parameters(points.positions)
+    axes, parameters = frames(points.normals), world._parameters(points.positions)
     return _Vertices(paths, points, axes, to_local(axes, -directions), parameters, carried)
 
 

@@ -131,35 +131,6 @@ def _bent_to(to_eye: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Flo
     return torch.where(cosines < _LEAST_COSINE, bent, normals)
 
 
-def closest_twin(mesh: Mesh, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Hits:
-    """The same as `RayMesh.closest` in plain PyTorch: every ray against every triangle, in double precision.
-
-    Source: Moeller and Trumbore 1997, Fast, Minimum Storage Ray/Triangle Intersection.
-    """
-    a, b, c = mesh.corners().double().unbind(dim=1)
-    o, d = origins.double()[:, None], directions.double()[:, None]
-    across = torch.linalg.cross(d, (c - a)[None])
-    determinants = ((b - a) * across).sum(dim=-1)
-    inverse = torch.where(determinants == 0, torch.inf, 1 / determinants)
-    from_a = o - a
-    second = (from_a * across).sum(dim=-1) * inverse
-    along = torch.linalg.cross(from_a, (b - a).expand_as(from_a))
-    third = (d * along).sum(dim=-1) * inverse
-    distances = ((c - a) * along).sum(dim=-1) * inverse
-    inside = (second >= 0) & (third >= 0) & (second + third <= 1) & (distances > 0) & (distances < _LONGEST)
-    distances, triangles = torch.where(inside, distances, _LONGEST).min(dim=1)
-    found = distances < _LONGEST
-    chosen = triangles[:, None]
-    second, third = (values.gather(1, chosen)[:, 0] for values in (second, third))
-    barycentric = torch.stack([1 - second - third, second], dim=-1)
-    return Hits(
-        found,
-        torch.where(found, triangles, -1),
-        torch.where(found[:, None], barycentric, 0.0).float(),
-        distances.float(),
-    )
-
-
 @dataclass(frozen=True)
 class PixelHits:
     """Surface points behind the pixels of one image."""

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from unmix_plugin.neumatex.tracing.families import DecodableFamily, MaterialFamily
+from unmix_plugin.neumatex.tracing.families import MaterialFamily
 
 NUM_CHANNELS = 12
 """Channels of a plane, as published."""
@@ -48,29 +48,6 @@ class Surface(Protocol):
             positions: Model space, where the mesh fits in [-1, 1]^3.
         """
         ...
-
-
-@dataclass(frozen=True)
-class _DecodedSurface:
-    """The same materials, their parameters decoded where they are looked up."""
-
-    encoded: Surface
-    decodable: DecodableFamily
-    """Of `encoded`."""
-
-    @property
-    def family(self) -> MaterialFamily:
-        return self.decodable.decoded_family
-
-    def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
-        return self.decodable.decoded(self.encoded.parameters(positions))
-
-
-def decoded_once(surface: Surface) -> Surface:
-    """The same materials so that a network, where the family has one, is evaluated once a point, not once a
-    direction."""
-    family = surface.family
-    return _DecodedSurface(surface, family) if isinstance(family, DecodableFamily) else surface
 
 
 @dataclass(frozen=True)
