@@ -22,7 +22,7 @@ from tests.products.ball_model import (
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export_mesh
+from unmix_plugin.products.mesh import _mesh_paths, _textures, _write_mesh, export
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
@@ -309,4 +309,4 @@ def test_a_mesh_without_faces_is_refused():
 )
 def test_impossible_settings_are_refused(density, smoothing, said):
     with pytest.raises(ConfigError, match=said):
-        export_mesh(MagicMock(spec=Job), Mesh(density=density, smoothing=smoothing))
+        export(MagicMock(spec=Job), Mesh(density=density, smoothing=smoothing))

@@ -11,7 +11,7 @@ from PIL import Image
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.products import metamerism
-from unmix_plugin.products.metamerism import _find_metamers, export_metamerism
+from unmix_plugin.products.metamerism import _find_metamers, export
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Metamerism
 from unmix_plugin.spectral.bands import Bands
@@ -71,7 +71,7 @@ def pairs_of(found):
 
 def exported(folder, materials, lights=BOTH, **asked):
     job = MagicMock(spec=Job, materials=materials, folder=folder, working=MagicMock(), say=MagicMock())
-    written = export_metamerism(job, Metamerism(lights=lights, **asked))
+    written = export(job, Metamerism(lights=lights, **asked))
     assert written == [folder / "metamerism.csv", folder / "metamerism.png"]
     job.claim.assert_called_once_with(written)
     return job

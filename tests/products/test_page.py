@@ -83,7 +83,7 @@ def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=4
         lambda _, items: iter(items),
         cast("Any", None),
     )
-    (path,) = page.export_page(job, "", resolution, library)
+    (path,) = page.export(job, page.Page(resolution=resolution, library=library))
     facts = json.loads(path.read_text().split('id="data-facts">')[1].split("</script>")[0])
     return facts, said, path
 

@@ -209,10 +209,8 @@ def _render(
         if needs_survey(asked):
             with working(console, "looking at all views for what their pictures share"):
                 survey = take_survey(scene, cameras.views, asked)
-    with RenderJob(scene, cameras, outputs, survey, folder, processes) as job:
-        for block in follow(console, "rendering", job.blocks()):
-            job.render(block)
-        job.finish()
+    job = RenderJob(scene, cameras, outputs, survey, folder, processes)
+    job.render(follow(console, "rendering", job.blocks()))
     if not processes.is_first:
         return
     for path, output in legends.items():

@@ -33,7 +33,7 @@ SHARE_SCALE = ColourScale("viridis", 0.0, 1.0, "abundance")
 """Colours of abundances, the same in every figure."""
 
 
-def export_abundances(job: Job, asked: Abundances) -> list[Path]:
+def export(job: Job, asked: Abundances) -> list[Path]:
     """Write the abundances of views: npy, envi and exr hold the same float32 numbers, png is a figure."""
     return job.write_views(
         asked.views, partial(view_paths, asked.formats), partial(_write_view, asked.formats)

@@ -19,7 +19,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import PredictedView
 
 
-def export_cubes(job: Job, asked: Cubes) -> list[Path]:
+def export(job: Job, asked: Cubes) -> list[Path]:
     """Write the spectra of views."""
     return job.write_views(
         asked.views, partial(view_paths, asked.formats), partial(_write_view, asked.formats)

@@ -25,7 +25,7 @@ _LINE_STYLES = ("-", "--", "-.", ":")
 _LEGEND_ROWS = 16
 
 
-def export_endmembers(job: Job, asked: Endmembers) -> list[Path]:
+def export(job: Job, asked: Endmembers) -> list[Path]:
     """Write table, library and plot, and in the run's own bands the angles to all known spectra.
 
     Raises:

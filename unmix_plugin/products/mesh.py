@@ -34,7 +34,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 _MOST_SMOOTHING = 8.0
 
 
-def export_mesh(job: Job, asked: Mesh) -> list[Path]:
+def export(job: Job, asked: Mesh) -> list[Path]:
     """Sample the density, march through it, trim and colour the surface."""
     density, smoothing, formats, texture_size = (
         asked.density,

@@ -48,7 +48,7 @@ class _Metamers:
     """Those with an endmember of the run first, each kind by its greatest difference."""
 
 
-def export_metamerism(job: Job, asked: Metamerism) -> list[Path]:
+def export(job: Job, asked: Metamerism) -> list[Path]:
     """Compare all pairs in all lights; write them as CSV, and swatches of the first dozen in every light."""
     table_path, figure_path = job.folder / "metamerism.csv", job.folder / "metamerism.png"
     job.claim([table_path, figure_path])

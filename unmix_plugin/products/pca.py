@@ -35,7 +35,7 @@ _LEAST_EXPLAINED = 1e-6
 """Part of the variance that a component has to explain to be shown."""
 
 
-def export_pca(job: Job, asked: Pca) -> list[Path]:
+def export(job: Job, asked: Pca) -> list[Path]:
     """Find the components of all views, then paint each."""
     views, table = resized_views(job.views(asked.views)), job.folder / "components.csv"
     paths = [job.folder / f"{view.name}.png" for view in views]

@@ -172,7 +172,7 @@ _RAYS_PER_POINT = 5
 _COUNT_BOUNDS = (1, 10_000_000)
 
 
-def export_point_cloud(job: Job, asked: PointCloud) -> list[Path]:
+def export(job: Job, asked: PointCloud) -> list[Path]:
     """Look through all cameras of the run, clean and thin what they see."""
     (low, high), count, materials = _COUNT_BOUNDS, asked.num_points, job.materials
     if not low <= count <= high:

@@ -9,6 +9,7 @@ from typing import Any
 
 from unmix_plugin.formats.files import make_folder, write_file
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Poses
 from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.camera_files import camera_entry
@@ -16,7 +17,7 @@ from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 
-def export_poses(job: Job) -> list[Path]:
+def export(job: Job, _: Poses) -> list[Path]:
     """Write transforms.json."""
     path = job.folder / "transforms.json"
     job.claim([path])

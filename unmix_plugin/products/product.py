@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -70,6 +71,11 @@ class Product(RunProduct):
     """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
     sensor: Path | None = None
     """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Write the product by `export` of the module of its name, which is imported for it alone."""
+        module = import_module(f"unmix_plugin.products.{self.name.replace('-', '_')}")
+        return module.export(job, self)
 
 
 @dataclass(frozen=True)

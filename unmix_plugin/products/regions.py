@@ -3,9 +3,6 @@ the command line asks for them."""
 
 from __future__ import annotations
 
-import csv
-import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +10,9 @@ from jaxtyping import Bool
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
-from unmix_plugin.formats.files import make_folder, write_file
+from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Regions
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
 from unmix_plugin.trained.measures import keep_region
@@ -27,7 +25,24 @@ def measured_surface(job: Job) -> MeasuredSurface:
     return MeasuredSurface.of(job.scene, job.follow, job.working)
 
 
-def export_regions(job: Job) -> list[Path]:
+def export(job: Job, asked: Regions) -> list[Path]:
+    """Keep a region with the run, after a look at what is in it, or forget one; otherwise measure all of them."""
+    described = (asked.box, asked.material, asked.view, asked.polygon, asked.mask)
+    is_described = any(what is not None for what in described)
+    if asked.add is None and not is_described:
+        if asked.remove is None:
+            return _measure_all(job)
+        return [keep_region(job.loaded.folder, asked.remove, None)]
+    if asked.add is None or asked.remove is not None:
+        raise ConfigError("give --add NAME with what the region is, or --remove NAME alone")
+    name, region = check_name(asked.add, job.loaded.measures.regions), _requested(job, asked)
+    found = measured_surface(job).measure(region, name)
+    path = keep_region(job.loaded.folder, name, region)
+    job.say(f"{name}: {found.said(job.materials.names, job.scene.scale)}")
+    return [path]
+
+
+def _measure_all(job: Job) -> list[Path]:
     """Write regions.csv (area and abundances of each kept region and of each material), regions-spectra.csv (mean and
     standard deviation), and the means as the library regions.sli."""
     table, spectra = job.folder / "regions.csv", job.folder / "regions-spectra.csv"
@@ -46,10 +61,8 @@ def export_regions(job: Job) -> list[Path]:
         area_cm2 = "" if factor is None else f"{one.area * factor:.6g}"
         rows.append([name, f"{one.area:.6g}", area_cm2, *(f"{share:.6g}" for share in one.abundances)])
         job.say(f"{name}: {one.said(names, scale)}")
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
     make_folder(job.folder)
-    write_file(table, text.getvalue().encode())
+    write_file(table, csv_bytes(rows))
     columns = {
         f"{name} {what}": values
         for name, one in found.items()
@@ -66,31 +79,8 @@ def export_regions(job: Job) -> list[Path]:
     return [table, spectra, *written]
 
 
-@dataclass(frozen=True)
-class RegionRequest:
-    """A region as the command line has it; exactly one of box, material, polygon and mask."""
-
-    box: tuple[str, str] | None = None
-    material: str | None = None
-    view: str | None = None
-    polygon: str | None = None
-    mask: Path | None = None
-
-
-def change_regions(job: Job, name: str | None, removed: str | None, asked: RegionRequest) -> list[Path]:
-    """Keep a region with the run, after a look at what is in it, or forget one."""
-    if removed is not None and name is None and asked == RegionRequest():
-        return [keep_region(job.loaded.folder, removed, None)]
-    if name is None or removed is not None:
-        raise ConfigError("give --add NAME with what the region is, or --remove NAME alone")
-    name, region = check_name(name, job.loaded.measures.regions), _requested(job, asked)
-    found = measured_surface(job).measure(region, name)
-    path = keep_region(job.loaded.folder, name, region)
-    job.say(f"{name}: {found.said(job.materials.names, job.scene.scale)}")
-    return [path]
-
-
-def _requested(job: Job, asked: RegionRequest) -> Region:
+def _requested(job: Job, asked: Regions) -> Region:
+    """The region that is asked for: exactly one of box, material, polygon and mask."""
     given = [what for what in (asked.box, asked.material, asked.polygon, asked.mask) if what is not None]
     if len(given) != 1 or (asked.view is not None) != (asked.polygon is not None or asked.mask is not None):
         raise ConfigError("give one of --box, --material, --view with --polygon, and --view with --mask")

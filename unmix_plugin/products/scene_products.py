@@ -1,5 +1,7 @@
-"""What `unmix-export` offers of scenes of mixed materials: each product with its options. The help needs nothing
-else, so the work of a product, in the module of its name, is imported when it is asked for."""
+"""What `unmix-export` offers of scenes of mixed materials: each product with its options.
+
+The help needs nothing else, so the work of a product, `export` in the module of its name, is imported when asked for.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,6 @@ class Abundances(ViewProduct):
     formats: tuple[Literal["npy", "png", "envi", "exr"], ...] = ("npy", "png")
     """npy, envi (.hdr and .img), exr (a channel for each endmember), png."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Render the views and write the abundances of each."""
-        from unmix_plugin.products.abundances import export_abundances
-
-        return export_abundances(job, self)
-
 
 @dataclass(frozen=True)
 class Cubes(ViewProduct):
@@ -36,12 +32,6 @@ class Cubes(ViewProduct):
 
     formats: tuple[Literal["envi", "exr", "npy"], ...] = ("envi",)
     """envi, exr, npy (without wavelengths)."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Render the views and write the spectra of each."""
-        from unmix_plugin.products.cubes import export_cubes
-
-        return export_cubes(job, self)
 
 
 @dataclass(frozen=True)
@@ -56,12 +46,6 @@ class Endmembers(Product):
     ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     compare: Literal["scale", "continuum"] = "scale"
     """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Write table, library, plot and angles."""
-        from unmix_plugin.products.endmembers import export_endmembers
-
-        return export_endmembers(job, self)
 
 
 @dataclass(frozen=True)
@@ -88,12 +72,6 @@ class Mesh(Product):
     """Texels along the edges of textures in GLB and beside OBJ: colour, segmentation, abundances; None: as many as the
     surface needs, from 1024 on. 0: none, colours of vertices instead."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Sample the density, march through it, trim and colour the surface."""
-        from unmix_plugin.products.mesh import export_mesh
-
-        return export_mesh(job, self)
-
 
 @dataclass(frozen=True)
 class Metamerism(Product):
@@ -114,12 +92,6 @@ class Metamerism(Product):
     """Known spectra to pair in place of the built-in ones: .csv files, ENVI spectral libraries, texts of ECOSTRESS
     or USGS, or folders of them; +builtin adds the built-in ones."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Compare all pairs in all lights."""
-        from unmix_plugin.products.metamerism import export_metamerism
-
-        return export_metamerism(job, self)
-
 
 @dataclass(frozen=True)
 class Page(Product):
@@ -137,12 +109,6 @@ class Page(Product):
     """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
     ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Find the surface, look at every vertex, write the page."""
-        from unmix_plugin.products.page.page import export_page
-
-        return export_page(job, self.title, self.resolution, self.library)
-
 
 @dataclass(frozen=True)
 class Pca(Product):
@@ -155,12 +121,6 @@ class Pca(Product):
     """What has its components taken."""
     views: Literal["eval", "train", "all"] = "eval"
     """Which of the scene's views to render."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Find the components of all views, then paint each."""
-        from unmix_plugin.products.pca import export_pca
-
-        return export_pca(job, self)
 
 
 @dataclass(frozen=True)
@@ -176,12 +136,6 @@ class PointCloud(Product):
     """Numbers to add to each point: spectral indices, targets, nearest known spectra and absorptions, as in index:ndvi
     target:ace:paint.csv library:angle:mine.csv absorption:centre:650-700."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Look through all cameras of the run, clean and thin what they see."""
-        from unmix_plugin.products.point_cloud import export_point_cloud
-
-        return export_point_cloud(job, self)
-
 
 @dataclass(frozen=True)
 class Poses(Product):
@@ -189,12 +143,6 @@ class Poses(Product):
     corrected them, where it did."""
 
     name = "poses"
-
-    def write(self, job: Job) -> list[Path]:
-        """Write transforms.json."""
-        from unmix_plugin.products.poses import export_poses
-
-        return export_poses(job)
 
 
 @dataclass(frozen=True)
@@ -219,15 +167,6 @@ class Regions(Product):
     """Picture of that view's size: what is seen where it is white."""
     remove: str | None = None
     """Name of a region to forget."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Keep or forget a region, or measure all of them."""
-        from unmix_plugin.products.regions import RegionRequest, change_regions, export_regions
-
-        asked = RegionRequest(self.box, self.material, self.view, self.polygon, self.mask)
-        if self.add is None and self.remove is None and asked == RegionRequest():
-            return export_regions(job)
-        return change_regions(job, self.add, self.remove, asked)
 
 
 @dataclass(frozen=True)
@@ -255,14 +194,6 @@ class Report(Product):
     """Its inventory number."""
     notes: str | None = None
     """What a reader should know of the object and its capture."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Render, compare and lay out."""
-        from unmix_plugin.products.report.report import export_report
-
-        is_edited = self.edits is not None or self.illuminant is not None
-        about = {name: getattr(self, name) for name in ("title", "author", "object", "number", "notes")}
-        return export_report(job, self.max_views, self.data, self.library, is_edited, about)
 
 
 @dataclass(frozen=True)
@@ -294,12 +225,6 @@ class Segmentation(ViewProduct):
 
     name = "segmentation"
 
-    def write(self, job: Job) -> list[Path]:
-        """Render the views and write the materials of each."""
-        from unmix_plugin.products.segmentation import export_segmentation
-
-        return export_segmentation(job, self)
-
 
 @dataclass(frozen=True)
 class Spectrum(Product):
@@ -325,12 +250,6 @@ class Spectrum(Product):
     compare: Literal["scale", "continuum"] = "scale"
     """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Probe the place and write what is there."""
-        from unmix_plugin.products.spectrum import export_spectrum
-
-        return export_spectrum(job, self)
-
 
 @dataclass(frozen=True)
 class Splats(Product):
@@ -346,12 +265,6 @@ class Splats(Product):
     up: Literal["y", "z"] = "y"
     """z: axes stay those of the scene's world."""
 
-    def write(self, job: Job) -> list[Path]:
-        """Find the surface and make a Gaussian of each of its vertices."""
-        from unmix_plugin.products.splats import export_splats
-
-        return export_splats(job, self)
-
 
 @dataclass(frozen=True)
 class Volume(Product):
@@ -362,12 +275,6 @@ class Volume(Product):
 
     resolution: int = 128
     """Cells along the longest edge of the scene box."""
-
-    def write(self, job: Job) -> list[Path]:
-        """Sample the field, slice by slice."""
-        from unmix_plugin.products.volume import export_volume
-
-        return export_volume(job, self)
 
 
 PRODUCTS: tuple[RunWork, ...] = (

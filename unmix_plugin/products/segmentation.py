@@ -21,7 +21,7 @@ from unmix_plugin.trained.evaluation import PredictedView
 from unmix_plugin.trained.run_materials import endmember_colours
 
 
-def export_segmentation(job: Job, asked: Segmentation) -> list[Path]:
+def export(job: Job, asked: Segmentation) -> list[Path]:
     """Write scores, figure and ids of views, and the legend of the ids."""
     path, legend = job.folder / "legend.csv", _legend_bytes(job.materials)
     if not (path.is_file() and path.read_bytes() == legend):  # other views of the same run have the same

@@ -48,7 +48,7 @@ _WHOLE = 0.95
 """Alpha from which a pixel shows one thing."""
 
 
-def export_spectrum(job: Job, asked: Spectrum) -> list[Path]:
+def export(job: Job, asked: Spectrum) -> list[Path]:
     """Probe a place and write what is there."""
     view_name, pixel_text, point_text, region = asked.view, asked.pixel, asked.point, asked.region
     measured = over_views = spread = None
@@ -139,25 +139,7 @@ def _with_all_bands(scene: Scene) -> dict[str, int]:
     return {frame.name: index for index, frame in frames if scene.sensor_of(index).sees_all_bands}
 
 
-@dataclass(frozen=True)
-class _OverViews:
-    """What training views measured of one place."""
-
-    spectra: Float[np.ndarray, "N B"]
-    """In the light of the prediction, one of each view that sees it."""
-
-    @property
-    def mean(self) -> Float[np.ndarray, " B"]:
-        """Over the views."""
-        return self.spectra.mean(axis=0)
-
-    @property
-    def spread(self) -> Float[np.ndarray, " B"]:
-        """Standard deviation over the views: noise, gloss, light that moves, and what poses or the surface are off."""
-        return self.spectra.std(axis=0, ddof=1)
-
-
-def _over_views(job: Job, scene: Scene | None, probe: Probe) -> _OverViews | None:
+def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray, "N B"] | None:
     """What the training views that see a probed place measured of it; None where fewer than two do."""
     if scene is None or probe.position is None or probe.opacity < OCCUPIED_ACCUMULATION:
         return None
@@ -181,7 +163,7 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> _OverViews | Non
     if len(spectra) < 2:
         job.say("fewer than two training views see the place: no spread over views")
         return None
-    return _OverViews(np.stack(spectra))
+    return np.stack(spectra)
 
 
 @dataclass(frozen=True)
@@ -199,8 +181,9 @@ class _ProbedPlace:
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
     spread: Float[np.ndarray, " B"] | None = None
     """Standard deviation, of a region."""
-    over_views: _OverViews | None = None
-    """What training views measured."""
+    over_views: Float[np.ndarray, "N B"] | None = None
+    """What training views measured, in the light of the prediction; they differ by noise, gloss, light that moves, and
+    what poses or the surface are off."""
 
 
 def _spectrum_paths(folder: Path, name: str) -> list[Path]:
@@ -218,8 +201,8 @@ def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: Trained
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
     if place.over_views is not None:
-        columns["mean over views"] = place.over_views.mean
-        columns["standard deviation over views"] = place.over_views.spread
+        columns["mean over views"] = place.over_views.mean(axis=0)
+        columns["standard deviation over views"] = place.over_views.std(axis=0, ddof=1)
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
     table = SpectraTable(materials.bands, tuple(columns), np.stack(list(columns.values())))
@@ -246,8 +229,8 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
             wavelengths, mean - place.spread, mean + place.spread, color="0.85", label="± 1 std. dev."
         )
     if place.over_views is not None:
-        mean, spread = place.over_views.mean, place.over_views.spread
-        label = f"{len(place.over_views.spectra)} training views, ± 1 std. dev."
+        mean, spread = place.over_views.mean(axis=0), place.over_views.std(axis=0, ddof=1)
+        label = f"{len(place.over_views)} training views, ± 1 std. dev."
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
@@ -289,7 +272,7 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         **place.facts,
         "world_position": None if position is None else position.tolist(),
         "opacity": probe.opacity,
-        "measured_in_views": None if place.over_views is None else len(place.over_views.spectra),
+        "measured_in_views": None if place.over_views is None else len(place.over_views),
         "material": max(shares, key=lambda name: shares[name]) if is_something else None,
         "abundances": shares,
         "library": [match_json(shown.match) for shown in place.matches],

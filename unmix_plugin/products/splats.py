@@ -31,7 +31,7 @@ _OPACITY = 0.98
 _WHAT = "surface of an unmix-nerf run as Gaussians"
 
 
-def export_splats(job: Job, asked: Splats) -> list[Path]:
+def export(job: Job, asked: Splats) -> list[Path]:
     """Find the surface and make a Gaussian of each of its vertices."""
     paths = {kind: job.folder / f"splats.{kind}" for kind in asked.formats}
     job.claim(list(paths.values()))

@@ -23,7 +23,7 @@ _FASTEST = 1
 """Compression that the disk doesn't wait for; most of a volume is empty and shrinks to nothing anyway."""
 
 
-def export_volume(job: Job, asked: Volume) -> list[Path]:
+def export(job: Job, asked: Volume) -> list[Path]:
     """Sample the field, slice by slice."""
     grid, path = GridPoints.over(job.scene.scene_box.aabb, asked.resolution), job.folder / "volume.npz"
     job.claim([path])

@@ -38,9 +38,8 @@ def render(
     """Render into a folder."""
     products = choose_formats(outputs, formats, SCENE, cameras.is_path)
     survey = take_survey(SCENE, cameras.views, {product.output for product in products})
-    with RenderJob(SCENE, cameras, products, survey, folder) as job:
-        for block in job.blocks(pixels):
-            job.render(block)
+    job = RenderJob(SCENE, cameras, products, survey, folder)
+    job.render(job.blocks(pixels))
     return products, survey, job
 
 

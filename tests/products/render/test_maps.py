@@ -32,9 +32,8 @@ def folder(tmp_path_factory):
     for source in ("map", "map:east"):
         cameras = choose_cameras(SCENE, CameraRequest(source, pixel_size=0.2), SCALE)
         outputs = choose_formats(["accumulation", "spectral"], ["tif", "envi"], SCENE, False)
-        with RenderJob(SCENE, cameras, outputs, Survey(), folder) as job:
-            for block in job.blocks():
-                job.render(block)
+        job = RenderJob(SCENE, cameras, outputs, Survey(), folder)
+        job.render(job.blocks())
     return folder
 
 

@@ -90,9 +90,8 @@ def test_everything_that_it_shows_is_written_in_every_format(tmp_path, is_path):
     outputs = choose_formats(["all"], ["npy", "envi", "exr", "png", "mp4"], SCENE, is_path)
     survey = take_survey(SCENE, cameras.views, [one.output for one in outputs])
     assert 290 < survey.scales["heat"].low < survey.scales["heat"].high < 310
-    with RenderJob(SCENE, cameras, outputs, survey, tmp_path) as job:
-        for block in job.blocks(30):
-            job.render(block)
+    job = RenderJob(SCENE, cameras, outputs, survey, tmp_path)
+    job.render(job.blocks(30))
     for one in outputs:
         assert all(path.is_file() for path in output_paths(tmp_path, one, cameras))
         assert not needs_legend(one, SCENE) or len(draw_legend(one.output, job.palette)) > 1000

@@ -23,7 +23,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int, Int64, UInt8, UInt16
+from jaxtyping import Float, Float64, Int, UInt8, UInt16
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -36,6 +36,7 @@ from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import draw_abundances
 from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.scene_products import Page
 from unmix_plugin.products.segmentation import draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
@@ -94,36 +95,30 @@ class ShownAsPage(Protocol):
         ...
 
 
-def export_page(job: Job, title: str, resolution: int, library: Sequence[Path] = ()) -> list[Path]:
-    """Find the surface, look at every vertex, and write `page.html`.
+def export(job: Job, asked: Page) -> list[Path]:
+    """Find the surface, look at every vertex, and write `page.html`, with as many triangles as fit.
 
-    Args:
-        job: The run and where to write.
-        title: Of the page; empty: the scene's name.
-        resolution: Cells along the longest edge of the scene box; fewer where the page would have more triangles than
-            `MOST_TRIANGLES` or exceed `MOST_BYTES`.
-        library: Known spectra to compare with, as `library_of` takes them.
     Raises:
         ConfigError: a library for an object without bands, or too large a one.
         SpectrumError: a library that can't be read or compared.
     """
     path, scene = job.folder / "page.html", job.loaded.scene
     job.claim([path])
-    known = None if isinstance(scene, ShownAsPage) else _known_spectra(job.materials, library)
-    asked, before = resolution, math.inf
+    known = None if isinstance(scene, ShownAsPage) else _known_spectra(job.materials, asked.library)
+    resolution, before = asked.resolution, math.inf
     while True:
         if isinstance(scene, ShownAsPage):
             with job.working("looking at the surface"):
                 content = scene.page_content(resolution)
         else:
             content, resolution = _mixture_content(job, resolution)
-        known = known or _known_spectra(content.materials, library)
-        if resolution < asked:
+        known = known or _known_spectra(content.materials, asked.library)
+        if resolution < asked.resolution:
             content.facts["notes"].append(
-                f"The surface is as fine as {resolution} cells along the longest edge, not {asked}: browsers turn "
-                f"{MOST_TRIANGLES:,} triangles smoothly, and a mail takes {MOST_BYTES / 1e6:g} MB."
+                f"The surface is as fine as {resolution} cells along the longest edge, not {asked.resolution}: "
+                f"browsers turn {MOST_TRIANGLES:,} triangles smoothly, and a mail takes {MOST_BYTES / 1e6:g} MB."
             )
-        page = _page(job, content, known, title)
+        page = _page(job, content, known, asked.title)
         if len(page) <= MOST_BYTES:
             break
         # No resolution shrinks scripts, library, pictures and tables of light.
@@ -145,21 +140,16 @@ def export_page(job: Job, title: str, resolution: int, library: Sequence[Path] =
     return [write_file(path, page)]
 
 
-@dataclass(frozen=True)
-class _KnownSpectra:
-    """Reflectances of a library at the bands of a page, without those that can't be compared there."""
-
-    sources: list[dict[str, str]]
-    """Name and source of each."""
-    steps: UInt16[np.ndarray, "M B"]
-    """Of 65534 for its greatest value, which angles don't ask for; `_UNKNOWN` where nothing was measured."""
+_KnownSpectra = tuple[list[dict[str, str]], UInt16[np.ndarray, "M B"]]
+"""Name and source of each spectrum that can be compared at the bands of a page, and its reflectance there: steps of
+65534 for its greatest value, which angles don't ask for; `_UNKNOWN` where nothing was measured."""
 
 
 def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _KnownSpectra:
     if materials is None:
         if library:
             raise ConfigError("the object is known in colours, not in bands: leave out --library")
-        return _KnownSpectra([], np.zeros((0, 0), np.uint16))
+        return [], np.zeros((0, 0), np.uint16)
     known, light = library_of(library, materials.bands), _light_of(materials)
     chosen = known.comparable(materials.bands, light)
     if chosen.sum() > _MOST_KNOWN:
@@ -173,7 +163,7 @@ def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _Kno
         for one, is_in in zip(known.materials, chosen, strict=True)
         if is_in
     ]
-    return _KnownSpectra(named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2"))
+    return named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2")
 
 
 def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
@@ -182,7 +172,7 @@ def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
 
 def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> bytes:
     """The whole page."""
-    arrays, layout = _packed({**content.arrays, "known": known.steps})
+    arrays, layout = _packed({**content.arrays, "known": known[1]})
     scale = job.loaded.scale
     root = job.loaded.record.summary.get("root")
     name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
@@ -194,7 +184,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "metres_per_unit": None if scale is None else scale.metres_per_unit,
         "scale": None if scale is None else scale.said,
         **_spectral_facts(content.materials),
-        "known": known.sources,
+        "known": known[0],
         "regions": [],
         **content.facts,
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
@@ -326,7 +316,8 @@ def _vertex_arrays(
     above = look_at(scene, positions, -normals).map(lambda packed: packed.cpu())
     found = above.map(lambda packed: packed / packed[:, :1].clamp(min=1e-6))
     tints = torch.zeros_like(above.specular)
-    fit = _GlossFit.empty(len(positions))
+    # Least squares of each vertex: how much gloss is sent along a direction.
+    squares, products = _RIDGE * torch.eye(9).repeat(len(positions), 1, 1), torch.zeros(len(positions), 9)
     trained = [view.camera for view in scene.views if view.split == "train"]
     for camera in trained[:: -(-len(trained) // _CAMERAS)]:
         directions = normalize(camera.camera_to_world[0, :, 3].cpu() - positions, dim=1)
@@ -336,7 +327,9 @@ def _vertex_arrays(
             gloss = seen.specular / seen.accumulation.clamp(min=1e-6)[:, None]
             tints[part] += gloss
             along = torch.from_numpy(directions_to_world(frame, directions[part].numpy())).float()
-            fit.add(part, _harmonics(along), gloss.sum(dim=1))
+            basis = _harmonics(along)
+            squares[part] += basis[:, :, None] * basis[:, None, :]
+            products[part] += basis * gloss.sum(dim=1, keepdim=True)
     arrays = {
         "positions": frame.to_world(mesh.vertices),
         "faces": mesh.faces,
@@ -346,31 +339,9 @@ def _vertex_arrays(
         "confidence": scene.materials.to("cpu").confidence(found).numpy(),
     }
     if len(scene.materials.specular_spectra):
-        arrays["gloss"] = fit.solve().numpy()
+        arrays["gloss"] = torch.linalg.solve(squares, products[..., None])[..., 0].numpy()
         arrays["tints"] = (tints / tints.sum(dim=1, keepdim=True).clamp(min=1e-9)).numpy()
     return arrays
-
-
-@dataclass(frozen=True)
-class _GlossFit:
-    """Least squares of each vertex: how much gloss is sent along a direction."""
-
-    squares: Float[Tensor, "V 9 9"]
-    products: Float[Tensor, "V 9"]
-
-    @staticmethod
-    def empty(count: int) -> _GlossFit:
-        """Nothing seen yet."""
-        return _GlossFit(_RIDGE * torch.eye(9).repeat(count, 1, 1), torch.zeros(count, 9))
-
-    def add(self, part: Int64[Tensor, " P"], basis: Float[Tensor, "P 9"], gloss: Float[Tensor, " P"]) -> None:
-        """What one camera sees of some of the vertices."""
-        self.squares[part] += basis[:, :, None] * basis[:, None, :]
-        self.products[part] += basis * gloss[:, None]
-
-    def solve(self) -> Float[Tensor, "V 9"]:
-        """The nine coefficients."""
-        return torch.linalg.solve(self.squares, self.products[..., None])[..., 0]
 
 
 def _harmonics(directions: Float[Tensor, "V 3"]) -> Float[Tensor, "V 9"]:

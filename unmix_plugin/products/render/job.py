@@ -8,11 +8,12 @@ puts the frames of a round into the videos.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import groupby
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import torch
@@ -120,35 +121,6 @@ def _bounds(values: Float[Tensor, "..."]) -> tuple[float, float]:
     return low, max(high, low + 1e-6)
 
 
-class _FrameExchange:
-    """Takes the frames that this process draws; at the end of a round they follow each other by rank."""
-
-    def __init__(self, processes: Processes, num_videos: int, videos: Sequence[FrameSink]) -> None:
-        """"""
-        self._processes, self._videos = processes, videos
-        self._drawn: list[np.ndarray | None] = [None] * num_videos
-
-    def sink(self, video: int) -> FrameSink:
-        """Takes the frame of this round of a video."""
-
-        def take(frame: np.ndarray) -> None:
-            self._drawn[video] = frame
-
-        return take
-
-    def end_round(self) -> None:
-        """Hand over the frames of this round; a process without a view in it has none."""
-        if not self._drawn:
-            return
-        drawn = self._processes.gather(self._drawn)
-        self._drawn = [None] * len(self._drawn)
-        with self._processes.together():
-            for frames in drawn:
-                for add, frame in zip(self._videos, frames, strict=False):
-                    if frame is not None:
-                        add(frame)
-
-
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0
 """Frames a second of a path, and of views that don't follow each other."""
 
@@ -164,13 +136,10 @@ class _Block:
     """Index of the view."""
     first_row: int
     camera: Cameras
-    is_last: bool
-    """Whether the view ends with it."""
 
 
 class RenderJob:
-    """A context in which to render the blocks, in their order. A view's files get their names when its last block is
-    done, videos at the end; after an error nothing incomplete is left."""
+    """Views to be rendered into files."""
 
     def __init__(
         self,
@@ -190,14 +159,14 @@ class RenderJob:
             folder: Where to write.
             processes: That share the views, each with a job like this one.
         """
-        self._scene, self._cameras, self._survey = scene, cameras, survey
-        self._processes, self._num_rounds = processes, 0
-        materials = scene.materials if isinstance(scene, TrainedScene) else None
-        self._materials = materials
+        self._scene, self._cameras, self._survey, self._processes = scene, cameras, survey, processes
+        self._materials = scene.materials if isinstance(scene, TrainedScene) else None
+        self.palette = Palette.of(self._materials, survey.scales)
+        """The colours of the pictures."""
         self._setting = RenderSetting(
             folder,
             cameras.size,
-            Palette.of(materials, survey.scales),
+            self.palette,
             _scene_bands(scene),
             channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
             cameras.frames_per_second,
@@ -209,14 +178,6 @@ class RenderJob:
         own = {*survey.scores, *(["pca"] if survey.pca is not None else [])}
         asked = dict.fromkeys("spectral" if one.output.name in own else one.output.name for one in outputs)
         self._asked = [name for name in asked if name != "accumulation"]
-        self._files, self._view = ExitStack(), ExitStack()
-        self._exchange = _FrameExchange(processes, len(self._moving), ())
-        self._sinks: list[RowsSink] = []
-
-    @property
-    def palette(self) -> Palette:
-        """The colours of the pictures."""
-        return self._setting.palette
 
     def blocks(self, pixels: int | None = None) -> list[_Block]:
         """All that this process is to render.
@@ -231,81 +192,63 @@ class RenderJob:
         rows = max(1, pixels // width)
         own = list(enumerate(self._cameras.views))[self._processes.rank :: self._processes.count]
         return [
-            _Block(
-                index,
-                first,
-                view.camera.crop(0, first, width, min(rows, height - first)),
-                first + rows >= height,
-            )
+            _Block(index, first, view.camera.crop(0, first, width, min(rows, height - first)))
             for index, view in own
             for first in range(0, height, rows)
         ]
 
-    def __enter__(self) -> RenderJob:
-        usual = _PATH_FPS if self._cameras.is_path else _VIEWS_FPS
-        frames_per_second = self._cameras.frames_per_second or usual
-        with ExitStack() as opening:
-            videos = [
-                opening.enter_context(video(one, self._setting, frames_per_second))
-                for one in self._moving
-                if self._processes.is_first
-            ]
-            self._exchange = _FrameExchange(self._processes, len(self._moving), videos)
-            self._view = opening.enter_context(ExitStack())
-            self._files = opening.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self._files.__exit__(kind, error, traceback)
-
-    def render(self, block: _Block) -> None:
-        """Render a block and hand it to the files.
+    def render(self, blocks: Iterable[_Block]) -> None:
+        """Render `blocks`, in their order. A view's files get their names when its last block is done, videos at the
+        end; after an error nothing incomplete is left.
 
         Raises:
             RunError: the disk is full or refuses, or another process failed.
             Follower: this is not the first process, and one failed.
         """
-        if block.first_row == 0:
-            self._open_view(block.view)
-        rows = Rows(block.first_row, self._values(block.camera))
-        for sink in self._sinks:
-            sink(rows)
-        if block.is_last:
-            self._view.close()
-            self._end_round()
+        views, processes, setting = self._cameras.views, self._processes, self._setting
+        frames_per_second = self._cameras.frames_per_second or (
+            _PATH_FPS if self._cameras.is_path else _VIEWS_FPS
+        )
+        with ExitStack() as files:
+            videos = [
+                files.enter_context(video(one, setting, frames_per_second))
+                for one in self._moving
+                if processes.is_first
+            ]
+            num_rounds = 0
+            for index, parts in groupby(blocks, key=lambda block: block.view):
+                drawn: list[np.ndarray | None] = [None] * len(self._moving)
+                progress = index / max(1, len(views) - 1)
+                with processes.together(), ExitStack() as of_view:
+                    sinks: list[RowsSink] = []
+                    for one in self._still:
+                        path = still_paths(setting.folder, one, views[index].name)[0]
+                        sinks.append(of_view.enter_context(still(path, one, setting)))
+                    for place, one in enumerate(self._moving):
+                        add = partial(drawn.__setitem__, place)
+                        sinks.append(of_view.enter_context(frame(one.output, progress, setting, add)))
+                    for block in parts:
+                        rows = Rows(block.first_row, self._values(block.camera))
+                        for sink in sinks:
+                            sink(rows)
+                self._end_round(drawn, videos)
+                num_rounds += 1
+            # The other processes may have one view more.
+            for _ in range(num_rounds, -(-len(views) // processes.count)):
+                with processes.together():
+                    pass
+                self._end_round([None] * len(self._moving), videos)
 
-    def finish(self) -> None:
-        """Wait for the views of the other processes, where they have one more.
-
-        Raises:
-            RunError, Follower: as `render`.
-        """
-        while self._num_rounds * self._processes.count < len(self._cameras.views):
-            with self._processes.together():
-                pass
-            self._end_round()
-
-    def _end_round(self) -> None:
-        self._num_rounds += 1
-        self._exchange.end_round()
-
-    def _open_view(self, index: int) -> None:
-        views = self._cameras.views
-        progress = index / max(1, len(views) - 1)
-        self._view.enter_context(self._processes.together())
-        paths = [still_paths(self._setting.folder, one, views[index].name)[0] for one in self._still]
-        self._sinks = [
-            self._view.enter_context(still(path, one, self._setting))
-            for path, one in zip(paths, self._still, strict=True)
-        ]
-        self._sinks += [
-            self._view.enter_context(
-                frame(one.output, progress, self._setting, self._exchange.sink(video_index))
-            )
-            for video_index, one in enumerate(self._moving)
-        ]
+    def _end_round(self, drawn: list[np.ndarray | None], videos: Sequence[FrameSink]) -> None:
+        """Hand over the frames that each process drew, which follow each other by rank; one without a view has none."""
+        if not drawn:
+            return
+        of_all = self._processes.gather(drawn)
+        with self._processes.together():
+            for frames in of_all:
+                for add, drawn_frame in zip(videos, frames, strict=False):
+                    if drawn_frame is not None:
+                        add(drawn_frame)
 
     def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
         view = self._scene.look(camera)

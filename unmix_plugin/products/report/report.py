@@ -39,6 +39,7 @@ from unmix_plugin.products.report.pictures import (
     evenly,
     material_cards,
 )
+from unmix_plugin.products.scene_products import Report
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
@@ -52,38 +53,22 @@ from unmix_plugin.trained.run_views import RunView, world_frame
 _VIEWS_WITH_SHARES = 2
 
 
-def export_report(
-    job: Job,
-    max_views: int,
-    data: Path | None,
-    library: Sequence[Path],
-    is_edited: bool,
-    about: Mapping[str, str | None],
-) -> list[Path]:
-    """Render, compare and lay out.
-
-    Args:
-        job: The run and where to write.
-        max_views: Most evaluation views to render.
-        data: Scene folder, where it is no longer where the run was trained on it.
-        library: Files of reflectances to compare with too.
-        is_edited: Whether the scene differs from the one that was trained.
-        about: `title`, `author`, `object`, `number` and `notes`; None: as the run keeps them.
-    """
-    if max_views < 1:
-        raise ConfigError(f"--max-views is {max_views}; choose at least 1")
+def export(job: Job, asked: Report) -> list[Path]:
+    """Render, compare and lay out."""
+    if asked.max_views < 1:
+        raise ConfigError(f"--max-views is {asked.max_views}; choose at least 1")
     job.claim([job.folder / "report.html"])
-    known, said = library_of(library, job.materials.bands), _about(job.loaded.folder, about)
-    chosen = evenly(job.views("eval"), max_views)
+    known, said = library_of(asked.library, job.materials.bands), _about(job.loaded.folder, asked)
+    chosen = evenly(job.views("eval"), asked.max_views)
     scene, notes = None, []
-    if is_edited:
+    if asked.edits is not None or asked.illuminant is not None:
         notes.append(
             "Edited: what is rendered here is the run with the edits or the light asked for; figures and training "
             "are those of the run itself."
         )
     else:
         with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, data)
+            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, asked.data)
         if scene is None:
             job.say("the scene folder was not found: nothing measured in the report; give it with --data")
     views = _look(job, chosen, scene)
@@ -334,9 +319,10 @@ def _summary(
     return text if errors else f"{text} Not compared with measured views."
 
 
-def _about(run: RunFolder, given: Mapping[str, str | None]) -> dict[str, str]:
+def _about(run: RunFolder, asked: Report) -> dict[str, str]:
     """Title, author, object, number and notes: what is given now, beside what the run keeps from before."""
     path, kept = run.path / "report.json", {}
+    given = {name: getattr(asked, name) for name in ("title", "author", "object", "number", "notes")}
     if path.exists():
         kept = {name: read_run_json(path).get(name) or "" for name in given}
         if not all(isinstance(text, str) for text in kept.values()):
