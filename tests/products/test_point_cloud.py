@@ -20,7 +20,7 @@ from unmix_plugin.products.point_cloud import (
     _require_point_scores,
     _thinned,
     _write_point_cloud,
-    export_point_cloud,
+    export,
 )
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import PointCloud
@@ -263,4 +263,4 @@ def test_nothing_to_export_is_said(points, tmp_path):
 @pytest.mark.parametrize("count", [0, -3, 10_000_001])
 def test_an_impossible_number_of_points_is_refused(count):
     with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
-        export_point_cloud(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))
+        export(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))

@@ -9,9 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.viewer import page
 from unmix_plugin.viewer.page import WAIT_S, Debounced, choice, new_file, number, text
-from unmix_plugin.viewer.rendering.painting import ColourMapLegend, _SwatchLegend, _TextLegend, legend_html
+from unmix_plugin.viewer.rendering.painting import legend_html
 
 anything = st.one_of(
     st.none(), st.booleans(), st.integers(), st.floats(), st.text(), st.lists(st.integers()), st.binary()
@@ -135,9 +136,9 @@ def parsed(content):
         page.paragraph(EVIL, is_warning=True),
         page.bars([(EVIL, 0.5, (1.0, 0.0, 0.0))]),
         page.table([(EVIL, EVIL)]),
-        legend_html(_TextLegend(EVIL)),
-        legend_html(_SwatchLegend(((EVIL, (0.1, 0.2, 0.3)),))),
-        legend_html(ColourMapLegend("viridis", 0.0, 1.0, EVIL)),
+        legend_html(EVIL),
+        legend_html(((EVIL, (0.1, 0.2, 0.3)),)),
+        legend_html(ColourScale("viridis", 0.0, 1.0, EVIL)),
         page.swatches([(EVIL, (0.0, 0.0, 0.0))]),
     ],
 )
@@ -148,7 +149,7 @@ def test_words_of_users_are_shown_and_never_run(content):
 
 
 def test_a_colour_bar_says_its_values_and_goes_from_end_to_end():
-    content = legend_html(ColourMapLegend("gray", -1.0, 3.0, "radiance"))
+    content = legend_html(ColourScale("gray", -1.0, 3.0, "radiance"))
     found = parsed(content)
     assert [value in found.text for value in ("-1", "1", "3", "radiance")] == [True] * 4
     assert "#000000" in content

@@ -29,8 +29,8 @@ from unmix_plugin.trained.measures import keep_region, read_measures
 from unmix_plugin.trained.model_scene import ModelScene
 from unmix_plugin.trained.regions import Box, InView
 from unmix_plugin.trained.run_views import recorded_views, world_frame
-from unmix_plugin.viewer.rendering.painting import BACKGROUNDS
 from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
+from unmix_plugin.viewer.rendering.settings import BACKGROUNDS
 
 
 def source_of_bands(folder, *centers_nm):

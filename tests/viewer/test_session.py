@@ -5,16 +5,17 @@ import numpy as np
 from tests.viewer.pages import decoded, opened, page_of, show_layer
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.viewer.recipes import RecipeHistory
-from unmix_plugin.viewer.rendering.painting import LayerSettings
-from unmix_plugin.viewer.session import KEPT_S, KeptPages, _PageState, _TrainingCurve
+from unmix_plugin.viewer.rendering.settings import LayerSettings
+from unmix_plugin.viewer.server import _KEPT_S, _KeptPages
+from unmix_plugin.viewer.session import PageState, _TrainingCurve
 
 
 def state(rows):
-    return _PageState(None, LayerSettings(), RecipeHistory(), rows, 1)
+    return PageState(None, LayerSettings(), RecipeHistory(), rows, 1)
 
 
 def test_the_page_that_was_closed_last_comes_back_first_and_once():
-    pages = KeptPages()
+    pages = _KeptPages()
     for rows in (100, 200):
         pages.leave("mine", state(rows))
     pages.leave("other", state(300))
@@ -24,9 +25,9 @@ def test_the_page_that_was_closed_last_comes_back_first_and_once():
 
 def test_what_was_left_long_ago_is_forgotten():
     now = [0.0]
-    pages = KeptPages(lambda: now[0])
+    pages = _KeptPages(lambda: now[0])
     pages.leave("mine", state(100))
-    now[0] = KEPT_S
+    now[0] = _KEPT_S
     assert pages.take("mine") is None
 
 

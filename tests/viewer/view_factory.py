@@ -23,18 +23,12 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.trained.open_run import unmix_scene
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.painting import (
-    LAYERS,
-    LayerAids,
-    LayerSettings,
-    Legend,
-    _Picture,
-    layer_named,
-    render_reference,
-)
+from unmix_plugin.viewer.rendering.aids import LayerAids, render_reference
+from unmix_plugin.viewer.rendering.painting import LAYERS, Legend, _Picture, layer_named
 from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedometer
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,11 +23,53 @@ from unmix_plugin.viewer.gate import Gate
 from unmix_plugin.viewer.page import failures_said, paragraph
 from unmix_plugin.viewer.panels import panels_of
 from unmix_plugin.viewer.rendering.scene import SceneSource
-from unmix_plugin.viewer.session import KeptPages, SceneReader, Services, Session, browser_of
+from unmix_plugin.viewer.session import PageState, SceneReader, Services, Session
 from unmix_plugin.viewer.view_cameras import beside, point_ahead, pose_of
 
 _TICK_S = 0.5
 _UNWATCHED_S = 5
+
+
+_KEPT_S = 600.0
+"""How long what a page left is kept."""
+
+_MOST_KEPT = 64
+_STORAGE_KEY = "unmix-nerf"
+_ANSWER_S = 2.0
+
+
+class _KeptPages:
+    """States of pages that were closed recently, by the browser that they were in."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._left: list[tuple[float, str, PageState]] = []
+        self._lock = threading.Lock()
+
+    def leave(self, browser: str, state: PageState) -> None:
+        """Keep the state of a page that was closed."""
+        with self._lock:
+            self._left = [*self._left, (self._clock(), browser, state)][-_MOST_KEPT:]
+
+    def take(self, browser: str) -> PageState | None:
+        """The state of the browser's page that was closed last and has not come back; None if there is none."""
+        with self._lock:
+            self._left = [kept for kept in self._left if self._clock() - kept[0] < _KEPT_S]
+            mine = [index for index, kept in enumerate(self._left) if kept[1] == browser]
+            return self._left.pop(mine[-1])[2] if mine else None
+
+
+def _browser_of(client: viser.ClientHandle) -> str:
+    """The name that a page's browser keeps for this viewer, a new one if it has none or does not say."""
+    try:
+        known = client.local_storage.get_item(_STORAGE_KEY, _ANSWER_S)
+    except (RuntimeError, TimeoutError):  # storage is blocked, or the page has gone
+        known = None
+    if isinstance(known, str) and 0 < len(known) < 100:
+        return known
+    name = secrets.token_hex(16)
+    client.local_storage.set_item(_STORAGE_KEY, name)
+    return name
 
 
 class Viewer:
@@ -56,7 +100,7 @@ class Viewer:
         self._options = options
         self._say = say
         self._gate = Gate(options.host, options.secret(os.environ), say)
-        self._kept_pages = KeptPages()
+        self._kept_pages = _KeptPages()
         self.services = Services(source, read_scene, recipe, options.environments, library)
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -141,7 +185,7 @@ class Viewer:
             self._open(client)
 
     def _open(self, client: viser.ClientHandle) -> None:
-        browser = browser_of(client)
+        browser = _browser_of(client)
         session = Session(client, self.services, self._kept_pages.take(browser), browser)
         with self._lock:
             if self._stopped.is_set() or client.client_id in self._sessions:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import secrets
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -21,6 +20,7 @@ from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
@@ -32,7 +32,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.page import failures_said, number, paragraph
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
-from unmix_plugin.viewer.rendering.painting import ColourMapLegend, LayerSettings, first_settings, legend_html
+from unmix_plugin.viewer.rendering.painting import legend_html
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     HEIGHT_BOUNDS,
@@ -42,6 +42,7 @@ from unmix_plugin.viewer.rendering.pictures import (
 from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
+from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, pose_from, pose_of
 
 if TYPE_CHECKING:
@@ -191,16 +192,8 @@ def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | N
     return True
 
 
-KEPT_S = 600.0
-"""How long what a page left is kept."""
-
-_MOST_KEPT = 64
-_STORAGE_KEY = "unmix-nerf"
-_ANSWER_S = 2.0
-
-
 @dataclass(frozen=True)
-class _PageState:
+class PageState:
     """What a page shows, and the edits that it may go back to."""
 
     pose: ViewPose | None
@@ -209,40 +202,6 @@ class _PageState:
     largest_height: int
     subpixels: int
     light: LightChoice = LightChoice()
-
-
-class KeptPages:
-    """States of pages that were closed recently, by the browser that they were in."""
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._left: list[tuple[float, str, _PageState]] = []
-        self._lock = threading.Lock()
-
-    def leave(self, browser: str, state: _PageState) -> None:
-        """Keep the state of a page that was closed."""
-        with self._lock:
-            self._left = [*self._left, (self._clock(), browser, state)][-_MOST_KEPT:]
-
-    def take(self, browser: str) -> _PageState | None:
-        """The state of the browser's page that was closed last and has not come back; None if there is none."""
-        with self._lock:
-            self._left = [kept for kept in self._left if self._clock() - kept[0] < KEPT_S]
-            mine = [index for index, kept in enumerate(self._left) if kept[1] == browser]
-            return self._left.pop(mine[-1])[2] if mine else None
-
-
-def browser_of(client: viser.ClientHandle) -> str:
-    """The name that a page's browser keeps for this viewer, a new one if it has none or does not say."""
-    try:
-        known = client.local_storage.get_item(_STORAGE_KEY, _ANSWER_S)
-    except (RuntimeError, TimeoutError):  # storage is blocked, or the page has gone
-        known = None
-    if isinstance(known, str) and 0 < len(known) < 100:
-        return known
-    name = secrets.token_hex(16)
-    client.local_storage.set_item(_STORAGE_KEY, name)
-    return name
 
 
 _MOVING_QUALITY, _RESTING_QUALITY = 80, 90
@@ -263,7 +222,7 @@ class Session:
         self,
         client: viser.ClientHandle,
         services: Services,
-        state: _PageState | None = None,
+        state: PageState | None = None,
         browser: str = "",
     ) -> None:
         """`state` is what the page showed before it was loaded again, if it was; `browser` names its browser."""
@@ -334,10 +293,10 @@ class Session:
             tell()
 
     @property
-    def state(self) -> _PageState:
+    def state(self) -> PageState:
         """What the page shows, to be restored when it is loaded again."""
         view = self.view
-        return _PageState(
+        return PageState(
             view.pose, view.settings, self.history, view.largest_height, view.subpixels, view.edit.light
         )
 
@@ -467,7 +426,7 @@ class Session:
             depth=shown.depth,
         )
         legend = shown.legend
-        self.value_range_shown = (legend.low, legend.high) if isinstance(legend, ColourMapLegend) else None
+        self.value_range_shown = (legend.low, legend.high) if isinstance(legend, ColourScale) else None
         if self._legend is not None and (content := legend_html(legend)) != self._legend_shown:
             self._legend_shown = self._legend.content = content
         if self._status is not None and not self.view.has_reported:

@@ -35,7 +35,8 @@ from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.open_run import load_run
-from unmix_plugin.viewer.rendering.painting import LayerSettings, _SwatchLegend, layers_of
+from unmix_plugin.viewer.rendering.painting import layers_of
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 
 SPECTRAL = [*SMALL, "--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
 
@@ -111,9 +112,9 @@ def test_the_viewer_paints_abundances_as_a_mixture_of_the_colours_of_the_segment
     view, layers = scene.look(scene.views[0].camera), layers_of(scene)
     mixed, legend = layers["abundances"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
     labelled, _ = layers["segmentation"].paint(view, LayerSettings(), None)  # type: ignore[arg-type]
-    assert isinstance(legend, _SwatchLegend)
-    assert [name for name, _ in legend.entries] == ["abundances 0", "abundances 1"]
-    colours = torch.tensor([colour for _, colour in legend.entries])
+    assert isinstance(legend, tuple)
+    assert [name for name, _ in legend] == ["abundances 0", "abundances 1"]
+    colours = torch.tensor([colour for _, colour in legend])
     for row, column in ((6, 12), (18, 12)):
         shares = view["abundances"][row, column]
         torch.testing.assert_close(mixed[row, column], shares @ colours, atol=1e-4, rtol=0)

@@ -30,9 +30,10 @@ from unmix_plugin.viewer.rendering.captures import (
     output_of,
     render_argv,
 )
-from unmix_plugin.viewer.rendering.painting import LAYERS, LayerSettings, first_settings
+from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
 from unmix_plugin.viewer.view_cameras import sized_camera
 
 

@@ -13,26 +13,26 @@ from torch.testing import assert_close
 from tests.method_factory import with_a_sky
 from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb
 from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.rendering import painting
 from unmix_plugin.viewer.rendering.painting import (
+    LAYERS,
+    _colour_table,
+    _over_background,
+    _paint_values,
+    _to_display,
+)
+from unmix_plugin.viewer.rendering.settings import (
     BACKGROUNDS,
     COLOUR_MAPS,
     EXPOSURE_BOUNDS,
     GAMMA_BOUNDS,
-    LAYERS,
     VIEW_TRANSFORMS,
-    ColourMapLegend,
     LayerSettings,
-    _colour_table,
-    _over_background,
-    _paint_values,
-    _SwatchLegend,
-    _TextLegend,
-    _to_display,
 )
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
@@ -189,14 +189,14 @@ def test_every_layer_is_a_picture_that_shows_something(frame, aids, layer):
     assert float(picture.min()) >= 0
     assert float(picture.max()) <= 1
     assert picture.flatten(0, 1).std(dim=0).max() > 0.01
-    assert isinstance(legend, ColourMapLegend | _SwatchLegend | _TextLegend)
+    assert isinstance(legend, ColourScale | tuple | str)
 
 
 def test_colour_is_the_output_of_renders(frame, aids):
     opaque = solid(frame)
     picture, legend = painted(opaque, aids, "rgb")
     assert_close(picture, opaque["rgb"], atol=1e-5, rtol=0)
-    assert legend.text.startswith("true colour")
+    assert legend.startswith("true colour")
 
 
 @pytest.mark.parametrize("layer", ["rgb", "false-colour", "band", "diffuse"])
@@ -248,7 +248,7 @@ def test_wavelengths_beyond_the_bands_show_the_outermost_band(frame, aids):
 
 def test_false_colour_names_the_bands_that_it_shows(frame, aids):
     _, legend = painted(frame, aids, "false-colour", false_colour_nm=(649.0, 551.0, 449.0))
-    assert legend.text == "red 650 nm, green 550 nm, blue 450 nm"
+    assert legend == "red 650 nm, green 550 nm, blue 450 nm"
 
 
 def test_an_abundance_is_the_share_of_what_is_seen(frame, aids):
@@ -269,7 +269,7 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
     for layer in ("abundances", "segmentation"):
         picture, legend = painted(row, aids, layer)
         assert_close(picture[0], colours, atol=1e-6, rtol=0)
-        assert [name for name, _ in legend.entries] == list(frame.materials.names)
+        assert [name for name, _ in legend] == list(frame.materials.names)
 
 
 @pytest.mark.parametrize("layer", [name for name in PAINTED if name != "accumulation"])
@@ -350,7 +350,7 @@ def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_und
     expected = _over_background(_paint_values(values, (-1.0, 1.0), "viridis"), opacity, settings)
     assert_close(picture, expected, atol=1e-5, rtol=0)
     assert_close(picture[values.isnan()], torch.ones_like(picture[values.isnan()]))
-    assert isinstance(legend, ColourMapLegend)
+    assert isinstance(legend, ColourScale)
     assert ("of radiance: light unknown" in legend.label) == (light is None)
 
 

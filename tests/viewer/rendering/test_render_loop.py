@@ -21,10 +21,10 @@ from tests.viewer.view_factory import (
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.outputs import MaterialView
-from unmix_plugin.viewer.rendering.painting import LayerSettings
 from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, _num_channels
 from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import camera_of
 
 

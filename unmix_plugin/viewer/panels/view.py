@@ -17,17 +17,17 @@ from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
-from unmix_plugin.viewer.rendering.painting import (
+from unmix_plugin.viewer.rendering.painting import layer_named
+from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
+from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.settings import (
     BACKGROUNDS,
     COLOUR_MAPS,
     EXPOSURE_BOUNDS,
     GAMMA_BOUNDS,
     VIEW_TRANSFORMS,
     covered,
-    layer_named,
 )
-from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
-from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import pose_of
 

@@ -29,7 +29,8 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
-from unmix_plugin.viewer.rendering.painting import LayerSettings, index_output
+from unmix_plugin.viewer.rendering.painting import index_output
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""

@@ -1,33 +1,30 @@
-"""What can be shown of a rendered view, how a user has chosen to see it, and what the colours mean.
+"""What can be shown of a rendered view, and what the colours mean.
 
 A layer is a function from a view to a picture and its legend. Titles, kinds and ranges are those of the table of
 outputs; here is how they are painted.
 
 Notation: pictures are (H, W, 3) sRGB in [0, 1]; what is transparent shows the background. `light` is linear RGB in sRGB
-primaries, 0 and up, 1 = the full scale of the sensor before exposure. `N` reference rays that end on something, `B`
-bands.
+primaries, 0 and up, 1 = the full scale of the sensor before exposure.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from html import escape
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.registry import Output, OutputKind
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.figures.plotting import css_colour
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import (
     agx,
     band_composite_matrix,
@@ -36,142 +33,33 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
     srgb_to_linear,
 )
-from unmix_plugin.spectral.maps.indices import available_indices
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
-from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.page import BLOCK_STYLE, choice, number, paragraph, swatches, text
-
-_ViewTransform = Literal["srgb", "agx"]
-VIEW_TRANSFORMS: dict[_ViewTransform, str] = {
-    "srgb": "cut at white (sRGB, exact)",
-    "agx": "kept (AgX, as film does)",
-}
-"""Names and what users read."""
-
-BACKGROUNDS = {"grey": 0.92, "white": 1.0, "black": 0.0}
-"""sRGB value of what shows nothing; grey is that of the figures."""
-
-COLOUR_MAPS = ("viridis", "magma", "inferno", "cividis", "turbo", "coolwarm", "gray")
-"""As matplotlib names them."""
-
-EXPOSURE_BOUNDS, GAMMA_BOUNDS = (-8.0, 8.0), (0.2, 5.0)
-_WAVELENGTH_BOUNDS = (1.0, 1e5)
-_VALUE_BOUNDS = (-1e6, 1e6)
-_LONGEST_INDEX = 1000
-"""Letters that are kept: more than a formula may have, so that none becomes another one by being cut."""
-
-
-@dataclass(frozen=True)
-class LayerSettings:
-    """What is shown and how; every value lies within bounds."""
-
-    layer: str = "rgb"
-    wavelength_nm: float = 550.0
-    """Shown by the layer `band`."""
-    false_colour_nm: tuple[float, float, float] = (650.0, 550.0, 450.0)
-    """Shown as red, green, blue by the layer `false-colour`."""
-    endmember: int = 0
-    """Shown by the layer `abundance`."""
-    index: str = ""
-    """Shown by the layer `index`: a name or a formula, as the output `index:` takes it; empty where none is chosen."""
-    colour_map: str = "viridis"
-    value_range: tuple[float, float] | None = None
-    """Values at the ends of the colour map; None for the layer's own."""
-    exposure_ev: float = 0.0
-    """Stops."""
-    gamma: float = 1.0
-    view_transform: _ViewTransform = "srgb"
-    background: str = "grey"
-    """Where nothing is seen; one of `BACKGROUNDS`."""
-
-    def changed(self, name: str, value: Any) -> LayerSettings:
-        """With one setting as a browser sent it, brought within its bounds; what makes no sense changes nothing."""
-        return replace(self, **{name: _CHECKS[name](value, getattr(self, name))})
-
-
-def first_settings(bands: Bands) -> LayerSettings:
-    """What a page shows at first; false colour from the middles of the long, middle and short third of the bands."""
-    centers_nm, count = bands.centers_nm.tolist(), len(bands)
-    starts = (centers_nm[5 * count // 6], centers_nm[count // 2], centers_nm[count // 6])
-    wavelength_nm = covered(bands, LayerSettings.wavelength_nm)
-    return LayerSettings("rgb", wavelength_nm, starts, index=next(iter(available_indices(bands)), ""))
-
-
-def _checked_range(value: Any, before: tuple[float, float] | None) -> tuple[float, float] | None:
-    if value is None:
-        return None
-    try:
-        low, high = (number(part, *_VALUE_BOUNDS, fallback=math.nan) for part in value)
-    except (TypeError, ValueError):
-        return before
-    return (low, high) if low < high else before
-
-
-def _checked_wavelengths(value: Any, before: tuple[float, float, float]) -> tuple[float, ...]:
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        return before
-    return tuple(
-        number(one, *_WAVELENGTH_BOUNDS, fallback=old) for one, old in zip(value, before, strict=True)
-    )
-
-
-_CHECKS: dict[str, Callable[[Any, Any], Any]] = {
-    "layer": lambda value, before: value if isinstance(value, str) and len(value) < 100 else before,
-    "wavelength_nm": lambda value, before: number(value, *_WAVELENGTH_BOUNDS, fallback=before),
-    "false_colour_nm": _checked_wavelengths,
-    "endmember": lambda value, before: int(number(value, 0, 254, fallback=before)),
-    "index": lambda value, before: (
-        " ".join(text(value).split())[:_LONGEST_INDEX] if isinstance(value, str) else before
-    ),
-    "colour_map": lambda value, before: choice(value, COLOUR_MAPS, before),
-    "value_range": _checked_range,
-    "exposure_ev": lambda value, before: number(value, *EXPOSURE_BOUNDS, fallback=before),
-    "gamma": lambda value, before: number(value, *GAMMA_BOUNDS, fallback=before),
-    "view_transform": lambda value, before: choice(value, VIEW_TRANSFORMS, before),
-    "background": lambda value, before: choice(value, BACKGROUNDS, before),
-}
-
+from unmix_plugin.viewer.page import BLOCK_STYLE, paragraph, swatches
+from unmix_plugin.viewer.rendering.aids import LayerAids
+from unmix_plugin.viewer.rendering.settings import (
+    BACKGROUNDS,
+    COLOUR_MAPS,
+    LayerSettings,
+    ViewTransform,
+    covered,
+)
 
 _Picture: TypeAlias = Float[Tensor, "H W 3"]
 
 _LEVELS = 1024
 
 
-@dataclass(frozen=True)
-class ColourMapLegend:
-    """Values and their colours."""
-
-    colour_map: str
-    low: float
-    high: float
-    label: str
-
-
-@dataclass(frozen=True)
-class _SwatchLegend:
-    """Names and their sRGB colours."""
-
-    entries: tuple[tuple[str, tuple[float, ...]], ...]
-
-
-@dataclass(frozen=True)
-class _TextLegend:
-    """One phrase."""
-
-    text: str
-
-
-Legend: TypeAlias = ColourMapLegend | _SwatchLegend | _TextLegend
+Legend: TypeAlias = ColourScale | tuple[tuple[str, tuple[float, ...]], ...] | str
+"""What the colours of a picture mean: values, names with their sRGB colours, or one phrase."""
 
 
 def _to_display(
-    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: _ViewTransform
+    light: Float[Tensor, "*pixels 3"], exposure_ev: float, gamma: float, transform: ViewTransform
 ) -> Float[Tensor, "*pixels 3"]:
     """Light as a display shows it: `srgb` clips at white, `agx` compresses 16.5 stops, as film does; gamma is last."""
     exposed = light * 2.0**exposure_ev
@@ -222,10 +110,10 @@ def as_bytes(picture: _Picture) -> UInt8[np.ndarray, "H W 3"]:
 
 def legend_html(shown: Legend) -> str:
     """What the colours of a picture mean."""
-    if isinstance(shown, _TextLegend):
-        return paragraph(shown.text)
-    if isinstance(shown, _SwatchLegend):
-        return swatches(shown.entries)
+    if isinstance(shown, str):
+        return paragraph(shown)
+    if not isinstance(shown, ColourScale):
+        return swatches(shown)
     table = _colour_table(shown.colour_map)
     chosen = np.linspace(0, len(table) - 1, 17).round().astype(int)
     stops = ",".join(css_colour(table[index].tolist()) for index in chosen)
@@ -238,30 +126,6 @@ def legend_html(shown: Legend) -> str:
     )
 
 
-_NUM_CAMERAS = 6
-_NUM_RAYS = 6000
-
-
-@torch.no_grad()
-def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients, Float[Tensor, "N 3"]]:
-    """Coefficients of rays through some of the cameras, spread over all, and where the rays end, model space."""
-    step = max(1, len(cameras) // _NUM_CAMERAS)
-    chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
-    cameras = cameras.one_size()
-    aspect = cameras.width / cameras.height
-    height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
-    parts, points = [], []
-    for index in chosen:
-        camera = cameras[index].resized(max(1, round(aspect * height)), height)
-        seen = scene.look(camera, subpixels=1).coefficients.flatten()
-        rays = camera.to(scene.device).image_rays(0)
-        ends = rays.origins + seen.ray_distance[:, None] * rays.directions
-        is_seen = seen.is_occupied
-        parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
-        points.append(ends[is_seen])
-    return Coefficients.concatenate(parts), torch.cat(points)
-
-
 def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
     """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
     if len(values) == 0:
@@ -269,62 +133,6 @@ def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf)
     low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
     low = min(low, low_at_most)
     return (low, high if high > low + 1e-6 else low + 1.0)
-
-
-_MOST_REMEMBERED = 32
-_ValueT = TypeVar("_ValueT")
-
-_ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
-"""A view's error against the nearest training view, where it is known, and that view's name."""
-
-
-@dataclass(frozen=True)
-class LayerAids:
-    """What layers need to know of the run."""
-
-    reference: Coefficients
-    """Of some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes
-    are taken from them, so that colours mean the same from everywhere. (N, ...)."""
-    reference_points: Float[Tensor, "N 3"]
-    """Where the rays end, model space."""
-    scene_box: SceneBox
-    error_of: _ErrorOf | None = None
-    why_no_error: str = "the scene is not at hand"
-    _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
-
-    def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
-        """What the rays show with the given materials, as if each ended fully on what it ended on."""
-        return materials.spectra(self.reference) / self.reference.accumulation[:, None]
-
-    def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
-        """sRGB colours that stand for the materials, as in all pictures of a run."""
-        return self._remembered(
-            "colours",
-            materials,
-            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
-        )
-
-    def _pca_of(self, materials: Materials) -> PcaColours:
-        """Principal components of what the reference rays show with the materials."""
-        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference_spectra(materials)))
-
-    def _depth_range(self, frame: MaterialView) -> tuple[float, float]:
-        """Distances between which the scene box lies, world units."""
-        aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
-        middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
-        distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
-        return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
-
-    def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
-        """What `make` gives, kept for the materials that clients look at."""
-        spectra = torch.cat([materials.endmembers, materials.specular_spectra])
-        key = (what, spectra.cpu().numpy().tobytes())
-        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
-        if found is None:
-            if len(self._kept) >= _MOST_REMEMBERED:
-                self._kept.clear()
-            found = self._kept[key] = make()
-        return found
 
 
 _Painter = Callable[[Any, LayerSettings, Any], tuple[_Picture, Legend]]
@@ -374,7 +182,7 @@ def _layer_of(output: Output) -> _Layer:
     """The layer of an output of a kind that can be painted."""
 
     def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[_Picture, Legend]:
-        values, opacity, legend = frame[output.name], frame.opacity, _TextLegend(output.what)
+        values, opacity, legend = frame[output.name], frame.opacity, output.what
         if output.kind in ("srgb", "linear"):
             light = values if output.kind == "linear" else srgb_to_linear(values.clamp(0, 1))
             return _tone_mapped(light, frame.coverage, settings), legend
@@ -397,7 +205,7 @@ def _layer_of(output: Output) -> _Layer:
             legend = _swatches(names, palette)
         elif output.kind == "vectors":
             values = (values + 1) / 2
-            legend = _TextLegend(f"{output.what}; red, green, blue: x, y, z from -1 to 1")
+            legend = f"{output.what}; red, green, blue: x, y, z from -1 to 1"
         return _over_background(values.clamp(0, 1), opacity, settings), legend
 
     return _Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
@@ -413,11 +221,11 @@ def _paint_scaled(
     """Values in the colours of a scale, or of the user's own, over the background where they fill but a part."""
     shown = settings.value_range or scale
     picture = _paint_values(values, shown, settings.colour_map)
-    return _over_background(picture, part, settings), ColourMapLegend(settings.colour_map, *shown, label)
+    return _over_background(picture, part, settings), ColourScale(settings.colour_map, *shown, label)
 
 
-def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> _SwatchLegend:
-    return _SwatchLegend(tuple(zip(names, map(tuple, colours.tolist()), strict=True)))
+def _swatches(names: Sequence[str], colours: Float[Tensor, "K 3"]) -> Legend:
+    return tuple(zip(names, map(tuple, colours.tolist()), strict=True))
 
 
 _CHUNK = 1 << 16
@@ -467,7 +275,7 @@ def _paint_colour(diffuse: bool, specular: bool) -> _Painter:
         light = frame.materials.through(
             frame.coefficients, rgb_matrix(bands), diffuse=diffuse, specular=specular
         )
-        return _tone_mapped(light, frame.coverage, settings), _TextLegend(describe_colour(bands))
+        return _tone_mapped(light, frame.coverage, settings), describe_colour(bands)
 
     return paint
 
@@ -479,7 +287,7 @@ def _paint_false_colour(
     wavelengths = tuple(covered(bands, value) for value in settings.false_colour_nm)
     light = frame.materials.through(frame.coefficients, band_composite_matrix(bands, wavelengths))
     shown = [f"{bands.centers_nm[bands.nearest(value)]:.0f} nm" for value in wavelengths]
-    legend = _TextLegend(f"red {shown[0]}, green {shown[1]}, blue {shown[2]}")
+    legend = f"red {shown[0]}, green {shown[1]}, blue {shown[2]}"
     return _tone_mapped(light, frame.coverage, settings), legend
 
 
@@ -521,17 +329,17 @@ def _paint_segmentation(
 
 
 def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
-    colours = aids._pca_of(frame.materials)
+    colours = aids.pca_of(frame.materials)
     seen = _unpremultiplied(frame.materials.through(frame.coefficients, colours.axes), frame.opacity)
     components = seen - colours.mean @ colours.axes
     stretched = (components - colours.low) / (colours.high - colours.low).clamp(min=1e-9)
-    legend = _TextLegend("red, green, blue: first, second, third principal component of the spectra")
+    legend = "red, green, blue: first, second, third principal component of the spectra"
     return _over_background(stretched.clamp(0, 1), frame.opacity, settings), legend
 
 
 def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
     label = "distance along the viewing axis, world units"
-    return _paint_scaled(frame.depth, frame.opacity, settings, aids._depth_range(frame), label)
+    return _paint_scaled(frame.depth, frame.opacity, settings, aids.depth_range(frame), label)
 
 
 def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
@@ -545,12 +353,6 @@ def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
 def _unpremultiplied(values: Float[Tensor, "H W C"], part: Float[Tensor, "H W"]) -> Float[Tensor, "H W C"]:
     """Values of what is seen in a part of each pixel, rather than of what is seen on black."""
     return values / part.clamp(min=1e-3)[..., None]
-
-
-def covered(bands: Bands, wavelength_nm: float) -> float:
-    """The wavelength, or the nearest that some band covers."""
-    low, high = float(bands.edges_nm[0]), float(bands.edges_nm[-1])
-    return min(max(low, wavelength_nm), high)
 
 
 def _own(name: str, paint: _Painter, *controls: str) -> _Layer:

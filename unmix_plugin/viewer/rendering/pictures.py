@@ -28,8 +28,10 @@ from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.painting import LayerSettings, Legend, as_bytes, layer_named, layers_of
-from unmix_plugin.viewer.rendering.scene import Edit, SceneAids, SceneSource
+from unmix_plugin.viewer.rendering.aids import SceneAids
+from unmix_plugin.viewer.rendering.painting import Legend, as_bytes, layer_named, layers_of
+from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of
 
 HEIGHT_BOUNDS = (16, 2048)

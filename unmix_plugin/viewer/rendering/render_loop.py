@@ -15,7 +15,6 @@ from typing import Any
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.page import failures_said
-from unmix_plugin.viewer.rendering.painting import LayerSettings
 from unmix_plugin.viewer.rendering.pictures import (
     DEFAULT_HEIGHT,
     RESTING_COST,
@@ -25,6 +24,7 @@ from unmix_plugin.viewer.rendering.pictures import (
     wants_more,
 )
 from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import ViewPose
 
 _POLL_S = 0.05

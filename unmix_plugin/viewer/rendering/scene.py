@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 
-from unmix_plugin.editing import Recipe, changes_geometry, edit_scene, sample_seen
+from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
@@ -33,7 +33,6 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_materials import relit as relit_measurement
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.painting import LayerAids, render_reference
 
 
 @dataclass(frozen=True)
@@ -187,7 +186,7 @@ _TOLERANCE = 0.03
 """Depths of a point and of what a view renders there may differ by so much of the depth."""
 
 _VIEWS_KEPT = 4
-_STEPS_KEPT = 200
+STEPS_KEPT = 200
 """What was rendered so many training steps ago is rendered again."""
 
 _VIEWS_TRIED = 6
@@ -301,7 +300,7 @@ class MeasuredViews:
         step = self._source.version
         with self._lock:
             kept = self._distances.get(index)
-        if kept is not None and step - kept[0] < _STEPS_KEPT:
+        if kept is not None and step - kept[0] < STEPS_KEPT:
             return kept[1]
         with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
             seen = scene.look(camera, subpixels=1).coefficients
@@ -311,42 +310,3 @@ class MeasuredViews:
             while len(self._distances) > _VIEWS_KEPT:
                 self._distances.popitem(last=False)
         return distance
-
-
-class SceneAids:
-    """What layers and edits need of the scene beside the view itself: made again as training goes on."""
-
-    def __init__(self, source: SceneSource, has_materials: bool) -> None:
-        self.measured: MeasuredViews | None = None
-        """What the training views measured, once the scene is read."""
-        self._why_not_measured = "the scene is still being read"
-        self._source, self._has_materials = source, has_materials
-        self._for_layers: tuple[int, LayerAids] | None = None
-        self._seen: tuple[int, Coefficients] | None = None
-
-    def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
-        """Note what was measured, or why that is unknown."""
-        self.measured, self._why_not_measured = measured, why_not
-        self._for_layers = None
-
-    def for_layers(self) -> LayerAids | None:
-        """What layers need; None without materials. Must not be called while the scene is lent."""
-        if not self._has_materials:
-            return None
-        kept, version = self._for_layers, self._source.version
-        age = 0 if kept is None else version - kept[0]
-        if kept is None or age >= _STEPS_KEPT or (age > 0 and not self._source.device.is_training):
-            error_of = None if self.measured is None else self.measured.error
-            why_not, record = self._why_not_measured, self._source.record
-            with self._source.borrowed_materials() as scene:
-                reference = render_reference(scene, record.train_cameras)
-            kept = (version, LayerAids(*reference, record.scene_box, error_of, why_not))
-            self._for_layers = kept
-        return kept[1]
-
-    def see(self, scene: TrainedScene) -> Coefficients:
-        """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
-        version = self._source.version
-        if self._seen is None or version - self._seen[0] >= _STEPS_KEPT:
-            self._seen = (version, sample_seen(scene))
-        return self._seen[1]

@@ -1,0 +1,142 @@
+"""What layers and edits need to know of the scene beside the view itself.
+
+Notation: `N` reference rays that end on something, `B` bands, `K` endmembers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from unmix_plugin.editing import sample_seen
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.spectral.materials import Coefficients, Materials
+from unmix_plugin.spectral.subspace import PcaColours
+from unmix_plugin.trained.outputs import MaterialView
+from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, MeasuredViews, SceneSource
+
+_NUM_CAMERAS = 6
+_NUM_RAYS = 6000
+
+
+@torch.no_grad()
+def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients, Float[Tensor, "N 3"]]:
+    """Coefficients of rays through some of the cameras, spread over all, and where the rays end, model space."""
+    step = max(1, len(cameras) // _NUM_CAMERAS)
+    chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
+    cameras = cameras.one_size()
+    aspect = cameras.width / cameras.height
+    height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
+    parts, points = [], []
+    for index in chosen:
+        camera = cameras[index].resized(max(1, round(aspect * height)), height)
+        seen = scene.look(camera, subpixels=1).coefficients.flatten()
+        rays = camera.to(scene.device).image_rays(0)
+        ends = rays.origins + seen.ray_distance[:, None] * rays.directions
+        is_seen = seen.is_occupied
+        parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
+        points.append(ends[is_seen])
+    return Coefficients.concatenate(parts), torch.cat(points)
+
+
+_MOST_REMEMBERED = 32
+_ValueT = TypeVar("_ValueT")
+
+_ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
+"""A view's error against the nearest training view, where it is known, and that view's name."""
+
+
+@dataclass(frozen=True)
+class LayerAids:
+    """What layers need to know of the run."""
+
+    reference: Coefficients
+    """Of some rays through the whole scene that stay the same while the camera moves: colour scales and principal axes
+    are taken from them, so that colours mean the same from everywhere. (N, ...)."""
+    reference_points: Float[Tensor, "N 3"]
+    """Where the rays end, model space."""
+    scene_box: SceneBox
+    error_of: _ErrorOf | None = None
+    why_no_error: str = "the scene is not at hand"
+    _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
+        """What the rays show with the given materials, as if each ended fully on what it ended on."""
+        return materials.spectra(self.reference) / self.reference.accumulation[:, None]
+
+    def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
+        """sRGB colours that stand for the materials, as in all pictures of a run."""
+        return self._remembered(
+            "colours",
+            materials,
+            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
+        )
+
+    def pca_of(self, materials: Materials) -> PcaColours:
+        """Principal components of what the reference rays show with the materials."""
+        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference_spectra(materials)))
+
+    def depth_range(self, frame: MaterialView) -> tuple[float, float]:
+        """Distances between which the scene box lies, world units."""
+        aabb, scale = self.scene_box.aabb.cpu(), frame.scene.frame.scale
+        middle, radius = aabb.mean(dim=0), float((aabb[1] - aabb[0]).norm()) / 2
+        distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
+        return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
+
+    def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
+        """What `make` gives, kept for the materials that clients look at."""
+        spectra = torch.cat([materials.endmembers, materials.specular_spectra])
+        key = (what, spectra.cpu().numpy().tobytes())
+        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
+        if found is None:
+            if len(self._kept) >= _MOST_REMEMBERED:
+                self._kept.clear()
+            found = self._kept[key] = make()
+        return found
+
+
+class SceneAids:
+    """What layers and edits need of the scene beside the view itself: made again as training goes on."""
+
+    def __init__(self, source: SceneSource, has_materials: bool) -> None:
+        self.measured: MeasuredViews | None = None
+        """What the training views measured, once the scene is read."""
+        self._why_not_measured = "the scene is still being read"
+        self._source, self._has_materials = source, has_materials
+        self._for_layers: tuple[int, LayerAids] | None = None
+        self._seen: tuple[int, Coefficients] | None = None
+
+    def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
+        """Note what was measured, or why that is unknown."""
+        self.measured, self._why_not_measured = measured, why_not
+        self._for_layers = None
+
+    def for_layers(self) -> LayerAids | None:
+        """What layers need; None without materials. Must not be called while the scene is lent."""
+        if not self._has_materials:
+            return None
+        kept, version = self._for_layers, self._source.version
+        age = 0 if kept is None else version - kept[0]
+        if kept is None or age >= STEPS_KEPT or (age > 0 and not self._source.device.is_training):
+            error_of = None if self.measured is None else self.measured.error
+            why_not, record = self._why_not_measured, self._source.record
+            with self._source.borrowed_materials() as scene:
+                reference = render_reference(scene, record.train_cameras)
+            kept = (version, LayerAids(*reference, record.scene_box, error_of, why_not))
+            self._for_layers = kept
+        return kept[1]
+
+    def see(self, scene: TrainedScene) -> Coefficients:
+        """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
+        version = self._source.version
+        if self._seen is None or version - self._seen[0] >= STEPS_KEPT:
+            self._seen = (version, sample_seen(scene))
+        return self._seen[1]
