@@ -39,7 +39,6 @@ from unmix_plugin.neumatex.prior.small import (
     SHIPPED,
     Estimates,
     SmallPrior,
-    _filled_triplane,
     _read_colours,
     fit_loss,
     fit_planes,
@@ -48,7 +47,7 @@ from unmix_plugin.neumatex.prior.small import (
 )
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.neumatex.tracing.surface import Readers, plane_features
+from unmix_plugin.neumatex.tracing.surface import Readers, Triplane, plane_features
 
 
 def estimates(log_variance: float = -6.0) -> Estimates:
@@ -315,7 +314,9 @@ def test_a_prediction_is_a_triplane_of_the_resolution_asked_for(scene, material)
 def test_planes_in_a_resolution_that_subdivides_theirs_are_the_same_material():
     planes = torch.randn(3, 12, 32, 32, generator=generator())
     positions = 2 * torch.rand(50, 3, generator=generator()) - 1
-    own, finer = (_filled_triplane(make_prior(), planes, "pbr", resolution) for resolution in (32, 63))
+    own, finer = (
+        Triplane.filled(make_prior().readers_of("pbr"), planes, resolution) for resolution in (32, 63)
+    )
     assert_close(finer.parameters_at(positions), own.parameters_at(positions), atol=1e-4, rtol=0)
 
 

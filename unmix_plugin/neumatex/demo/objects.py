@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,6 +138,17 @@ class _Subject:
         traced = TracedObject(self.ray_mesh, light, self.surface)
         return traced.picture(cameras, index, samples, _BOUNCES, _SUBPIXELS, self.generator)
 
+    def in_each_light(
+        self, folder: Path, lights: Sequence[str], views: int, seed: int, say: Say
+    ) -> Iterator[tuple[Path, Environment, Cameras]]:
+        """Where what is seen in each light is written, the light, and from where it is seen; that of training first."""
+        for number, name in enumerate(lights):
+            say(f"demo object: rendering light {number + 1} of {len(lights)} ({name})")
+            place = folder / "relit" / name if number else folder
+            first = 1000 + _VIEWS_A_LIGHT * number if number else 0
+            cameras = self.cameras(_VIEWS_A_LIGHT if number else views, first)
+            yield place, built_in_environment(name, seed), cameras
+
     def exposure(self, light: Environment, mean_radiance: float) -> Float[Tensor, ""]:
         """Factor of a light that gives the object a mean radiance."""
         cameras = self.cameras(4, 0).resized(24, 24)
@@ -169,17 +180,10 @@ def write_object(
     subject = _Subject(RayMesh(mesh), surface, torch.Generator().manual_seed(seed), size)
     colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
     _write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
-    for number, name in enumerate(lights):
-        _tell(say, number, lights)
-        light = built_in_environment(name, seed)
+    for place, light, cameras in subject.in_each_light(folder, lights, views, seed, say):
         light = Environment(light.image * subject.exposure(light, _MEAN_RADIANCE))
-        if number == 0:
-            cameras = subject.cameras(views, 0)
-            _write_pictures(folder, subject, light, cameras, _EVALUATION_INTERVAL)
-            _write_base_colours(folder / "truth" / "base_colour", subject, cameras)
-        else:
-            cameras = subject.cameras(_VIEWS_A_LIGHT, 1000 + _VIEWS_A_LIGHT * number)
-            _write_pictures(folder / "relit" / name, subject, light, cameras, 1)
+        _write_pictures(place, subject, light, cameras, _EVALUATION_INTERVAL if place == folder else 1)
+    _write_base_colours(folder / "truth" / "base_colour", subject, subject.cameras(views, 0))
 
 
 def _write_pictures(
@@ -225,17 +229,11 @@ def write_spectral_object(
     _write_mesh(folder / "mesh.glb", ray_mesh.mesh, colours.clamp(0, 1), surface.names)
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
     write_spectra_csv(folder / "endmembers.csv", table)
-    for number, name in enumerate(lights):
-        _tell(say, number, lights)
-        light = built_in_environment(name, seed)
-        if number == 0:
-            cameras = subject.cameras(views, 0)
-            truth = {"materials": list(surface.names), "endmembers_path": "endmembers.csv"}
-            _write_cubes(folder, subject, light, cameras, bands, _LAMP, truth)
-        else:
-            cameras = subject.cameras(_VIEWS_A_LIGHT, 1000 + _VIEWS_A_LIGHT * number)
-            lamp = _OTHER_LAMP if number % 2 else _LAMP
-            _write_cubes(folder / "relit" / name, subject, light, cameras, bands, lamp, {})
+    truth = {"materials": list(surface.names), "endmembers_path": "endmembers.csv"}
+    places = subject.in_each_light(folder, lights, views, seed, say)
+    for number, (place, light, cameras) in enumerate(places):
+        lamp = _OTHER_LAMP if number % 2 else _LAMP
+        _write_cubes(place, subject, light, cameras, bands, lamp, {} if number else truth)
 
 
 def _write_cubes(
@@ -305,10 +303,6 @@ def _abundances(subject: _Subject, cameras: Cameras, index: int) -> Float[Tensor
     hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
     found = hits.image(surface.family.abundances(surface.parameters(hits.points.positions)))
     return found / hits.alpha().clamp(min=1e-6)[..., None]
-
-
-def _tell(say: Say, number: int, names: Sequence[str]) -> None:
-    say(f"demo object: rendering light {number + 1} of {len(names)} ({names[number]})")
 
 
 def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:

@@ -26,16 +26,12 @@ from unmix_plugin.engine import Cameras, Model, RayBundle, TrainingCallback, Tra
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit.evaluation import evaluate_object_image, evaluation_outputs
 from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig, ObjectRecord
-from unmix_plugin.neumatex.fit.start import (
-    PriorAnchor,
-    material_family,
-    start_plain,
-    start_spectral,
-    views_of,
-)
+from unmix_plugin.neumatex.fit.start import start_plain, start_spectral, views_of
 from unmix_plugin.neumatex.fit.tone import LampRatio, SpectralDisplay, ToneMapping, psnr_db, tone_curve
 from unmix_plugin.neumatex.tracing.environment import Environment
+from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, TracedObjectCache
 from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 
@@ -54,7 +50,10 @@ class NeumatexModel(Model):
         self.record = record
         self.endmembers: nn.Parameter | None = self._empty_endmembers()
         self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
-        self.family = material_family(self.config.material, self.endmembers, self.gains)
+        if self.endmembers is not None:
+            self.family = SpectralFamily(self.endmembers, self.gains)
+        else:
+            self.family = NeuralFamily() if self.config.material == "neural" else PbrFamily()
         # A run keeps the decoder that it was fitted with.
         networks = {name: getattr(self.family, name, None) for name in ("decoder", "encoder")}
         frozen = {name: part.requires_grad_(False) for name, part in networks.items() if part is not None}
@@ -64,9 +63,10 @@ class NeumatexModel(Model):
         shares = 0 if self.endmembers is None else len(self.endmembers)
         self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
         self.light_curve = self._light_curve()
-        self.anchor = None
+        self.prior: Triplane | None = None
+        """Neither its material nor its log-variance changes while the object is fitted."""
         if self.config.prior != "none" and not record.is_spectral:
-            self.anchor = PriorAnchor(Triplane(parameters, resolution, generator=generator))
+            self.prior = Triplane(parameters, resolution, generator=generator).requires_grad_(False)
         if not self.config.fit_networks:
             for network in self.triplane.parameter_groups()["networks"]:
                 network.requires_grad_(False)
@@ -84,7 +84,7 @@ class NeumatexModel(Model):
             self.get_buffer(name).copy_(torch.from_numpy(initial_data[name]))
         if self.endmembers is not None:
             start_spectral(self, initial_data, generator)
-        elif self.anchor is None:
+        elif self.prior is None:
             start_plain(self.triplane, self.family)
         else:
             from unmix_plugin.neumatex.prior.small import predict
@@ -99,7 +99,7 @@ class NeumatexModel(Model):
                 generator=generator,
             )
             self.triplane.load_state_dict(found.state_dict())
-            self.anchor.triplane.load_state_dict(found.state_dict())
+            self.prior.load_state_dict(found.state_dict())
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Planes, networks unless they stay as they are, and the camera's response where there is one."""
@@ -162,9 +162,9 @@ class NeumatexModel(Model):
         if isinstance(self.light_curve, LampRatio):
             residuals = residuals * self.light_curve.weights(batch["numbers"])
         losses = {"picture": _squared_error(residuals, outputs["found"])}
-        if self.anchor is not None and self.config.regularisation > 0:
+        if self.prior is not None and self.config.regularisation > 0:
             positions = outputs["positions"]
-            distance = self.anchor.distance(self.surface.parameters(positions), positions)
+            distance = _distance(self.prior, self.surface.parameters(positions), positions)
             losses["prior"] = self.config.regularisation * distance
         return losses
 
@@ -260,6 +260,16 @@ def _settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> Non
     bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
     endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
     gains.fill_(1)
+
+
+def _distance(
+    prior: Triplane, parameters: Float[Tensor, "N P"], positions: Float[Tensor, "N 3"]
+) -> Float[Tensor, ""]:
+    """Squared distance of parameters from the prior's, each over its expected squared error; mean over the points of
+    the sum over the parameters."""
+    with torch.no_grad():
+        expected, precision = prior.parameters_at(positions), (-prior.log_variance(positions)).exp()
+    return ((parameters - expected).square() * precision).sum(dim=-1).mean()
 
 
 def _squared_error(residuals: Float[Tensor, "2 R C"], found: Tensor) -> Float[Tensor, ""]:

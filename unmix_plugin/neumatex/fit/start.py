@@ -28,7 +28,6 @@ from unmix_plugin.neumatex.tracing.families import (
     NUM_GLOSS,
     LayeredFamily,
     MaterialFamily,
-    PbrFamily,
     SpectralFamily,
 )
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
@@ -44,7 +43,7 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 if TYPE_CHECKING:
     from unmix_plugin.neumatex.fit.model import NeumatexModel
-    from unmix_plugin.neumatex.fit.settings import MaterialName, NeumatexModelConfig
+    from unmix_plugin.neumatex.fit.settings import NeumatexModelConfig
 
 _PLAIN_GLOSS = (0.5, 0.2)
 """Roughness and specular level of a common dielectric, half rough."""
@@ -65,23 +64,6 @@ _LEAST_FOUND = 0.5
 """Opacity from which a run has something at a point, and share of points at which it must."""
 
 
-def material_family(
-    name: MaterialName,
-    endmembers: Float[Tensor, "K B"] | None = None,
-    gains: Float[Tensor, " K"] | None = None,
-) -> MaterialFamily:
-    """The family of that name; the neural one with the shipped decoder, the spectral one with these endmembers and
-    gains.
-
-    Raises:
-        ConfigError: the shipped decoder can't be read.
-    """
-    if endmembers is not None:
-        return SpectralFamily(endmembers, gains)
-    families: dict[MaterialName, type] = {"neural": NeuralFamily, "pbr": PbrFamily}
-    return families[name]()
-
-
 def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     """Make a new triplane give a plain material nearly everywhere."""
     *_, last = triplane.readers.material_network.children()
@@ -91,8 +73,9 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
         last.weight.mul_(_START_SPREAD)
         plain = _plain_parameters(family)
         raw = plain.logit()
-        if triplane.num_shares:
-            raw[: triplane.num_shares] = plain[: triplane.num_shares].log()
+        shares = triplane.readers.num_shares
+        if shares:
+            raw[:shares] = plain[:shares].log()
         last.bias.copy_(raw)
 
 
@@ -110,28 +93,6 @@ def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
         shares = torch.full((family.num_endmembers,), 1 / family.num_endmembers)
         return torch.cat([shares, torch.tensor(_PLAIN_GLOSS)])
     return torch.tensor([0.5, 0.5, 0.5, 0.5, 0.0]).clamp(*_START_RANGE)
-
-
-class PriorAnchor(nn.Module):
-    """The prior's material and its log-variance, neither of which changes while the object is fitted."""
-
-    def __init__(self, triplane: Triplane) -> None:
-        """
-        Args:
-            triplane: Gives the shapes; its numbers are those of the prior once they are loaded.
-        """
-        super().__init__()
-        self.triplane = triplane.requires_grad_(False)
-
-    def distance(
-        self, parameters: Float[Tensor, "N P"], positions: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, ""]:
-        """Squared distance of parameters from the prior's, each over its expected squared error; mean over the points
-        of the sum over the parameters."""
-        with torch.no_grad():
-            expected = self.triplane.parameters_at(positions)
-            precision = (-self.triplane.log_variance(positions)).exp()
-        return ((parameters - expected).square() * precision).sum(dim=-1).mean()
 
 
 def views_of(arrays: Mapping[str, np.ndarray]) -> PosedViews:
@@ -258,15 +219,14 @@ def _fit_shares(
     trained = [parameter.requires_grad for parameter in parameters]
     triplane.requires_grad_(True)
     with torch.no_grad():
-        others = triplane.parameters_at(positions)[:, triplane.num_shares :]
+        others = triplane.parameters_at(positions)[:, triplane.readers.num_shares :]
     optimiser = torch.optim.Adam(parameters, lr=_RATE)
     with torch.enable_grad():
         for _ in range(_STEPS):
             chosen = torch.randint(len(positions), (_POINTS,), generator=generator).to(positions.device)
-            found = triplane.parameters_at(positions[chosen])
-            logarithms = found[:, : triplane.num_shares].clamp(min=1e-6).log()
-            distance = -(shares[chosen] * logarithms).sum(dim=1).mean()
-            kept = (found[:, triplane.num_shares :] - others[chosen]).square().sum(dim=1).mean()
+            found, kept = triplane.parameters_at(positions[chosen]).tensor_split([shares.shape[1]], dim=1)
+            distance = -(shares[chosen] * found.clamp(min=1e-6).log()).sum(dim=1).mean()
+            kept = (kept - others[chosen]).square().sum(dim=1).mean()
             optimiser.zero_grad()
             (distance + kept).backward()
             optimiser.step()

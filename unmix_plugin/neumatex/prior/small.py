@@ -206,7 +206,7 @@ def predict(
         observations = _observe(chosen, ray_mesh, environment.to("cpu"), generator)
         said = prior.estimate(prior(observations), material)
     planes = fit_planes(prior.readers_of(material), Estimates(observations.positions, *said))[0]
-    return _filled_triplane(prior, planes, material, resolution)
+    return Triplane.filled(prior.readers_of(material), planes, resolution)
 
 
 def _observe(
@@ -244,18 +244,6 @@ def _read_colours(
         colours.append(found[:, :3])
         shown.append((depths > 0) & (found[:, 3] >= _LEAST_ALPHA))
     return torch.stack(colours, dim=1), torch.stack(shown, dim=1)
-
-
-def _filled_triplane(
-    prior: SmallPrior, planes: Float[Tensor, "3 C R R"], material: MaterialName, resolution: int
-) -> Triplane:
-    """Planes in another resolution with copies of the prior's networks for a material."""
-    readers, size = prior.readers_of(material), (resolution, resolution)
-    triplane = Triplane(readers.num_parameters, resolution, planes.shape[1])
-    triplane.readers.load_state_dict(readers.state_dict())
-    with torch.no_grad():
-        triplane.planes.copy_(functional.interpolate(planes, size, mode="bilinear", align_corners=True))
-    return triplane
 
 
 def read_small_prior(

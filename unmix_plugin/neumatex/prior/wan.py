@@ -118,11 +118,7 @@ class WanPrior(nn.Module):
 
     def triplane(self, planes: Float[Tensor, "3 12 S S"]) -> Triplane:
         """One object's planes with copies of the networks that read them."""
-        triplane = Triplane(self.readers.num_parameters, resolution=planes.shape[-1])
-        triplane.readers.load_state_dict(self.readers.state_dict())
-        with torch.no_grad():
-            triplane.planes.copy_(planes)
-        return triplane
+        return Triplane.filled(self.readers, planes, planes.shape[-1])
 
     def parameter_groups(self) -> dict[Literal["backbone", "networks"], list[nn.Parameter]]:
         """What training moves: the backbone slowly (published: 5e-5), what is new faster (5e-4)."""

@@ -122,15 +122,18 @@ class Triplane(nn.Module):
         self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
         self.readers = Readers(num_parameters, num_channels, generator, num_shares)
 
-    @property
-    def num_parameters(self) -> int:
-        """P."""
-        return self.readers.num_parameters
-
-    @property
-    def num_shares(self) -> int:
-        """How many of the first parameters sum to 1."""
-        return self.readers.num_shares
+    @staticmethod
+    def filled(readers: Readers, planes: Float[Tensor, "3 C R R"], resolution: int) -> Triplane:
+        """Planes in a resolution of its own with copies of the networks that read them."""
+        triplane, size = (
+            Triplane(readers.num_parameters, resolution, planes.shape[1]),
+            (resolution, resolution),
+        )
+        triplane.readers.load_state_dict(readers.state_dict())
+        with torch.no_grad():
+            resized = functional.interpolate(planes, size, mode="bilinear", align_corners=True)
+            triplane.planes.copy_(resized if planes.shape[-1] != resolution else planes)
+        return triplane
 
     def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Parameters of the material in (0, 1); differentiable by planes and networks."""
