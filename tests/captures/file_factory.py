@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tifffile
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
@@ -121,24 +122,52 @@ def header_text(cube: np.ndarray, interleave: str, change: dict[str, str | None]
     return "ENVI\n" + "".join(f"{key} = {value}\n" for key, value in entries.items() if value is not None)
 
 
+def check_file(file: SpectralFile, **expected: Any) -> None:
+    """That a file is and says what is expected; texts (`evidence`, `warning`, `note`) may be parts of what it says.
+
+    `values` are its numbers, `calibrated` those after its gains and offsets; other names are its fields, those of its
+    bands, or entries of its metadata.
+    """
+    bands = file.bands
+    for name, value in expected.items():
+        match name:
+            case "values":
+                np.testing.assert_array_equal(file.read(), value)
+            case "calibrated":
+                assert file.linear is not None
+                np.testing.assert_allclose(file.linear.apply(file.read(), slice(None)), value, atol=2e-6)
+            case "nm" | "fwhm":
+                found = bands.wavelengths_nm if name == "nm" else bands.fwhm_nm
+                assert (found is None) == (value is None), file.notes
+                if found is not None:
+                    np.testing.assert_allclose(found, np.broadcast_to(value, found.shape), atol=1e-5)
+            case "bad":
+                assert bands.bad is not None
+                assert np.flatnonzero(bands.bad).tolist() == value
+            case "evidence":
+                assert value in bands.evidence
+            case "warning" | "note":
+                said = file.warnings if name == "warning" else file.notes
+                assert any(value in text for text in said), said
+            case "names":
+                assert bands.names == tuple(value)
+            case _:
+                found = getattr(file, name) if hasattr(file, name) else file.metadata.get(name)
+                assert found == (pytest.approx(value) if isinstance(value, float) else value), name
+
+
+def rows_and_bands_of(file: SpectralFile, values: np.ndarray) -> None:
+    """That a file gives all its numbers, and any rows and bands of them."""
+    rows, last = values.shape[0], values.shape[2] - 1
+    assert (file.shape, file.dtype.newbyteorder("=")) == (values.shape, values.dtype.newbyteorder("="))
+    np.testing.assert_array_equal(file.read(), values)
+    assert file.read().dtype == values.dtype.newbyteorder("=")
+    for some, bands in ((slice(2, rows - 1, 2), np.array([last, 0, last])), (slice(-2, None), slice(1, 3))):
+        np.testing.assert_array_equal(file.read(some, bands), values[some][..., bands])
+    np.testing.assert_array_equal(file.read(slice(1, 1)), values[1:1])
+
+
 def present(value: Any) -> Any:
     """A value that has to be there."""
     assert value is not None
     return value
-
-
-def linear_values_of(file: SpectralFile) -> np.ndarray:
-    """All numbers after its gains and offsets, which must be there."""
-    return present(file.linear).apply(file.read(), slice(None))
-
-
-def centres_nm(file: SpectralFile) -> np.ndarray:
-    """Its wavelengths, which must be there."""
-    assert file.bands.wavelengths_nm is not None, file.notes
-    return file.bands.wavelengths_nm
-
-
-def widths_nm(file: SpectralFile) -> np.ndarray:
-    """Its widths of bands, which must be there."""
-    assert file.bands.fwhm_nm is not None, file.notes
-    return file.bands.fwhm_nm

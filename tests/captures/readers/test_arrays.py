@@ -11,7 +11,11 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from tests.captures.file_factory import centres_nm, linear_values_of, widths_nm
+from tests.captures.file_factory import (
+    check_file,
+    present,
+    rows_and_bands_of,
+)
 from unmix_plugin.captures.readers import matlab
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -67,18 +71,12 @@ PLAIN = CUBE.astype(np.int16)
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("bands_at", [0, 1, 2])
 def test_the_image_and_its_wavelengths_are_found(tmp_path, name, bands_at):
-    stored = np.moveaxis(PLAIN, 2, bands_at)
-    arrays = {"thumbnail": PLAIN[..., 0], "cube": np.ascontiguousarray(stored)}
-    arrays |= {"wavelengths": NM, "fwhm": NM / 100}
+    stored = np.ascontiguousarray(np.moveaxis(PLAIN, 2, bands_at))
+    arrays = {"thumbnail": PLAIN[..., 0], "cube": stored, "wavelengths": NM, "fwhm": NM / 100}
     WRITERS[name](tmp_path / name, arrays)
     file = open_spectral_file(tmp_path / name)
-    assert (file.shape, file.dtype.newbyteorder("=")) == ((8, 9, 5), np.dtype("i2"))
-    np.testing.assert_array_equal(file.read(), PLAIN)
-    some = file.read(slice(2, 7, 2), np.array([4, 0, 4]))
-    np.testing.assert_array_equal(some, PLAIN[2:7:2][..., [4, 0, 4]])
-    np.testing.assert_array_equal(centres_nm(file), NM)
-    np.testing.assert_allclose(widths_nm(file), NM / 100)
-    assert "'wavelengths', no unit: 450 to 650 taken as nm" in file.bands.evidence
+    rows_and_bands_of(file, PLAIN)
+    check_file(file, nm=NM, fwhm=NM / 100, evidence="'wavelengths', no unit: 450 to 650 taken as nm")
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -107,16 +105,16 @@ def test_files_that_are_cut_short_are_refused(tmp_path, name):
 
 def test_lists_of_pixels_are_images_once_their_size_is_known(tmp_path):
     listed = CUBE.transpose(2, 0, 1).reshape(5, -1, order="F")  # as MATLAB's reshape does it
-    scipy.io.savemat(tmp_path / "a.mat", {"Y": listed, "A": listed[:3]})
-    file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(8, 9)))
-    np.testing.assert_array_equal(file.read(slice(2, 5), slice(1, 4)), CUBE[2:5, :, 1:4])
-    with pytest.raises(CaptureError, match=r"Y \(5, 72\) is not a list of 70 pixels"):
-        open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="Y", size=(7, 10)))
-    scipy.io.savemat(tmp_path / "b.mat", {"Y": listed, "nRow": 8, "nCol": 9, "nBand": 5})
-    np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.mat").read(), CUBE)
-    scipy.io.savemat(tmp_path / "c.mat", {"Y": listed.T})
-    file = open_spectral_file(tmp_path / "c.mat", ReadOptions(size=(8, 9)))
-    np.testing.assert_array_equal(file.read(), CUBE)
+    path = tmp_path / "a.mat"
+    for arrays, options in (
+        ({"Y": listed, "A": listed[:3]}, ReadOptions(dataset="Y", size=(8, 9))),
+        ({"Y": listed, "nRow": 8, "nCol": 9, "nBand": 5}, ReadOptions()),
+        ({"Y": listed.T}, ReadOptions(size=(8, 9))),
+    ):
+        scipy.io.savemat(path, arrays)
+        rows_and_bands_of(open_spectral_file(path, options), CUBE)
+    with pytest.raises(CaptureError, match=r"Y \(72, 5\) is not a list of 70 pixels"):
+        open_spectral_file(path, ReadOptions(dataset="Y", size=(7, 10)))
 
 
 @pytest.mark.parametrize("do_compression", [False, True])
@@ -133,9 +131,7 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
     doubles = CUBE.astype(np.float64)  # MATLAB would store them in two bytes each
     scipy.io.savemat(tmp_path / "a.mat", {**others, "z_cube": doubles}, do_compression=do_compression)
     file = open_spectral_file(tmp_path / "a.mat", ReadOptions(dataset="z_cube"))
-    assert file.dtype == np.float64
-    np.testing.assert_array_equal(file.read(), doubles)
-    np.testing.assert_array_equal(centres_nm(file), NM)
+    check_file(file, dtype=np.dtype("f8"), values=doubles, nm=NM)
     with pytest.raises(CaptureError, match=r"e_logical \(8, 9, 5\), wl \(5, 1\), z_cube \(8, 9, 5\)$"):
         open_spectral_file(tmp_path / "a.mat")
 
@@ -147,24 +143,23 @@ def test_compressed_variables_of_matlab_are_unpacked_piece_by_piece(tmp_path, mo
 
 
 def test_units_scale_and_groups_of_hdf5(tmp_path):
+    """Facts of groups hold for the images in them."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         image = file.create_dataset("site/reflectance", data=CUBE)
-        image.attrs["Scale_Factor"] = 10000.0
-        image.attrs["Data_Ignore_Value"] = -9999.0
+        image.attrs.update({"Scale_Factor": 10000.0, "Data_Ignore_Value": -9999.0})
+        file["site"].attrs.update({"integration_time": 20.0, "integration_time_units": "us"})
         file["site/metadata/wavelength"] = NM / 1000
         file["site/metadata/wavelength"].attrs["Units"] = "micrometers"
         file["site/metadata/bbl"] = np.array([1, 0, 1, 1, 1])
         file["site/observations"] = np.zeros((8, 9, 10))
+        file["exposure"] = 3.0
     file = open_spectral_file(tmp_path / "a.h5")
-    np.testing.assert_allclose(centres_nm(file), NM)
-    assert (file.scale, file.no_data) == (10000, -9999)
-    assert file.bands.bad is not None
-    assert file.bands.bad.tolist() == [False, True, False, False, False]
-    assert file.metadata["dataset"] == "site/reflectance"
+    check_file(file, nm=NM, scale=10000, no_data=-9999, bad=[1], dataset="site/reflectance", exposure_s=2e-5)
     with h5py.File(tmp_path / "b.h5", "w") as file:
-        file["cube"] = CUBE
-        file["cube"].attrs["wavelengths"] = NM
-    np.testing.assert_array_equal(centres_nm(open_spectral_file(tmp_path / "b.h5")), NM)
+        file["run/cube"] = CUBE
+        file["run/cube"].attrs["wavelengths"] = NM
+        file["run"].attrs["scale_factor"] = 0.5
+    check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 
 def test_axes_by_the_names_of_netcdf4(tmp_path):
@@ -178,10 +173,7 @@ def test_axes_by_the_names_of_netcdf4(tmp_path):
         for axis, name in enumerate(("wavelength", "lat", "lon")):
             file["radiance"].dims[axis].attach_scale(file[name])
         file["radiance"].attrs["scale_factor"] = 0.0001
-    file = open_spectral_file(tmp_path / "a.nc")
-    np.testing.assert_array_equal(file.read(), square)
-    assert file.scale == pytest.approx(10000)
-    assert file.notes == ()
+    check_file(open_spectral_file(tmp_path / "a.nc"), values=square, scale=10000, notes=())
 
 
 def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
@@ -193,44 +185,19 @@ def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):
         open_spectral_file(tmp_path / "a.h5")
 
 
-@pytest.mark.parametrize("name", ["big.h5", "big.npy"])
-def test_files_of_terabytes_open_at_once(tmp_path, name):
-    shape = (10**5, 10**4, 500)
-    if name == "big.h5":
-        with h5py.File(tmp_path / name, "w") as file:
-            file.create_dataset("cube", shape, "u2", chunks=(1, 100, 500))
-        with (tmp_path / name).open("r+b") as opened:  # as large as such a file would be
-            opened.truncate(10**12)
-    else:
-        described = {"descr": "<u2", "fortran_order": False, "shape": shape}
-        with (tmp_path / name).open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, described)
-            file.truncate(file.tell() + 10**5 * 10**4 * 500 * 2)
-    file = open_spectral_file(tmp_path / name)
-    assert file.shape == shape
-    assert file.read(slice(99_999, 10**5), slice(0, 2)).shape == (1, 10**4, 2)
-
-
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["f2", ">f4", "u1", "f8"])
 def test_npy_arrays_are_mapped(tmp_path, order, dtype):
     np.save(tmp_path / "a.npy", np.asarray(CUBE.astype(dtype), order=order))
-    file = open_spectral_file(tmp_path / "a.npy")
-    assert file.dtype == np.dtype(dtype)
-    some = file.read(slice(1, 3), np.array([3, 1]))
-    np.testing.assert_array_equal(some, CUBE.astype(dtype)[1:3][..., [3, 1]])
-    np.save(tmp_path / "b.npy", CUBE[..., 0])
-    np.testing.assert_array_equal(open_spectral_file(tmp_path / "b.npy").read(), CUBE[..., :1])
+    rows_and_bands_of(open_spectral_file(tmp_path / "a.npy"), CUBE.astype(dtype))
 
 
 def test_the_order_of_axes_can_be_said(tmp_path):
     np.save(tmp_path / "a.npy", CUBE.transpose(2, 0, 1))
-    assert "axis 0 is the shortest" in open_spectral_file(tmp_path / "a.npy").warnings[0]
-    file = open_spectral_file(tmp_path / "a.npy", ReadOptions(axes="byx"))
-    np.testing.assert_array_equal(file.read(), CUBE)
-    file = open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM))
-    np.testing.assert_array_equal(file.read(), CUBE)
-    assert file.bands.evidence == "given by the user"
+    check_file(open_spectral_file(tmp_path / "a.npy"), warning="axis 0 is the shortest")
+    check_file(open_spectral_file(tmp_path / "a.npy", ReadOptions(axes="byx")), values=CUBE)
+    given = open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM))
+    check_file(given, values=CUBE, evidence="given by the user")
     with pytest.raises(CaptureError, match="3 wavelengths were given for 5 rows x 8 columns x 9 bands"):
         open_spectral_file(tmp_path / "a.npy", ReadOptions(wavelengths_nm=NM[:3]))
 
@@ -250,11 +217,11 @@ def test_pickles_are_never_loaded(tmp_path, kind):
         open_spectral_file(path)
 
 
-def test_a_bare_tensor_is_an_image(tmp_path):
+def test_bare_arrays_of_two_axes_and_tensors_are_images(tmp_path):
+    np.save(tmp_path / "a.npy", CUBE[..., 0])
+    check_file(open_spectral_file(tmp_path / "a.npy"), values=CUBE[..., :1])
     torch.save(torch.tensor(CUBE.astype("u1")), tmp_path / "a.pt")
-    file = open_spectral_file(tmp_path / "a.pt")
-    assert (file.reader, file.shape, file.dtype) == ("torch", (8, 9, 5), np.uint8)
-    np.testing.assert_array_equal(file.read(slice(0, 2)), CUBE.astype("u1")[:2])
+    check_file(open_spectral_file(tmp_path / "a.pt"), reader="torch", values=CUBE.astype("u1"))
 
 
 def test_members_that_promise_too_much_are_refused(tmp_path):
@@ -288,34 +255,12 @@ def prisma(path, zeros=(0, 1)):
 def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_bands(tmp_path):
     path = prisma(tmp_path / "a.he5")
     file = open_spectral_file(path, ReadOptions(dataset="VNIR_Cube"))
-    np.testing.assert_array_equal(file.read(), CUBE)
-    np.testing.assert_array_equal(centres_nm(file)[2:], [700, 600, 500])
-    np.testing.assert_array_equal(file.bands.bad, [True, True, False, False, False])
-    np.testing.assert_array_equal(widths_nm(file), 11)
-    np.testing.assert_allclose(linear_values_of(file), CUBE / 65535 - 0.1, atol=1e-6)
+    check_file(file, values=CUBE, bad=[0, 1], fwhm=11, calibrated=CUBE / 65535 - 0.1)
+    np.testing.assert_array_equal(present(file.bands.wavelengths_nm)[2:], [700, 600, 500])
     other = open_spectral_file(path, ReadOptions(dataset="SWIR_Cube"))
-    np.testing.assert_array_equal(centres_nm(other), [2400, 1800, 1200, 1000])
-    np.testing.assert_allclose(linear_values_of(other), CUBE[..., :4] / 100 - 2, atol=1e-5)
+    check_file(other, nm=[2400, 1800, 1200, 1000], calibrated=CUBE[..., :4] / 100 - 2)
     with pytest.raises(CaptureError, match="2 data sets could be the image"):  # none of them their errors
         open_spectral_file(path)
-
-
-@pytest.mark.parametrize(("bands", "is_known"), [(NM, True), (np.arange(1.0, 6), False)])
-def test_a_list_called_bands_may_be_wavelengths(tmp_path, bands, is_known):
-    scipy.io.savemat(tmp_path / "a.mat", {"rad": CUBE, "rgb": CUBE[..., :3], "bands": bands})
-    options = ReadOptions() if is_known else ReadOptions(dataset="rad")
-    assert (open_spectral_file(tmp_path / "a.mat", options).bands.wavelengths_nm is not None) == is_known
-
-
-def test_facts_of_groups_hold_for_the_images_in_them(tmp_path):
-    facts = {"integration_time": 20.0, "integration_time_units": "us", "scale_factor": 0.5}
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["run/cube"] = CUBE
-        file["run"].attrs.update(facts)
-        file["exposure"] = 3.0
-    found = open_spectral_file(tmp_path / "a.h5")
-    assert found.metadata["exposure_s"] == pytest.approx(2e-5)
-    assert found.scale == 2
 
 
 LARGE = CUBE + np.uint16(50_000)
@@ -341,14 +286,25 @@ def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
         for name, value in attributes.items():
             setattr(variable, name, value)
     found = open_spectral_file(tmp_path / "a.nc")
-    np.testing.assert_array_equal(found.read(), stored)
+    check_file(found, values=stored, valid_range=valid_range, no_data=no_data)
     assert found.dtype.kind == ("u" if "_Unsigned" in attributes else "i")
-    assert (found.valid_range, found.no_data) == (valid_range, no_data)
 
 
-def test_arrays_that_are_not_used_are_named(tmp_path):
-    cube, nm = np.ones((4, 5, 3), np.float32), np.array([450.0, 550.0, 650.0])
-    np.savez(tmp_path / "a.npz", cube=cube, wavelengths=nm, exposure_ms=np.array(5.0))
-    assert not open_spectral_file(tmp_path / "a.npz").notes
-    np.savez(tmp_path / "a.npz", cube=cube, wavelengths=nm, scale=np.array(1e4), mask=cube[..., 0] > 0)
-    assert open_spectral_file(tmp_path / "a.npz").notes == ("also in the file, and not used: scale, mask",)
+@pytest.mark.parametrize(
+    ("arrays", "dataset", "expected"),
+    [
+        ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": NM}, None, {"nm": NM}),
+        ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": np.arange(1.0, 6)}, "rad", {"nm": None}),
+        ({"cube": CUBE, "wavelengths": NM, "exposure_ms": [5.0]}, None, {"notes": (), "exposure_s": 0.005}),
+        (
+            {"cube": CUBE, "wavelengths": NM, "scale": 1e4, "mask": CUBE[..., 0] > 0},
+            None,
+            {"notes": ("also in the file, and not used: scale, mask",)},
+        ),
+    ],
+)
+def test_arrays_beside_the_image_are_used_by_their_names_or_said_not_to_be(
+    tmp_path, arrays, dataset, expected
+):
+    np.savez(tmp_path / "a.npz", **arrays)
+    check_file(open_spectral_file(tmp_path / "a.npz", ReadOptions(dataset=dataset)), **expected)

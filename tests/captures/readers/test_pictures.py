@@ -6,7 +6,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import centres_nm
+from tests.captures.file_factory import check_file, rows_and_bands_of
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 
@@ -14,37 +14,29 @@ RGB = np.random.default_rng(0).integers(0, 255, (6, 9, 3)).astype(np.uint8)
 DEEP = np.random.default_rng(1).integers(0, 65535, (6, 9, 3)).astype(np.uint16)
 
 
-def test_colours_are_three_bands_of_unknown_wavelength(tmp_path):
-    Image.fromarray(RGB).save(tmp_path / "a.png")
-    Image.fromarray(RGB).save(tmp_path / "a.jpg", quality=100)
-    for name in ("a.png", "a.jpg"):
-        file = open_spectral_file(tmp_path / name)
-        with Image.open(tmp_path / name) as picture:
-            some = file.read(slice(1, 4), np.array([2, 0]))
-            np.testing.assert_array_equal(some, np.asarray(picture)[1:4][..., [2, 0]])
-        assert file.bands.names == ("red", "green", "blue")
-        assert file.bands.wavelengths_nm is None
-        assert file.metadata["encoding"] == "sRGB"
+@pytest.mark.parametrize("name", ["a.png", "a.jpg"])
+def test_colours_are_three_bands_of_unknown_wavelength(tmp_path, name):
+    Image.fromarray(RGB).save(tmp_path / name, quality=100)
+    file = open_spectral_file(tmp_path / name)
+    with Image.open(tmp_path / name) as picture:
+        rows_and_bands_of(file, np.asarray(picture))
+    check_file(file, names=("red", "green", "blue"), nm=None, encoding="sRGB")
 
 
 def test_numbers_of_sixteen_bits_keep_them(tmp_path):
     (tmp_path / "rgb.png").write_bytes(imagecodecs.png_encode(DEEP))
     (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(DEEP[..., 0].copy()))
-    colours = open_spectral_file(tmp_path / "rgb.png")
-    np.testing.assert_array_equal(colours.read(), DEEP)
-    assert "red, green and blue are taken as light, as stored" in colours.warnings[0]
-    np.testing.assert_array_equal(open_spectral_file(tmp_path / "grey.png").read(), DEEP[..., :1])
+    said = "red, green and blue are taken as light, as stored"
+    check_file(open_spectral_file(tmp_path / "rgb.png"), values=DEEP, warning=said)
+    check_file(open_spectral_file(tmp_path / "grey.png"), values=DEEP[..., :1])
 
 
 def test_opacity_palettes_and_bits(tmp_path):
     Image.fromarray(np.dstack([RGB, RGB[..., :1]])).save(tmp_path / "rgba.png")
-    file = open_spectral_file(tmp_path / "rgba.png")
-    np.testing.assert_array_equal(file.read(), RGB)
-    assert "opacity" in file.notes[0]
-    Image.fromarray(RGB).quantize(256).save(tmp_path / "palette.png")
-    with Image.open(tmp_path / "palette.png") as picture:
-        read = open_spectral_file(tmp_path / "palette.png").read()
-        np.testing.assert_array_equal(read, picture.convert("RGB"))
+    check_file(open_spectral_file(tmp_path / "rgba.png"), values=RGB, note="opacity")
+    palette = Image.fromarray(RGB).quantize(256)
+    palette.save(tmp_path / "palette.png")
+    check_file(open_spectral_file(tmp_path / "palette.png"), values=palette.convert("RGB"))
     Image.fromarray(RGB[..., 0] > 99).save(tmp_path / "bits.png")
     read = open_spectral_file(tmp_path / "bits.png").read()
     np.testing.assert_array_equal(read[..., 0] > 0, RGB[..., 0] > 99)
@@ -69,10 +61,8 @@ def test_a_folder_is_an_image_by_rising_wavelength(tmp_path, names, nm, suffix):
             tifffile.imwrite(tmp_path / f"{name}.tif", plane)
     Image.fromarray(RGB).save(tmp_path / "preview.jpg")
     file = open_spectral_file(tmp_path)
-    np.testing.assert_allclose(centres_nm(file), np.sort(nm))
-    assert "names of files" in file.bands.evidence
+    check_file(file, nm=np.sort(nm), evidence="names of files", note="1 picture of another kind")
     np.testing.assert_array_equal(file.read()[0, 0], np.argsort(nm))
-    assert "1 picture of another kind" in file.notes[-1]
 
 
 def test_counted_files_keep_their_order_and_have_no_wavelengths(tmp_path):
@@ -106,30 +96,11 @@ def test_pictures_that_are_cut_short_are_refused(tmp_path, suffix):
             open_spectral_file(path).read()
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"", "the file is empty"),
-        (b"hello world", "of no known kind: begins with b'hello wo'"),
-        (b"\x1f\x8b" + bytes(20), "compressed with gzip; unpack it first"),
-        (b"<!DOCTYPE html><html>", "a web page"),
-        (b"PK\x05\x06" + bytes(18), "no known kind"),
-    ],
-)
-def test_other_files_are_refused_with_the_reason(tmp_path, data, message):
-    (tmp_path / "a.raw").write_bytes(data)
-    with pytest.raises(CaptureError, match=message):
-        open_spectral_file(tmp_path / "a.raw")
-    with pytest.raises(CaptureError, match="no such file"):
-        open_spectral_file(tmp_path / "missing.tif")
-
-
 def test_the_exposure_of_a_picture_is_that_of_its_exif(tmp_path):
     picture = Image.new("L", (3, 2))
     exif = picture.getexif()
     exif[0x8769] = {0x829A: 0.02, 0x8827: 200}
     picture.save(tmp_path / "a.png", exif=exif)
-    metadata = open_spectral_file(tmp_path / "a.png").metadata
-    assert (metadata["exposure_s"], metadata["gain"]) == (pytest.approx(0.02), 2.0)
+    check_file(open_spectral_file(tmp_path / "a.png"), exposure_s=0.02, gain=2.0)
     picture.save(tmp_path / "b.png")
-    assert "exposure_s" not in open_spectral_file(tmp_path / "b.png").metadata
+    check_file(open_spectral_file(tmp_path / "b.png"), exposure_s=None)

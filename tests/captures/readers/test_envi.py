@@ -1,0 +1,272 @@
+"""ENVI images: headers as programs write them, against SPy and by hand."""
+
+import re
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import spectral.io.envi as spy
+import tifffile
+
+from tests.captures.file_factory import AXES, check_file, header_text, rows_and_bands_of, write_envi
+from unmix_plugin.captures.layouts.cubes import find_cubes
+from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.captures.spectral_file import ReadOptions
+from unmix_plugin.errors import CaptureError
+
+CUBE = np.random.default_rng(0).integers(0, 200, (5, 7, 4))
+STORED = CUBE.transpose(AXES["bil"]).tobytes()
+NM = [400, 500, 600, 700]
+
+
+@pytest.mark.parametrize("interleave", AXES)
+@pytest.mark.parametrize(
+    "dtype", ["u1", "<i2", ">i2", "<i4", ">f4", "<f8", "<u2", ">u2", "<u4", "<i8", ">u8"]
+)
+def test_numbers_are_those_that_spy_reads(tmp_path, interleave, dtype):
+    header = write_envi(tmp_path / "cube.hdr", CUBE.astype(dtype), interleave)
+    file = open_spectral_file(header)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        image: Any = spy.open(str(header))
+        np.testing.assert_array_equal(file.read(), np.asarray(image.load(dtype=np.float64)))
+    assert file.interleave == interleave
+    rows_and_bands_of(file, CUBE.astype(dtype))
+
+
+def test_files_of_spy_are_read(tmp_path):
+    cube = np.random.default_rng(1).random((6, 3, 5)).astype(np.float32)
+    entries = {
+        "wavelength": [0.45, 0.5, 0.55, 0.6, 0.7],
+        "wavelength units": "Micrometers",
+        "fwhm": [0.01] * 5,
+    }
+    spy.save_image(str(tmp_path / "cube.hdr"), cube, metadata=entries, interleave="bil")
+    file = open_spectral_file(tmp_path / "cube.img")
+    check_file(file, values=cube, nm=[450, 500, 550, 600, 700], fwhm=10, evidence="'wavelength', Micrometers")
+    assert file.files == (tmp_path / "cube.hdr", tmp_path / "cube.img")
+
+
+def test_a_header_as_headwall_and_plantcv_write_it(tmp_path):
+    text = """ENVI
+; made by hand
+description = {[CAMERA {1}]
+  wavelength = nothing}
+samples = 7
+lines=5 ; rows
+bands = 4
+data type = 12
+interleave = BIL
+file type = ENVI
+wavelength units = nm
+wavelength = {
+400.5
+,410
+;,415
+,420,
+430 }
+bbl = {1,0,1,1}
+reflectance scale factor = 10000
+data ignore value = 65535
+;AOI height = 1008
+"""
+    (tmp_path / "cube.hdr").write_text(text)
+    (tmp_path / "cube").write_bytes(CUBE.astype("<u2").transpose(AXES["bil"]).tobytes())
+    file = open_spectral_file(tmp_path / "cube")
+    check_file(file, values=CUBE, nm=[400.5, 410, 420, 430], bad=[1], scale=10000, no_data=65535)
+    assert file.path == tmp_path / "cube.hdr"
+    assert file.warnings == ("the header has no byte order; taken as little-endian",)
+
+
+@pytest.mark.parametrize(
+    ("entries", "expected"),
+    [
+        ("wavelength = {0.4, 0.5, 0.6, 2.5}", {"nm": [400, 500, 600, 2500], "evidence": "as micrometres"}),
+        ("wavelength = {400, 500, 600, 700}", {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}),
+        ("wavelength = {400 500\n600\n700}", {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}),
+        ("wavelength units = Micrometers\nwavelength = {.4,.5,.6,.7}", {"nm": NM, "evidence": "Micrometers"}),
+        ("band names = {a (400 nm), b 500 nm, 600 nm, 700nm}", {"nm": NM, "evidence": "a (400 nm)"}),
+        ("band names = {0.4 um, 0.5 um, 0.6 um, 0.7 um}", {"nm": NM, "evidence": "unit um"}),
+        ("band names = {400, 500, 600, 700}", {"nm": NM, "evidence": "increase and are taken as nm"}),
+        ("wavelength = {400, 500, 600}", {"nm": None, "warning": "are left out: 3 for 4 bands"}),
+        ("wavelength = {400, nan, 600, 700}", {"nm": None, "warning": "that of band 1 (from 0) is nan"}),
+        ("wavelength = {400, x, 600, 700}", {"nm": None, "warning": "are not a list of numbers"}),
+        (
+            "wavelength units = Index\nwavelength = {1, 2, 3, 4}",
+            {"nm": None, "warning": "unit 'Index' can't be"},
+        ),
+        (
+            "wavelength units = Micrometers\nwavelength = {400, 500, 600, 700}",
+            {"nm": None, "warning": "can't be in Micrometers"},
+        ),
+        ("wavelength units = nm\nwavelength = {.4, .5, .6, .7}", {"nm": None, "warning": "can't be in nm"}),
+        ("wavelength = {1, 2, 3, 40}", {"nm": None, "warning": "with no unit can't be brought to nm"}),
+        ("band names = {Band 201, Band 202, Band 203, Band 204}", {"nm": None}),
+        ("band names = {a, b, c, d}", {"nm": None, "names": "abcd"}),
+        ("band names = {450 nm, 460 nm, red, 480 nm}", {"nm": None}),
+        (
+            "wavelength = {500, 510, 520, 530}\nwavelength units = nm\nfwhm = {.0055, .0055, .0055, .0055}",
+            {"fwhm": None, "warning": "FWHM are left out: they would be"},
+        ),
+        (
+            "wavelength = {.5, .51, .52, .53}\nwavelength units = Micrometers\nfwhm = {5.5, 5.5, 5.5, 5.5}",
+            {"fwhm": None, "warning": "FWHM are left out: they would be"},
+        ),
+        ("data ignore value = -9999 ; none measured", {"no_data": -9999}),
+        ("data ignore value = unset", {"warning": "'data ignore value' is unset, no number: not used"}),
+        (
+            "wavelength = {400, 500, 600, 700}\nsensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}",
+            {"nm": NM},
+        ),
+    ],
+)
+def test_what_a_header_says_of_bands_is_used_or_left_out_with_a_reason(tmp_path, entries, expected):
+    check_file(open_spectral_file(write_envi(tmp_path / "cube.hdr", CUBE, "bsq", entries)), **expected)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding):
+    header = write_envi(tmp_path / "a.hdr", CUBE, "bil")
+    more = "sensor = Größe [m\nwavelength_units = nm\nwavelength = [ 400 500\n   600 700]\nbbl = [1 0 1 1]\n"
+    header.write_bytes((header.read_text() + more).encode(encoding))
+    check_file(open_spectral_file(header), nm=NM, bad=[1], values=CUBE)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"interleave": "bup"}, "'interleave' is 'bup'; expected bsq, bil or bip"),
+        ({"interleave": None}, "'interleave' is missing"),
+        ({"data type": "6"}, "complex"),
+        ({"data type": "7"}, r"'data type' is 7; expected one of 1 \(uint8\)"),
+        ({"data type": None}, "'data type' is missing; expected a whole number"),
+        ({"samples": "0"}, "'samples' is 0; expected a whole number of at least 1"),
+        ({"lines": "-5"}, "'lines' is -5"),
+        ({"bands": "many"}, "'bands' is many"),
+        ({"bands": "9" * 5000}, "'bands' is 9"),
+        ({"samples": "1e400"}, "'samples' is 1e400; expected a whole number"),
+        ({"header offset": "nan"}, "'header offset' is nan; expected a whole number"),
+        ({"byte order": "2"}, "'byte order' is 2; expected 0"),
+        ({"header offset": "1.5"}, "'header offset' is 1.5"),
+        ({"file compression": "1"}, "compressed"),
+        ({"file type": "ENVI Spectral Library"}, "library of spectra; expected an image"),
+        ({"major frame offsets": "{0, 8}"}, "'major frame offsets' is 0, 8"),
+        ({"lines": "6"}, "cut short: 280 bytes; cube.hdr promises 336"),
+        ({"lines": "1000000000"}, "cut short"),
+        ({"header offset": "4"}, "promises 284"),
+        ({"wavelength": "{1, 2"}, "the list of 'wavelength' is never closed"),
+        (
+            {"wavelength": "{1, 2, 3, 4}\nwavelength = {2, 3, 4, 5}"},
+            r"cube\.hdr: 'wavelength' is there twice, with different values",
+        ),
+        ({"data gain values": "{1, 2}"}, "'data gain values' gives 2 gains for 4 bands"),
+        ({"data gain values": "{1, 2, x, 1}"}, "'data gain values' has 'x'"),
+        ({"data gain values": "{1, 0, 2, 1}"}, "gains from 0 to 2; expected finite numbers above 0"),
+        ({"data gain values": "2\nreflectance scale factor = 10000"}, "it is unclear which the numbers need"),
+    ],
+)
+def test_headers_that_cannot_be_followed_are_refused(tmp_path, change, message):
+    header = write_envi(tmp_path / "cube.hdr", CUBE.astype("<i2"), "bil")
+    header.write_text(header_text(CUBE.astype("<i2"), "bil", change))
+    with pytest.raises(CaptureError, match=message):
+        open_spectral_file(header)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("BYTEORDER I\nNROWS 540\n", "header of an ESRI"),
+        (bytes(range(256)).decode("latin-1"), "no ENVI header: its first line is not 'ENVI'"),
+    ],
+)
+def test_headers_of_other_programs_are_refused(tmp_path, text, message):
+    (tmp_path / "cube.hdr").write_text(text, encoding="latin-1", newline="")
+    with pytest.raises(CaptureError, match=message):
+        open_spectral_file(tmp_path / "cube.hdr")
+
+
+@pytest.mark.parametrize(
+    ("header", "files", "meant"),
+    [
+        ("cube.hdr", {"cube.RAW": STORED, "cube.dat": b"notes"}, "cube.RAW"),
+        ("cube.hdr", {"cube.bil": STORED, "cube.bsq": bytes(len(STORED))}, "cube.bil"),
+        ("cube.hdr", {"cube": STORED, "cube.bil": bytes(2 * len(STORED))}, "cube"),
+        ("cube.raw.hdr", {"cube.raw": STORED}, "cube.raw"),
+        (
+            "cube.hdr",
+            {"cube.img": bytes(len(STORED)), "cube.bsq": STORED},
+            "cube.img and cube.bsq could each be what it describes",
+        ),
+        ("cube.hdr", {"other.raw": STORED}, "no file of numbers beside this header; expected cube or"),
+        ("cube.hdr", {"cube": b"\x1f\x8b\x08" + bytes(50)}, "cube: compressed with gzip; unpack it"),
+    ],
+)
+def test_the_numbers_of_a_header_are_the_file_that_fits_it_best(tmp_path, header, files, meant):
+    """A file of numbers that is named itself is meant in any case."""
+    (tmp_path / header).write_text(header_text(CUBE, "bil", {}))
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    if meant not in files:
+        with pytest.raises(CaptureError, match=re.escape(meant)):
+            open_spectral_file(tmp_path / header)
+    else:
+        assert open_spectral_file(tmp_path / header).sources == (tmp_path / meant,)
+        check_file(open_spectral_file(tmp_path / meant), values=CUBE)
+
+
+def test_two_names_of_one_file_of_numbers_are_one_file(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", CUBE, "bsq")
+    (tmp_path / "cube").rename(tmp_path / "cube.img")
+    if not (tmp_path / "cube.IMG").exists():  # as on a disk that ignores case
+        (tmp_path / "cube.IMG").hardlink_to(tmp_path / "cube.img")
+    check_file(open_spectral_file(header), values=CUBE)
+
+
+def test_a_file_that_is_cut_while_open_is_reported(tmp_path):
+    file = open_spectral_file(write_envi(tmp_path / "cube.hdr", CUBE, "bip"))
+    (tmp_path / "cube").write_bytes(b"")
+    with pytest.raises(CaptureError, match="the file was cut"):
+        file.read()
+
+
+def test_the_header_beside_a_tiff_describes_it(tmp_path):
+    cube = CUBE.astype("<u2")
+    tifffile.imwrite(tmp_path / "a.tif", cube, planarconfig="contig", photometric="minisblack")
+    more = "file type = TIFF\nbbl = {1, 0, 1, 1}\ntint = 5\nwavelength = {400, 500, 600, 700}\n"
+    (tmp_path / "a.hdr").write_text(header_text(cube, "bip", {}) + more)
+    for name in ("a.tif", "a.hdr"):
+        file = open_spectral_file(tmp_path / name)
+        check_file(file, reader="tiff", values=cube, nm=NM, bad=[1], exposure_s=0.005)
+    (tmp_path / "a.hdr").write_text(header_text(cube[:2], "bip", {}) + more)
+    check_file(open_spectral_file(tmp_path / "a.tif"), warning="describes 2 x 7 x 4")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("data type = ", "data type = 6;", "'data type' is 6"),
+        ("data type = ", "kind = ", "'data type' is missing"),
+    ],
+)
+def test_a_faulty_header_of_numbers_is_refused_and_not_read_as_that_of_a_quick_look(tmp_path, old, new, said):
+    header = write_envi(tmp_path / "x.hdr", CUBE, "bil")
+    (tmp_path / "x").rename(tmp_path / "x.img")
+    tifffile.imwrite(tmp_path / "x.tif", CUBE[..., 0])
+    header.write_text(header.read_text().replace(old, new))
+    with pytest.raises(CaptureError, match=said):
+        open_spectral_file(header)
+    assert open_spectral_file(tmp_path / "x.tif").shape == (*CUBE.shape[:2], 1)
+    with pytest.raises(CaptureError, match="would both be the view 'x'"):
+        find_cubes(tmp_path, ReadOptions())
+
+
+@pytest.mark.parametrize("other", [".mat", ".tif", ".npy"])
+def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, other):
+    header = write_envi(tmp_path / "s.hdr", CUBE, "bil")
+    (tmp_path / "s").rename(tmp_path / "s.spe")
+    np.save(tmp_path / "s.npy", CUBE[:2])
+    (tmp_path / "s.npy").rename(tmp_path / f"s{other}")
+    check_file(open_spectral_file(header), values=CUBE)
+    with pytest.raises(CaptureError, match="would both be the view 's'"):
+        find_cubes(tmp_path, ReadOptions())

@@ -1,0 +1,61 @@
+"""A file of an instrument: reading parts of it, and stacks of several."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.captures.file_factory import file_of
+from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values, stack_bands
+from unmix_plugin.errors import CaptureError
+
+
+def part(tmp_path, value, **metadata):
+    scale = metadata.get("scale")
+    return replace(
+        file_of(np.full((2, 3, 1), value), np.array([400.0 + value]), metadata=metadata),
+        path=tmp_path / str(value),
+        bands=BandTable(np.array([400.0 + value]), "test"),
+        linear=linear_values(tmp_path, 1, [1 / scale], [], "test") if scale else None,
+    )
+
+
+def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
+    parts = [part(tmp_path, 1, camera="a", exposure_s=0.1, scale=2.0)]
+    parts.append(part(tmp_path, 2, camera="a", exposure_s=0.2))
+    stack = stack_bands(parts, tmp_path)
+    assert stack.metadata == {
+        "camera": "a",
+        "exposure_s": [0.1, 0.2],
+        "parts": [{"exposure_s": 0.1, "scale": 2.0}, {"exposure_s": 0.2}],
+    }
+    assert (stack.bands.evidence, stack.scale) == ("test", None)
+    np.testing.assert_array_equal(stack.read(slice(1, 2), np.array([1, 0]))[0, 0], [2, 1])
+    alike = stack_bands([part(tmp_path, 1, scale=3.0), part(tmp_path, 2, scale=3.0)], tmp_path)
+    assert (alike.scale, alike.metadata, alike.warnings) == (3.0, {"scale": 3.0}, ())
+    assert "only some of the files of one view state gains" in stack.warnings[0]
+    mixed = stack_bands([*parts, replace(part(tmp_path, 3), bands=BandTable())], tmp_path).bands
+    assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (RuntimeError("no luck\nat all"), r"a: can't be read \(RuntimeError: no luck at all\)"),
+        (MemoryError(), "a: too little memory"),
+    ],
+)
+def test_what_a_library_raises_while_reading_is_an_error_of_the_file(tmp_path, error, message):
+    def read_part(*_):
+        raise error
+
+    with pytest.raises(CaptureError, match=message):
+        SpectralFile(tmp_path / "a", "npy", (2, 3, 1), np.dtype("u1"), read_part).read()
+
+
+def test_bands_that_are_not_there_are_an_index_error():
+    values = np.random.default_rng(0).random((5, 7, 4))
+    with pytest.raises(IndexError):
+        file_of(values).read(bands=np.array([4]))
+    some = file_of(values).read(slice(0, 5, 2), slice(None, None, -1))
+    np.testing.assert_array_equal(some, values[::2, :, ::-1])
