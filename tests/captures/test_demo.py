@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.captures.file_factory import check_file
 from tests.captures.poses.alignment import align_poses
 from tests.commands.running import run
 from unmix_plugin.captures import demo as demo_capture
@@ -27,6 +28,7 @@ from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import find_markers
 from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.poses.reading import read_poses
+from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.commands.process import process
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, reflected
@@ -68,15 +70,6 @@ def read_counts(path):
     return np.fromfile(path, "<u2").reshape(-1, BANDS, SIZE).transpose(0, 2, 1).astype(float)
 
 
-def header_of(path):
-    lines = path.read_text().splitlines()[1:]
-    return dict(line.split(" = ", 1) for line in lines)
-
-
-def list_of(text):
-    return [float(value) for value in text.strip("{ }").split(",")]
-
-
 def test_the_folder_holds_views_references_true_poses_and_truth(folder):
     names = [f"view_{index:03d}" for index in range(VIEWS)]
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
@@ -85,18 +78,12 @@ def test_the_folder_holds_views_references_true_poses_and_truth(folder):
         *(f"truth/{name}.png" for name in names),
         *("truth/endmembers.csv", "truth/illuminant.csv", "poses-true.json"),
     }
-
-
-def test_headers_say_how_the_numbers_lie_and_which_bands_are_bad(folder):
+    nm = np.linspace(400, 700, BANDS)
     for name, lines in (("view_003", SIZE), ("white", 100), ("dark", 100)):
-        header = header_of(folder / f"{name}.hdr")
-        assert (header["interleave"], header["data type"], header["byte order"]) == ("bil", "12", "0")
-        assert [int(header[key]) for key in ("lines", "samples", "bands")] == [lines, SIZE, BANDS]
-        assert header["wavelength units"] == "Nanometers"
-        np.testing.assert_allclose(list_of(header["wavelength"]), np.linspace(400, 700, BANDS))
-        np.testing.assert_allclose(list_of(header["fwhm"]), 300 / (BANDS - 1), atol=1e-3)
-        assert np.flatnonzero(np.array(list_of(header["bbl"])) == 0).tolist() == [0, 4]
-        assert (folder / f"{name}.raw").stat().st_size == 2 * lines * SIZE * BANDS
+        file = open_spectral_file(folder / f"{name}.hdr")
+        check_file(file, shape=(lines, SIZE, BANDS), nm=nm, bad=[0, 4], interleave="bil")
+        np.testing.assert_allclose(file.bands.fwhm_nm, 300 / (BANDS - 1), atol=1e-3)
+        np.testing.assert_array_equal(file.read(), read_counts(folder / f"{name}.raw"))
 
 
 def test_white_and_dark_turn_counts_into_the_true_reflectance(folder, truth):
@@ -107,23 +94,6 @@ def test_white_and_dark_turn_counts_into_the_true_reflectance(folder, truth):
     whole = counts < 65535
     assert np.abs(found - expected)[whole].mean() < 0.005
     assert np.abs(counts / 65535 - expected)[whole].mean() > 0.05, "the references matter"
-
-
-def test_dark_and_white_differ_from_column_to_column(folder):
-    dark, white = (read_counts(folder / f"{name}.raw")[..., GOOD] for name in ("dark", "white"))
-    for image in (dark, white):
-        columns = image.mean(axis=0)
-        assert (columns.std(axis=0) > 5 * image.std(axis=0).mean(axis=0) / 10).all(), "more than noise leaves"
-    edge, middle = white[:, [0, -1]].mean(), white[:, SIZE // 2 - 2 : SIZE // 2 + 2].mean()
-    assert edge < 0.85 * middle
-
-
-def test_bad_bands_are_dead_or_drowned_in_noise(folder):
-    white = read_counts(folder / "white.raw")
-    noise = white.std(axis=0).mean(axis=0) / white.mean(axis=(0, 1)).clip(1)
-    assert (white[..., 4] == 0).all()
-    assert (noise[[0, 8]] > 0.2).all()
-    assert (noise[GOOD] < 0.03).all()
 
 
 def test_noise_is_that_of_electrons_counted_and_read():
@@ -167,13 +137,6 @@ def test_a_number_out_of_bounds_is_refused_before_anything_is_written(tmp_path, 
     with pytest.raises(ConfigError, match=rf"--{name} of a demo capture must be \d+ to \d+; found {value}"):
         make_demo_capture(tmp_path / "capture", **{name: value})
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_with_something_in_it_is_refused_and_left_alone(tmp_path):
-    (tmp_path / "thesis.tex").write_text("years")
-    with pytest.raises(ConfigError, match="is not empty"):
-        make_demo_capture(tmp_path, 16, 10, 4)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
 def test_a_board_of_markers_lies_around_the_plate_where_it_is_asked_for():

@@ -105,53 +105,39 @@ def test_found_poses_become_metres_in_the_upright_world(tmp_path, monkeypatch):
         ({0: "view_00:32,4"}, "outside the view; expected columns 0 to 31, rows 0 to 23"),
         ({2: "view_01:3,-1"}, "outside the view"),
         ({0: "view_01:3,4"}, "both pixels of point 1 are of one view; expected two"),
-        (
-            {2: "view_01:30,2", 3: "view_02:2,22"},
-            "point 2, views view_01 and view_02: its rays miss each other by 1",
-        ),
+        ({2: "view_01:30,2", 3: "view_02:2,22"}, "views view_01 and view_02: its rays miss each other by 1"),
+        ({"same": True}, "the two points are 0.0 px apart; expected more than 5"),
+        ({"beside": True}, "nearly parallel (0.00 degrees between them); expected 2 or more"),
+        ({"unposed": True}, "view_00 has no pose; choose another view"),
+        ({"metres": True}, "transforms.json gives metres already; leave it out"),
     ],
 )
 def test_what_can_not_be_is_refused(tmp_path, changes, said):
-    root, words = capture_with(tmp_path / "capture", LENSES["pinhole"])
+    keys = {"metres_per_unit": 0.5} if "metres" in changes else {}
+    root, words = capture_with(tmp_path / "capture", LENSES["pinhole"], **keys)
     asked = [*words, true_metres()]
-    for index, value in changes.items():
-        asked[index] = value
+    for index in changes.keys() & set(range(5)):
+        asked[index] = changes[index]
+    content = json.loads((root / "transforms.json").read_text())
+    if "same" in changes:
+        asked[2:4] = asked[:2]
+    elif "beside" in changes:
+        moved = np.array(content["frames"][0]["transform_matrix"])
+        moved[:3, 3] += 0.01 * moved[:3, 0]
+        content["frames"][1]["transform_matrix"] = moved.tolist()
+        asked[1] = asked[0].replace("view_00", "view_01")
+    elif "unposed" in changes:
+        del content["frames"][0]
+    (root / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(ConfigError) as refused:
         process(root, tmp_path / "scene", known_distance=tuple(asked))
     assert said in str(refused.value)
     assert not (tmp_path / "scene").exists()
 
 
-def test_one_point_twice_and_rays_side_by_side_are_refused(tmp_path):
+def test_the_scale_is_given_once(tmp_path):
     root, words = capture_with(tmp_path / "capture", LENSES["pinhole"])
-    with pytest.raises(ConfigError, match=r"the two points are 0\.0 px apart; expected more than 5"):
-        process(root, tmp_path / "scene", known_distance=(*words[:2], *words[:2], 1.0))
-    content = json.loads((root / "transforms.json").read_text())
-    moved = np.array(content["frames"][0]["transform_matrix"])
-    moved[:3, 3] += 0.01 * moved[:3, 0]
-    content["frames"][1]["transform_matrix"] = moved.tolist()
-    (root / "transforms.json").write_text(json.dumps(content))
-    beside = (words[0], words[0].replace("view_00", "view_01"))
-    with pytest.raises(
-        ConfigError, match=r"nearly parallel \(0\.00 degrees between them\); expected 2 or more"
-    ):
-        process(root, tmp_path / "scene", known_distance=(*beside, *words[2:], 1.0))
-
-
-def test_a_scale_that_is_known_already_is_not_given_again(tmp_path):
-    root, words = capture_with(tmp_path / "capture", LENSES["pinhole"], metres_per_unit=0.5)
-    with pytest.raises(ConfigError, match=r"transforms\.json gives metres already; leave it out"):
-        process(root, tmp_path / "scene", known_distance=(*words, 1.0))
     asked = ["cubes", "--data", root, "--output-dir", tmp_path / "scene", "--known-distance", *words, "1"]
     ended = run(command, *asked, "--poses", "markers", "--marker-size", "0.05")
     assert ended.status == 2
     assert "--known-distance and --marker-size both give the scale" in ended.err
-
-
-def test_a_view_without_a_pose_is_named(tmp_path):
-    root, words = capture_with(tmp_path / "capture", LENSES["pinhole"])
-    content = json.loads((root / "transforms.json").read_text())
-    content["frames"] = content["frames"][1:]
-    (root / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(ConfigError, match="view_00 has no pose; choose another view"):
-        process(root, tmp_path / "scene", known_distance=(*words, 1.0))

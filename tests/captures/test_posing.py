@@ -36,17 +36,6 @@ def test_a_ring_stands_upright_around_the_origin_whatever_its_world_was():
     np.testing.assert_allclose(stacked[:, 2, 3], heights, atol=1e-9)
 
 
-def test_what_was_placed_returns_to_the_source():
-    poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
-    placed, placement, _notes = _place_poses(poses)
-    for name, camera in placed.cameras.items():
-        back = placement.to_source(camera.camera_to_world[:, 3])
-        np.testing.assert_allclose(back, poses.cameras[name].camera_to_world[:, 3] + FAR, rtol=0, atol=1e-8)
-    assert placed.points is not None
-    assert poses.points is not None
-    np.testing.assert_allclose(placement.to_source(placed.points), poses.points + FAR, rtol=0, atol=1e-8)
-
-
 def test_a_known_up_axis_is_kept_and_cameras_in_parallel_have_their_points_in_the_middle():
     points = np.array([[1.0, 2.0, -3.0], [2.0, 2.0, -3.0], [3.0, 2.0, -3.0]])
     row = in_a_row()
@@ -91,17 +80,22 @@ def test_sparse_points_are_written_with_their_colours(tmp_path):
     np.testing.assert_array_equal(np.stack([vertex[name] for name in ("red", "green", "blue")], 1), colours)
 
 
-def test_written_placements_are_read_back_to_the_source(tmp_path):
-    poses = elsewhere(ring_set(offset=FAR))
+def test_what_was_placed_returns_to_the_source_also_when_it_was_written(tmp_path):
+    poses = elsewhere(ring_set(points=np.ones((2, 3)), offset=FAR))
     placed, placement, _notes = _place_poses(poses)
     stacked = {name: camera.camera_to_world for name, camera in placed.cameras.items()}
     found = read_poses(write_json(tmp_path / "transforms.json", transforms(stacked, **placement.to_json())))
     for name, camera in poses.cameras.items():
-        mine = found.cameras[name].camera_to_world
-        np.testing.assert_allclose(mine[:, :3], camera.camera_to_world[:, :3], atol=1e-9)
+        source, mine = camera.camera_to_world, found.cameras[name].camera_to_world
         np.testing.assert_allclose(
-            mine[:, 3] + found.offset, camera.camera_to_world[:, 3] + FAR, rtol=0, atol=1e-7
+            placement.to_source(stacked[name][:, 3]), source[:, 3] + FAR, rtol=0, atol=1e-8
         )
+        np.testing.assert_allclose(mine[:, :3], source[:, :3], atol=1e-9)
+        np.testing.assert_allclose(mine[:, 3] + found.offset, source[:, 3] + FAR, rtol=0, atol=1e-7)
+    assert placed.points is not None
+    np.testing.assert_allclose(
+        placement.to_source(placed.points), 1 + np.stack([FAR, FAR]), rtol=0, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("offset", [np.zeros(3), FAR])
@@ -155,46 +149,33 @@ def test_rotations_in_the_files_turn_a_lens_against_another():
     assert all("turned as the files say" in note for note in notes)
 
 
-def test_offsets_between_posed_lenses_go_before_those_in_the_files():
-    offset = np.eye(4)
+def test_offsets_and_lenses_that_were_found_go_before_those_in_the_files():
+    offset, lens = np.eye(4), replace(SMALL_LENS, focal_px=(6.0, 6.0))
     offset[:3, :3] = Rotation.from_euler("xyz", [1, 2, 3], degrees=True).as_matrix()
     offset[:3, 3] = (0.1, -0.2, 0.3)
     views = [rig_view(release, sensor, ANGLES[sensor]) for release in ("r1", "r2", "r3") for sensor in "ab"]
     posed = {f"{release}a": turned_camera(index + 1) for index, release in enumerate(("r1", "r2", "r3"))}
     for release in ("r1", "r2"):
         square = np.vstack([posed[f"{release}a"].camera_to_world, [0, 0, 0, 1]])
-        posed[f"{release}b"] = PosedCamera((square @ offset)[:3], SMALL_LENS)
+        posed[f"{release}b"] = PosedCamera((square @ offset)[:3], lens)
     completed, notes = _complete_rigs(views, posed)
     expected = np.vstack([posed["r3a"].camera_to_world, [0, 0, 0, 1]]) @ offset
     np.testing.assert_allclose(completed["r3b"].camera_to_world, expected[:3], atol=1e-12)
+    assert completed["r3b"].lens == lens
     assert notes == (
         "1 view of lens b got the pose of another lens of their release, moved as in other releases",
     )
 
 
-def test_views_without_any_help_are_left_out_and_said():
+def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_left_alone():
     views = [rig_view("r1", "a"), rig_view("r1", "b"), *(rig_view("r2", x, ANGLES[x]) for x in "ab")]
     completed, notes = _complete_rigs(views, {"r1a": turned_camera(1)})
     assert set(completed) == {"r1a"}
     assert any("1 view of lens b left out: there is no pose, and nothing says" in note for note in notes)
     assert sum("no lens of their release has a pose" in note for note in notes) == 2
-
-
-def test_views_without_release_are_left_alone():
-    single = [CaptureView("one", rig_view("", "a").cube), CaptureView("two", rig_view("", "a").cube)]
+    single = [replace(views[0], name=name, sensor="", release="") for name in ("one", "two")]
     completed, notes = _complete_rigs(single, {"one": turned_camera(1)})
-    assert set(completed) == {"one"}
-    assert notes == ()
-
-
-def test_a_lens_that_was_found_goes_before_that_of_the_file():
-    found = replace(SMALL_LENS, focal_px=(6.0, 6.0))
-    views = [rig_view(release, sensor, ANGLES[sensor]) for release in ("r1", "r2") for sensor in "ab"]
-    posed = {
-        name: replace(turned_camera(seed), lens=found) for seed, name in enumerate(("r1a", "r1b", "r2a"), 1)
-    }
-    completed, _ = _complete_rigs(views, posed)
-    assert completed["r2b"].lens == found
+    assert (set(completed), notes) == ({"one"}, ())
 
 
 def test_a_lens_that_pixels_would_be_brought_into_is_refused_once_they_are_written():

@@ -35,21 +35,26 @@ from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
+def references_of(capture, suffix: str = "hdr") -> dict[str, Path]:
+    return {name: capture.root / f"{name}.{suffix}" for name in ("white", "dark")}
+
+
+def record_of(scene: Path):
+    return json.loads((scene / "process.json").read_text())
+
+
 @pytest.mark.parametrize("kind", ["envi", "npy"])
 def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
     capture = make_capture(tmp_path / "capture", kind=kind)
-    suffix = "hdr" if kind == "envi" else "npy"
-    references = {name: capture.root / f"{name}.{suffix}" for name in ("white", "dark")}
     stated = {} if kind == "envi" else {"wavelengths": ",".join(map(str, WAVELENGTHS_NM))}
-
+    references = references_of(capture, "hdr" if kind == "envi" else "npy")
     process(capture.root, tmp_path / "scene", **references, **stated)
-
     scene = load_scene(tmp_path / "scene")
     np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM)
     assert [frame.name for frame in scene.frames] == sorted(capture.reflectance)
     for index, frame in enumerate(scene.frames):
         np.testing.assert_allclose(scene.cube(index), capture.reflectance[frame.name], atol=1.0 / 1000)
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    record = record_of(tmp_path / "scene")
     assert record["decisions"]["scale"]["calibrated"] == 1.0
     assert {Path(file["path"]).stem for file in record["references"]} == {"white", "dark"}
     for source in (source for view in record["views"] for source in view["sources"]):
@@ -57,24 +62,8 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
         assert (source["sha256"], source["bytes"]) == (hashlib.sha256(data).hexdigest(), len(data))
 
 
-def bright_square() -> np.ndarray:
-    square = np.zeros((HEIGHT, WIDTH), bool)
-    square[HEIGHT // 4 : HEIGHT // 4 + HEIGHT // 2, WIDTH // 4 : WIDTH // 4 + WIDTH // 2] = True
-    return square
-
-
-def test_background_is_cut_out_at_the_threshold_of_the_border(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture", noise=4.0)
-    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
-
-    process(capture.root, tmp_path / "scene", mask="black", **references)
-
-    scene = load_scene(tmp_path / "scene")
-    expected = bright_square()
-    for index in range(4):
-        alpha = present(scene.alpha(index))
-        np.testing.assert_array_equal(alpha > 0.5, expected)
-        assert scene.cube(index)[~expected].max() == 0.0
+BRIGHT_SQUARE = np.zeros((HEIGHT, WIDTH), bool)
+BRIGHT_SQUARE[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 4 : 3 * WIDTH // 4] = True
 
 
 def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, monkeypatch):
@@ -150,88 +139,49 @@ def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: P
     white = np.fromfile(capture.root / "white.raw", "<u2").reshape(-1, len(WAVELENGTHS_NM), WIDTH)
     white[:, 2] = 4095  # which no view reaches
     white.tofile(capture.root / "white.raw")
-    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
-    findings = process(capture.root, tmp_path / "scene", **references)
+    findings = process(capture.root, tmp_path / "scene", **references_of(capture))
     assert findings[0].startswith("white.hdr: the white is saturated in 550 nm: these bands are left out")
     scene = load_scene(tmp_path / "scene")
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 2))
-    np.testing.assert_allclose(
-        scene.cube(0), np.delete(capture.reflectance["view_00"], 2, axis=2), atol=1.0 / 1000
-    )
+    expected = np.delete(capture.reflectance["view_00"], 2, axis=2)
+    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
 
 
 def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
-    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
-    findings = process(capture.root, tmp_path / "scene", **references, white_reflectance="0.02")
-    scale = json.loads((tmp_path / "scene" / "process.json").read_text())["decisions"]["scale"]["calibrated"]
+    stated = references_of(capture) | {"white_reflectance": "0.02"}
+    findings = process(capture.root, tmp_path / "scene", **stated)
+    scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
     assert scale != 1
     assert findings[0].startswith(f"values (reflectance) were divided by {scale:g}, as ")
-    kept = process(capture.root, tmp_path / "kept", **references, white_reflectance="0.02", scale=1.0)
-    assert not any("divided by" in finding for finding in kept)
+    said = [process(capture.root, tmp_path / "kept", **stated, scale=1.0)]
+    for name, values in capture.reflectance.items():  # numbers whose meaning nobody stated
+        write_cube(capture.root, name, (900 * values).astype(np.float32))
+    said.append(process(capture.root, tmp_path / "unstated"))
+    assert not any("divided by" in finding for findings in said for finding in findings)
+    assert record_of(tmp_path / "unstated")["decisions"]["scale"]["calibrated"] > 1
 
 
-@pytest.mark.parametrize("factor", [None, 10])
-def test_numbers_without_a_stated_meaning_are_divided_without_a_warning(tmp_path: Path, factor):
-    capture = make_capture(tmp_path / "capture")
-    for name, values in capture.reflectance.items():
-        header = {"reflectance scale factor": factor}
-        write_cube(capture.root, name, (900 * values).astype(np.float32), header=header)
-    findings = process(capture.root, tmp_path / "scene")
-    assert (
-        json.loads((tmp_path / "scene" / "process.json").read_text())["decisions"]["scale"]["calibrated"] > 1
-    )
-    assert any("divided by" in finding for finding in findings) == (factor is not None)
-
-
-def test_views_come_in_the_order_of_their_numbers(tmp_path: Path):
+def test_views_come_in_the_order_of_their_numbers_and_those_without_a_pose_are_left_out(tmp_path: Path):
     """Ranges of --angles, and neighbours among many views, go by it."""
-    capture = make_capture(tmp_path / "capture", views=3)
-    names = ["turn_9", "turn_10", "turn_11"]
+    capture = make_capture(tmp_path / "capture", views=4)
+    names = ["turn_9", "turn_10", "turn_11", "turn_12"]
     for old, new in zip(capture.reflectance, names, strict=True):
         for suffix in ("hdr", "raw"):
             (capture.root / f"{old}.{suffix}").rename(capture.root / f"{new}.{suffix}")
     assert [view.name for view in find_cubes(capture.root, ReadOptions()).views] == names
-    write_poses(capture.root / "transforms.json", names)
+    write_poses(capture.root / "transforms.json", names[:3])
     process(capture.root, tmp_path / "scene")
-    assert [frame.name for frame in load_scene(tmp_path / "scene").frames] == names
-
-
-def test_views_without_a_pose_are_left_out(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture")
-    write_poses(capture.root / "transforms.json", ["view_00", "view_02", "view_03"])
-    process(capture.root, tmp_path / "scene")
-    names = [frame.name for frame in load_scene(tmp_path / "scene").frames]
-    assert names == ["view_00", "view_02", "view_03"]
-
-
-def test_pictures_become_linear_bands(tmp_path: Path):
-    root = tmp_path / "capture"
-    root.mkdir()
-    generator = np.random.default_rng(0)
-    pixels = generator.integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-    for name in ("a", "b"):
-        Image.fromarray(pixels).save(root / f"{name}.png")
-    write_poses(root / "transforms.json", ["a", "b"])
-    process(root, tmp_path / "scene", wavelengths="620,555,503")
-
-    scene = load_scene(tmp_path / "scene")
-    np.testing.assert_allclose(scene.wavelengths_nm, [503.0, 555.0, 620.0])
-    encoded = pixels[..., ::-1] / 255.0
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(scene.cube(0), linear, atol=1e-4)
+    assert [frame.name for frame in load_scene(tmp_path / "scene").frames] == names[:3]
 
 
 def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
-    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
-    panel = np.linspace(0.5, 0.9, len(WAVELENGTHS_NM))
-    rows = [
-        f"{nm:g},{value:.6f}" for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)
-    ]  # of another colour
+    panel = np.linspace(0.5, 0.9, len(WAVELENGTHS_NM))  # of another colour
+    rows = [f"{nm:g},{value:.6f}" for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)]
     (tmp_path / "panel.csv").write_text("\n".join(["wavelength,reflectance", *rows]))
-    process(capture.root, tmp_path / "scene", white_reflectance=str(tmp_path / "panel.csv"), **references)
-
+    stated = references_of(capture) | {"white_reflectance": str(tmp_path / "panel.csv")}
+    process(capture.root, tmp_path / "scene", **stated)
     lamp = capture.white.mean(axis=0) / panel
     written = np.loadtxt(tmp_path / "scene" / "illuminant.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(written[:, 1], lamp / lamp.max(), rtol=1e-4)
@@ -316,19 +266,30 @@ def test_two_processes_do_not_write_one_scene(interrupted, writer, tmp_path: Pat
 
 
 def test_the_next_start_goes_on_with_the_next_view(interrupted, writer, tmp_path: Path):
+    """And with those whose record is damaged."""
+    unfinished = tmp_path / "scene.unfinished"
     assert not (tmp_path / "scene").exists()
-    assert len(list((tmp_path / "scene.unfinished" / "cubes").glob("*.npy"))) == 2
-    assert not (tmp_path / "scene.unfinished" / "transforms.json").exists()
-
+    assert len(list((unfinished / "cubes").glob("*.npy"))) == 2
+    assert not (unfinished / "transforms.json").exists()
+    (unfinished / "views" / "view_00.json").write_text('{"name": "view')
     process(interrupted.root, tmp_path / "scene")
-    assert writer.written == ["view_02", "view_03"]
-    assert not (tmp_path / "scene.unfinished").exists()
+    assert writer.written == ["view_00", "view_02", "view_03"]
+    assert not unfinished.exists()
     process(interrupted.root, tmp_path / "whole")
     for path in sorted((tmp_path / "whole").rglob("*")):
         if path.is_file() and path.name != "process.json":
             mine = tmp_path / "scene" / path.relative_to(tmp_path / "whole")
             assert mine.read_bytes() == path.read_bytes()
     assert len(load_scene(tmp_path / "scene").frames) == 4
+
+
+def test_a_library_that_poses_need_is_asked_for_before_any_view_is_written(
+    interrupted, writer, tmp_path: Path, monkeypatch
+):
+    monkeypatch.setattr("importlib.util.find_spec", {}.get)
+    with pytest.raises(CaptureError, match='pycolmap is not installed: python -m pip install "opencv'):
+        process(interrupted.root, tmp_path / "new", poses="estimate")
+    assert writer.written == []
 
 
 @pytest.mark.parametrize("options", [{"bin_bands": 3}, {}], ids=["options", "input"])
@@ -339,12 +300,6 @@ def test_other_options_or_inputs_start_again(interrupted, writer, tmp_path: Path
         numbers.tofile(interrupted.root / "view_03.raw")
     process(interrupted.root, tmp_path / "scene", **options)
     assert len(writer.written) == 4
-
-
-def test_a_damaged_record_is_written_again(interrupted, writer, tmp_path: Path):
-    (tmp_path / "scene.unfinished" / "views" / "view_00.json").write_text('{"name": "view')
-    process(interrupted.root, tmp_path / "scene")
-    assert writer.written == ["view_00", "view_02", "view_03"]
 
 
 def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):
@@ -420,56 +375,38 @@ def test_turned_pictures_are_read_as_stored_with_a_note_and_their_poses_name_the
         notes_of(tmp_path / "capture", tmp_path / "other")
 
 
-def test_a_backdrop_that_nobody_named_is_cut_out_and_said(tmp_path: Path):
+@pytest.mark.parametrize("mask", ["black", "auto"])
+def test_a_backdrop_is_cut_out_also_where_nobody_named_it(tmp_path: Path, mask):
     capture = make_capture(tmp_path / "capture", noise=4.0)
-    references = {name: capture.root / f"{name}.hdr" for name in ("white", "dark")}
-
-    process(capture.root, tmp_path / "scene", mask="auto", **references)
-
+    process(capture.root, tmp_path / "scene", mask=mask, **references_of(capture))
     scene = load_scene(tmp_path / "scene")
-    square = bright_square()
     for index, frame in enumerate(scene.frames):
         alpha = present(scene.alpha(index))
-        np.testing.assert_array_equal(alpha > 0.5, square)
-        assert scene.cube(index)[~square].max() == 0.0
-        expected = capture.reflectance[frame.name][square]
-        np.testing.assert_allclose(scene.cube(index)[square], expected, atol=0.02)
-    report = (tmp_path / "scene" / "report.txt").read_text()
-    assert "backdrop found, black (0.020): 25% of the pixels are matter" in report
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
-    assert record["decisions"]["mask"] == "auto"
-    assert record["decisions"]["sensors"]["all views"]["background"]["kind"] == "found"
-    mean = np.mean(record["views"][0]["mean_spectrum"])
-    assert mean == pytest.approx(capture.reflectance["view_00"][square].mean(), rel=0.02)
+        np.testing.assert_array_equal(alpha > 0.5, BRIGHT_SQUARE)
+        assert scene.cube(index)[~BRIGHT_SQUARE].max() == 0.0
+        expected = capture.reflectance[frame.name][BRIGHT_SQUARE]
+        np.testing.assert_allclose(scene.cube(index)[BRIGHT_SQUARE], expected, atol=0.02)
+    if mask == "auto":
+        report = (tmp_path / "scene" / "report.txt").read_text()
+        assert "backdrop found, black (0.020): 25% of the pixels are matter" in report
+        decisions = record_of(tmp_path / "scene")["decisions"]
+        assert decisions["mask"] == "auto"
+        assert decisions["sensors"]["all views"]["background"]["kind"] == "found"
 
 
-def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture")
+def test_without_a_backdrop_all_of_each_image_is_the_scene_and_nothing_but_backdrop_is_refused(
+    tmp_path: Path,
+):
+    capture = make_capture(tmp_path / "capture", noise=4.0)
     generator = np.random.default_rng(0)
     for name in capture.reflectance:
         counts = generator.integers(200, 3000, (HEIGHT, WIDTH, 1)) * np.linspace(0.5, 1.0, 9)
         write_cube(capture.root, name, counts.astype(np.uint16))
-
     process(capture.root, tmp_path / "scene", mask="auto")
-
     assert not load_scene(tmp_path / "scene").has_alpha
     report = " ".join((tmp_path / "scene" / "report.txt").read_text().split())
     assert "no mask of matter: all of each image belongs to the scene" in report
-
-
-def test_a_capture_of_nothing_but_background_is_refused(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture", noise=4.0)
-    generator = np.random.default_rng(0)
     for name in capture.reflectance:
         write_cube(capture.root, name, generator.integers(98, 104, (HEIGHT, WIDTH, 9)).astype(np.uint16))
     with pytest.raises(CaptureError, match="no view shows anything but background"):
-        process(capture.root, tmp_path / "scene", mask="auto", scale=4000.0)
-
-
-def test_a_library_that_poses_need_is_asked_for_before_any_view_is_written(
-    interrupted, writer, tmp_path: Path, monkeypatch
-):
-    monkeypatch.setattr("importlib.util.find_spec", {}.get)
-    with pytest.raises(CaptureError, match='pycolmap is not installed: python -m pip install "opencv'):
-        process(interrupted.root, tmp_path / "new", poses="estimate")
-    assert writer.written == []
+        process(capture.root, tmp_path / "empty", mask="auto", scale=4000.0)

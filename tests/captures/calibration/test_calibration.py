@@ -32,20 +32,19 @@ def _noisy(level: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.rint(level + noise).astype(np.uint16)
 
 
-def test_lines_that_differ_by_noise_alone_are_averaged_column_by_column():
-    columns = 1000.0 + 20.0 * np.arange(SAMPLES)[None, :, None] + np.zeros((LINES, 1, NUM))
-    counts = _noisy(columns)
+def test_lines_that_differ_by_noise_alone_are_averaged_and_images_used_pixel_by_pixel():
+    counts = _noisy(1000.0 + 20.0 * np.arange(SAMPLES)[None, :, None] + np.zeros((LINES, 1, NUM)))
     found = open_reference(file_of(counts), "white reference", EMPTY)
     assert not found.is_per_pixel
     np.testing.assert_allclose(found.rows(slice(3, 5), ALL, ALL_BANDS), counts.mean(axis=0)[None], rtol=1e-6)
-
-
-def test_an_image_that_differs_from_row_to_row_is_used_pixel_by_pixel():
-    rows = np.linspace(0.5, 1.0, LINES)[:, None, None]
-    counts = _noisy(2000.0 * rows + np.zeros((1, SAMPLES, NUM)))
+    counts = _noisy(np.linspace(1000.0, 2000.0, LINES)[:, None, None] + np.zeros((1, SAMPLES, NUM)))
     found = open_reference(file_of(counts), "white reference", EMPTY)
     assert found.is_per_pixel
     np.testing.assert_array_equal(found.rows(slice(3, 5), slice(2, 6), ALL_BANDS), counts[3:5, 2:6])
+    wide = np.random.default_rng(0).random((5, SAMPLES + 7, NUM)).astype(np.float32)
+    found = open_reference(file_of(wide), "white reference", EMPTY)
+    np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS), wide.mean(axis=(0, 1))[None, None], rtol=1e-5)
+    assert f"it is {SAMPLES + 7} columns wide and the cubes {SAMPLES}" in found.how
 
 
 def test_a_line_of_another_binning_is_interpolated_along_the_line():
@@ -56,22 +55,6 @@ def test_a_line_of_another_binning_is_interpolated_along_the_line():
     line = open_reference(file_of(coarse), "dark frame", EMPTY).rows(ALL, ALL, ALL_BANDS)[0, :, 0]
     np.testing.assert_allclose(line[1:-1], 0.5 * (np.arange(SAMPLES) - 0.5)[1:-1])
     assert (line[0], line[-1]) == (0.0, SAMPLES // 2 - 1)
-
-
-def test_a_wider_white_is_averaged_over_its_columns_and_said_so():
-    wide = np.random.default_rng(0).random((5, SAMPLES + 7, NUM)).astype(np.float32)
-    found = open_reference(file_of(wide), "white reference", EMPTY)
-    np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS), wide.mean(axis=(0, 1))[None, None], rtol=1e-5)
-    assert f"it is {SAMPLES + 7} columns wide and the cubes {SAMPLES}" in found.how
-
-
-def test_a_panel_is_the_mean_of_its_rectangle():
-    counts = _noisy(np.full((LINES, SAMPLES, NUM), 800.0))
-    found = panel_reference(file_of(counts), (2, 3, 4, 5), "a view")
-    mean = counts[2:6, 3:8].mean(axis=(0, 1))
-    np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS)[0, 0], mean, rtol=1e-6)
-    with pytest.raises(ConfigError, match="leaves the image of 40 rows and 24 columns"):
-        panel_reference(file_of(counts), (38, 0, 4, 4), "a view")
 
 
 HEIGHT, WIDTH, BANDS = 12, 8, 4
@@ -129,21 +112,6 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     np.testing.assert_allclose(found.values[:, 4], (counts[:, 4] - 50.0) / 2950, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("no_data", "expected"), [(7.0, [True, True]), (0.0, [False, True]), (-1.0, [False, False])]
-)
-def test_a_no_data_value_of_zero_has_to_stand_in_every_band(no_data: float, expected: list[bool]):
-    value = 7 if no_data == 7.0 else 0
-    stored = np.array([[[value, 5], [value, value]]], np.uint16)
-    np.testing.assert_array_equal(find_missing(stored, file_of(stored, no_data=no_data))[0], expected)
-
-
-def test_numbers_out_of_the_valid_range_are_missing():
-    stored = np.array([[[5, 6], [4, 6], [5, 9]]], np.uint16)
-    file = file_of(stored, valid_range=(5.0, 8.0))
-    np.testing.assert_array_equal(find_missing(stored, file)[0], [False, True, True])
-
-
 def test_a_reference_has_gains_where_the_cubes_have_them():
     stored = np.full((4, 3, 2), 100, np.uint16)
     gains, offsets = np.array([0.5, 2.0]), np.array([1.0, -1.0])
@@ -154,11 +122,6 @@ def test_a_reference_has_gains_where_the_cubes_have_them():
     for pair in ((cube, file_of(stored)), (file_of(stored), cube)):
         with pytest.raises(CaptureError, match=r"no gains or scale.*its header"):
             open_reference(pair[0], "white reference", pair[1])
-
-
-def test_a_pixel_without_a_number_in_some_band_is_missing():
-    stored = np.array([[[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]]], np.float32)
-    np.testing.assert_array_equal(find_missing(stored, file_of(stored))[0], [True, False, True])
 
 
 @given(st.integers(0, 5), st.integers(0, 5), st.integers(1, 3), st.floats(5.0, 500.0), st.floats(-20.0, 40.0))
@@ -213,10 +176,29 @@ def test_what_a_reference_lacks_is_told_by_all_of_its_bands():
     assert not white.is_per_pixel
 
 
-def test_a_panel_is_what_was_measured_of_its_rectangle():
+@pytest.mark.parametrize("no_data", [None, 65535.0])
+def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: float | None):
     counts, _ = _cube()
     counts[2:4, 3] = 65535
-    panel = panel_reference(file_of(counts, no_data=65535.0), (2, 3, 2, 3), "a view")
-    np.testing.assert_allclose(panel.mean[0, 0], counts[2:4, 4:6].mean(axis=(0, 1)), rtol=1e-6)
+    panel = panel_reference(file_of(counts, no_data=no_data), (2, 3, 2, 3), "a view")
+    expected = counts[2:4, 3 if no_data is None else 4 : 6].mean(axis=(0, 1))
+    np.testing.assert_allclose(panel.rows(ALL, ALL, EVERY)[0, 0], expected, rtol=1e-6)
     with pytest.raises(CaptureError, match="no pixel of --white-rectangle holds a measurement"):
         panel_reference(file_of(counts, no_data=65535.0), (2, 3, 2, 1), "a view")
+    with pytest.raises(ConfigError, match="leaves the image of 12 rows and 8 columns"):
+        panel_reference(file_of(counts), (10, 0, 4, 4), "a view")
+
+
+@pytest.mark.parametrize(
+    ("stored", "facts", "expected"),
+    [
+        ([[7, 5], [7, 7], [1, 2]], {"no_data": 7.0}, [True, True, False]),
+        ([[0, 5], [0, 0], [1, 2]], {"no_data": 0.0}, [False, True, False]),  # which is dark, too
+        ([[0, 5], [0, 0], [1, 2]], {"no_data": -1.0}, [False, False, False]),
+        ([[5, 6], [4, 6], [5, 9]], {"valid_range": (5.0, 8.0)}, [False, True, True]),
+        ([[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]], {}, [True, False, True]),
+    ],
+)
+def test_pixels_without_a_measurement_in_some_band_are_missing(stored, facts, expected):
+    numbers = np.array([stored], np.float32 if np.isinf(stored).any() else np.uint16)
+    np.testing.assert_array_equal(find_missing(numbers, file_of(numbers, **facts))[0], expected)

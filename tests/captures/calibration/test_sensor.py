@@ -70,27 +70,27 @@ def test_bands_that_have_nothing_in_common_are_not_all_noise():
     assert notes == ("12 of 12 bands have noise above 30% of their signal; all are kept",)
 
 
-def test_bands_are_sorted_and_binned_by_wavelength():
+def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     choice = _BandChoice(np.array([700.0, 500.0, 600.0, 800.0, 550.0]), {3: "named"})
     np.testing.assert_array_equal(choice.kept, [1, 4, 2, 0])
     np.testing.assert_allclose(choice.centers_nm(2), [525.0, 650.0])
-
-
-def test_a_wavelength_is_used_once():
     assert list(_BandChoice(np.array([500.0, 510.0, 500.0]), {}).without_repeated().dropped) == [2]
 
 
-@pytest.mark.parametrize(("top", "expected"), [(4095, 4095.0), (3900, 3900.0), (None, 65535.0)])
-def test_the_end_of_the_detector_is_a_plateau(top: int | None, expected: float):
-    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top or 60000).astype(np.uint16)
-    assert _find_saturation([file_of(counts)], np.arange(6))[0] == expected
-
-
-def test_numbers_of_missing_pixels_are_not_the_end_of_the_detector():
-    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, 4095).astype(np.uint16)
-    counts[::3] = 65535
-    file = file_of(counts, valid_range=(0.0, 10000.0))
-    assert _find_saturation([file], np.arange(6))[0] == 4095.0
+@pytest.mark.parametrize(
+    ("top", "facts", "part", "value", "expected"),
+    [
+        (4095, {}, np.s_[:0], 0, 4095.0),
+        (3900, {}, np.s_[:0], 0, 3900.0),
+        (60000, {}, np.s_[:0], 0, 65535.0),
+        (4095, {"valid_range": (0.0, 10000.0)}, np.s_[::3], 65535, 4095.0),  # which are missing
+        (60000, {}, np.s_[..., 3], 60000, 65535.0),  # a band that is stuck
+    ],
+)
+def test_the_end_of_the_detector_is_a_plateau(top: int, facts, part, value: int, expected: float):
+    counts = GENERATOR.normal(2000, 900, (64, 64, 6)).clip(0, top).astype(np.uint16)
+    counts[part] = value
+    assert _find_saturation([file_of(counts, **facts)], np.arange(6))[0] == expected
 
 
 def test_missing_pixels_of_a_white_do_not_count_as_saturated():
@@ -102,9 +102,3 @@ def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
     white = open_reference(file_of(counts, no_data=65535.0), "white reference", file_of(counts))
     assert not _clipped_bands(white, 65535.0).any()
-
-
-def test_a_band_that_is_stuck_does_not_count_as_saturated():
-    counts = GENERATOR.integers(0, 2000, (64, 64, 6)).astype(np.uint16)
-    counts[..., 3] = 60000
-    assert _find_saturation([file_of(counts)], np.arange(6))[0] == 65535.0

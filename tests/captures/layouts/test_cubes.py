@@ -53,10 +53,25 @@ def stems(root):
     ],
 )
 def test_each_view_of_a_tree_has_its_own_references(tmp_path, white, dark, folder):
+    """Also where its files were copied together, if their names tell it."""
     write_tree(tmp_path / "tree", white, dark, folder)
-    assert stems(tmp_path / "tree") == {name: (name, white.format(name), dark.format(name)) for name in NAMES}
-    capture = find_cubes(tmp_path / "tree", PLAIN)
-    assert len(capture.notes) == 2
+    expected = {name: (name, white.format(name), dark.format(name)) for name in NAMES}
+    assert stems(tmp_path / "tree") == expected
+    assert len(find_cubes(tmp_path / "tree", PLAIN).notes) == 2
+    if white == "WHITEREF_{}":
+        (tmp_path / "flat").mkdir()
+        for path in tmp_path.glob("tree/*/capture/*"):
+            shutil.copy(path, tmp_path / "flat")
+        assert stems(tmp_path / "flat") == expected
+
+
+def test_trees_of_several_days_may_have_the_same_names_and_references_above_them_are_named(tmp_path):
+    for day in ("monday", "tuesday"):
+        write_tree(tmp_path / day)
+    write_cube(tmp_path, "white", counts(3000))
+    days = [f"{day}_{name}_{name}" for day in ("monday", "tuesday") for name in NAMES]
+    assert sorted(stems(tmp_path)) == days
+    assert any("references: white.hdr;" in note for note in find_cubes(tmp_path, PLAIN).notes)
 
 
 def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
@@ -69,14 +84,6 @@ def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
         np.testing.assert_allclose(stored, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
 
 
-def test_files_of_a_tree_that_were_copied_together_keep_their_references(tmp_path):
-    write_tree(tmp_path / "tree")
-    (tmp_path / "flat").mkdir()
-    for path in tmp_path.glob("tree/*/capture/*"):
-        shutil.copy(path, tmp_path / "flat")
-    assert stems(tmp_path / "flat") == {name: (name, f"WHITEREF_{name}", f"DARKREF_{name}") for name in NAMES}
-
-
 def test_reflectances_of_the_camera_are_taken_where_a_white_is_missing(tmp_path):
     write_tree(tmp_path)
     for path in tmp_path.glob("213/capture/WHITEREF*"):
@@ -85,28 +92,18 @@ def test_reflectances_of_the_camera_are_taken_where_a_white_is_missing(tmp_path)
     assert any("the reflectances that the camera wrote" in note for note in find_cubes(tmp_path, PLAIN).notes)
 
 
-def test_captures_of_several_days_may_have_the_same_names(tmp_path):
-    for day in ("monday", "tuesday"):
-        write_tree(tmp_path / day)
-    assert sorted(stems(tmp_path)) == [
-        f"{day}_{name}_{name}" for day in ("monday", "tuesday") for name in NAMES
-    ]
-
-
 def test_a_name_with_white_in_it_may_be_a_view_and_references_are_one_note(tmp_path):
     made = make_capture(tmp_path / "capture")
+    (tmp_path / "alone").mkdir()
     for name in ("white_pot", "dark_frame_2019-06-09_010", "WHITEREF_9-a"):
         write_cube(made.root, name, counts(7))
     capture = find_cubes(made.root, PLAIN)
     assert [view.name for view in capture.views] == [*made.reflectance, "white_pot"]
     (note,) = capture.notes
     assert note.startswith("left out, as named like references: ")
-
-
-def test_a_folder_of_references_alone_is_refused(tmp_path):
-    write_cube(tmp_path, "white", counts(7))
+    write_cube(tmp_path / "alone", "white", counts(7))
     with pytest.raises(CaptureError, match="holds references only"):
-        find_cubes(tmp_path, PLAIN)
+        find_cubes(tmp_path / "alone", PLAIN)
 
 
 def test_views_of_several_sizes_become_sensors(tmp_path):
@@ -138,13 +135,6 @@ def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_p
     for index, name in enumerate(NAMES):
         stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
         np.testing.assert_allclose(stored, (1000 + 100 * index) / 2000, atol=1e-4)
-
-
-def test_references_above_a_tree_are_named(tmp_path):
-    write_tree(tmp_path)
-    write_cube(tmp_path, "white", counts(3000))
-    assert list(stems(tmp_path)) == NAMES
-    assert any("references: white.hdr;" in note for note in find_cubes(tmp_path, PLAIN).notes)
 
 
 def test_views_are_named_so_that_every_system_has_a_file_for_each():

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
 from tests.captures.poses.alignment import align_poses
 from tests.scenes.scene_factory import look_at
@@ -67,65 +68,22 @@ def turned(points: np.ndarray, heights=(1.2,), sense: float = 1.0, off_deg: floa
 @pytest.mark.slow
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_outlines_alone_tell_the_axis_the_lens_and_the_sense(sense):
+    """Though some masks are too wide."""
     pictures, turns, masks, truth = turned(knobs(), sense=sense)
-    found = poses_from_turntable(pictures, turns, masks)
+    wide = {
+        name: binary_dilation(mask) if index % 3 else mask for index, (name, mask) in enumerate(masks.items())
+    }
+    found = poses_from_turntable(pictures, turns, wide if sense > 0 else masks)
     aligned = align_poses(found, truth)
     assert len(aligned.names) == COUNT
-    assert aligned.rms_px < 0.5
+    assert aligned.rms_px < (0.6 if sense > 0 else 0.5)
     assert any(f"turned {'against' if sense > 0 else 'with'} the clock" in note for note in found.notes)
 
 
 @pytest.mark.slow
 def test_two_heights_of_the_camera_share_one_world():
     pictures, turns, masks, truth = turned(knobs(), heights=(0.5, 2.0))
-    found = poses_from_turntable(pictures, turns, masks)
-    assert align_poses(found, truth).rms_px < 0.5
-
-
-@pytest.mark.slow
-def test_masks_that_are_too_wide_do_not_move_the_cameras():
-    from scipy.ndimage import binary_dilation
-
-    pictures, turns, masks, truth = turned(knobs())
-    wide = {
-        name: binary_dilation(masks[name]) if index % 3 else masks[name] for index, name in enumerate(masks)
-    }
-    assert align_poses(poses_from_turntable(pictures, turns, wide), truth).rms_px < 0.6
-
-
-def evidence_of(pictures, turns, masks):
-    names = sorted(pictures)
-    columns = ([values[name] for name in names] for values in (pictures, turns, masks))
-    return gather(cv2, *columns)
-
-
-def true_numbers(sense: float = 1.0):
-    pitch = np.arctan2(1.2 - 0.05, 3.0)
-    cameras = np.array([[0.0, pitch, 0.0, 0.0, 0.0, 0.0]])
-    return turntable_module._Numbers(420.0, sense, cameras, np.zeros(COUNT))
-
-
-def test_true_cameras_leave_nothing_of_the_outlines_unexplained():
-    evidence = evidence_of(*turned(knobs())[:3])
-    _, outlines = true_numbers().errors(evidence)
-    assert np.median(np.abs(outlines)) < 0.3
-    _, mirrored = true_numbers(-1.0).errors(evidence)
-    assert np.median(np.abs(mirrored)) > 1.0
-
-
-def test_slack_moves_pairs_by_the_difference_of_their_angles():
-    evidence = evidence_of(*turned(knobs())[:3])
-    numbers, step = true_numbers(), 1e-5
-    _, now = numbers.errors(evidence, rims=False)
-    _, ahead = numbers.errors(evidence, ahead=step, rims=False)
-    assert np.abs(ahead - now).max() > 1e-6
-    for view in (0, 7):
-        slack = np.zeros(COUNT)
-        slack[view] = step
-        _, alone = replace(numbers, slack=slack).errors(evidence, rims=False)
-        first, second = (evidence.touched == view).T
-        np.testing.assert_allclose(alone[first], ahead[first], atol=1e-9)
-        np.testing.assert_allclose((alone - now)[second], -(ahead - now)[second], atol=1e-7)
+    assert align_poses(poses_from_turntable(pictures, turns, masks), truth).rms_px < 0.5
 
 
 def test_views_that_are_all_alike_are_refused():
@@ -189,10 +147,10 @@ def test_angles_that_do_not_fit_the_views_are_refused(tmp_path, text, said):
 @pytest.mark.slow
 def test_matches_by_chance_do_not_move_the_cameras():
     pictures, turns, masks, truth = turned(knobs())
-    evidence = evidence_of(pictures, turns, masks)
-    generator = np.random.default_rng(2)
+    names, generator = sorted(pictures), np.random.default_rng(2)
+    evidence = gather(cv2, *([values[name] for name in names] for values in (pictures, turns, masks)))
     pairs = generator.integers(0, COUNT - 1, 600)
     points = generator.uniform(70, 130, (600, 2, 2))
     disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)
-    found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, sorted(pictures))
+    found = turntable_module._pose_set(turntable_module._fit(disturbed), disturbed, names)
     assert align_poses(found, truth).rms_px < 0.5
