@@ -90,10 +90,7 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"drop_bands": "red"}, "'red' is not a wavelength or range"),
     (REFERENCES | {"white_rectangle": ("view_00", 0, 0, 4, 4)}, "--white and --white-rectangle both"),
     ({"white_rectangle": ("cow", 0, 0, 4, 4)}, "--white-rectangle cow"),
-    (
-        {"white_rectangle": ("view_00", 20, 0, 10, 4)},
-        "--white-rectangle view_00 20 0 10 4 .* leaves the image",
-    ),
+    ({"white_rectangle": ("view_00", 20, 0, 10, 4)}, "view_00 20 0 10 4 .* leaves the image"),
     (REFERENCES | {"white_reflectance": "99"}, "is 99 to 99; expected"),
     (REFERENCES | {"white_reflectance": "a.csv"}, "expected a number such as"),
     ({"white_reflectance": "0.5"}, "--white-reflectance needs a white reference"),
@@ -104,28 +101,20 @@ OPTIONS: list[tuple[dict[str, Any], str]] = [
     ({"max_noise": 0.0}, "--max-noise 0: expected a share above 0"),
 ]
 SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
-    (
-        lambda root: np.save(root / "view_01.npy", COUNTS),
-        {},
-        r"hdr and .*npy would both be the view 'view_01'",
-    ),
+    (lambda root: np.save(root / "view_01.npy", COUNTS), {}, "npy would both be the view 'view_01'"),
     (_cube("view_01", COUNTS[..., :5]), {}, r"view_01\.hdr has 24 x 32 x 5 .*; expected 24 x 32 x 9"),
-    (
-        _cube("view_02", COUNTS[:10]),
-        {},
-        r"view_02 has 32 x 10 pixels .* for 32 x 24; expected the same shape",
-    ),
+    (_cube("view_02", COUNTS[:10]), {}, r"view_02 has 32 x 10 pixels .* 32 x 24; expected the same shape"),
     (_cube("view_01", wavelength=f"{{{MOVED}}}"), {}, r"view_01\.hdr has 453 nm at band 0; expected 450 nm"),
     (_cube("view_01", COUNTS.astype(np.float32)), {}, "holds float32; expected uint16"),
     (
-        _cube("view_01", COUNTS, **{"reflectance scale factor": 10000}),
+        _cube("view_01", **{"reflectance scale factor": 10000}),
         {},
-        r"view_00\.hdr has no gains or scale, .*view_01\.hdr has \(header field 'reflectance scale factor'\)",
+        r"view_00\.hdr has no gains or scale, .*factor",
     ),
     (
         _cube("white", wavelength=f"{{{BACKWARDS}}}"),
         REFERENCES,
-        r"white\.hdr has 850 nm at band 0; expected 450 nm",
+        r"white\.hdr has 850 nm at band 0; expected 450",
     ),
     (_cut, {}, r"view_01\.raw: cut short: 1000 bytes; view_01\.hdr promises 13824"),
     (_pointer, {}, r"view_09\.tif: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'"),
@@ -136,9 +125,9 @@ SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
     ),
     (_cube("white", COUNTS[..., :4]), REFERENCES, "the white reference has 4 bands, the cubes have 9"),
     (
-        _cube("white", np.full_like(COUNTS, 4095)),
+        _cube("white", 0 * COUNTS + 4095),
         REFERENCES | {"saturation": 4095.0},
-        "100% of the white reference is saturated",
+        "100% of the white reference is sat",
     ),
     (_fill(50), {"dark": "dark.hdr"}, "not above 0 .*; check the dark frame"),
     (_fill(7), {"saturation": 4000.0}, "no sampled pixel .* has a measurement in all bands"),
@@ -175,35 +164,36 @@ def test_a_bad_capture_is_refused(tmp_path: Path, spoil: Spoil, options: dict[st
         ("cubes", "nowhere", "nowhere is not there; give the folder of the capture with --data"),
         ("cube", ".", "did you mean cubes?"),
         ("cubes", ".", "holds no cubes; expected one file a view"),
+        ("cubes", "capture", None),
     ],
 )
-def test_the_command_ends_with_the_users_error(tmp_path: Path, layout: str, folder: str, message: str):
-    ended = run(process_command, layout, "--data", tmp_path / folder, "--output-dir", tmp_path / "scene")
-    assert ended.status == USER_ERROR
-    assert message in " ".join(ended.err.split())
+def test_the_command_ends_with_the_users_error_or_the_name_of_the_scene(
+    tmp_path: Path, layout: str, folder: str, message: str | None
+):
+    if message is None:
+        make_capture(tmp_path / "capture")
+    words = ["--data", tmp_path / folder, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
+    ended = run(process_command, layout, *words)
+    if message is None:
+        assert (ended.status, ended.last_line) == (0, f"scene: {tmp_path / 'scene'}")
+    else:
+        assert ended.status == USER_ERROR
+        assert message in " ".join(ended.err.split())
 
 
-def test_the_last_line_names_the_scene(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scene/file.txt", "is not empty; give a new folder"),
+        ("scene/folder/precious.txt", "is not empty; give a new folder"),
+        ("scene.unfinished/precious.txt", "is in the way and was not made by unmix-process"),
+    ],
+)
+def test_an_output_with_something_in_it_is_left_alone(tmp_path: Path, name: str, message: str):
     capture = make_capture(tmp_path / "capture")
-    words = ["--data", capture.root, "--output-dir", tmp_path / "scene", "--poses", "transforms.json"]
-    ended = run(process_command, "cubes", *words)
-    assert (ended.status, ended.last_line) == (0, f"scene: {tmp_path / 'scene'}")
-
-
-@pytest.mark.parametrize("name", ["file.txt", "folder/precious.txt"])
-def test_an_output_with_something_in_it_is_left_alone(tmp_path: Path, name: str):
-    capture = make_capture(tmp_path / "capture")
-    path = tmp_path / "out" / name
+    path = tmp_path / name
     path.parent.mkdir(parents=True)
     path.write_text("precious")
-    with pytest.raises(UnmixError, match="is not empty; give a new folder"):
-        process(capture.root, tmp_path / "out", overwrite=True)
+    with pytest.raises(UnmixError, match=message):
+        process(capture.root, tmp_path / "scene", overwrite=True)
     assert path.read_text() == "precious"
-
-
-def test_an_unfinished_folder_of_others_is_left_alone(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture")
-    (tmp_path / "scene.unfinished").mkdir()
-    (tmp_path / "scene.unfinished" / "precious.txt").write_text("precious")
-    with pytest.raises(UnmixError, match="is in the way and was not made by unmix-process"):
-        process(capture.root, tmp_path / "scene")

@@ -102,10 +102,11 @@ def judge(images: list[np.ndarray]) -> Backdrop | None:
 
 
 @pytest.mark.parametrize("name", BACKDROPS)
-def test_a_plain_backdrop_is_found_and_cut_out_with_soft_edges(name: str):
+def test_a_plain_backdrop_is_found_said_and_cut_out_with_soft_edges(name: str):
     images, covers = pictures(BACKDROPS[name])
     backdrop = judge(images)
     assert backdrop is not None
+    assert name not in ("black", "grey", "white") or backdrop.in_words.startswith(name)
     for image, cover in zip(images, covers, strict=True):
         seen = backdrop.find(backdrop.features(image), np.ones((HEIGHT, WIDTH), bool))
         assert seen is not None
@@ -176,14 +177,6 @@ def test_pixels_without_a_measurement_are_not_the_backdrop():
     assert seen is not None
     assert not seen.shown[:, :4].any()
     assert seen.shown[:, 4:8].all()
-
-
-def test_its_colour_is_said():
-    named = {"black": "black", "grey": "grey", "white": "white"}
-    for name, word in named.items():
-        backdrop = judge(pictures(BACKDROPS[name])[0])
-        assert backdrop is not None
-        assert backdrop.in_words.startswith(word)
 
 
 def test_a_backdrop_of_large_views_is_kept_thinned_out():

@@ -39,11 +39,7 @@ def test_the_map_of_one_picture_gives_a_spectrum_the_same_colour_in_any_other():
     values, _ = spectra()
     found = PcaColours.fit(values)
     torch.testing.assert_close(found(values[:12].reshape(3, 4, 6)).reshape(12, 3), found(values)[:12])
-
-
-def test_signs_do_not_depend_on_the_order_of_the_spectra():
-    values, _ = spectra()
-    torch.testing.assert_close(PcaColours.fit(values.flip(0)).axes, PcaColours.fit(values).axes)
+    torch.testing.assert_close(PcaColours.fit(values.flip(0)).axes, found.axes)
 
 
 def test_too_few_spectra_and_too_few_bands_give_black_where_there_is_nothing_to_tell():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import centres_nm, present
+from tests.captures.file_factory import check_file, present, rows_and_bands_of
 from tests.captures.layouts.data_sets import (
     PLAIN,
     intensity,
@@ -29,20 +29,18 @@ def scene(tmp_path_factory):
     return find_nespof(root, PLAIN)
 
 
-def test_views_have_the_first_stokes_component_of_all_wavelengths_and_opacity(scene):
+def test_views_have_the_first_stokes_component_of_all_wavelengths_and_opacity(scene, tmp_path):
     assert [view.name for view in scene.views] == ["r_0", "r_1", "r_2", "r_3", "r_4"]
-    for index, view in enumerate(scene.views):
-        expected = np.stack([intensity(index, wavelength) for wavelength in (450, 460, 470)], axis=-1)
-        np.testing.assert_array_equal(view.cube.read(), expected)
-        assert view.cube.bands.wavelengths_nm.tolist() == [450.0, 460.0, 470.0]
-        np.testing.assert_allclose(view.alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
-    cube = scene.views[2].cube
-    np.testing.assert_array_equal(cube.read(slice(1, 4), np.array([2, 0])), cube.read()[1:4][..., [2, 0]])
-
-
-def test_splits_are_those_of_the_files_and_repeated_frames_are_left_out(scene):
     assert [view.split for view in scene.views] == ["eval", "train", "train", "train", "train"]
     assert any("5 frames of transforms_test.json listed before" in note for note in scene.notes)
+    for index, view in enumerate(scene.views):
+        expected = np.stack([intensity(index, wavelength) for wavelength in (450, 460, 470)], axis=-1)
+        check_file(view.cube, values=expected, nm=[450, 460, 470])
+        np.testing.assert_allclose(view.alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
+    rows_and_bands_of(scene.views[2].cube, scene.views[2].cube.read())
+    write_nespof(tmp_path)
+    given = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
+    check_file(find_nespof(tmp_path, given).views[0].cube, nm=[500, 510, 520])
 
 
 def test_poses_and_field_of_view_belong_to_the_views(scene):
@@ -74,12 +72,6 @@ def test_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
     assert "val_same" in names
 
 
-def test_given_wavelengths_replace_the_names_of_folders(tmp_path):
-    write_nespof(tmp_path)
-    options = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
-    assert centres_nm(find_nespof(tmp_path, options).views[0].cube).tolist() == [500.0, 510.0, 520.0]
-
-
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
 def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, kind):
     names = [f"ch{index:02d}" for index in range(16)]
@@ -107,15 +99,18 @@ def _outside(root):
     path.write_text(path.read_text().replace("./val/r_0", "../../r_0"))
 
 
+def _of_another_size(root):
+    write_exr(root / "460/val/r_0.exr", stokes(np.zeros((5, 8))))
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda root: shutil.rmtree(root / "460/train"), r"lacks 4 files .*460/train/r_1.exr, .* and 1 more"),
+        (lambda root: [path.unlink() for path in root.glob("*.json")], "holds no"),
+        (lambda root: [shutil.rmtree(root / name) for name in ("450", "460", "470")], "holds no"),
         (_cut_short, r"r_0.exr can't be read as OpenEXR"),
-        (
-            lambda root: write_exr(root / "460/val/r_0.exr", stokes(np.zeros((5, 8)))),
-            "of one view have one size",
-        ),
+        (_of_another_size, "of one view have one size"),
         (_outside, "leaves the folder"),
     ],
 )
@@ -124,15 +119,6 @@ def test_a_spoilt_scene_is_refused(tmp_path, spoil, message):
     spoil(tmp_path / "scene")
     with pytest.raises(CaptureError, match=message):
         find_nespof(tmp_path / "scene", PLAIN)
-
-
-@pytest.mark.parametrize("name", ["transforms_train.json", "450"])
-def test_a_folder_of_another_kind_is_refused(tmp_path, name):
-    write_nespof(tmp_path, wavelengths=(450,))
-    for path in [*tmp_path.glob("transforms_*.json")] if name.endswith("json") else [tmp_path / name]:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(CaptureError, match="holds no"):
-        find_nespof(tmp_path, PLAIN)
 
 
 def test_real_captures_have_one_folder_a_view(tmp_path):

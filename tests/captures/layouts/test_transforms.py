@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from tests.captures.file_factory import centres_nm, present
+from tests.captures.file_factory import check_file, present, write_envi
 from tests.captures.layouts.data_sets import (
     LENS,
     PLAIN,
@@ -43,38 +43,41 @@ def edit(root, change):
 
 
 @pytest.mark.parametrize("written", ["eval", "val"])
-def test_cubes_pictures_and_labels_are_found_where_the_converter_left_them(tmp_path, written):
+def test_cubes_pictures_labels_and_poses_are_found_where_the_converter_left_them(tmp_path, written):
     write_unmix(tmp_path, written)
+    (tmp_path / "train" / "frame_00001.png").unlink()  # which is no fault
     capture = find_unmix_nerf(tmp_path, PLAIN)
+    assert [view.picture is None for view in capture.views] == [False, True, False, False, False]
     for index, view in enumerate(capture.views):
-        np.testing.assert_array_equal(view.cube.read(), cube(index))
-        assert view.picture is not None
-        assert view.labels is not None
-        assert (np.asarray(Image.open(view.labels)) == index).all()
+        check_file(view.cube, values=cube(index), nm=[450, 500, 550, 600], evidence="transforms.json")
+        assert (np.asarray(Image.open(present(view.labels))) == index).all()
+        camera = present(capture.poses).cameras[f"frame_{index:05d}"]
+        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
+        assert present(camera.lens).focal_px == (9.0, 9.0)
     told = any("2 paths name a folder 'val' whose files lie in 'eval'" in note for note in capture.notes)
     assert told == (written == "eval")
+    given = ReadOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
+    check_file(find_unmix_nerf(tmp_path, given).views[0].cube, nm=[400, 410, 420, 430])
 
 
-def test_lists_go_before_folders(tmp_path):
+def test_lists_go_before_folders_and_one_folder_for_all_says_nothing(tmp_path):
     lists: dict[str, list[str]] = {"train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)]}
     lists["test_filenames"] = ["train/frame_00002.npy"]
-    write_unmix(tmp_path, "eval", "val", **lists)
-    splits = [view.split for view in find_unmix_nerf(tmp_path, PLAIN).views]
+    write_unmix(tmp_path / "lists", **lists)
+    splits = [view.split for view in find_unmix_nerf(tmp_path / "lists", PLAIN).views]
     assert splits[:3] == ["train", "train", "eval"]
+    write_unmix(tmp_path / "one", written="train", named="train")
+    assert {view.split for view in find_unmix_nerf(tmp_path / "one", PLAIN).views} == {None}
 
 
-def test_one_folder_for_all_says_nothing(tmp_path):
-    write_unmix(tmp_path, written="train", named="train")
-    assert {view.split for view in find_unmix_nerf(tmp_path, PLAIN).views} == {None}
-
-
-def test_wavelengths_are_those_of_the_file_unless_given(tmp_path):
-    write_unmix(tmp_path)
-    cube = find_unmix_nerf(tmp_path, PLAIN).views[0].cube
-    assert centres_nm(cube).tolist() == [450.0, 500.0, 550.0, 600.0]
-    assert "transforms.json" in cube.bands.evidence
-    given = ReadOptions(wavelengths_nm=np.array([400.0, 410.0, 420.0, 430.0]))
-    assert centres_nm(find_unmix_nerf(tmp_path, given).views[0].cube).tolist() == [400.0, 410.0, 420.0, 430.0]
+@pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
+def test_wavelengths_are_never_made_up_and_poses_that_can_not_be_used_are_told(tmp_path, stated):
+    write_unmix(tmp_path, wavelengths=stated)
+    edit(tmp_path, lambda content: content["frames"][1].update(transform_matrix=np.zeros((4, 4)).tolist()))
+    capture = find_unmix_nerf(tmp_path, PLAIN)
+    assert capture.views[0].cube.bands.wavelengths_nm is None
+    assert (capture.poses, len(capture.views)) == (None, 5)
+    assert any("poses of the capture can't be used" in note for note in capture.notes)
 
 
 def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
@@ -87,73 +90,46 @@ def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
         assert view.cube.warnings == ()
 
 
-@pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
-def test_wavelengths_are_never_made_up(tmp_path, stated):
-    write_unmix(tmp_path, wavelengths=stated)
-    assert find_unmix_nerf(tmp_path, PLAIN).views[0].cube.bands.wavelengths_nm is None
-
-
-def test_poses_come_by_the_names_of_views(tmp_path):
-    write_unmix(tmp_path)
-    poses = present(find_unmix_nerf(tmp_path, PLAIN).poses)
-    assert sorted(poses.cameras) == [f"frame_0000{index}" for index in range(5)]
-    np.testing.assert_allclose(poses.cameras["frame_00004"].camera_to_world, pose(4)[:3], atol=1e-6)
-    lens = present(poses.cameras["frame_00004"].lens)
-    assert lens.focal_px == (9.0, 9.0)
-
-
-def test_corrupt_poses_are_told_and_others_may_be_given(tmp_path):
-    write_unmix(tmp_path)
-    edit(tmp_path, lambda content: content["frames"][1].update(transform_matrix=np.zeros((4, 4)).tolist()))
-    capture = find_unmix_nerf(tmp_path, PLAIN)
-    assert capture.poses is None
-    assert len(capture.views) == 5
-    assert any("poses of the capture can't be used" in note for note in capture.notes)
-
-
-def test_a_missing_picture_is_no_fault(tmp_path):
-    write_unmix(tmp_path)
-    (tmp_path / "train" / "frame_00001.png").unlink()
-    views = find_unmix_nerf(tmp_path, PLAIN).views
-    assert [view.picture is None for view in views] == [False, True, False, False, False]
-
-
-def test_missing_cubes_are_counted_and_another_layout_named(tmp_path):
-    write_unmix(tmp_path)
+def without_cubes(root):
     for index in range(3):
-        (tmp_path / "train" / f"frame_0000{index}.npy").unlink()
-    with pytest.raises(CaptureError, match=r"lacks 3 files .*train/frame_00000.npy.*nerfstudio"):
-        find_unmix_nerf(tmp_path, PLAIN)
-    edit(tmp_path, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
-    with pytest.raises(CaptureError, match=r"frames\[2\] has no 'hyperspectral_file_path'"):
-        find_unmix_nerf(tmp_path, PLAIN)
+        (root / "train" / f"frame_0000{index}.npy").unlink()
 
 
-@pytest.mark.parametrize("text", ["../outside.npy", "/etc/passwd", "link.npy"])
-def test_paths_that_leave_the_folder_are_refused(tmp_path, text):
-    root = tmp_path / "scene"
-    write_unmix(root)
-    np.save(tmp_path / "outside.npy", cube(0))
-    (root / "link.npy").symlink_to(tmp_path / "outside.npy")
-    edit(root, lambda content: content["frames"][0].update(hyperspectral_file_path=text))
-    with pytest.raises(CaptureError, match=r"frames\[0\].*leaves the folder"):
-        find_unmix_nerf(root, PLAIN)
+def with_path(text):
+    def spoil(root):
+        np.save(root.parent / "outside.npy", cube(0))
+        (root / "link.npy").symlink_to(root.parent / "outside.npy")
+        shutil.copy(root / "train/frame_00001.npy", root / "train/frame 00001.npy")
+        edit(root, lambda content: content["frames"][0].update(hyperspectral_file_path=text))
+
+    return spoil
 
 
-def test_views_that_would_share_a_name_are_refused(tmp_path):
-    write_unmix(tmp_path)
-    shutil.copy(tmp_path / "train/frame_00000.npy", tmp_path / "train/frame 00000.npy")
-    twin = {"hyperspectral_file_path": "train/frame 00000.npy"}
-    edit(tmp_path, lambda content: content["frames"][1].update(twin))
-    with pytest.raises(CaptureError, match="would both be the view 'frame_00000'"):
-        find_unmix_nerf(tmp_path, PLAIN)
+def without_key(root):
+    edit(root, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
 
 
-@pytest.mark.parametrize("content", ["{", '{"frames": 3}', '{"frames": [3]}', '{"no": "frames"}', ""])
-def test_a_damaged_list_of_frames_is_refused(tmp_path, content):
-    (tmp_path / "transforms.json").write_text(content)
-    with pytest.raises(CaptureError, match=r"transforms.json"):
-        find_unmix_nerf(tmp_path, PLAIN)
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (without_cubes, r"lacks 3 files .*train/frame_00000.npy.*nerfstudio"),
+        (without_key, r"frames\[2\] has no 'hyperspectral_file_path'"),
+        *(
+            (with_path(text), r"frames\[0\].*leaves the folder")
+            for text in ("../outside.npy", "/etc/passwd", "link.npy")
+        ),
+        (with_path("train/frame 00001.npy"), "would both be the view 'frame_00001'"),
+        *(
+            (lambda root, content=content: (root / "transforms.json").write_text(content), "transforms.json")
+            for content in ("{", '{"frames": 3}', '{"frames": [3]}', '{"no": "frames"}', "")
+        ),
+    ],
+)
+def test_a_spoilt_list_of_frames_is_refused(tmp_path, spoil, message):
+    write_unmix(tmp_path / "scene")
+    spoil(tmp_path / "scene")
+    with pytest.raises(CaptureError, match=message):
+        find_unmix_nerf(tmp_path / "scene", PLAIN)
 
 
 @pytest.mark.parametrize(("kind", "scale"), [(torch.uint8, 255.0), (torch.float32, None)])
@@ -162,15 +138,9 @@ def test_tensors_of_8_bits_are_fractions_of_255(tmp_path, kind, scale):
     capture = find_hs_nerf(tmp_path, PLAIN)
     assert capture.layout == "hs-nerf"
     for index, view in enumerate(capture.views):
-        assert view.cube.scale == scale
+        check_file(view.cube, scale=scale, nm=None)
         np.testing.assert_allclose(view.cube.read() / (scale or 1.0), cube(index), atol=1.01 / 255)
-        assert view.cube.bands.wavelengths_nm is None
-        assert view.picture is not None
-        assert view.picture.name == f"frame_{index:05d}.jpg"
-
-
-def test_given_wavelengths_must_be_one_a_band(tmp_path):
-    write_hs(tmp_path)
+        assert present(view.picture).name == f"frame_{index:05d}.jpg"
     with pytest.raises(CaptureError, match=r"frame_00000.pt.* 3 "):
         find_hs_nerf(tmp_path, ReadOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
 
@@ -184,27 +154,19 @@ def test_pictures_are_cubes_of_three_bands(tmp_path, mode):
     frames[1]["mask_path"] = "mask.png"
     write_json(tmp_path / "transforms.json", LENS | {"frames": frames})
     first, second = find_nerfstudio(tmp_path, PLAIN).views
-    np.testing.assert_array_equal(first.cube.read(), pixels[..., :3])
-    assert first.cube.metadata["encoding"] == "sRGB"
-    assert first.picture == first.cube.path
-    assert first.mask is None
-    assert second.mask is not None
-    assert first.cube.bands.wavelengths_nm is None
-    assert "--wavelengths 610,550,465" in first.cube.bands.evidence
+    evidence = "--wavelengths 610,550,465"
+    check_file(first.cube, values=pixels[..., :3], encoding="sRGB", nm=None, evidence=evidence)
+    assert (first.picture, first.mask, second.mask is None) == (first.cube.path, None, False)
 
 
 def test_frames_may_name_envi_headers_in_a_folder_of_their_own(tmp_path):
-    import spectral.io.envi
-
     (tmp_path / "raw").mkdir()
-    bands = {"wavelength": [450, 500, 550, 600], "wavelength units": "nm"}
-    spectral.io.envi.save_image(str(tmp_path / "raw" / "a.hdr"), cube(3), metadata=bands)
+    write_envi(tmp_path / "raw" / "a.hdr", cube(3), "bip", "wavelength = {450, 500, 550, 600}")
     frames = [{"file_path": "a.hdr", "transform_matrix": pose(0)}]
     write_json(tmp_path / "transforms.json", LENS | {"datadir": "raw", "frames": frames})
     (view,) = find_nerfstudio(tmp_path, PLAIN).views
-    np.testing.assert_array_equal(view.cube.read(), cube(3))
+    check_file(view.cube, values=cube(3), nm=[450, 500, 550, 600])
     assert view.picture is None
-    assert view.cube.bands.wavelengths_nm is not None
 
 
 def test_pictures_of_blender_have_no_suffix_and_a_file_for_each_split(tmp_path):
@@ -219,15 +181,6 @@ def test_pictures_of_blender_have_no_suffix_and_a_file_for_each_split(tmp_path):
     np.testing.assert_allclose(capture.poses.cameras["test_r_0"].camera_to_world, pose(2)[:3], atol=1e-6)
 
 
-def test_a_turned_picture_stays_as_it_is_stored(tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
-    frames = [{"file_path": "a.jpg", "transform_matrix": pose(0)}]
-    write_json(tmp_path / "transforms.json", LENS | {"frames": frames})
-    assert find_nerfstudio(tmp_path, PLAIN).views[0].cube.shape == (6, 8, 3)
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_an_empty_folder_is_refused_by_every_layout(tmp_path, layout):
     with pytest.raises(CaptureError, match=r"holds no"):
@@ -240,56 +193,49 @@ def process(layout, root, output, **given) -> Scene:
     return load_scene(output)
 
 
-def names(scene, indices):
-    return [scene.frames[index].name for index in indices]
-
-
-def test_nespof(tmp_path):
-    write_nespof(tmp_path / "ajar")
-    scene = process("nespof", tmp_path / "ajar", tmp_path / "scene", scale=2.0)
-    assert scene.wavelengths_nm.tolist() == [450.0, 460.0, 470.0]
-    assert names(scene, scene.eval_indices) == ["r_0"]
-    assert names(scene, scene.train_indices) == ["r_1", "r_2", "r_3", "r_4"]
-    index = [frame.name for frame in scene.frames].index("r_3")
-    alpha = present(scene.alpha(index))
-    np.testing.assert_allclose(alpha, np.linspace(0, 1, 35).reshape(5, 7), atol=0.003)
-    seen = alpha > 0
-    expected = np.stack([intensity(3, wavelength) for wavelength in (450, 460, 470)], axis=-1) / 2.0
-    np.testing.assert_allclose(scene.cube(index)[seen], expected[seen], atol=1e-4)
-
-
-def test_nespof_real(tmp_path):
-    write_real(tmp_path / "real", views=("a", "b", "c"))
-    scene = process("nespof-real", tmp_path / "real", tmp_path / "scene", scale=2.0)
-    expected = np.stack([intensity(1, 450), intensity(1, 460)], axis=-1) / 2.0
-    np.testing.assert_allclose(scene.cube(1), expected, atol=1e-4)
-
-
-def test_unmix_nerf(tmp_path):
-    write_unmix(tmp_path / "hotdog")
-    scene = process("unmix-nerf", tmp_path / "hotdog", tmp_path / "scene", scale=1.0, mask="none")
-    assert names(scene, scene.eval_indices) == ["frame_00003", "frame_00004"]
-    np.testing.assert_allclose(scene.cube(1), cube(1), atol=1e-4)
-    labels = present(scene.labels(4))
-    assert (labels == 4).all()
-
-
-def test_hs_nerf_asks_for_wavelengths(tmp_path):
-    write_hs(tmp_path / "basil")
-    with pytest.raises(CaptureError, match=r"wavelengths of its 4 bands are unknown .*--wavelengths"):
-        process("hs-nerf", tmp_path / "basil", tmp_path / "scene")
-    options = {"wavelengths": "450,500,550,600", "scale": 1.0}
-    scene = process("hs-nerf", tmp_path / "basil", tmp_path / "scene", **options)
-    assert scene.wavelengths_nm.tolist() == [450.0, 500.0, 550.0, 600.0]
-    np.testing.assert_allclose(scene.cube(2), cube(2), atol=1.01 / 255)
-
-
-def test_nerfstudio_says_what_three_bands_may_stand_for(tmp_path):
-    write_unmix(tmp_path / "room", written="val")
-    with pytest.raises(CaptureError, match=r"--wavelengths 610,550,465"):
-        process("nerfstudio", tmp_path / "room", tmp_path / "scene")
-    scene = process("nerfstudio", tmp_path / "room", tmp_path / "scene", wavelengths="610,550,465", scale=1.0)
-    assert scene.wavelengths_nm.tolist() == [465.0, 550.0, 610.0]
-    pixels = np.asarray(Image.open(tmp_path / "room" / "train" / "frame_00002.png")) / 255
-    linear = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(scene.cube(2), linear[..., ::-1], atol=1e-4)
+@pytest.mark.parametrize(
+    ("layout", "write", "wavelengths", "said"),
+    [
+        (
+            "nerfstudio",
+            lambda root: write_unmix(root, written="val"),
+            "610,550,465",
+            "--wavelengths 610,550,465",
+        ),
+        ("hs-nerf", write_hs, "450,500,550,600", "wavelengths of its 4 bands are unknown .*--wavelengths"),
+        ("unmix-nerf", write_unmix, None, None),
+        ("nespof", write_nespof, None, None),
+        ("nespof-real", lambda root: write_real(root, views=("a", "b", "c")), None, None),
+    ],
+)
+def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout, write, wavelengths, said):
+    """Or asks for the wavelengths that it lacks."""
+    write(tmp_path / "data")
+    if said is not None:
+        with pytest.raises(CaptureError, match=said):
+            process(layout, tmp_path / "data", tmp_path / "scene")
+    options = {"wavelengths": wavelengths, "scale": 2.0 if "nespof" in layout else 1.0}
+    options |= {"mask": "none"} if layout == "unmix-nerf" else {}
+    scene = process(layout, tmp_path / "data", tmp_path / "scene", **options)
+    stokes = [[intensity(index, nm) / 2 for nm in (450, 460, 470)] for index in range(3)]
+    match layout:
+        case "nerfstudio":
+            pixels = np.asarray(Image.open(tmp_path / "data/train/frame_00002.png"))[..., ::-1] / 255
+            linear = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
+            index, expected, nm, atol = 2, linear, [465, 550, 610], 1e-4
+        case "hs-nerf":
+            index, expected, nm, atol = 2, cube(2), [450, 500, 550, 600], 1.01 / 255
+        case "unmix-nerf":
+            index, expected, nm, atol = 1, cube(1), [450, 500, 550, 600], 1e-4
+            assert (present(scene.labels(4)) == 4).all()
+        case "nespof":
+            index = [frame.name for frame in scene.frames].index("r_2")
+            alpha = present(scene.alpha(index))
+            np.testing.assert_allclose(alpha, np.linspace(0, 1, 35).reshape(5, 7), atol=0.003)
+            expected, nm, atol = (alpha > 0)[..., None] * np.stack(stokes[2], axis=-1), [450, 460, 470], 1e-4
+        case _:
+            index, expected, nm, atol = 1, np.stack(stokes[1][:2], axis=-1), [450, 460], 1e-4
+    np.testing.assert_allclose(scene.cube(index), expected, atol=atol)
+    assert scene.wavelengths_nm.tolist() == nm
+    evaluated = {"unmix-nerf": ["frame_00003", "frame_00004"], "nespof": ["r_0"]}.get(layout)
+    assert evaluated is None or [scene.frames[i].name for i in scene.eval_indices] == evaluated

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from tests.captures.file_factory import present
@@ -30,12 +28,18 @@ def read(tmp_path, content, **options):
     return read_poses(write_json(tmp_path / "transforms.json", content), **options)
 
 
-def test_poses_and_lens_are_those_of_the_file(tmp_path):
-    found = read(tmp_path, transforms(ring()))
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_poses_and_lens_are_those_of_the_file(tmp_path, encoding):
+    content = transforms(ring(), k3=0.02, k4=-0.01)
+    (tmp_path / "transforms.json").write_bytes(json.dumps(content).encode(encoding))
+    found = read_poses(tmp_path / "transforms.json")
     assert_same_poses(found, ring())
-    assert {camera.lens for camera in found.cameras.values()} == {LENS}
+    assert {camera.lens for camera in found.cameras.values()} == {replace(LENS, higher_radial=(0.02, -0.01))}
     assert any("6 of 6 frames name files that are not there" in note for note in found.notes)
     np.testing.assert_array_equal(found.up, [0, 0, 1])
+    bare = read(tmp_path, transforms(ring())["frames"])
+    assert_same_poses(bare, ring())
+    assert all(camera.lens is None for camera in bare.cameras.values())
 
 
 def test_scaled_rotations_are_made_rigid_and_the_factor_is_said(tmp_path):
@@ -43,12 +47,6 @@ def test_scaled_rotations_are_made_rigid_and_the_factor_is_said(tmp_path):
     found = read(tmp_path, transforms(scaled))
     assert_same_poses(found, ring())
     assert "the rotations of 6 of 6 cameras were scaled by 0.25; made rigid, positions kept" in found.notes
-
-
-def test_a_bare_list_has_poses_without_lenses(tmp_path):
-    found = read(tmp_path, transforms(ring())["frames"])
-    assert_same_poses(found, ring())
-    assert all(camera.lens is None for camera in found.cameras.values())
 
 
 def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_the_pictures(tmp_path):
@@ -155,23 +153,14 @@ def test_focal_lengths_in_degrees_and_as_a_matrix(tmp_path):
     lens = lens_of(read(tmp_path, {**content, "x_fov": 60.0, "y_fov": 50.0}))
     np.testing.assert_allclose(lens.focal_px, [320 / math.tan(math.pi / 6), 240 / math.tan(math.radians(25))])
     matrix = [[500, 0, 321, 0], [0, 510, 239, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    for frame in content["frames"]:
-        frame["intrinsic_matrix"] = matrix
-    lens = lens_of(read(tmp_path, content))
-    assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
-    for frame in content["frames"]:
-        frame |= {"fl_x": None, "cy": None}
-    lens = lens_of(read(tmp_path, content))
-    assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
+    for more in ({"intrinsic_matrix": matrix}, {"fl_x": None, "cy": None}):
+        for frame in content["frames"]:
+            frame |= more
+        lens = lens_of(read(tmp_path, content))
+        assert (lens.focal_px, lens.center_px) == ((500, 510), (321, 239))
     matrix[0][1] = 2
     with pytest.raises(CaptureError, match="skew 2; expected focal lengths above 0 and no skew"):
         read(tmp_path, content)
-
-
-def test_json_of_windows_editors_is_read(tmp_path):
-    for encoding in ("utf-8-sig", "utf-16"):
-        (tmp_path / "transforms.json").write_bytes(json.dumps(transforms(ring())).encode(encoding))
-        assert_same_poses(read_poses(tmp_path / "transforms.json"), ring())
 
 
 def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
@@ -181,11 +170,6 @@ def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
     assert_same_poses(found, moved)
     np.testing.assert_allclose(found.offset, far, atol=3.0)
     assert max(np.abs(camera.camera_to_world).max() for camera in found.cameras.values()) < 10
-
-
-def test_terms_beyond_k2_are_kept(tmp_path):
-    lens = read(tmp_path, transforms(ring(), k3=0.02, k4=-0.01)).cameras["images/view_0.png"].lens
-    assert lens == replace(LENS, higher_radial=(0.02, -0.01))
 
 
 @pytest.mark.parametrize(
@@ -228,40 +212,16 @@ def test_faults_are_told_with_what_was_expected(tmp_path, change, message):
         read(tmp_path, transforms(ring()) | change)
 
 
-def test_one_name_for_two_poses_is_refused_and_for_one_pose_mentioned(tmp_path):
+def test_one_name_for_two_poses_or_one_pose_for_all_is_refused_and_a_frame_listed_twice_mentioned(tmp_path):
     content = transforms(ring())
     content["frames"].append(content["frames"][0])
     assert any("listed twice" in note for note in read(tmp_path, content).notes)
     content["frames"][-1] = {**content["frames"][1], "file_path": content["frames"][0]["file_path"]}
     with pytest.raises(CaptureError, match=r"two cameras of the name images/view_0\.png"):
         read(tmp_path, content)
-
-
-def test_cameras_that_all_have_one_pose_are_refused(tmp_path):
     pose = next(iter(ring().values()))
     with pytest.raises(CaptureError, match="all 6 cameras have the same pose"):
         read(tmp_path, transforms(dict.fromkeys(ring(), pose)))
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
-    max_leaves=8,
-)
-
-
-@given(st.sampled_from(sorted(transforms({}))), VALUES, VALUES)
-def test_json_of_any_content_is_read_or_refused(tmp_path_factory, key, value, matrix):
-    content = transforms(ring(3)) | {key: value}
-    if key != "frames":
-        content["frames"][1]["transform_matrix"] = matrix
-    path = tmp_path_factory.mktemp("fuzz") / "transforms.json"
-    path.write_text(json.dumps(content), encoding="utf-8")
-    try:
-        found = read_poses(path)
-    except CaptureError:
-        return
-    assert all(np.isfinite(camera.camera_to_world).all() for camera in found.cameras.values())
 
 
 def write(tmp_path, **options):
@@ -269,8 +229,9 @@ def write(tmp_path, **options):
     return tmp_path / "poses_bounds.npy"
 
 
-def test_axes_are_turned_and_names_are_those_of_the_pictures(tmp_path):
+def test_axes_are_turned_and_names_are_those_of_the_pictures_or_go_by_order(tmp_path):
     path = write(tmp_path)
+    assert list(read_poses(path).cameras) == [f"#{index:04d}" for index in range(6)]
     (tmp_path / "images").mkdir()
     for index in range(6):
         (tmp_path / f"images/view_{index}.png").touch()
@@ -279,10 +240,6 @@ def test_axes_are_turned_and_names_are_those_of_the_pictures(tmp_path):
         assert_same_poses(found, ring())
     lens = present(found.cameras["images/view_0.png"].lens)
     assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (640, 480, (500, 500), (320, 240))
-
-
-def test_poses_without_pictures_go_by_order(tmp_path):
-    assert list(read_poses(write(tmp_path)).cameras) == [f"#{index:04d}" for index in range(6)]
 
 
 def test_other_arrays_and_damaged_files_are_refused(tmp_path):

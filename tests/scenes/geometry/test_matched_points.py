@@ -34,17 +34,13 @@ def above_ground(places):
 @pytest.mark.parametrize(
     "cameras", [flight_cameras(flight_poses()), strip_cameras()], ids=["frames", "lines"]
 )
-def test_matched_places_lie_on_the_ground(cameras):
+def test_matched_places_lie_on_the_ground_at_the_depths_of_their_cameras(cameras):
     found = find_matched_points(cameras, read_from(ground_views(cameras)))
     assert found is not None
     assert above_ground(found.places).abs().quantile(0.9) < 0.05
     assert found.are_equally_far
-
-
-def test_depths_are_those_of_the_camera_that_is_named():
-    cameras = flight_cameras(flight_poses())
-    found = find_matched_points(cameras, read_from(ground_views(cameras)))
-    assert found is not None
+    if cameras.is_line_camera(0):
+        return
     for view in found.views.unique().tolist():
         of_view = found.views == view
         _, depths = cameras.project(found.places[of_view], view)
@@ -70,12 +66,14 @@ def test_pixels_that_are_not_valid_are_no_features():
     assert above_ground(found.places).abs().quantile(0.9) < 0.1
 
 
-def test_views_that_share_nothing_or_show_one_colour_have_no_matched_places():
+def test_views_that_share_nothing_show_one_colour_or_stand_at_one_place_have_no_matched_places():
     cameras = flight_cameras(flight_poses())
     unrelated = [np.random.default_rng(view).random((HEIGHT, WIDTH, 1), np.float32) for view in range(5)]
     plain = [np.full((HEIGHT, WIDTH, 1), 0.5, np.float32)] * 5
     assert find_matched_points(cameras, read_from(unrelated)) is None
     assert find_matched_points(cameras, read_from(plain)) is None
+    turning = flight_cameras(flight_poses(5, spacing=0.0, sway=0.1))
+    assert find_matched_points(turning, read_from(ground_views(turning))) is None
 
 
 @pytest.mark.parametrize(("spread", "light"), [(0.0, "fixed"), (0.15, "per-view")])
@@ -86,12 +84,6 @@ def test_exposures_that_differ_are_told_by_matched_places(spread, light):
     found = find_matched_points(cameras, read_from(views))
     assert found is not None
     assert judge_exposure(cameras, found.places, found.seen_by(16)) == light
-
-
-def test_views_from_one_place_tell_no_distance():
-    poses = flight_poses(5, spacing=0.0, sway=0.1)
-    cameras = flight_cameras(poses)
-    assert find_matched_points(cameras, read_from(ground_views(cameras))) is None
 
 
 @pytest.mark.parametrize("count", [5, 12])

@@ -64,15 +64,23 @@ def test_right_poses_raise_no_alarm_far_from_the_origin(demo, tmp_path, with_alp
     assert check_scene_poses(scene) is None
 
 
+TURN = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
+APPLIED = {"applied_transform": TURN, "applied_scale": 0.5, "offset": [-2.5e6, -4.2e6, 4e6]}
+
+
+@pytest.mark.parametrize("with_alpha", [False, True])
 @pytest.mark.parametrize("wrong", [None, *WRONG])
-def test_conventions_are_told_in_a_scene_that_was_turned_and_is_geo_referenced(demo, tmp_path, wrong):
-    folder = rewritten(demo, tmp_path / "scene", WRONG.get(wrong, lambda pose: pose), with_alpha=False)
+def test_conventions_are_told_in_a_scene_that_was_turned_and_is_geo_referenced(
+    demo, tmp_path, wrong, with_alpha
+):
+    folder = rewritten(demo, tmp_path / "scene", WRONG.get(wrong, lambda pose: pose), with_alpha)
     path = folder / "transforms.json"
-    turn = [[0, 0, 1, 0.5], [1, 0, 0, -2], [0, 1, 0, 0.25]]
-    applied = {"applied_transform": turn, "applied_scale": 0.5, "offset": [-2.5e6, -4.2e6, 4e6]}
-    path.write_text(json.dumps(json.loads(path.read_text()) | applied))
-    warning = check_scene_poses(load_scene(folder))
-    assert warning is None if wrong is None else f"the poses look like {wrong}" in str(warning)
+    path.write_text(json.dumps(json.loads(path.read_text()) | ({} if with_alpha else APPLIED)))
+    try:
+        said = check_scene_poses(load_scene(folder))
+    except SceneError as error:
+        said = str(error)
+    assert said is None if wrong is None else f"the poses look like {wrong}" in str(said)
 
 
 def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
@@ -82,16 +90,6 @@ def test_the_remedy_of_the_warning_mends_the_poses(demo, tmp_path):
     assert "invert each, then multiply it from the right by diag(1, -1, -1, 1)" in warning
     mended = rewritten(as_colmap, tmp_path / "mended", lambda pose: np.linalg.inv(pose) @ FLIP)
     assert check_scene_poses(load_scene(mended)) is None
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_poses_with_alpha_are_called_what_they_are(demo, tmp_path, wrong):
-    folder = rewritten(demo, tmp_path / "scene", WRONG[wrong])
-    try:
-        said = check_scene_poses(load_scene(folder))
-    except SceneError as error:
-        said = str(error)
-    assert f"the poses look like {wrong}" in str(said)
 
 
 def test_views_that_show_nothing_give_no_verdict(demo):

@@ -55,15 +55,13 @@ def _with_scale(root: Path, scale: object) -> Path:
     return folder.root
 
 
-def test_integers_are_divided_by_the_scale_of_the_scene(tmp_path: Path):
-    scene = load_scene(_with_scale(tmp_path, 4000))
-    assert scene.options.value_scale == 4000
-    np.testing.assert_allclose(scene.cube(0), 0.25)
-
-
-def test_the_option_goes_before_the_scale_of_the_scene(tmp_path: Path):
-    scene = load_scene(_with_scale(tmp_path, 4000), SceneOptions(value_scale=2000.0))
-    np.testing.assert_allclose(scene.cube(0), 0.5)
+@pytest.mark.parametrize(("option", "value"), [(None, 0.25), (2000.0, 0.5)])
+def test_integers_are_divided_by_the_scale_of_the_scene_unless_an_option_says_another(
+    tmp_path: Path, option, value
+):
+    scene = load_scene(_with_scale(tmp_path, 4000), SceneOptions(value_scale=option))
+    assert scene.options.value_scale == (option or 4000)
+    np.testing.assert_allclose(scene.cube(0), value)
 
 
 @pytest.mark.parametrize("scale", [0, -1, "65535", 1e40])

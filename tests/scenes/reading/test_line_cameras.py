@@ -28,12 +28,8 @@ def test_a_pose_a_row_and_key_poses_of_the_same_path_are_one_camera(folder, line
     for index in range(6):
         matrices = [matrix.tolist() for matrix in row_poses(ring_poses(6)[index])]
         ends = [{"row": row, "transform_matrix": matrices[row]} for row in (0, HEIGHT - 1)]
-        given = (
-            {"key_poses": None, "row_poses": matrices}
-            if index % 2
-            else {"row_poses": None, "key_poses": ends}
-        )
-        folder.edit(set_frame(index, **given))
+        rows, keys = (matrices, None) if index % 2 else (None, ends)
+        folder.edit(set_frame(index, row_poses=rows, key_poses=keys))
     found = load_scene(folder.root)
     for index in range(6):
         mine, theirs = lines.cameras.image_rays(index), found.cameras.image_rays(index)
@@ -101,7 +97,7 @@ def test_poses_that_do_not_fit_the_rows_are_one_error(folder):
         (lambda keys: {"key_poses": [keys[0], 7]}, "expected an object with 'row'"),
         (
             lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]},
-            "has the row \"x\"; expected an object with 'row' (a number)",
+            'has the row "x"; expected an object',
         ),
         (lambda keys: {"key_poses": [keys[0], {"row": 15}]}, "'transform_matrix' is absent"),
         (lambda keys: {"key_poses": turned(keys, 1)}, "turns by 180 degrees from row 0 to row 15"),

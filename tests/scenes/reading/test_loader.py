@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from PIL import Image
 
 from tests.scenes.scene_factory import (
@@ -32,32 +33,37 @@ def test_every_part_of_a_scene_is_what_was_written(tmp_path):
     folder = make_scene(tmp_path / "scene")
     scene = load_scene(folder.root)
     assert scene.wavelengths_nm.tolist() == list(WAVELENGTHS)
-    assert scene.train_indices == (1, 2, 3, 4, 5)
-    assert scene.eval_indices == (0,)
-    assert scene.material_names == ("leaf", "clay")
+    assert (scene.train_indices, scene.eval_indices) == ((1, 2, 3, 4, 5), (0,))
     assert (scene.has_alpha, scene.has_labels, scene.has_abundances) == (True, True, True)
     assert [frame.name for frame in scene.frames] == [f"view_{i}" for i in range(6)]
-    stored = np.load(folder.root / "cubes/view_3.npy")
-    cube = scene.cube(3)
+    stored, cube = np.load(folder.root / "cubes/view_3.npy"), scene.cube(3)
     assert cube.dtype == np.float32
     assert np.array_equal(cube, stored.astype(np.float32))
     pixels = np.asarray(Image.open(folder.root / "images/view_3.png"))
-    alpha, srgb, labels, abundances = scene.alpha(3), scene.srgb(3), scene.labels(3), scene.abundances(3)
-    assert alpha is not None
-    assert srgb is not None
-    assert labels is not None
-    assert abundances is not None
-    np.testing.assert_allclose(alpha, pixels[..., 3] / 255.0, atol=1e-7)
-    np.testing.assert_allclose(srgb, pixels[..., :3] / 255.0, atol=1e-7)
-    assert np.array_equal(labels, np.asarray(Image.open(folder.root / "labels/view_3.png")))
-    assert np.array_equal(abundances, np.load(folder.root / "abundances/view_3.npy").astype(np.float32))
+    for found, expected in (
+        (scene.alpha(3), pixels[..., 3] / 255.0),
+        (scene.srgb(3), pixels[..., :3] / 255.0),
+        (scene.labels(3), np.asarray(Image.open(folder.root / "labels/view_3.png"))),
+        (scene.abundances(3), np.load(folder.root / "abundances/view_3.npy")),
+    ):
+        assert found is not None
+        np.testing.assert_allclose(found, expected, atol=1e-7)
     assert scene.valid_mask(3).all()
+    summary = json.loads(json.dumps(scene.summary(), allow_nan=False))
+    assert summary["train_indices"] == list(scene.train_indices)
+    assert summary["wavelengths_nm"] == list(WAVELENGTHS)
+    assert summary["input_hashes"] == scene.input_hashes
+    assert summary["normalisation"]["scale"] == scene.normalisation.scale
+    assert summary["options"]["invalid_pixels"] == "refuse"
 
 
-def test_light_and_endmembers_come_at_the_scenes_bands(tmp_path):
-    scene = load_scene(make_scene(tmp_path / "scene").root)
-    assert scene.endmembers is not None
-    np.testing.assert_allclose(scene.endmembers, [[0.1, 0.3, 0.1, 0.1], SPECTRUM.tolist()], atol=1e-7)
+def test_endmembers_come_at_the_scenes_bands_by_the_names_of_materials(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    scene, expected = load_scene(folder.root), np.array([[0.1, 0.3, 0.1, 0.1], SPECTRUM.tolist()])
+    assert scene.material_names == ("leaf", "clay")
+    np.testing.assert_allclose(scene.endmembers, expected, atol=1e-7)
+    swapped = load_scene(folder.edit(lambda c: c.update(materials=["clay", "leaf"])).root)
+    np.testing.assert_allclose(swapped.endmembers, expected[::-1], atol=1e-7)
 
 
 def test_lines_of_a_lamp_between_bands_count_in_the_light_of_a_scene_as_in_a_light_to_show_it_in(tmp_path):
@@ -69,16 +75,6 @@ def test_lines_of_a_lamp_between_bands_count_in_the_light_of_a_scene_as_in_a_lig
     # 560 nm is where the intervals of the bands at 520 and 600 nm meet, which are 75 and 80 nm wide: each has half of a
     # triangle of 100 nm over 1.
     np.testing.assert_allclose(light, np.array([1, 1 + 50 / 75, 1 + 50 / 80, 1]) / (1 + 50 / 75))
-
-
-def test_endmember_columns_follow_the_materials_by_name(tmp_path):
-    folder = make_scene(tmp_path / "scene")
-    straight = load_scene(folder.root).endmembers
-    folder.edit(lambda c: c.update(materials=["clay", "leaf"]))
-    swapped = load_scene(folder.root).endmembers
-    assert straight is not None
-    assert swapped is not None
-    assert np.array_equal(swapped, straight[::-1])
 
 
 def test_cameras_see_the_same_pixels_before_and_after_normalisation(tmp_path):
@@ -101,47 +97,42 @@ def test_normalisation_to_world_undoes_to_model_and_survives_json(tmp_path):
     assert np.array_equal(again.to_model(points), normalisation.to_model(points))
 
 
-@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8"])
-def test_cubes_of_every_float_type_and_byte_order_read_alike(tmp_path, dtype):
+@pytest.mark.parametrize(
+    ("dtype", "scale"),
+    [
+        *((dtype, None) for dtype in ("<f2", "<f4", ">f4", "<f8", "fortran")),
+        *(("u1", 255.0), ("<u2", 65535.0), ("<i2", 10000.0), ("<i4", 10000.0)),
+    ],
+)
+def test_cubes_of_every_type_and_byte_order_read_alike(tmp_path, dtype, scale):
     folder = make_scene(tmp_path / "scene")
     expected = load_scene(folder.root).cube(1)
-    folder.edit_cubes(lambda cube: cube.astype(dtype))
-    assert np.array_equal(load_scene(folder.root).cube(1), expected)
+
+    def change(cube):
+        if dtype == "fortran":
+            return np.asfortranarray(cube)
+        return (
+            cube.astype(dtype) if scale is None else np.round(cube.astype(np.float64) * scale).astype(dtype)
+        )
+
+    found = load_scene(folder.edit_cubes(change).root, SceneOptions(value_scale=scale)).cube(1)
+    np.testing.assert_allclose(found, expected, atol=0.0 if scale is None else 0.5 / scale + 1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(("dtype", "scale"), [("u1", 255), ("<u2", 65535), ("<i2", 10000), ("<i4", 10000)])
-def test_integer_cubes_are_divided_by_the_value_scale(tmp_path, dtype, scale):
-    folder = make_scene(tmp_path / "scene")
-    expected = load_scene(folder.root).cube(1)
-    folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * scale).astype(dtype))
-    scene = load_scene(folder.root, SceneOptions(value_scale=float(scale)))
-    np.testing.assert_allclose(scene.cube(1), expected, atol=0.5 / scale + 1e-6)
-
-
-def test_a_cube_in_fortran_order_reads_like_any_other(tmp_path):
-    folder = make_scene(tmp_path / "scene")
-    expected = load_scene(folder.root).cube(1)
-    folder.edit_cubes(np.asfortranarray)
-    assert np.array_equal(load_scene(folder.root).cube(1), expected)
-
-
-def test_few_highlights_above_one_are_clipped_like_a_saturated_sensor(tmp_path):
-    folder = make_scene(tmp_path / "scene").edit_cube(1, lambda cube: cube.__setitem__((8, 10, 0), 3.0))
-    assert load_scene(folder.root).cube(1)[8, 10, 0] == 1.0
-
-
-def test_invalid_pixels_are_masked_out_and_zero_when_asked_to(tmp_path):
+def test_few_highlights_above_one_are_clipped_and_invalid_pixels_masked_and_zero_when_asked_to(tmp_path):
     def spoil(cube):
         cube[2, 3, 1] = np.nan
         cube[4, 5, 0] = -0.5
         cube[6, 7, 3] = np.inf
+        cube[8, 10, 0] = 3.0
 
-    folder = make_scene(tmp_path / "scene").edit_cube(2, spoil)
-    scene = load_scene(folder.root, SceneOptions(invalid_pixels="mask"))
-    invalid = np.argwhere(~scene.valid_mask(2)).tolist()
-    assert invalid == [[2, 3], [4, 5], [6, 7]]
+    scene = load_scene(
+        make_scene(tmp_path / "scene").edit_cube(2, spoil).root, SceneOptions(invalid_pixels="mask")
+    )
+    assert np.argwhere(~scene.valid_mask(2)).tolist() == [[2, 3], [4, 5], [6, 7]]
     assert np.isfinite(scene.cube(2)).all()
     assert not scene.cube(2)[2, 3].any()
+    assert scene.cube(2)[8, 10, 0] == 1.0
     assert scene.valid_mask(1).all()
 
 
@@ -202,11 +193,11 @@ def test_paths_of_other_systems_are_followed(tmp_path, renamed):
             content[key] = [renamed(path) for path in content[key]]
 
     scene = load_scene(folder.edit(rename).root)
-    assert [frame.cube_path for frame in scene.frames] == [frame.cube_path for frame in plain.frames]
-    assert [frame.label_path for frame in scene.frames] == [frame.label_path for frame in plain.frames]
+    for found, frame in zip(scene.frames, plain.frames, strict=True):
+        assert (found.cube_path, found.label_path) == (frame.cube_path, frame.label_path)
 
 
-def test_a_mask_of_another_machine_is_not_looked_for_by_its_bare_name(tmp_path):
+def test_a_file_of_another_machine_is_not_looked_for_by_its_bare_name_where_more_is_asked(tmp_path):
     (tmp_path / "a.png").write_bytes(b"a picture")
     assert find_named(tmp_path, "/home/someone/masks/a.png") == tmp_path / "a.png"
     assert find_named(tmp_path, "/home/someone/masks/a.png", least_parts=2) is None
@@ -214,22 +205,15 @@ def test_a_mask_of_another_machine_is_not_looked_for_by_its_bare_name(tmp_path):
     assert find_named(tmp_path / "inside", "../a.png") is None
 
 
-def test_black_pixels_of_a_mask_do_not_count(tmp_path):
+def test_black_pixels_of_a_mask_do_not_count_and_opaque_pictures_are_no_alpha(tmp_path):
     folder = make_scene(tmp_path / "scene", alpha=False)
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:3] = 0
     Image.fromarray(mask).save(folder.root / "mask.png")
-    folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
-    scene = load_scene(folder.root)
-    assert not scene.valid_mask(1)[:3].any()
-    assert scene.valid_mask(1)[3:].all()
-    assert scene.alpha(1) is None
-
-
-def test_pictures_that_are_opaque_everywhere_are_no_alpha(tmp_path):
-    scene = load_scene(make_scene(tmp_path / "scene", alpha=False).root)
+    scene = load_scene(folder.edit(set_frame(1, mask_path="mask.png")).root)
+    np.testing.assert_array_equal(scene.valid_mask(1), mask > 0)
     assert not scene.has_alpha
-    assert scene.alpha(0) is None
+    assert scene.alpha(1) is None
 
 
 def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):
@@ -241,44 +225,50 @@ def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):
                 del frame[key]
 
     scene = load_scene(make_scene(tmp_path / "scene").edit(bare).root)
-    assert scene.srgb(0) is None
-    assert scene.labels(0) is None
-    assert scene.abundances(0) is None
-    assert scene.material_names is None
-    assert scene.illuminant is None
+    absent = (scene.srgb(0), scene.labels(0), scene.abundances(0), scene.material_names, scene.illuminant)
+    assert absent == (None,) * 5
     assert (scene.has_alpha, scene.has_labels, scene.has_abundances) == (False, False, False)
 
 
-def test_size_may_be_left_to_the_cubes_and_the_lens_to_an_angle(tmp_path):
-    def use_angle(content):
-        for key in ("w", "h", "fl_x", "fl_y", "cx", "cy"):
+LENS = {"focal": [FOCAL, FOCAL], "center": [WIDTH / 2, HEIGHT / 2], "distortion": [0, 0, 0, 0]}
+ANGLE = 2 * np.arctan(0.5 * WIDTH / 33.0)
+MATRIX = [[34.0, 0, 9.5], [0, 34.0, 8.5], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("keys", "of_frame", "expected", "others"),
+    [
+        ({"camera_angle_x": ANGLE}, {}, {"focal": [33.0, 33.0]}, None),  # without any other key of a lens
+        ({}, {"fl_x": 33.0, "cx": 9.5}, {"focal": [33.0, FOCAL], "center": [9.5, HEIGHT / 2]}, {}),
+        ({}, {"k1": 0.01}, {"distortion": [0.01, 0, 0, 0]}, {}),
+        ({}, {"camera_angle_x": ANGLE}, {"focal": [33.0, 33.0]}, {}),
+        ({}, {"intrinsic_matrix": MATRIX}, {"focal": [34.0, 34.0], "center": [9.5, 8.5]}, {}),
+        ({"distortion_params": [0.1, 0.2, 0, 0, 0.3, 0.4]}, {}, {"distortion": [0.1, 0.2, 0.3, 0.4]}, None),
+        (
+            {},
+            {"k1": 0.1, "k3": 0.02, "k4": 0.03},
+            {"distortion": [0.1, 0, 0, 0, 0.02, 0.03]},
+            {"distortion": [0] * 6},
+        ),
+    ],
+)
+def test_a_frames_own_lens_goes_before_that_of_the_scene_and_sizes_may_be_left_to_the_cubes(
+    tmp_path, keys, of_frame, expected, others
+):
+    """`others`: what other frames have in place of the lens of the scene; None where it is theirs, too."""
+
+    def change(content):
+        for key in ("w", "h", *(("fl_x", "fl_y", "cx", "cy") if "camera_angle_x" in keys else ())):
             del content[key]
-        content["camera_angle_x"] = 2 * np.arctan(0.5 * WIDTH / FOCAL)
+        content.update(keys)
+        content["frames"][4].update(of_frame)
 
-    cameras = load_scene(make_scene(tmp_path / "scene").edit(use_angle).root).cameras
+    cameras = load_scene(make_scene(tmp_path / "scene").edit(change).root).cameras
     assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
-    np.testing.assert_allclose(cameras.focal_px.numpy(), FOCAL, rtol=1e-6)
-    np.testing.assert_allclose(cameras.center_px.numpy(), [[WIDTH / 2, HEIGHT / 2]] * 6)
-
-
-def test_a_frames_own_lens_goes_before_that_of_the_scene(tmp_path):
-    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][4].update(fl_x=33.0, cx=9.5, k1=0.01))
-    cameras = load_scene(folder.root).cameras
-    assert cameras.focal_px[4].tolist() == [33.0, FOCAL]
-    assert cameras.center_px[4].tolist() == [9.5, HEIGHT / 2]
-    np.testing.assert_allclose(cameras.distortion[4].numpy(), [0.01, 0, 0, 0], atol=1e-9)
-    assert cameras.focal_px[3].tolist() == [FOCAL, FOCAL]
-
-
-def test_the_angle_of_a_frame_goes_before_the_focal_length_of_the_scene(tmp_path):
-    angle = 2 * np.arctan(0.5 * WIDTH / 33.0)
-    matrix = [[34.0, 0, 9.5], [0, 34.0, 8.5], [0, 0, 1]]
-    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][4].update(camera_angle_x=angle))
-    cameras = load_scene(folder.edit(lambda c: c["frames"][3].update(intrinsic_matrix=matrix)).root).cameras
-    np.testing.assert_allclose(
-        cameras.focal_px[2:5].numpy(), [[FOCAL] * 2, [34.0] * 2, [33.0] * 2], rtol=1e-6
-    )
-    assert cameras.center_px[3].tolist() == [9.5, 8.5]
+    for frame, lens in ((4, LENS | expected), (3, LENS | (expected if others is None else others))):
+        assert_allclose(cameras.focal_px[frame].numpy(), lens["focal"], rtol=1e-6)
+        assert_allclose(cameras.center_px[frame].numpy(), lens["center"], rtol=1e-6)
+        assert_allclose(cameras.distortion[frame].numpy(), lens["distortion"], rtol=1e-6)
 
 
 def test_keys_that_are_not_followed_or_not_known_are_said(tmp_path):
@@ -290,29 +280,13 @@ def test_keys_that_are_not_followed_or_not_known_are_said(tmp_path):
     assert unknown == "transforms.json: keys that are not known and not used: mask_file"
 
 
-def test_distortion_params_are_read_in_nerfstudios_order(tmp_path):
-    folder = make_scene(tmp_path / "scene").edit(
-        lambda c: c.update(distortion_params=[0.1, 0.2, 0, 0, 0.3, 0.4])
-    )
-    np.testing.assert_allclose(
-        load_scene(folder.root).cameras.distortion[0].numpy(), [0.1, 0.2, 0.3, 0.4], rtol=1e-6
-    )
-
-
-def test_higher_radial_terms_of_one_frame_give_all_frames_six_coefficients(tmp_path):
-    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][1].update(k1=0.1, k3=0.02, k4=0.03))
-    found = load_scene(folder.root).cameras.distortion
-    np.testing.assert_allclose(found[1].numpy(), [0.1, 0, 0, 0, 0.02, 0.03], rtol=1e-6)
-    assert found.shape[1] == 6
-    assert not found[0].any()
-
-
 def test_poses_of_three_rows_read_like_those_of_four(tmp_path):
     folder = make_scene(tmp_path / "scene")
     expected = load_scene(folder.root).cameras.camera_to_world
-    folder.edit(
-        lambda c: [frame.update(transform_matrix=frame["transform_matrix"][:3]) for frame in c["frames"]]
-    )
+    for index in range(6):
+        folder.edit(
+            set_frame(index, transform_matrix=folder.content["frames"][index]["transform_matrix"][:3])
+        )
     assert torch.equal(load_scene(folder.root).cameras.camera_to_world, expected)
 
 
@@ -349,16 +323,6 @@ def test_every_file_read_has_its_hash_and_a_changed_file_another(tmp_path):
     folder.edit_cube(1, lambda cube: cube * np.float16(0.5))
     after = load_scene(folder.root).input_hashes
     assert {path for path in before if before[path] != after[path]} == {"cubes/view_1.npy"}
-
-
-def test_the_summary_is_json_and_holds_what_a_run_must_know(tmp_path):
-    scene = load_scene(make_scene(tmp_path / "scene").root)
-    summary = json.loads(json.dumps(scene.summary(), allow_nan=False))
-    assert summary["train_indices"] == list(scene.train_indices)
-    assert summary["wavelengths_nm"] == list(WAVELENGTHS)
-    assert summary["input_hashes"] == scene.input_hashes
-    assert summary["normalisation"]["scale"] == scene.normalisation.scale
-    assert summary["options"]["invalid_pixels"] == "refuse"
 
 
 def test_links_out_of_the_folder_are_followed_when_allowed(tmp_path):

@@ -15,18 +15,21 @@ from unmix_plugin.spectral.sensor import SceneSensor
 def test_frames_have_the_size_and_bands_of_their_sensor(tmp_path):
     scene = load_scene(make_rig(tmp_path / "rig").root)
     assert scene.is_rig
+    assert "colours.csv" in scene.input_hashes
     assert [frame.sensor for frame in scene.frames] == [0, 0, 0, 1, 1, 2]
     assert [sensor.name for sensor in scene.sensors] == ["4-bands-20x16", "small", "2-bands-20x16"]
     assert [sensor.bands for sensor in scene.sensors] == [(0, 1, 2, 3), (2, 0), None]
-    assert [scene.cube(index).shape for index in (0, 3, 5)] == [(16, 20, 4), (8, 10, 2), (16, 20, 2)]
-    for index in (0, 3, 5):
-        alpha, labels, abundances = scene.alpha(index), scene.labels(index), scene.abundances(index)
-        assert alpha is not None
-        assert labels is not None
-        assert abundances is not None
-        assert alpha.shape == labels.shape == abundances.shape[:2] == scene.valid_mask(index).shape
-        assert alpha.shape == scene.cube(index).shape[:2]
-    assert [scene.cameras.size(index) for index in (0, 3)] == [(20, 16), (10, 8)]
+    for index, shape in ((0, (16, 20, 4)), (3, (8, 10, 2)), (5, (16, 20, 2))):
+        assert scene.cube(index).shape == shape
+        for own in (
+            scene.alpha(index),
+            scene.labels(index),
+            scene.abundances(index),
+            scene.valid_mask(index),
+        ):
+            assert own is not None
+            assert own.shape[:2] == shape[:2]
+        assert scene.cameras.size(index) == shape[1::-1]
 
 
 def test_channels_of_responses_are_weighted_means_in_the_order_of_the_columns(tmp_path):
@@ -38,14 +41,11 @@ def test_channels_of_responses_are_weighted_means_in_the_order_of_the_columns(tm
     assert red[3] == blue[3] == 0 < blue[0]
 
 
-def test_one_ordinary_camera_is_no_rig_and_leaves_no_trace_in_records(tmp_path):
-    scene = load_scene(make_scene(tmp_path / "scene").root)
+def test_frames_of_two_sizes_and_equal_bands_are_two_sensors_and_those_of_one_no_rig(tmp_path):
+    folder = make_scene(tmp_path / "scene")
+    scene = load_scene(folder.root)
     assert not scene.is_rig
     assert not {"sensors", "frame_sensors"} & scene.summary().keys()
-
-
-def test_frames_of_two_sizes_and_equal_bands_are_two_sensors(tmp_path):
-    folder = make_scene(tmp_path / "scene")
     halve(folder, 2)
     scene = load_scene(folder.root)
     assert [frame.sensor for frame in scene.frames] == [0, 0, 1, 0, 0, 0]
@@ -71,11 +71,6 @@ def test_a_record_of_a_rig_keeps_its_sensors_and_other_bands_are_another_scene(t
     for index in (3, 4):
         folder.edit(set_frame(index, bands=[0, 2]))
     assert scene_identity(load_scene(folder.root).summary()) != scene_identity(first)
-
-
-def test_responses_are_among_the_files_that_make_a_scene_the_same(tmp_path):
-    folder = make_rig(tmp_path / "rig")
-    assert "colours.csv" in load_scene(folder.root).input_hashes
 
 
 @pytest.mark.parametrize(

@@ -35,45 +35,26 @@ def split_of(
     return split
 
 
-def test_lists_go_before_names_and_order():
-    names = ["train_0.png", "train_1.png", "test_2.png"]
-    split = split_of(names, train=["test_2.png"], test=["train_0.png"])
-    assert split == Split((2,), (0,))
-
-
-def test_the_test_list_goes_before_the_validation_list():
-    assert split_of(["a", "b", "c"], train=["a"], val=["b"], test=["c"]) == Split((0,), (2,))
-    assert split_of(["a", "b", "c"], train=["a"], val=["b"]) == Split((0,), (1,))
-    assert split_of(["a", "b", "c"], train=["a"], val=["b"], test=[]) == Split((0,), (1,))
-
-
-def test_a_list_that_is_absent_is_what_the_others_leave():
-    assert split_of(["a", "b", "c", "d"], train=["a", "c"]) == Split((0, 2), (1, 3))
-    assert split_of(["a", "b", "c", "d"], val=["b"], test=["c"]) == Split((0, 3), (2,))
-
-
-def test_lists_may_spell_a_path_in_another_way():
-    assert split_of(
-        ["./images/a.png", "images/b.png"], train=["images/a.png"], test=["images/./b.png"]
-    ).train == (0,)
-
-
 @pytest.mark.parametrize(
-    "names",
+    ("names", "lists", "expected"),
     [
-        ["train/r_0.png", "train/r_1.png", "test/r_0.png"],
-        ["images/train_0.png", "images/train_1.png", "images/eval_2.png"],
-        ["images/train-0.png", "images/training1.png", "images/val2.png"],
-        ["a/b/Train/0.png", "a/b/Train/1.png", "a/b/Test/2.png"],
+        (["train_0", "train_1", "test_2"], {"train": ["test_2"], "test": ["train_0"]}, Split((2,), (0,))),
+        ("abc", {"train": ["a"], "val": ["b"], "test": ["c"]}, Split((0,), (2,))),
+        ("abc", {"train": ["a"], "val": ["b"]}, Split((0,), (1,))),
+        ("abc", {"train": ["a"], "val": ["b"], "test": []}, Split((0,), (1,))),
+        ("abcd", {"train": ["a", "c"]}, Split((0, 2), (1, 3))),  # the others are left
+        ("abcd", {"val": ["b"], "test": ["c"]}, Split((0, 3), (2,))),
+        (["./x/a", "x/b"], {"train": ["x/a"], "test": ["x/./b"]}, Split((0,), (1,))),
+        (["train_0", "val_1", "eval_2", "test_3"], {}, Split((0,), (3,))),
+        (["train_0", "val_1", "eval_2"], {}, Split((0,), (1, 2))),
+        (["train/r_0.png", "train/r_1.png", "test/r_0.png"], {}, Split((0, 1), (2,))),
+        (["images/train_0.png", "images/train_1.png", "images/eval_2.png"], {}, Split((0, 1), (2,))),
+        (["images/train-0.png", "images/training1.png", "images/val2.png"], {}, Split((0, 1), (2,))),
+        (["a/b/Train/0.png", "a/b/Train/1.png", "a/b/Test/2.png"], {}, Split((0, 1), (2,))),
     ],
 )
-def test_folders_and_file_names_tell_the_split(names):
-    assert split_of(names) == Split((0, 1), (2,))
-
-
-def test_test_frames_go_before_validation_frames_by_name_too():
-    assert split_of(["train_0", "val_1", "eval_2", "test_3"]) == Split((0,), (3,))
-    assert split_of(["train_0", "val_1", "eval_2"]) == Split((0,), (1, 2))
+def test_lists_go_before_names_of_folders_and_files_and_tests_before_validation(names, lists, expected):
+    assert split_of(list(names), **lists) == expected
 
 
 def test_words_that_only_begin_like_a_split_are_no_split():
@@ -89,15 +70,16 @@ def test_every_nth_frame_evaluates_and_no_frame_is_lost_or_used_twice(count, int
     assert split.evaluation == tuple(range(0, count, interval))
 
 
-@pytest.mark.parametrize("interval", [1, 0, -3])
-def test_an_interval_that_leaves_nothing_to_train_on_is_refused(interval):
-    with pytest.raises(SceneError, match="--eval-interval: is"):
-        split_of(["a", "b"], method="interval", interval=interval)
-
-
-def test_lists_that_are_asked_for_must_be_there():
-    with pytest.raises(SceneError, match="--eval-split lists needs them"):
-        split_of(["a", "b"], method="lists")
+@pytest.mark.parametrize(
+    ("method", "interval", "message"),
+    [
+        *(("interval", interval, "--eval-interval: is") for interval in (1, 0, -3)),
+        ("lists", 8, "--eval-split lists needs them"),
+    ],
+)
+def test_a_split_that_can_not_be_made_is_refused(method, interval, message):
+    with pytest.raises(SceneError, match=message):
+        split_of(["a", "b"], method=method, interval=interval)
 
 
 def test_the_options_choose_the_split_of_a_scene(tmp_path):

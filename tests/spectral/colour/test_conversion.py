@@ -1,6 +1,7 @@
 """Lights by name and from files: their values, what a band sees of them, and what is refused."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,13 +70,14 @@ def test_linear_rgb_is_the_published_srgb_matrix_up_to_the_white_of_each_channel
     assert_close(rgb_matrix(bands, torch.float64), raw / raw.sum(0))
 
 
-@given(visible)
-def test_flat_spectrum_is_white_with_unit_luminance_on_any_visible_sampling(bands):
-    if colour_mode(bands) == "false-colour":
-        return
-    white = torch.ones(len(bands), dtype=torch.float64) @ rgb_matrix(bands, torch.float64)
+@given(visible | anywhere)
+def test_flat_spectrum_is_white_with_unit_luminance_on_any_sampling_false_colour_too(bands):
+    matrix = rgb_matrix(bands, torch.float64)
+    white = torch.ones(len(bands), dtype=torch.float64) @ matrix
     assert_close(white, torch.ones(3, dtype=torch.float64))
     assert_close(luminance(white), torch.tensor(1.0, dtype=torch.float64))
+    if colour_mode(bands) == "false-colour":
+        assert float(matrix.min()) >= 0
 
 
 @pytest.mark.parametrize(
@@ -97,23 +99,6 @@ def test_a_band_weighs_what_the_fine_bands_inside_its_interval_weigh_together():
     edges = [400, 460, 520, 556, 571, 589]
     sums = torch.stack([fine[low - 360 : high - 360].sum(0) for low, high in pairwise(edges)])
     assert_close(coarse, sums / sums[:, 1].sum())
-
-
-def test_spectra_look_like_their_names():
-    bands = Bands.of(range(400, 701, 10))
-    nm = torch.tensor(bands.centers_nm)
-    for low, high, channel in ((600, 700, 0), (500, 570, 1), (400, 480, 2)):
-        rgb = ((nm >= low) & (nm <= high)).double() @ rgb_matrix(bands, torch.float64)
-        assert int(rgb.argmax()) == channel
-        assert rgb[channel] > 2 * rgb.sort().values[1]
-
-
-@given(anywhere)
-def test_flat_spectrum_is_white_on_every_sampling_false_colour_too(bands):
-    matrix = rgb_matrix(bands, torch.float64)
-    assert_close(matrix.sum(0), torch.ones(3, dtype=torch.float64))
-    if colour_mode(bands) == "false-colour":
-        assert float(matrix.min()) >= 0
 
 
 @pytest.mark.parametrize(
@@ -138,26 +123,13 @@ def test_true_colour_needs_bands_in_blue_green_and_red(centers, mode):
     assert describe_colour(bands).startswith(mode.replace("-", " "))
 
 
-def test_false_colour_shows_the_longest_third_red_and_the_shortest_blue():
-    matrix = rgb_matrix(Bands.of([800, 850, 900, 950, 1000, 1050]), torch.float64)
-    half = 0.5
+def test_false_colour_shows_the_longest_third_red_and_the_shortest_blue_and_says_so():
+    bands, half = Bands.of([800, 850, 900, 950, 1000, 1050]), 0.5
     expected = torch.tensor([[0, 0, half]] * 2 + [[0, half, 0]] * 2 + [[half, 0, 0]] * 2, dtype=torch.float64)
-    assert_close(matrix, expected)
-
-
-def test_false_colour_of_one_band_is_grey():
+    assert_close(rgb_matrix(bands, torch.float64), expected)
+    said = "false colour: red 975-1075 nm, green 875-975 nm, blue 775-875 nm"
+    assert describe_colour(bands) == said
     assert_close(rgb_matrix(Bands.of([900])), torch.ones(1, 3))
-
-
-def test_false_colour_says_its_ranges():
-    assert describe_colour(Bands.of([800, 850, 900, 950, 1000, 1050])) == (
-        "false colour: red 975-1075 nm, green 875-975 nm, blue 775-875 nm"
-    )
-
-
-def test_xyz_without_visible_light_is_refused():
-    with pytest.raises(SpectrumError, match=r"3 bands, 900-1100 nm hold no visible light"):
-        xyz_matrix(Bands.of([900, 1000, 1100]))
 
 
 def test_band_composite_picks_the_nearest_band_of_each_channel():
@@ -166,11 +138,20 @@ def test_band_composite_picks_the_nearest_band_of_each_channel():
     assert picked.tolist() == [30.0, 15.0, 0.0]
 
 
-def test_band_composite_refuses_what_the_sensor_does_not_see():
-    with pytest.raises(SpectrumError, match="no band at 860 nm"):
-        band_composite_matrix(Bands.of([400, 500, 600]), (860, 500, 400))
-    with pytest.raises(SpectrumError, match=r"three wavelengths .* found 2"):
-        band_composite_matrix(Bands.of([400, 500, 600]), (500, 400))
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda bands: band_composite_matrix(bands, (860, 500, 400)), "no band at 860 nm"),
+        (lambda bands: band_composite_matrix(bands, (500, 400)), "three wavelengths .* found 2"),
+        (lambda _: xyz_matrix(Bands.of([900, 1000, 1100])), "3 bands, 900-1100 nm hold no visible light"),
+        (lambda _: parse_light("D66"), "there is no light 'D66'; nearest: D65"),
+        (lambda _: parse_light(""), "known are, among others, A, D50"),
+        (lambda _: parse_light("lamp.txt"), r"or give a \.csv file"),
+    ],
+)
+def test_what_a_sensor_does_not_see_or_nobody_knows_is_refused(ask, message):
+    with pytest.raises(SpectrumError, match=message):
+        ask(Bands.of([400, 500, 600]))
 
 
 @given(st.floats(-0.5, 2))
@@ -228,19 +209,31 @@ def test_the_incandescent_light_is_its_black_body_within_the_table_and_beyond():
     assert power[7] / power[1] == pytest.approx(planck[1] / planck[0], rel=1e-3)
 
 
-def test_a_line_counts_in_its_band_wherever_it_lies_between_centres(tmp_path):
-    path = tmp_path / "line.csv"
-    path.write_text("wavelength,power\n380,0\n434,0\n435,1\n436,0\n720,0\n")
-    power = illuminant_power(path, VISIBLE)
-    np.testing.assert_allclose(power[VISIBLE.centers_nm == 430], 1.0)
-    np.testing.assert_allclose(power[VISIBLE.centers_nm == 440], 1.0)
-    assert power.sum() == pytest.approx(2)
+@pytest.mark.parametrize(
+    ("rows", "bands", "expected"),
+    [
+        # A line counts in its band wherever it lies between centres.
+        ("380,0\n434,0\n435,1\n436,0\n720,0", [410, 420, 430, 440, 450], [0, 0, 1, 1, 0]),
+        # A light that is given at the bands is taken as it is.
+        ("450,1\n500,10\n550,2", [450, 500, 550], [0.1, 1.0, 0.2]),
+    ],
+)
+def test_a_light_from_a_file_is_what_bands_see_of_it(tmp_path, rows, bands, expected):
+    (tmp_path / "lamp.csv").write_text(f"wavelength,power\n{rows}\n")
+    np.testing.assert_allclose(illuminant_power(tmp_path / "lamp.csv", Bands.of(bands)), expected)
 
 
-def test_a_light_that_is_given_at_the_bands_is_taken_as_it_is(tmp_path):
-    path = tmp_path / "lines.csv"
-    path.write_text("wavelength,power\n450,1\n500,10\n550,2\n")
-    np.testing.assert_allclose(illuminant_power(path, Bands.of([450, 500, 550])), [0.1, 1.0, 0.2])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("wavelength,a,b\n300,1,1\n800,1,1\n", "a light has two columns, wavelength and power; found 3"),
+        ("wavelength,power\n300,0\n800,0\n", "has no power in any of 31 bands"),
+    ],
+)
+def test_a_file_must_hold_one_light_that_shines(tmp_path, text, message):
+    (tmp_path / "lamp.csv").write_text(text)
+    with pytest.raises(SpectrumError, match=message):
+        illuminant_power(tmp_path / "lamp.csv", VISIBLE)
 
 
 @pytest.mark.parametrize("name", ["D50", "FL2"])
@@ -270,27 +263,17 @@ def test_a_light_linear_in_wavelength_is_sampled_at_band_centres(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("word", "light"), [("a", "A"), (" d65 ", "D65"), ("fl2", "FL2"), ("60 A/W (Soft White)", None)]
-)
-def test_lights_are_named_in_any_case(word, light):
-    assert parse_light(word) == (light or word)
-
-
-def test_what_ends_in_csv_is_a_file(tmp_path):
-    assert parse_light(f"{tmp_path}/A.CSV") == tmp_path / "A.CSV"
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
+    ("word", "light"),
     [
-        ("D66", "there is no light 'D66'; nearest: D65"),
-        ("", "known are, among others, A, D50"),
-        ("lamp.txt", r"or give a \.csv file"),
+        ("a", "A"),
+        (" d65 ", "D65"),
+        ("fl2", "FL2"),
+        ("60 A/W (Soft White)", "60 A/W (Soft White)"),
+        ("lamps/A.CSV", Path("lamps/A.CSV")),
     ],
 )
-def test_an_unknown_light_is_refused_with_the_nearest(word, message):
-    with pytest.raises(SpectrumError, match=message):
-        parse_light(word)
+def test_lights_are_named_in_any_case_and_what_ends_in_csv_is_a_file(word, light):
+    assert parse_light(word) == light
 
 
 def test_a_light_that_does_not_reach_is_refused_by_how_much_and_held_when_asked():
@@ -299,16 +282,6 @@ def test_a_light_that_does_not_reach_is_refused_by_how_much_and_held_when_asked(
         illuminant_power("FL2", beyond)
     held = illuminant_power("FL2", beyond, "hold")
     assert held[-1] == held[-2] > 0
-
-
-def test_a_file_must_hold_one_light_that_shines(tmp_path):
-    path = tmp_path / "lamp.csv"
-    path.write_text("wavelength,a,b\n300,1,1\n800,1,1\n")
-    with pytest.raises(SpectrumError, match="a light has two columns, wavelength and power; found 3"):
-        illuminant_power(path, VISIBLE)
-    path.write_text("wavelength,power\n300,0\n800,0\n")
-    with pytest.raises(SpectrumError, match="has no power in any of 31 bands"):
-        illuminant_power(path, VISIBLE)
 
 
 def test_white_is_as_bright_as_its_luminance_or_without_colours_as_its_mean_radiance():

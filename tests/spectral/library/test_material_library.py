@@ -85,14 +85,17 @@ def test_only_shared_lit_bands_are_compared_and_their_number_is_told():
     assert match.angle_rad == pytest.approx(0, abs=1e-7)
     dark = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0])
     assert small_library().nearest(spectrum[None], bands, dark)[0][0].num_bands == 3
+    four = Bands.of([400, 500, 600, 700])
+    for spectra, own in (  # that hardly overlap, or are black or not finite, resemble nothing
+        (np.ones((1, 9)), Bands.of(np.arange(400, 1300, 100))),
+        (np.ones((1, 2)), Bands.of([500, 600])),
+        (np.zeros((1, 4)), four),
+        (np.array([[0.1, math.nan, 0.2, 0.3]]), four),
+    ):
+        assert small_library().nearest(spectra, own) == [[]]
 
 
-def test_materials_that_hardly_overlap_are_passed_over():
-    assert small_library().nearest(np.ones((1, 9)), Bands.of(np.arange(400, 1300, 100)))[0] == []
-    assert small_library().nearest(np.ones((1, 2)), Bands.of([500, 600]))[0] == []
-
-
-def test_a_comparison_of_absorptions_ignores_the_slope():
+def test_a_comparison_of_absorptions_ignores_the_slope_also_of_materials_that_begin_at_0():
     wavelengths = np.linspace(400, 700, 31)
     dip = 1 - 0.5 * np.exp(-(((wavelengths - 550) / 20) ** 2))
     other = 1 - 0.5 * np.exp(-(((wavelengths - 500) / 20) ** 2))
@@ -104,36 +107,29 @@ def test_a_comparison_of_absorptions_ignores_the_slope():
     spectrum = (slope * dip)[None]
     assert MaterialLibrary(materials).nearest(spectrum, VISIBLE)[0][0].name == "other"
     assert MaterialLibrary(materials).nearest(spectrum, VISIBLE, comparison="continuum")[0][0].name == "dip"
+    edge = LibraryMaterial("edge", VISIBLE, np.linspace(0, 0.8, 31) ** 2, "")
+    half = edge.reflectance[None] / 2
+    [match] = MaterialLibrary((edge,)).nearest(half, VISIBLE, comparison="continuum")[0]
+    assert match.angle_rad == pytest.approx(0, abs=1e-6)
 
 
 def test_a_material_is_found_by_its_full_or_its_short_name_in_any_case():
     library = small_library()
     assert library.find("A/Red").name == "a/red"
     assert library.find(" FLAT ").name == "a/flat"
-    with pytest.raises(SpectrumError, match="'red' may be any of a/red, b/red; give the full name"):
-        library.find("red")
-
-
-def test_absorptions_are_compared_of_materials_that_begin_at_0_too():
-    black_at_400 = LibraryMaterial("edge", VISIBLE, np.linspace(0, 0.8, 31) ** 2, "")
-    spectrum = black_at_400.reflectance[None] / 2
-    [match] = MaterialLibrary((black_at_400,)).nearest(spectrum, VISIBLE, comparison="continuum")[0]
-    assert match.angle_rad == pytest.approx(0, abs=1e-6)
-
-
-def test_of_names_that_differ_in_case_alone_the_exact_one_is_found():
-    flat = [LibraryMaterial(name, VISIBLE, np.ones(31), "") for name in ("Leaf", "leaf", "x/LEAF")]
-    library = MaterialLibrary(tuple(flat))
-    assert [library.find(name).name for name in ("Leaf", "leaf")] == ["Leaf", "leaf"]
-    with pytest.raises(SpectrumError, match="'LEAF' may be any of Leaf, leaf; give the full name"):
-        library.find("LEAF")
-
-
-def test_an_unknown_name_is_answered_with_the_nearest():
-    with pytest.raises(SpectrumError, match="the library has no 'carot'; nearest: memory colours/carrot"):
-        measured_library().find("carot")
-    with pytest.raises(SpectrumError, match="it has 3 materials, among them a/flat"):
-        small_library().find("zzz")
+    flat = tuple(LibraryMaterial(name, VISIBLE, np.ones(31), "") for name in ("Leaf", "leaf", "x/LEAF"))
+    cases = MaterialLibrary(flat)
+    assert [cases.find(name).name for name in ("Leaf", "leaf")] == ["Leaf", "leaf"]
+    for where, name, said in (
+        (library, "red", "'red' may be any of a/red, b/red; give the full name"),
+        (cases, "LEAF", "'LEAF' may be any of Leaf, leaf; give the full name"),
+        (measured_library(), "carot", "the library has no 'carot'; nearest: memory colours/carrot"),
+        (library, "zzz", "it has 3 materials, among them a/flat"),
+    ):
+        with pytest.raises(SpectrumError, match=said):
+            where.find(name)
+    with pytest.raises(SpectrumError, match="different names; found 'Leaf' twice"):
+        MaterialLibrary((flat[0],) * 2)
 
 
 def test_nothing_is_extrapolated_unless_asked_for():
@@ -141,11 +137,6 @@ def test_nothing_is_extrapolated_unless_asked_for():
     with pytest.raises(SpectrumError, match=r"a/red: .* 20 nm below and 20 nm above their range"):
         library.reflectance("a/red", wide)
     np.testing.assert_array_equal(library.reflectance("a/red", wide, beyond="hold"), [0.1, 0.1, 0.9])
-
-
-def test_names_must_differ():
-    with pytest.raises(SpectrumError, match="different names; found 'x' twice"):
-        MaterialLibrary((LibraryMaterial("x", VISIBLE, np.ones(31), ""),) * 2)
 
 
 def test_the_built_in_names_can_be_read_and_no_skin_is_among_them():
@@ -167,12 +158,3 @@ def test_where_a_material_was_not_measured_it_is_neither_compared_nor_made_up():
     with pytest.raises(SpectrumError, match="holed was not measured at 600 nm"):
         library.reflectance("holed", bands)
     np.testing.assert_allclose(library.reflectance("holed", bands, "hold"), [0.1, 0.15, 0.3, 0.45, 0.5])
-
-
-def test_spectra_that_are_black_or_not_finite_resemble_nothing():
-    bands = Bands.of([400, 500, 600, 700])
-    angles, _ = small_library().angles(
-        np.array([[0.0] * 4, [0.1, math.nan, 0.2, 0.3], [1.0, 1, 1, 1]]), bands
-    )
-    assert np.isnan(angles).all(axis=1).tolist() == [True, True, False]
-    assert small_library().nearest(np.zeros((1, 4)), bands) == [[]]

@@ -85,19 +85,6 @@ def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
         read_spectra_csv(written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1"))
 
 
-def test_a_table_must_hold_together():
-    with pytest.raises(
-        SpectrumError, match=r"2 names and 3 bands need spectra of shape \(2, 3\); found \(3, 2\)"
-    ):
-        SpectraTable(SMALL.bands, SMALL.names, SMALL.spectra.T)
-
-
-@given(st.lists(st.floats(0, 1), min_size=3, max_size=3))
-def test_resampling_to_the_same_bands_changes_nothing(values):
-    table = SpectraTable(SMALL.bands, ("a",), np.array([values]))
-    np.testing.assert_array_equal(table.resampled(Bands.of([400, 500, 600])).spectra, table.spectra)
-
-
 @given(
     st.floats(-1, 1), st.lists(st.floats(401, 599), min_size=1, max_size=9, unique_by=lambda x: round(x, 2))
 )
@@ -111,6 +98,13 @@ def test_resampling_is_exact_for_straight_spectra(slope, centers):
 def test_resampling_interpolates_linearly_and_keeps_leading_axes():
     resampled = resample_spectra(SMALL.spectra[None], SMALL.bands, Bands.of([425, 560]))
     np.testing.assert_allclose(resampled, [[[0.2, 0.32], [0.25, 1.9]]])
+    np.testing.assert_array_equal(SMALL.resampled(Bands.of([400, 500, 600])).spectra, SMALL.spectra)
+    ends = SMALL.resampled(Bands.of([400 - 1e-9, 600 + 1e-9]))  # rounding is no extrapolation
+    np.testing.assert_allclose(ends.spectra, [[0.1, 0.2], [0, 2.5]])
+    with pytest.raises(SpectrumError, match="spectra of 2 values do not fit 3 bands"):
+        resample_spectra(np.ones((4, 2)), SMALL.bands, SMALL.bands)
+    with pytest.raises(SpectrumError, match=r"need spectra of shape \(2, 3\); found \(3, 2\)"):
+        SpectraTable(SMALL.bands, SMALL.names, SMALL.spectra.T)
 
 
 @pytest.mark.parametrize(
@@ -124,13 +118,3 @@ def test_resampling_interpolates_linearly_and_keeps_leading_axes():
 def test_extrapolation_is_refused_with_the_distance(centers, message):
     with pytest.raises(SpectrumError, match=message):
         SMALL.resampled(Bands.of(centers))
-
-
-def test_rounding_of_the_ends_is_no_extrapolation():
-    table = SMALL.resampled(Bands.of([400 - 1e-9, 600 + 1e-9]))
-    np.testing.assert_allclose(table.spectra, [[0.1, 0.2], [0, 2.5]])
-
-
-def test_spectra_of_another_length_do_not_fit_their_bands():
-    with pytest.raises(SpectrumError, match="spectra of 2 values do not fit 3 bands"):
-        resample_spectra(np.ones((4, 2)), SMALL.bands, SMALL.bands)

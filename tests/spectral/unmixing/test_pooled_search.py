@@ -9,7 +9,7 @@ from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
 from tests.spectral.unmixing.surface_pixels import surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.pooled_search import _archetypes, _ranked, pooled_search
+from unmix_plugin.spectral.unmixing.pooled_search import _archetypes, pooled_search
 
 
 def angles(found, materials):
@@ -66,19 +66,6 @@ def test_archetypes_are_corners_of_the_pixels_that_make_all_of_them_up():
     runs = _archetypes(pixels.float(), 3, seeded())
     worst = torch.stack([angles(run, materials).max() for run in runs])
     assert float(worst.median()) < 0.1
-
-
-def test_of_sets_that_do_as_well_the_one_that_most_searches_found_is_chosen():
-    seen = normalize(torch.rand(50, 6, dtype=torch.float64, generator=seeded()), dim=1)
-    lonely = normalize(torch.eye(6, dtype=torch.float64)[:3] + 0.1, dim=1)
-    common = [
-        normalize(torch.eye(6, dtype=torch.float64)[3:] + 0.1 + 0.001 * step, dim=1) for step in range(3)
-    ]
-    weights = torch.ones(50, dtype=torch.float64)
-    # The price of pixels explained as well by all: the first two are the same pixels, mirrored.
-    mirrored = torch.cat([seen, seen.flip(1)])
-    ranked = _ranked([lonely, *common], mirrored, torch.cat([weights, weights]))
-    assert float(spectral_angle(ranked[0], common[1]).max()) < 0.01
 
 
 def test_few_shapes_are_searched_in_pairs_and_too_many_endmembers_refused():
