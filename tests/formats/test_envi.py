@@ -44,10 +44,17 @@ def test_another_reader_gets_every_digit_of_the_wavelengths_and_their_unit(tmp_p
     assert bands.band_unit == "Nanometers"
 
 
-def test_a_width_has_no_digits_of_rounding(tmp_path):
-    """396.32 and 401.02 differ by 4.699999999999989 as floats."""
-    write_envi_cube(tmp_path / "view", random_cube()[..., :2], Bands.of([396.32, 401.02]), None, "x")
-    assert "fwhm = { 4.7, 4.7 }" in (tmp_path / "view.hdr").read_text()
+@pytest.mark.parametrize(
+    ("bands", "fwhm"),
+    [
+        (Bands.of([396.32, 401.02]), "{ 4.7, 4.7 }"),  # which differ by 4.699999999999989 as floats
+        (Bands(np.array([450.0, 460, 480]), np.full(3, 10.0)), "{ 10.0, 10.0, 10.0 }"),  # a band is left out
+    ],
+)
+def test_widths_are_those_of_the_instrument_without_digits_of_rounding(tmp_path, bands, fwhm):
+    write_envi_cube(tmp_path / "a.view", random_cube(bands=len(bands)), bands, None, "x")
+    assert {path.name for path in tmp_path.iterdir()} == {"a.view.hdr", "a.view.img"}
+    assert f"fwhm = {fwhm}" in (tmp_path / "a.view.hdr").read_text()
 
 
 def test_names_survive_but_for_what_the_format_has_no_way_to_say(tmp_path):
@@ -62,11 +69,6 @@ def test_names_survive_but_for_what_the_format_has_no_way_to_say(tmp_path):
 def test_a_visible_spectrum_is_shown_by_its_red_green_and_blue(tmp_path):
     write_envi_cube(tmp_path / "view", random_cube(), Bands.of([460, 500, 550, 600, 640]), None, "x")
     assert opened(tmp_path / "view").metadata["default bands"] == ["5", "3", "1"]
-
-
-def test_a_name_with_a_dot_keeps_it(tmp_path):
-    write_envi_cube(tmp_path / "a.b", random_cube(), None, None, "x")
-    assert {path.name for path in tmp_path.iterdir()} == {"a.b.hdr", "a.b.img"}
 
 
 def test_a_disk_that_fills_up_leaves_neither_file_and_keeps_the_old_ones(tmp_path, monkeypatch):
@@ -90,24 +92,24 @@ def test_an_old_header_never_stands_beside_new_numbers(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("wavelengths", "names", "said"),
-    [(BANDS, None, "5 wavelengths for 4 bands"), (None, ["a"], "1 names for 4 bands")],
+    ("write", "said"),
+    [
+        (lambda at: write_envi_cube(at, random_cube(bands=4), BANDS, None, "x"), "5 wavelengths for 4 bands"),
+        (lambda at: write_envi_cube(at, random_cube(bands=4), None, ["a"], "x"), "1 names for 4 bands"),
+        (lambda at: write_envi_library(at, SPECTRA, BANDS, NAMES[:2]), "2 names and 5 wavelengths"),
+        (lambda at: write_rows(at, random_cube(height=6)), "7 rows; got 6"),
+        (lambda at: write_rows(at, random_cube(height=8)), "7 rows; got 8"),
+    ],
 )
-def test_wavelengths_and_names_must_be_as_many_as_the_bands(tmp_path, wavelengths, names, said):
+def test_wavelengths_names_and_rows_must_be_as_many_as_were_promised(tmp_path, write, said):
     with pytest.raises(ValueError, match=said):
-        write_envi_cube(tmp_path / "view", random_cube(bands=4), wavelengths, names, "x")
+        write(tmp_path / "view")
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("given", [6, 8])
-def test_too_few_or_too_many_rows_make_no_file(tmp_path, given):
-    cube = random_cube(height=given)
-    with (
-        pytest.raises(ValueError, match=f"7 rows; got {given}"),
-        envi_cube_rows(tmp_path / "view", (7, 5, 5), None, None, "x") as add,
-    ):
-        add(cube)
-    assert list(tmp_path.iterdir()) == []
+def write_rows(at, rows):
+    with envi_cube_rows(at, (7, 5, 5), None, None, "x") as add:
+        add(rows)
 
 
 SPECTRA = np.random.default_rng(1).random((3, len(WAVELENGTHS_NM)))
@@ -124,14 +126,3 @@ def test_another_reader_gets_spectra_names_and_wavelengths(tmp_path):
     bands: Any = library.bands
     assert tuple(bands.centers) == WAVELENGTHS_NM
     assert bands.band_unit == "Nanometers"
-
-
-def test_widths_of_the_instrument_are_kept_beside_bands_that_were_left_out(tmp_path):
-    bands = Bands(np.array([450.0, 460, 480]), np.full(3, 10.0))
-    write_envi_library(tmp_path / "lib", np.ones((1, 3)), bands, ["white"])
-    assert "fwhm = { 10.0, 10.0, 10.0 }" in (tmp_path / "lib.hdr").read_text()
-
-
-def test_names_must_be_as_many_as_spectra(tmp_path):
-    with pytest.raises(ValueError, match="2 names and 5 wavelengths"):
-        write_envi_library(tmp_path / "lib", SPECTRA, BANDS, NAMES[:2])

@@ -23,17 +23,7 @@ def wavelength_of(name):
     return float(found[1].replace(",", ".")) if found else 0.0
 
 
-def test_each_band_is_a_channel_named_by_its_wavelength(tmp_path):
-    cube = random_cube()
-    path = write_spectral_exr(tmp_path / "deep" / "view.exr", cube, BANDS, None)
-    _, channels = opened(path)
-    read = {wavelength_of(name): pixels for name, pixels in channels.items()}
-    assert tuple(sorted(read)) == WAVELENGTHS_NM
-    for index, wavelength in enumerate(WAVELENGTHS_NM):
-        assert read[wavelength].dtype == np.float32
-        np.testing.assert_array_equal(read[wavelength], cube[..., index])
-
-
+@pytest.mark.parametrize("quantity", ["radiance", "reflectance"])
 @pytest.mark.parametrize(
     "laid_out",
     [
@@ -42,14 +32,23 @@ def test_each_band_is_a_channel_named_by_its_wavelength(tmp_path):
         lambda cube: np.moveaxis(np.moveaxis(cube, 2, 0).copy(), 0, 2),
     ],
 )
-def test_numbers_are_right_however_they_lie_in_memory(tmp_path, laid_out):
-    cube = random_cube()
-    path = write_spectral_exr(tmp_path / "view.exr", laid_out(cube), BANDS, cube[..., :3], cube[..., 4])
-    _, channels = opened(path)
+def test_each_band_is_a_channel_named_by_its_wavelength_however_numbers_lie_in_memory(
+    tmp_path, laid_out, quantity
+):
+    cube, path = random_cube(), tmp_path / "deep" / "view.exr"
+    write_spectral_exr(path, laid_out(cube), BANDS, cube[..., :3], cube[..., 4], quantity=quantity)
+    header, channels = opened(path)
     spectral = sorted((name for name in channels if wavelength_of(name)), key=wavelength_of)
-    np.testing.assert_array_equal(np.stack([channels[name] for name in spectral], axis=-1), cube)
+    assert tuple(map(wavelength_of, spectral)) == WAVELENGTHS_NM
+    assert {name[:2] for name in spectral} == {"S0" if quantity == "radiance" else "T."}
+    assert ("emissiveUnits" in header) == (quantity == "radiance")
+    found = np.stack([channels[name] for name in spectral], axis=-1)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, cube)
     np.testing.assert_array_equal(np.stack([channels[name] for name in "RGB"], axis=-1), cube[..., :3])
     np.testing.assert_array_equal(channels["A"], cube[..., 4])
+    with pytest.raises(ValueError, match="5 wavelengths for spectra of shape"):
+        write_spectral_exr(tmp_path / "v.exr", random_cube(bands=4), BANDS, None)
 
 
 def test_the_header_says_which_layout_it_is_and_loses_nothing_by_compression(tmp_path):
@@ -58,16 +57,6 @@ def test_the_header_says_which_layout_it_is_and_loses_nothing_by_compression(tmp
     assert header["emissiveUnits"] == "W.m^-2.sr^-1"
     assert header["comments"] == "of a test"
     assert header["compression"] == OpenEXR.ZIP_COMPRESSION
-
-
-def test_reflectance_is_in_reflective_channels_and_has_no_unit_of_light(tmp_path):
-    cube = random_cube()
-    path = write_spectral_exr(tmp_path / "v.exr", cube, BANDS, None, quantity="reflectance")
-    header, channels = opened(path)
-    assert "emissiveUnits" not in header
-    assert all(name.startswith("T.") for name in channels)
-    spectral = sorted(channels, key=wavelength_of)
-    np.testing.assert_array_equal(np.stack([channels[name] for name in spectral], axis=-1), cube)
 
 
 def test_channels_of_any_name_keep_their_type(tmp_path):
@@ -97,8 +86,3 @@ def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path, mon
         write_spectral_exr(path, random_cube() + 1, BANDS, None)
     assert path.read_bytes() == old
     assert [file.name for file in tmp_path.iterdir()] == ["v.exr"]
-
-
-def test_wavelengths_must_be_as_many_as_bands(tmp_path):
-    with pytest.raises(ValueError, match="5 wavelengths for spectra of shape"):
-        write_spectral_exr(tmp_path / "v.exr", random_cube(bands=4), BANDS, None)

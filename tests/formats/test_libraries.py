@@ -170,25 +170,13 @@ Number of X Values: 4
 """
 
 
-def test_values_that_a_header_marks_as_ignored_are_gaps(tmp_path):
-    path, _ = written_by_spectral(tmp_path, data_ignore_value=0.25)
-    np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
-
-
-def test_bands_that_a_header_marks_as_bad_are_gaps_and_gains_are_refused(tmp_path):
-    path, _ = written_by_spectral(tmp_path, bbl=[1, 0, 1])
-    np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
+def test_bands_or_values_that_a_header_marks_are_gaps_and_gains_are_refused(tmp_path):
+    for changed in ({"bbl": [1, 0, 1]}, {"data_ignore_value": 0.25}):
+        path, _ = written_by_spectral(tmp_path, **changed)
+        np.testing.assert_allclose(read_library(path)[0].reflectance, [0.1, NAN, 0.5])
     written_by_spectral(tmp_path, data_offset_values="{ -0.1 }")
     with pytest.raises(SpectrumError, match="'data offset values' can't be applied to spectra"):
         read_library(path)
-
-
-def test_libraries_of_a_folder_are_found_whatever_the_suffix_of_their_numbers(tmp_path):
-    path, _ = written_by_spectral(tmp_path)
-    count = len(library_of([tmp_path]).materials)
-    path.with_suffix(".sli").rename(path.with_suffix(""))
-    (tmp_path / "image.hdr").write_text("ENVI\nfile type = ENVI Standard\n")
-    assert len(library_of([tmp_path]).materials) == count
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # it leaves its file open
@@ -227,6 +215,9 @@ def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_chann
     assert (name, wavelengths, values) == ("Olivine GDS70", [500.0, 600.0], [0.31, 0.32])
 
 
+IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelength", "Wavenumber")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
@@ -239,11 +230,7 @@ def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_chann
         ("x.txt", "hello\n", "there are no numbers in it"),
         ("x.txt", "400 1\nend\n", "'end' stands among the numbers"),
         ("x.txt", "400\n500\n", "no lines with a wavelength and a value"),
-        (
-            "x.txt",
-            ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelength", "Wavenumber"),
-            "'X Units' is",
-        ),
+        ("x.txt", IN_WAVENUMBERS, "'X Units' is"),
         ("x.txt", ECOSTRESS.replace("Reflectance", "Transmittance"), "'Y Units' is .* expected reflectance"),
         ("x.pdf", "", r"a library is a \.csv, an ENVI spectral library"),
     ],
@@ -264,18 +251,18 @@ def test_own_files_are_the_library_alone_unless_the_built_in_ones_are_asked_for(
     assert both.find("moss (b.csv)").origin == (second, "moss")
 
 
-def test_a_folder_stands_for_the_libraries_in_it(tmp_path):
+def test_a_folder_stands_for_the_libraries_in_it_whatever_the_suffix_of_their_numbers(tmp_path):
     written(tmp_path, "a.csv", "wavelength,moss\n400,1\n500,2\n")
     written(tmp_path, "maple.spectrum.txt", ECOSTRESS)
     written(tmp_path, "maple.ancillary.txt", "Genus: Acer\n")
-    written_by_spectral(tmp_path)
+    path, _ = written_by_spectral(tmp_path)
+    (tmp_path / "image.hdr").write_text("ENVI\nfile type = ENVI Standard\n")
+    assert library_of([tmp_path]).names == ("moss", "Acer rubrum", "oak", "fir tree")
+    path.with_suffix(".sli").rename(path.with_suffix(""))
     assert library_of([tmp_path]).names == ("moss", "Acer rubrum", "oak", "fir tree")
     (tmp_path / "none").mkdir()
     with pytest.raises(SpectrumError, match="none: no library in this folder"):
         library_of([tmp_path / "none"])
-
-
-def test_a_library_that_shares_too_few_bands_is_refused(tmp_path):
-    path = written(tmp_path, "ir.csv", "wavelength,clay\n1000,1\n1500,3\n2500,4\n")
+    infrared = written(tmp_path, "ir.csv", "wavelength,clay\n1000,1\n1500,3\n2500,4\n")
     with pytest.raises(SpectrumError, match=r"from 1000 to 2500 nm, can.t be compared: each covers"):
-        library_of([path], Bands.of(np.linspace(400, 700, 31)))
+        library_of([infrared], Bands.of(np.linspace(400, 700, 31)))

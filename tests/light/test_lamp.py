@@ -55,10 +55,6 @@ def test_only_in_the_cameras_frame_the_lamp_goes_up_with_the_camera():
     assert (held.positions(high) - held.positions(low)).norm() > 2
 
 
-def test_a_lamp_is_the_same_after_it_was_written_as_numbers():
-    assert Lamp.of_numbers(NUMBERS) == TURNTABLE
-
-
 def test_what_stands_before_the_lamp_casts_a_shadow_and_what_stands_behind_does_not():
     positions = torch.tensor([[-0.5, 0.0, 0.5], [-0.5, 0.0, -0.5], [0.99, 0.0, 0.5]])
     lamps = positions + torch.tensor([5.0, 0.0, 0.0])
@@ -201,23 +197,18 @@ def test_gloss_follows_the_lamp_and_not_the_eye_alone():
     assert (one["specular_coefficients"] - other["specular_coefficients"]).abs().max() > 1e-4
 
 
-def test_where_the_lamp_is_not_known_shading_depends_on_the_direction_of_view():
-    config = replace(CONFIG, light="camera", lamp=())
-    model = config.setup(scene_box=BOX, metadata=make_model().metadata)
-    assert isinstance(model, UnmixModel)
-    assert (model.field.moving_lamp, model.grid.opaque) == (None, None)
-
-
 @pytest.mark.parametrize(
     ("numbers", "words"), [(NUMBERS, "the place of its lamp follows from shadows"), ((), "no shadows tell")]
 )
 def test_the_lamp_follows_from_the_data(numbers, words):
+    """Where it is not known shading depends on the direction of view."""
     data = {**initial_data(), "light": np.array("camera"), "lamp": np.array(numbers)}
     config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: data, torch.Generator())
     assert config.lamp == numbers
     assert words in reasons
-
-
-def test_a_lamp_of_too_few_numbers_is_refused():
+    model = replace(CONFIG, light="camera", lamp=numbers).setup(scene_box=BOX, metadata=make_model().metadata)
+    assert isinstance(model, UnmixModel)
+    assert (model.field.moving_lamp is None, model.grid.opaque is None) == (numbers == (),) * 2
+    assert Lamp.of_numbers(NUMBERS) == TURNTABLE
     with pytest.raises(ConfigError, match="ten numbers"):
         UnmixModelConfig(lamp=(0.0, 1.0))

@@ -79,16 +79,14 @@ def shading_of(normal: tuple[float, float, float]) -> LampShading:
     ("normal", "expected"),
     [((0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 2.0)],
 )
-def test_the_error_is_one_less_the_cosine_to_the_densities_own_normals(normal, expected):
+def test_the_error_is_one_less_the_cosine_to_the_densities_own_normals_and_0_without_samples(
+    normal, expected
+):
     generator = torch.Generator().manual_seed(0)
-    error = normals_error(growing_downwards, shading_of(normal), torch.rand(40, 3), torch.rand(40), generator)
-    assert float(error.detach()) == pytest.approx(expected, abs=1e-6)
-
-
-def test_without_samples_there_is_no_error():
-    shading = shading_of((0.0, 0.0, 1.0))
-    error = normals_error(growing_downwards, shading, torch.zeros(0, 3), torch.zeros(0), None)
-    assert float(error.detach()) == 0
+    for count, wanted in ((40, expected), (0, 0.0)):
+        places, weights = torch.rand(count, 3), torch.rand(count)
+        error = normals_error(growing_downwards, shading_of(normal), places, weights, generator)
+        assert float(error.detach()) == pytest.approx(wanted, abs=1e-6)
 
 
 def losses(model: UnmixModel, progress: float) -> dict[str, torch.Tensor]:

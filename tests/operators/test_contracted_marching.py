@@ -73,13 +73,9 @@ def test_samples_are_a_step_apart_in_the_inner_cube_and_then_farther_up_to_the_f
     assert len(samples) == pytest.approx((1 + 0.693 + 1) / step, rel=0.1)
 
 
-def test_a_ray_from_beyond_the_far_end_has_no_samples():
+def test_a_ray_from_beyond_the_far_end_has_no_samples_and_steps_of_no_length_are_refused():
     full = torch.zeros(4, 4, 4, dtype=torch.uint8)
     origins, directions = torch.tensor([[600.0, 0.0, 0.0]]), torch.tensor([[-1.0, 0.0, 0.0]])
     assert len(march_contracted(origins, directions, torch.zeros(1), full, 0.05)) == 0
-
-
-def test_steps_of_no_length_are_refused():
-    full = torch.zeros(4, 4, 4, dtype=torch.uint8)
     with pytest.raises(ValueError, match="step must be positive"):
         march_contracted(*make_rays(3), full, 0.0)

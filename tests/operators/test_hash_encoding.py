@@ -61,15 +61,6 @@ def test_a_field_linear_in_position_is_reproduced_exactly():
     assert_close(hash_encode(positions, vertices, layout), positions)
 
 
-def test_vertices_get_their_own_row():
-    layout = HashGridLayout(1, 1, 2, 2, 6)
-    table = torch.arange(27.0)[:, None]
-    corners = torch.tensor(
-        [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]]
-    )
-    assert hash_encode(corners, table, layout)[:, 0].tolist() == [0.0, 2.0, 6.0, 18.0, 26.0]
-
-
 @given(st.integers(0, 2**31 - 1))
 def test_encoding_is_linear_in_the_table(seed):
     positions, table = make(HASHED, 20, torch.float64, seed=seed)

@@ -113,13 +113,15 @@ def test_only_the_occupied_slab_is_sampled_and_its_samples_measure_it():
     assert len(samples) / n * 0.03 == pytest.approx(0.375, abs=1e-3)
 
 
-def test_rays_that_miss_or_meet_nothing_have_no_samples():
+def test_rays_that_miss_or_meet_nothing_have_no_samples_and_steps_of_no_length_are_refused():
     origins, directions, t_near, t_far, jitter = make_rays(6)
-    nothing = skip_distances(torch.zeros(4, 4, 4, dtype=torch.bool))
+    nothing, full = skip_distances(torch.zeros(4, 4, 4, dtype=torch.bool)), torch.zeros(4, 4, 4).byte()
     empty = march(origins, directions, t_near, t_far, jitter, nothing, 0.05)
-    missed = march(origins, directions, t_near, t_near, jitter, torch.zeros(4, 4, 4).byte(), 0.05)
+    missed = march(origins, directions, t_near, t_near, jitter, full, 0.05)
     assert len(empty) == len(missed) == 0
     assert empty.packed_info[:, 1].tolist() == [0] * 6
+    with pytest.raises(ValueError, match="step must be positive; got 0"):
+        march(*make_rays(2), full, 0.0)
 
 
 @pytest.mark.parametrize("most", [1, 3, 200])
@@ -164,11 +166,6 @@ def test_selecting_samples_keeps_them_packed_by_ray():
     assert kept.t.tolist() == [1.0, 2.0, 4.0]
     assert kept.ray_indices.tolist() == [0, 2, 2]
     assert kept.packed_info.tolist() == [[0, 1], [1, 0], [1, 2]]
-
-
-def test_a_step_of_no_length_is_refused():
-    with pytest.raises(ValueError, match="step must be positive; got 0"):
-        march(*make_rays(2), torch.zeros(2, 2, 2).byte(), 0.0)
 
 
 @pytest.mark.parametrize("num_rays", [0, 300])

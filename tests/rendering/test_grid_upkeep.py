@@ -23,16 +23,14 @@ RENDERER = VolumeRenderer(
 )
 
 
-def test_a_cell_as_wide_as_a_sample_is_occupied_from_an_opacity_of_3_percent():
-    assert 1 - math.exp(-_occupied_density(RENDERER, CELLS) * RENDERER.step) == pytest.approx(0.03)
-
-
-def test_a_cell_of_many_samples_is_occupied_from_an_opacity_of_8_percent_across_it_the_short_way():
-    for step in (0.05, 0.02, 0.001):
-        density = _occupied_density(replace(RENDERER, step=step), CELLS)
-        assert 1 - math.exp(-density * SHORT_WAY) == pytest.approx(0.08)
-
-
-def test_cells_of_an_unbounded_world_are_twice_as_wide():
-    density = _occupied_density(replace(RENDERER, step=0.001, is_unbounded=True), CELLS)
-    assert 1 - math.exp(-density * 0.4) == pytest.approx(0.08)
+@pytest.mark.parametrize(
+    ("changes", "way", "opacity"),
+    [
+        ({}, RENDERER.step, 0.03),  # as wide as a sample
+        *(({"step": step}, SHORT_WAY, 0.08) for step in (0.05, 0.02, 0.001)),  # many samples across it
+        ({"step": 0.001, "is_unbounded": True}, 0.4, 0.08),  # cells of a world are twice as wide
+    ],
+)
+def test_a_cell_is_occupied_from_an_opacity_along_a_sample_or_across_it_the_short_way(changes, way, opacity):
+    density = _occupied_density(replace(RENDERER, **changes), CELLS)
+    assert 1 - math.exp(-density * way) == pytest.approx(opacity)

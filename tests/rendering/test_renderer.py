@@ -170,7 +170,7 @@ def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity)
     assert found.num_evaluated <= len(samples)
 
 
-def test_what_lies_behind_an_opaque_front_is_not_evaluated():
+def test_what_lies_behind_an_opaque_front_is_not_evaluated_and_rays_that_miss_have_no_samples():
     renderer, field = make(pixel=0.02)
     bundle = rays(30)
     with torch.no_grad():
@@ -181,12 +181,7 @@ def test_what_lies_behind_an_opaque_front_is_not_evaluated():
     assert found.num_evaluated == 30 * 8
     assert len(samples) > 10 * found.num_evaluated
     assert len(found.samples) == 30
-
-
-def test_rays_that_miss_have_no_samples():
-    renderer, field = make()
-    bundle = rays(3)
-    away = type(bundle)(bundle.origins, -bundle.directions, bundle.camera_indices)
+    away = replace(bundle, directions=-bundle.directions)
     found = _visible_samples(field, renderer._march(away, None), away, renderer.step, 0.1)
     assert (len(found.samples), len(found.encoded()), found.num_evaluated) == (0, 0, 0)
 

@@ -78,10 +78,3 @@ def test_of_large_blocks_some_opaque_pixels_are_sampled_from(rig, monkeypatch):
     assert 0 < len(found) < 13
     assert {tuple(row) for row in found.tolist()} <= {tuple(row) for row in everything.tolist()}
     np.testing.assert_array_equal(table.sample_opaque(1, 1000, seed=0), found)
-
-
-def test_draws_of_a_single_sensor_do_not_depend_on_the_table_having_blocks(rig):
-    [group] = PixelTable(rig, CPU, (1, 2)).draw(40, torch.Generator().manual_seed(5))
-    expected = torch.randint(640, (40,), generator=torch.Generator().manual_seed(5))
-    assert torch.equal(group.numbers, expected)
-    assert torch.equal(group.cameras, expected // 320)

@@ -36,15 +36,12 @@ def weighted(weights: tuple[float, ...]) -> UnmixModel:
     return make_model(losses=LossConfig(band_weights=weights, background="black", rgb=0.0))
 
 
-def test_errors_count_by_the_weight_of_their_band():
+def test_errors_count_by_the_weight_of_their_band_and_weights_of_1_change_no_bit():
     plain, less = weighted(()), weighted(WEIGHTS)
     grown = [losses_of(m, 0.3)["spectral"] - losses_of(m, 0.0)["spectral"] for m in (plain, less)]
     assert_close(grown[1] / grown[0], torch.tensor(0.04), rtol=0.01, atol=0)
-
-
-def test_weights_of_1_change_no_bit():
-    plain, ones = losses_of(weighted(()), 0.1), losses_of(weighted((1.0,) * NUM_BANDS), 0.1)
-    assert all(torch.equal(plain[name], ones[name]) for name in plain)
+    before, ones = losses_of(weighted(()), 0.1), losses_of(weighted((1.0,) * NUM_BANDS), 0.1)
+    assert all(torch.equal(before[name], ones[name]) for name in before)
 
 
 def test_a_noisy_band_hardly_moves_the_mixtures_of_pixels():
@@ -103,7 +100,7 @@ def of_views(rays: RayBundle, num_views: int) -> RayBundle:
     return replace(rays, camera_indices=torch.arange(len(rays)) % num_views)
 
 
-def test_gains_are_relative_to_their_mean():
+def test_gains_are_relative_to_their_mean_and_only_light_per_view_has_them():
     gains = ViewGains(3, WAVELENGTHS)
     with torch.no_grad():
         gains.log_gains.copy_(torch.randn(3, 3))
@@ -112,10 +109,8 @@ def test_gains_are_relative_to_their_mean():
     with torch.no_grad():
         gains.log_gains.add_(1.0)
     assert_close(gains(torch.arange(3), gains.terms), found)
-
-
-def test_one_band_has_one_gain():
-    assert_close(smooth_terms(torch.tensor([550.0]))[0], torch.ones(1))
+    assert_close(smooth_terms(torch.tensor([550.0]))[0], torch.ones(1))  # one band has one gain
+    assert make_lit_model("fixed").view_gains is make_lit_model("camera").view_gains is None
 
 
 def test_training_finds_the_exposure_of_each_view():
@@ -154,8 +149,3 @@ def test_a_view_without_matter_stays_as_it_is():
     ones = torch.ones(4, 4)
     predicted = PredictedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
     assert align_gain(predicted, truth, WAVELENGTHS) is predicted
-
-
-@pytest.mark.parametrize("light", ["fixed", "camera"])
-def test_other_lights_have_no_gains(light):
-    assert make_lit_model(light).view_gains is None

@@ -13,8 +13,10 @@ import pytest
 from tests.captures.file_factory import file_of, present, write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
+    HEIGHT,
     LENSES,
     PANEL_LIGHT,
+    WIDTH,
     image,
     lens_pose,
     rays,
