@@ -178,7 +178,7 @@ def test_devices_streams_and_trailing_dots_of_windows_are_no_names(name, safe):
 def test_a_path_too_long_for_windows_is_said_to_be_that(tmp_path, monkeypatch, writes):
     """Its own words are that there is no such file or folder."""
     (tmp_path / "file").touch()
-    with pytest.raises(RunError, match="can't make the folder .*choose"):
+    with pytest.raises(RunError, match=r"can't make the folder .*choose"):
         writes(tmp_path / "file" / "name")
     with pytest.raises(RunError, match="File name too long; choose a shorter name"):
         write_file(tmp_path / ("a" * 256), b"")
