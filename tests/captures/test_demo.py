@@ -15,12 +15,8 @@ from tests.captures.poses.alignment import align_poses
 from tests.commands.running import run
 from unmix_plugin.captures import demo as demo_capture
 from unmix_plugin.captures.demo import (
-    FULL_WELL,
     MARKER_FAMILY,
     MARKER_SIZE,
-    READ_NOISE,
-    WHITE_SHARE,
-    _demo_line_camera,
     make_demo_capture,
     marked_place,
 )
@@ -34,7 +30,6 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, reflected
 from unmix_plugin.scenes.demo.shading import (
     band_centers_nm,
-    lamp_power,
     reflectances,
     render_view,
     speckled_things,
@@ -94,19 +89,6 @@ def test_white_and_dark_turn_counts_into_the_true_reflectance(folder, truth):
     whole = counts < 65535
     assert np.abs(found - expected)[whole].mean() < 0.005
     assert np.abs(counts / 65535 - expected)[whole].mean() > 0.05, "the references matter"
-
-
-def test_noise_is_that_of_electrons_counted_and_read():
-    wavelengths = band_centers_nm(BANDS)
-    camera = _demo_line_camera(8, wavelengths, lamp_power(wavelengths))
-    light = np.full((4000, 8, BANDS), 0.25, np.float32)
-    counts = camera.expose(light, np.random.default_rng(0)).astype(float)
-    electrons = 0.25 * camera.white_electrons
-    assert electrons.max() == pytest.approx(0.25 * WHITE_SHARE * FULL_WELL, rel=1e-5)
-    found = counts.std(axis=0) * FULL_WELL / 64000
-    np.testing.assert_allclose(found[:, GOOD], np.sqrt(electrons + READ_NOISE**2)[:, GOOD], rtol=0.06)
-    bright = camera.expose(np.full((2, 8, BANDS), 3.0, np.float32), np.random.default_rng(0))
-    assert (bright.max(axis=(0, 1))[GOOD] == 65535).any(), "highlights are cut off at the largest count"
 
 
 def test_labels_and_poses_are_those_of_the_views(folder, truth):

@@ -134,19 +134,6 @@ def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_diffe
     np.testing.assert_allclose(scene.cube(1), np.delete(counts, 3, axis=2) / 4095, atol=1e-4)
 
 
-def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture")
-    white = np.fromfile(capture.root / "white.raw", "<u2").reshape(-1, len(WAVELENGTHS_NM), WIDTH)
-    white[:, 2] = 4095  # which no view reaches
-    white.tofile(capture.root / "white.raw")
-    findings = process(capture.root, tmp_path / "scene", **references_of(capture))
-    assert findings[0].startswith("white.hdr: the white is saturated in 550 nm: these bands are left out")
-    scene = load_scene(tmp_path / "scene")
-    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 2))
-    expected = np.delete(capture.reflectance["view_00"], 2, axis=2)
-    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
-
-
 def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     stated = references_of(capture) | {"white_reflectance": "0.02"}
@@ -188,21 +175,6 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     scene = load_scene(tmp_path / "scene")
     np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
     np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
-
-
-def test_a_panel_in_a_view_serves_as_white(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture", views=2)
-    counts = np.full((HEIGHT, WIDTH, len(WAVELENGTHS_NM)), 600, np.uint16)
-    counts[4:10, 5:12] = 2400
-    counts += np.random.default_rng(0).integers(
-        0, 41, counts.shape, np.uint16
-    )  # otherwise its top is a plateau
-    write_cube(capture.root, "view_00", counts)
-    panel = {"white_rectangle": ("view_00", 4, 5, 6, 7), "white_reflectance": "0.5"}
-    process(capture.root, tmp_path / "scene", **panel)
-    cube = load_scene(tmp_path / "scene").cube(0)
-    white = counts[4:10, 5:12].mean(axis=(0, 1))
-    np.testing.assert_allclose(cube, 0.5 * counts / white, atol=1e-4)
 
 
 def test_what_was_done_is_written_for_people(tmp_path: Path):

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch.testing import assert_close
 
 from tests.engine.stopped_runs import stop_at
 from tests.poses.test_training import config_for, trained
@@ -25,15 +24,6 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def trainer(folder) -> Trainer:
     return trained(config_for(folder, "fixed"))
-
-
-def test_training_rays_start_where_their_row_was_taken(trainer):
-    manager = trainer.pipeline.datamanager
-    rays, _ = manager.next_train(0)
-    assert rays.pixel_coords is not None
-    expected = manager.train_cameras.poses_at(rays.camera_indices, rays.pixel_coords[:, 1])
-    assert_close(rays.origins, expected[:, :, 3])
-    assert len(rays.origins.unique(dim=0)) > len(manager.train_cameras)
 
 
 def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(trainer):

@@ -84,20 +84,6 @@ def test_blocks_of_any_size_give_the_same_values(rows: int, binning: int):
     np.testing.assert_array_equal(whole.saturated, (squares >= 3500).any(axis=(1, 3)))
 
 
-def test_exposures_are_brought_to_that_of_the_white():
-    counts, _ = _cube()
-    white = open_reference(
-        file_of(np.full((1, WIDTH, BANDS), 3000, np.uint16)), "white reference", file_of(counts)
-    )
-    calibration = Calibration(
-        WHOLE, EVERY, white=replace(white, reflectance=np.full(BANDS, 0.5)), exposure=np.full(1, 20.0)
-    )
-    shorter = file_of(counts, metadata={"exposure_s": 5.0, "gain": 2.0})
-    np.testing.assert_allclose(
-        calibration.rows(shorter, 0, HEIGHT).values, counts / 3000 * 0.5 * 20.0 / 10.0, rtol=1e-6
-    )
-
-
 def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     counts, file = _cube()
     light = np.full((1, WIDTH, BANDS), 3000, np.uint16)

@@ -1,7 +1,6 @@
 """Folders with one file a view, and trees as instruments write them."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +8,8 @@ import pytest
 
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process, write_cube, write_poses
 from tests.captures.layouts.data_sets import PLAIN
-from unmix_plugin.captures.calibration import sensor
-from unmix_plugin.captures.calibration.calibration import open_reference
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.layouts.registry import view_names
-from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 
 NAMES = [f"{number}" for number in range(212, 216)]
@@ -148,22 +143,6 @@ def test_two_cubes_of_one_name_in_a_tree_are_refused(tmp_path, twin):
     np.save(tmp_path / "213" / twin, counts(9))
     with pytest.raises(CaptureError, match=r"213\.hdr and .*213\.npy would both be the view"):
         find_cubes(tmp_path, PLAIN)
-
-
-def test_references_that_views_share_are_read_once(tmp_path, monkeypatch):
-    made = make_capture(tmp_path / "capture", views=3)
-    opened = []
-    monkeypatch.setattr(
-        sensor, "open_reference", lambda *given: opened.append(given[0].path) or open_reference(*given)
-    )
-    views = [
-        replace(view, dark=open_spectral_file(made.root / "dark.hdr"))
-        for view in find_cubes(made.root, PLAIN).views
-    ]
-    options = ProcessOptions("cubes", made.root, tmp_path / "scene")
-    prepared = sensor.prepare_sensor("", views, options, sensor.References(views=tuple(views)))
-    assert len(prepared.calibration.own) == 3
-    assert opened == [made.root / "dark.hdr"]
 
 
 def test_numbers_that_no_header_describes_are_named(tmp_path):

@@ -13,13 +13,10 @@ import pytest
 from tests.captures.file_factory import file_of, present, write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
-    HEIGHT,
     LENSES,
     PANEL_LIGHT,
-    WIDTH,
     image,
     lens_pose,
-    rays,
     write_flight,
     write_panel,
     write_poses,
@@ -57,15 +54,6 @@ def _process(root, output, poses, **given):
 
 def _view(capture, index, ending):
     return next(view for view in capture.views if view.name.endswith(f"_{index:04d}_{ending}"))
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: lens.ending)
-def test_every_lens_has_its_own_intrinsics(flight, lens):
-    found = present(_view(find_rig(flight, PLAIN), 0, lens.ending).lens)
-    x, y = (rays(lens)[..., :2] / -rays(lens)[..., 2:]).transpose(2, 0, 1)
-    pixels = project(found, x, -y)
-    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    np.testing.assert_allclose(pixels, (columns, rows), rtol=0, atol=0.01)
 
 
 def test_every_file_is_a_view_of_its_lens_and_release(flight):
@@ -133,16 +121,6 @@ def _beside_green(content, frames, release):
     found = np.linalg.inv(poses[0]) @ np.stack(poses)
     found[:, :3, 3] /= content.get("applied_scale", 1.0)
     return found
-
-
-def test_offsets_follow_from_releases_in_which_all_lenses_have_poses(flight, tmp_path):
-    write_poses(tmp_path / "some.json", LENSES, releases=3)
-    frames = json.loads((tmp_path / "some.json").read_text())["frames"]
-    write_poses(tmp_path / "all.json")
-    frames += json.loads((tmp_path / "all.json").read_text())["frames"][3:]
-    (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
-    found = _beside_green(*_frames(_process(flight, tmp_path / "scene", tmp_path / "poses.json")), "0007")
-    np.testing.assert_allclose(found[:, :3, 3], [lens.place for lens in LENSES], atol=1e-6)
 
 
 def test_the_scene_holds_the_radiance_of_the_ground(scene):

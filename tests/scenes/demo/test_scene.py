@@ -81,25 +81,6 @@ def test_what_a_highlight_adds_to_the_same_point_has_the_lamps_colour():
     assert spectral_angle(radiances[1], lamp) > 0.2
 
 
-def test_two_cameras_see_the_same_diffuse_light_at_the_same_point():
-    cameras = demo_cameras(32, 8)
-    rays = cameras.image_rays(0)
-    origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    distances, _ = first_hits(PLACEMENTS, origins, directions)
-    points = (origins + distances[:, None] * directions)[np.isfinite(distances)]
-    seen = _trace(origins, directions, LAMP[None])
-    eye = cameras.camera_to_world[5, :, 3].numpy()
-    lengths = np.linalg.norm(points - eye, axis=1)
-    towards = (points - eye) / lengths[:, None]
-    others, _ = first_hits(PLACEMENTS, np.broadcast_to(eye, points.shape), towards)
-    common = np.abs(others - lengths) < 1e-4
-    assert common.sum() > 50
-    again = _trace(np.broadcast_to(eye, points.shape)[common], towards[common], LAMP[None])
-    first = seen.diffuse[seen.is_hit][common]
-    # A shadow's border can fall to either side by rounding.
-    assert np.mean(np.abs(again.diffuse - first).max(axis=1) < 2e-3) > 0.98
-
-
 def test_abundances_lie_on_the_simplex_and_labels_are_the_largest_where_half_a_pixel_is_covered(view):
     sums, labels, labelled = view.abundances.sum(axis=-1), label_image(view), view.alpha >= 0.5
     assert (view.abundances >= 0).all()

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.scenes.demo.demo_parts import APPLE, LAMP, TABLE, row
+from tests.scenes.demo.demo_parts import APPLE, LAMP, row
 from unmix_plugin.scenes.demo.scene import demo_cameras
 from unmix_plugin.scenes.demo.shading import (
     _COAT_REFLECTANCE,
     _LAMP_IRRADIANCE,
     _coat_highlight,
     _direct_light,
-    _sky_light,
     _trace,
     speckled_things,
 )
@@ -33,13 +32,6 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
     assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None]) == 0
-
-
-def test_the_sky_is_darker_beside_a_thing_than_in_the_open():
-    beside, away = row(-0.5, -0.3, 0), row(0.0, -1.2, 0)
-    up = row(0, 0, 1)
-    near, far = _sky_light(beside, up, TABLE)[0], _sky_light(away, up, TABLE)[0]
-    assert 0 <= near < 0.3 * far
 
 
 def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():

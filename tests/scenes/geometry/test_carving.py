@@ -3,7 +3,6 @@
 Masks that contradict each other are told from masks that fit together.
 """
 
-import dataclasses
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
     _foreground_mask,
     _needed_witnesses,
-    carve,
     carve_box,
     foreground_rays,
     mask_warning,
@@ -92,15 +90,6 @@ def test_the_hull_holds_the_ball_through_a_bent_lens_too(lens):
     assert hull.mean() < 4.0 * (distances < radius).mean()
 
 
-def test_nothing_is_carved_by_what_lies_outside_the_images():
-    poses = [look_at(np.array([0.0, -4.0, 0.0]), np.zeros(3))]
-    cameras = dataclasses.replace(make_cameras(poses), focal_px=torch.full((1, 2), 400.0))
-    hull = carve_box(cameras, [np.zeros((SIDE, SIDE), bool)], BOX, 32)
-    seen = carve_box(cameras, None, BOX, 32)
-    assert (hull & ~seen).sum() == 0  # nothing unseen is kept
-    assert hull.any()  # cells at the image's edge reach out of it and stay
-
-
 def test_without_alpha_exactly_the_cells_in_front_of_some_camera_stay():
     poses = [look_at(np.array([0.0, -2.0, 0.2]), np.array([0.3, 0.0, 0.0]))]
     cameras = make_cameras(poses)
@@ -122,23 +111,6 @@ def test_a_resolution_of_one_is_a_single_cell_and_less_is_refused():
         carve_box(make_cameras(poses), None, BOX, 0)
 
 
-def test_every_opaque_pixel_of_an_evaluation_view_has_hull_behind_it(tmp_path):
-    scene = load_scene(make_scene(tmp_path / "scene", frames=9).root)
-    cells = 32
-    hull = torch.from_numpy(carve(scene, cells))
-    for index in scene.eval_indices:
-        alpha = scene.alpha(index)
-        assert alpha is not None
-        rays = scene.cameras.image_rays(index)[torch.from_numpy(alpha.reshape(-1) > 0.99)]
-        t_near, t_far = scene.scene_box.intersect(rays.origins, rays.directions)
-        steps = torch.linspace(0, 1, 200)
-        t = t_near[:, None] + (t_far - t_near)[:, None] * steps
-        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
-        x, y, z = (scene.scene_box.normalise(points) * cells).long().clamp(0, cells - 1).unbind(-1)
-        assert len(rays) > 20
-        assert hull[x, y, z].any(dim=1).all()
-
-
 def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     folder = make_scene(tmp_path / "scene")
     mask = np.zeros((16, 20), np.uint8)
@@ -150,16 +122,6 @@ def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     assert _foreground_mask(after, 1)[:, 10:].all()
     assert np.array_equal(_foreground_mask(after, 1)[:, :10], _foreground_mask(before, 1)[:, :10])
     assert np.array_equal(_foreground_mask(after, 2), _foreground_mask(before, 2))
-
-
-def test_the_box_of_a_ball_is_tight_around_it(tmp_path):
-    poses = ring_poses(10)
-    box = find_bounds(tmp_path, make_cameras(poses), ball_matter(poses, 0.5))
-    low, high = box.aabb.numpy()
-    assert (low <= -0.5).all()
-    assert (high >= 0.5).all()
-    assert (low >= -0.85).all()
-    assert (high <= 0.85).all()
 
 
 def test_the_box_of_a_room_seen_from_one_side_holds_what_all_cameras_look_at(tmp_path):

@@ -1,6 +1,5 @@
 """What distinguishes an unbounded world from a closed box, and which of its cells are carved."""
 
-import json
 from functools import partial
 
 import numpy as np
@@ -14,7 +13,7 @@ from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo import scene as demo_scene
 from unmix_plugin.scenes.demo.scene import _ROOM, _TABLE, _WORLD, make_demo_scene
 from unmix_plugin.scenes.demo.shading import render_view
-from unmix_plugin.scenes.geometry.carving import _carve_world, carve
+from unmix_plugin.scenes.geometry.carving import _carve_world
 from unmix_plugin.scenes.geometry.view_agreement import _WorldEvidence
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -70,21 +69,6 @@ def test_a_world_behind_what_is_transparent_is_refused(folders):
         load_scene(folders / "table", SceneOptions(world="unbounded"))
 
 
-def test_the_table_looks_the_same_in_any_place_and_the_world_covers_the_ground(folders):
-    names = json.loads((folders / "table" / "transforms.json").read_text())["frames"]
-    for frame in names[:4]:
-        alone, around = (load_cube(folders / place, frame) for place in ("table", "world"))
-        shows = alone.max(axis=-1) > 0  # one ray a pixel: either of the table or of what is around it
-        assert 0.2 < shows.mean() < 0.8
-        assert np.array_equal(alone[shows], around[shows])
-    around = load_cube(folders / "world", names[0])
-    assert (around.max(axis=-1) > 0).all()
-
-
-def load_cube(folder, frame):
-    return np.load(folder / frame["hyperspectral_file_path"]).astype(np.float32)
-
-
 def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_not():
     """Two cameras side by side see the same far places, and each what is right before it alone."""
     positions = [np.array([3.0, side, 0.3]) for side in (-1.0, 1.0)]
@@ -100,10 +84,3 @@ def test_cells_that_one_view_alone_sees_are_carved_and_those_that_many_see_are_n
     assert is_kept(-30.0, 0.0, 0.0)
     assert not is_kept(2.2, -1.0, 0.3)
     assert not is_kept(8.0, 0.0, 0.0)
-
-
-def test_the_grid_of_a_world_has_the_cells_asked_for(folders):
-    scene = load_scene(folders / "world")
-    assert carve(scene, 24).shape == (24, 24, 24)
-    coarse, fine = (carve(scene, cells).mean() for cells in (64, 128))
-    assert coarse == fine

@@ -21,7 +21,6 @@ from tests.scenes.scene_factory import (
     ring_poses,
     set_frame,
 )
-from unmix_plugin.scenes.placement import Normalisation
 from unmix_plugin.scenes.reading import loader
 from unmix_plugin.scenes.reading.faults import find_named
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
@@ -87,14 +86,6 @@ def test_cameras_see_the_same_pixels_before_and_after_normalisation(tmp_path):
     pixel, depth = scene.cameras.project(torch.from_numpy(scene.normalisation.to_model(point)).float(), 2)
     np.testing.assert_allclose(pixel[0].numpy(), expected, atol=1e-3)
     np.testing.assert_allclose(depth.item(), -local[0, 2] * scene.normalisation.scale, rtol=1e-5)
-
-
-def test_normalisation_to_world_undoes_to_model_and_survives_json(tmp_path):
-    normalisation = load_scene(make_scene(tmp_path / "scene").root).normalisation
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    np.testing.assert_allclose(normalisation.to_world(normalisation.to_model(points)), points, atol=1e-12)
-    again = Normalisation.from_json(json.loads(json.dumps(normalisation.to_json())))
-    assert np.array_equal(again.to_model(points), normalisation.to_model(points))
 
 
 @pytest.mark.parametrize(
@@ -290,15 +281,6 @@ def test_poses_of_three_rows_read_like_those_of_four(tmp_path):
     assert torch.equal(load_scene(folder.root).cameras.camera_to_world, expected)
 
 
-def test_names_take_the_folder_in_where_stems_repeat(tmp_path):
-    folder = make_scene(tmp_path / "scene")
-    (folder.root / "cubes/other").mkdir()
-    (folder.root / "cubes/view_1.npy").rename(folder.root / "cubes/other/view_0.npy")
-    folder.edit(lambda c: c["frames"][1].update(hyperspectral_file_path="cubes/other/view_0.npy"))
-    names = [frame.name for frame in load_scene(folder.root).frames]
-    assert names[:3] == ["cubes_view_0", "other_view_0", "cubes_view_2"]
-
-
 @pytest.mark.parametrize(
     ("files", "expected"),
     [
@@ -337,17 +319,6 @@ def test_links_out_of_the_folder_are_followed_when_allowed(tmp_path):
     )
     scene = load_scene(folder.root, SceneOptions(allow_outside_paths=True))
     assert scene.cube(1).shape == scene.cube(2).shape == (HEIGHT, WIDTH, len(WAVELENGTHS))
-
-
-def test_cubes_are_hashed_while_they_are_checked_and_not_read_again(tmp_path, monkeypatch):
-    folder = make_scene(tmp_path / "scene").edit_cube(2, np.asfortranarray)
-    hashed = []
-    monkeypatch.setattr(loader, "sha256_of", lambda path: hashed.append(path) or "")
-    hashes = load_scene(folder.root).input_hashes
-    assert hashed
-    assert not any(path.parent.name == "cubes" for path in hashed)
-    for name in ("cubes/view_1.npy", "cubes/view_2.npy"):
-        assert hashes[name] == hashlib.sha256((folder.root / name).read_bytes()).hexdigest()
 
 
 @pytest.mark.parametrize("away", [0.0, 5.0, 200.0])

@@ -80,19 +80,6 @@ def test_flat_spectrum_is_white_with_unit_luminance_on_any_sampling_false_colour
         assert float(matrix.min()) >= 0
 
 
-@pytest.mark.parametrize(
-    "centers",
-    [range(400, 701, 20), np.sort(np.random.default_rng(0).uniform(385, 745, 70)), range(390, 760, 7)],
-    ids=["coarse", "irregular", "dense"],
-)
-def test_sampling_hardly_changes_the_colour_of_a_smooth_spectrum(centers):
-    def colour(bands):
-        spectrum = 0.2 + 0.6 / (1 + np.exp(-(bands.centers_nm - 580) / 30))
-        return torch.tensor(spectrum) @ rgb_matrix(bands, torch.float64)
-
-    assert_close(colour(Bands.of(np.asarray(centers))), colour(EVERY_NM), atol=0.012, rtol=0)
-
-
 def test_a_band_weighs_what_the_fine_bands_inside_its_interval_weigh_together():
     fine = xyz_matrix(Bands.of(np.arange(360.5, 830)), torch.float64)  # edges at whole nm
     coarse = xyz_matrix(Bands.of([430, 490, 550, 562, 580]), torch.float64)

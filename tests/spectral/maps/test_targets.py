@@ -52,19 +52,6 @@ def loaded_covariance(background):
     return covariance + LOADING * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
 
 
-def test_the_matched_filter_of_two_bands_is_the_closed_form():
-    target, pixel = torch.tensor([0.8, 0.3]).double(), torch.tensor([[0.5, 0.9], [0.0, 0.0]]).double()
-    # With a diagonal covariance and a target that differs in the first band only, that band alone counts.
-    assert_close(matched_filter(pixel, target, Background.fit(FOUR)), torch.tensor([0.25, -1.0]).double())
-
-
-def test_adaptive_coherence_of_two_bands_is_the_closed_form():
-    target, pixel = torch.tensor([0.8, 0.3]).double(), torch.tensor([[0.5, 0.5]]).double()
-    first, second = 0.02 / 3 + LOADING * 0.05 / 3, 0.08 / 3 + LOADING * 0.05 / 3
-    expected = (0.01 / first) / (0.01 / first + 0.04 / second)
-    assert_close(adaptive_coherence(pixel, target, Background.fit(FOUR)), torch.tensor([expected]).double())
-
-
 def test_the_matched_filter_is_one_at_the_target_zero_at_the_mean_and_linear_between():
     target = torch.linspace(0.2, 0.9, 5).double()
     background = Background.fit(pixels())
