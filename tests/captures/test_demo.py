@@ -14,12 +14,7 @@ from tests.captures.file_factory import check_file
 from tests.captures.poses.alignment import align_poses
 from tests.commands.running import run
 from unmix_plugin.captures import demo as demo_capture
-from unmix_plugin.captures.demo import (
-    MARKER_FAMILY,
-    MARKER_SIZE,
-    make_demo_capture,
-    marked_place,
-)
+from unmix_plugin.captures.demo import MARKER_FAMILY, MARKER_SIZE, make_demo_capture, marked_place
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.marker_detection import find_markers
 from unmix_plugin.captures.poses.pose_set import PosedCamera
@@ -28,12 +23,7 @@ from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.commands.process import process
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import demo_cameras, label_image, reflected
-from unmix_plugin.scenes.demo.shading import (
-    band_centers_nm,
-    reflectances,
-    render_view,
-    speckled_things,
-)
+from unmix_plugin.scenes.demo.shading import band_centers_nm, reflectances, render_view, speckled_things
 from unmix_plugin.scenes.reading.loader import load_scene
 
 SIZE, BANDS, VIEWS = 48, 12, 5

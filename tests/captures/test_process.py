@@ -39,6 +39,12 @@ def references_of(capture, suffix: str = "hdr") -> dict[str, Path]:
     return {name: capture.root / f"{name}.{suffix}" for name in ("white", "dark")}
 
 
+def made(tmp_path: Path, capture, **options):
+    """The scene of a capture, and what looks wrong."""
+    findings = process(capture.root, tmp_path / "scene", **options)
+    return load_scene(tmp_path / "scene"), findings
+
+
 def record_of(scene: Path):
     return json.loads((scene / "process.json").read_text())
 
@@ -72,13 +78,9 @@ def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, 
     cameras = {Path(name).stem: camera for name, camera in tilted.cameras.items()}
     estimated = replace(tilted, cameras=cameras, up=None, has_world=False)
     monkeypatch.setattr(process_module, "poses_of_written_views", lambda *_: estimated)
-
-    process(capture.root, tmp_path / "scene", poses="estimate")
-
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture, poses="estimate")
     written = read_poses(tmp_path / "scene" / "transforms.json").cameras
-    model = scene.cameras.camera_to_world[:, :, 3].double().numpy()
-    world = scene.normalisation.to_world(model)
+    world = scene.normalisation.to_world(scene.cameras.camera_to_world[:, :, 3].double().numpy())
     expected = [written[f"images/{frame.name}.png"].camera_to_world for frame in scene.frames]
     np.testing.assert_allclose(world, [pose[:, 3] for pose in expected], atol=1e-6)
     np.testing.assert_allclose([pose[2, 0] for pose in expected], 0.0, atol=1e-9)  # cameras stand upright
@@ -87,18 +89,14 @@ def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, 
 
 def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
-    process(capture.root, tmp_path / "scene", crop=(4, 6, 16, 20), bin_pixels=2, bin_bands=3)
-
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture, crop=(4, 6, 16, 20), bin_pixels=2, bin_bands=3)
     assert (scene.cameras.height, scene.cameras.width) == (8, 10)
     np.testing.assert_allclose(scene.cameras.focal_px[0], 1.5 * WIDTH / 2)
     np.testing.assert_allclose(scene.cameras.center_px[0], [(WIDTH / 2 - 6) / 2, (HEIGHT / 2 - 4) / 2])
     np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM.reshape(3, 3).mean(axis=1))
     counts = np.fromfile(capture.root / "view_00.raw", "<u2").reshape(HEIGHT, len(WAVELENGTHS_NM), WIDTH)
-    corner = counts[4:6, :3, 6:8].mean()
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
-    scale = record["decisions"]["scale"]["calibrated"]
-    assert scene.cube(0)[0, 0, 0] == pytest.approx(corner / scale, abs=1e-4)
+    scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
+    assert scene.cube(0)[0, 0, 0] == pytest.approx(counts[4:6, :3, 6:8].mean() / scale, abs=1e-4)
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
@@ -109,15 +107,11 @@ def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_pat
     counts[20:22, :, :] = 7
     for name in ("view_00", "view_01"):
         write_cube(capture.root, name, counts, header={"data ignore value": 7})
-    process(capture.root, tmp_path / "scene")
-
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture)
     assert (scene.cube(0)[8:12, 8:12, 4] == 1.0).all()
     assert scene.cube(0)[8:12, 8:12, 3].max() < 1.0
-    expected = np.ones((HEIGHT, WIDTH), bool)
-    expected[20:22] = False
-    np.testing.assert_array_equal(scene.valid_mask(0), expected)
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    np.testing.assert_array_equal(scene.valid_mask(0), (counts != 7).all(axis=-1))
+    record = record_of(tmp_path / "scene")
     assert record["totals"]["saturated_pixels"] == 2 * 16
     assert record["totals"]["missing_pixels"] == 2 * 2 * WIDTH
     assert record["stored"]["value_scale"] == FULL_SCALE
@@ -128,8 +122,7 @@ def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_diffe
     counts = np.fromfile(capture.root / "view_01.raw", "<u2").reshape(HEIGHT, -1, WIDTH).transpose(0, 2, 1)
     marks = "{" + ", ".join("0" if band == 3 else "1" for band in range(counts.shape[2])) + "}"
     write_cube(capture.root, "view_01", counts.astype(">u2"), header={"byte order": 1, "bbl": marks})
-    process(capture.root, tmp_path / "scene", scale=4095.0)
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture, scale=4095.0)
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
     np.testing.assert_allclose(scene.cube(1), np.delete(counts, 3, axis=2) / 4095, atol=1e-4)
 
@@ -168,24 +161,22 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     rows = [f"{nm:g},{value:.6f}" for nm, value in zip(WAVELENGTHS_NM, panel, strict=True)]
     (tmp_path / "panel.csv").write_text("\n".join(["wavelength,reflectance", *rows]))
     stated = references_of(capture) | {"white_reflectance": str(tmp_path / "panel.csv")}
-    process(capture.root, tmp_path / "scene", **stated)
+    scene, _ = made(tmp_path, capture, **stated)
     lamp = capture.white.mean(axis=0) / panel
     written = np.loadtxt(tmp_path / "scene" / "illuminant.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(written[:, 1], lamp / lamp.max(), rtol=1e-4)
-    scene = load_scene(tmp_path / "scene")
     np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
     np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
 
 
 def test_what_was_done_is_written_for_people(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture")
-    findings = process(capture.root, tmp_path / "scene", drop_bands="500-600")
+    _, findings = made(tmp_path, make_capture(tmp_path / "capture"), drop_bands="500-600")
     report = (tmp_path / "scene" / "report.txt").read_text()
     assert "bands left out: 500 nm, 550 nm, 600 nm (named in --drop-bands)" in report
     assert findings[0] == "only 4 views: expect holes and fog; 15 or more all around serve better"
     assert findings[0] in report
     assert (tmp_path / "scene" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")
-    record = json.loads((tmp_path / "scene" / "process.json").read_text())
+    record = record_of(tmp_path / "scene")
     assert record["what_looks_wrong"] == findings
     dropped = record["decisions"]["sensors"]["all views"]["dropped_bands"]
     assert [band["wavelength_nm"] for band in dropped] == [500.0, 550.0, 600.0]

@@ -76,8 +76,7 @@ def shading_of(normal: tuple[float, float, float]) -> LampShading:
 
 
 @pytest.mark.parametrize(
-    ("normal", "expected"),
-    [((0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 2.0)],
+    ("normal", "expected"), [((0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 2.0)]
 )
 def test_the_error_is_one_less_the_cosine_to_the_densities_own_normals_and_0_without_samples(
     normal, expected

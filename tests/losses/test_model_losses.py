@@ -4,12 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import (
-    NUM_BANDS,
-    losses_of,
-    make_model,
-    make_rays,
-)
+from tests.method_factory import NUM_BANDS, losses_of, make_model, make_rays
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.presets import WITHOUT_ALPHA
 from unmix_plugin.settings import LossConfig
@@ -141,11 +136,7 @@ def test_abundances_are_drawn_to_those_that_measured_spectra_show():
 def test_the_guide_of_abundances_lets_go_of_them_as_training_goes_on():
     model = make_model(losses=LossConfig(abundances=0.5))
     begin_step = model.get_training_callbacks()[0].func
-    batch = {
-        "spectra": 0.5 * model.guide.endmembers,
-        "alpha": torch.ones(3),
-        "pixels": torch.arange(3),
-    }
+    batch = {"spectra": 0.5 * model.guide.endmembers, "alpha": torch.ones(3), "pixels": torch.arange(3)}
     wrong = torch.eye(3).roll(1, dims=1)
     found = []
     for progress in (0.0, 0.5, 1.0):

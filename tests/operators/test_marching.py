@@ -4,13 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.operators.marching import (
-    PackedSamples,
-    count_samples,
-    march,
-    march_first,
-    march_twin,
-)
+from unmix_plugin.operators.marching import PackedSamples, count_samples, march, march_first, march_twin
 from unmix_plugin.operators.occupancy import skip_distances
 
 

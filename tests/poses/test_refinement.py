@@ -111,21 +111,26 @@ def test_what_moves_all_views_alike_is_no_correction(pixel_size):
     assert sum(knots.counts) == len(before)
 
 
-def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it():
-    found = PoseRefinement((0,) * 6)
-    places = torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
-    places *= 4 / places.norm(dim=1, keepdim=True)
-    found.begin(places, box_around(torch.zeros(3)), 0.1)
-    found.gauge.zero_()
+@pytest.mark.parametrize(
+    ("runaways", "is_final", "free"),
+    [
+        (1, True, [True, True, True, False]),
+        (3, True, [False] * 4),  # when most views run away all are undone
+        (1, False, [True] * 4),  # while the grid is coarse it may try again
+    ],
+)
+def test_a_view_that_runs_away_gets_its_pose_back_and_keeps_it(runaways, is_final, free):
+    found = PoseRefinement((0,) * 4)
     with torch.no_grad():
         found.steps.fill_(0.01)
-        found.steps[2, 0] = 2 * LARGEST_STEP
-    found.undo_runaways()
-    assert found.is_free.tolist() == [True, True, False, True, True, True]
+        found.steps[4 - runaways :, 0] = 2 * LARGEST_STEP
+    found.undo_runaways(is_final=is_final)
+    assert found.is_free.tolist() == free
+    assert torch.equal(corrections(found)[3], torch.zeros(6))
+    assert bool((corrections(found)[0] != 0).all()) == (runaways == 1)
     with torch.no_grad():
-        found.steps[2, 1] = 0.1
-    assert torch.equal(corrections(found)[2], torch.zeros(6))
-    assert bool((corrections(found)[0] != 0).all())
+        found.steps[3, 0] = 0.1
+    assert float(corrections(found)[3, 0].detach()) == pytest.approx(0.0 if is_final else 0.1)
 
 
 def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
@@ -142,33 +147,6 @@ def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
     assert_close(turns / turns[0], torch.tensor([1.0, 1.0, 0.25]))
     found.undo_runaways()
     assert found.is_free.tolist() == [True, True, True, False]
-
-
-def with_runaways(count: int) -> PoseRefinement:
-    """Of four views, the last ones far off."""
-    found = PoseRefinement((0,) * 4)
-    with torch.no_grad():
-        found.steps.fill_(0.01)
-        found.steps[4 - count :, 0] = 1.0
-    return found
-
-
-def test_when_most_views_run_away_all_are_undone():
-    found = with_runaways(3)
-    found.undo_runaways()
-    assert not bool(found.is_free.any())
-    assert torch.equal(corrections(found), torch.zeros(4, 6))
-
-
-def test_while_the_grid_is_coarse_a_view_that_runs_away_may_try_again():
-    found = with_runaways(1)
-    found.undo_runaways(is_final=False)
-    assert bool(found.is_free.all())
-    assert torch.equal(corrections(found)[3], torch.zeros(6))
-    assert bool((corrections(found)[:3] != 0).all())
-    with torch.no_grad():
-        found.steps[3, 0] = 0.1
-    assert float(corrections(found)[3, 0].detach()) == pytest.approx(0.1)
 
 
 def test_a_shift_counts_by_the_distance_to_the_middle_of_the_scene():

@@ -103,12 +103,6 @@ def test_removing_a_material_takes_its_light_out_of_the_sky():
     assert_close(after[:, [0, 2, 3]], before[:, [0, 2, 3]])
 
 
-def test_a_bounded_field_has_no_sky_and_no_parameters_for_one():
-    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, 1.0, 0.1)
-    assert field.sky(rays(2).directions) is None
-    assert not [name for name in field.state_dict() if "sky" in name]
-
-
 def test_what_is_near_a_camera_learns_more_slowly_but_looks_the_same():
     values = torch.tensor([1.5, 2.5], requires_grad=True)
     scaled = scale_gradient(values, torch.tensor([0.25, 1.0]))
@@ -157,8 +151,11 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
     assert blocks == [2, 2, 1, 1, 1, 1]
 
 
-def test_a_bounded_field_with_a_backdrop_has_it_behind_all_matter():
+def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backdrop():
     config = UnmixFieldConfig(log2_rows_per_level=8)
+    bare = UnmixField(config, BOX, 3, 1, 1.0, 0.1)
+    assert bare.sky(rays(2).directions) is None
+    assert not [name for name in bare.state_dict() if "sky" in name]
     field = UnmixField(config, BOX, 3, 1, 1e-9, 0.1, has_sky=True)
     reachable = torch.ones((8, 8, 8), dtype=torch.bool)
     renderer = VolumeRenderer(BOX, torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3)

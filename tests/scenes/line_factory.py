@@ -8,15 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tests.scenes.scene_factory import (
-    FOCAL,
-    HEIGHT,
-    SPECTRUM,
-    WIDTH,
-    SceneFolder,
-    make_scene,
-    ring_poses,
-)
+from tests.scenes.scene_factory import FOCAL, HEIGHT, SPECTRUM, WIDTH, SceneFolder, make_scene, ring_poses
 
 SWEEP = 1.0
 """How far each camera moves along its y axis from the first row to the last, to either side of the middle."""

@@ -34,8 +34,7 @@ def write(folder: Path, text: str) -> Path:
 
 @settings(deadline=None, max_examples=30)
 @given(
-    st.lists(st.floats(0.01, 1), min_size=4, max_size=4),
-    st.lists(st.floats(0, 1), min_size=4, max_size=4),
+    st.lists(st.floats(0.01, 1), min_size=4, max_size=4), st.lists(st.floats(0, 1), min_size=4, max_size=4)
 )
 def test_a_flat_spectrum_is_1_in_every_channel(first, second):
     seen = sensor([410, 433, 570.5, 690], a=first, b=[*second[:3], 1.7]).seen_by(BANDS)

@@ -11,11 +11,7 @@ import scipy.io
 import scipy.sparse
 import torch
 
-from tests.captures.file_factory import (
-    check_file,
-    present,
-    rows_and_bands_of,
-)
+from tests.captures.file_factory import check_file, present, rows_and_bands_of
 from unmix_plugin.captures.readers import matlab
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions

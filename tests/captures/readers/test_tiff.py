@@ -143,10 +143,7 @@ SAID = [
         {"scale": 10000.0, "no_data": 65535},
     ),
     *(
-        (
-            {"description": description, "metadata": None},
-            {"nm": NM, "evidence": "image description"},
-        )
+        ({"description": description, "metadata": None}, {"nm": NM, "evidence": "image description"})
         for description in (
             json.dumps({"wavelengths_nm": NM}),
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),

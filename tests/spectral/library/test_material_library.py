@@ -8,11 +8,7 @@ from hypothesis import strategies as st
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.material_library import (
-    LibraryMaterial,
-    MaterialLibrary,
-    measured_library,
-)
+from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary, measured_library
 
 VISIBLE = Bands.of(np.linspace(400, 700, 31))
 NUM_MEASURED = 174

@@ -18,15 +18,8 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
-from unmix_plugin.spectral.maps.targets import (
-    LOADING,
-    Background,
-    adaptive_coherence,
-    matched_filter,
-)
-from unmix_plugin.spectral.maps.targets import (
-    parse_target as _parse_target,
-)
+from unmix_plugin.spectral.maps.targets import LOADING, Background, adaptive_coherence, matched_filter
+from unmix_plugin.spectral.maps.targets import parse_target as _parse_target
 
 
 def parse_target(text, bands):
