@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -92,12 +93,18 @@ def write_poses(path: Path, names: list[str], width: int = WIDTH, height: int = 
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def process(capture: Path, output: Path, **options: Any) -> list[str]:
-    """Make the scene of a capture of the layout `cubes`, with all of each image unless a mask is asked for; gives what
+def process(
+    capture: Path,
+    output: Path,
+    layout: str = "cubes",
+    tell: Callable[[str], object] = lambda _: None,
+    **options: Any,
+) -> list[str]:
+    """Make the scene of a capture, of the layout `cubes` with all of each image unless a mask is asked for; gives what
     looks wrong."""
-    given = {"poses": "transforms.json", "mask": "none", **options}
-    asked = ProcessOptions(layout="cubes", data=capture, output_dir=output, **given)
-    return process_capture(asked, lambda _: None, lambda _, views: views)
+    given = {"poses": "transforms.json", "mask": "none"} if layout == "cubes" else {}
+    asked = ProcessOptions(layout, data=capture, output_dir=output, **{**given, **options})
+    return process_capture(asked, tell, lambda _, views: views)
 
 
 def _reflectance(generator: np.random.Generator) -> np.ndarray:

@@ -26,9 +26,7 @@ from tests.captures.file_factory import present
 from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.layouts.cubes import find_cubes
-from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
@@ -309,8 +307,7 @@ def write_views(root: Path, ground: int, alpha: tuple[str, ...] = (), turned: tu
 def notes_of(root: Path, output: Path, wavelengths: str = "610,550,465", **options) -> str:
     """All that is said while the pictures become a scene."""
     told: list[str] = []
-    asked = ProcessOptions("nerfstudio", root, output, wavelengths=wavelengths, **options)
-    process_capture(asked, told.append, lambda _, views: views)
+    process(root, output, "nerfstudio", told.append, wavelengths=wavelengths, **options)
     return "\n".join(told)
 
 

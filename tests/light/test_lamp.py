@@ -206,9 +206,13 @@ def test_the_lamp_follows_from_the_data(numbers, words):
     config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: data, torch.Generator())
     assert config.lamp == numbers
     assert words in reasons
-    model = replace(CONFIG, light="camera", lamp=numbers).setup(scene_box=BOX, metadata=make_model().metadata)
+    config = replace(CONFIG, light="camera", lamp=numbers)
+    model = config.setup(scene_box=BOX, metadata=make_model().metadata)
     assert isinstance(model, UnmixModel)
     assert (model.field.moving_lamp is None, model.grid.opaque is None) == (numbers == (),) * 2
+
+
+def test_a_lamp_is_ten_numbers():
     assert Lamp.of_numbers(NUMBERS) == TURNTABLE
     with pytest.raises(ConfigError, match="ten numbers"):
         UnmixModelConfig(lamp=(0.0, 1.0))

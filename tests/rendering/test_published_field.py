@@ -66,14 +66,17 @@ def test_a_known_encoding_changes_no_value_and_no_gradient(field):
     assert_close(found[0], found[1])
 
 
-def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_chooses():
+def test_the_registered_settings_are_written_down_and_read_back_and_allow_no_light_that_moves():
     config = unmix_nerf_published.config
-    published = config.pipeline.model
-    assert isinstance(published, UnmixModelConfig)
-    assert published.as_published
     assert config_from_json(config_to_json(config), config) == config
     with pytest.raises(ConfigError, match="light fixed or per-view: the field as published has no shading"):
-        replace(published, light="camera")
+        replace(config.pipeline.model, light="camera")
+
+
+def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_chooses():
+    published = unmix_nerf_published.config.pipeline.model
+    assert isinstance(published, UnmixModelConfig)
+    assert published.as_published
     own = {name: getattr(published, name) for name in ("specular", "segmentation", "losses")}
     model = make_model(field=SMALL, as_published=True, **own)
     assert isinstance(model.field, PublishedField)

@@ -123,12 +123,15 @@ def test_views_fed_one_by_one_count_as_one_scene(seed):
     assert int(tally.confusion.sum()) == int((true != 255).sum())
 
 
-def test_one_matching_serves_all_views_and_the_confusion_matrix_names_rows_and_columns():
+def test_one_matching_serves_all_views():
     # Each view alone would be perfect under its own matching; the scene as a whole is half wrong.
     tally = SegmentationTally(2, 2)
     tally.add(labels(0, 1, 1), labels(0, 1, 1))
     tally.add(labels(1, 0, 0), labels(0, 1, 1))
     assert tally.scores().accuracy == pytest.approx(0.5)
+
+
+def test_the_confusion_matrix_has_predicted_ids_in_rows_and_missed_pixels_in_the_last():
     tally = SegmentationTally(2, 3)
     tally.add(labels(1, 1, 255, 0), labels(2, 2, 1, 255))
     assert tally.confusion.tolist() == [[0, 0, 0], [0, 0, 2], [0, 1, 0]]

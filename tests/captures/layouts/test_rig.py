@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.captures.capture_factory import process
 from tests.captures.file_factory import file_of, present, write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
@@ -22,10 +23,8 @@ from tests.captures.layouts.rig_flight import (
     write_poses,
 )
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
-from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import natural_order
-from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 
@@ -47,8 +46,7 @@ def scene(flight, tmp_path_factory):
 
 
 def _process(root, output, poses, **given):
-    options = ProcessOptions("rig", data=root, output_dir=output, poses=str(poses), mask="none", **given)
-    process_capture(options, lambda _: None, lambda _, views: views)
+    process(root, output, "rig", poses=str(poses), mask="none", **given)
     return output
 
 
@@ -66,7 +64,7 @@ def test_every_file_is_a_view_of_its_lens_and_release(flight):
     assert any("1 colour picture left out" in note for note in capture.notes)
 
 
-def test_the_scene_knows_bands_lenses_and_releases_and_poses_all_lenses_by_the_rig(scene):
+def test_frames_have_their_band_lens_and_release_and_releases_stay_together_when_views_are_split(scene):
     content, frames = _frames(scene)
     assert content["wavelengths"] == [550.0, 660.0, 735.0, 790.0]
     assert content["fwhm"] == [40.0, 40.0, 10.0, 40.0]
@@ -76,15 +74,15 @@ def test_the_scene_knows_bands_lenses_and_releases_and_poses_all_lenses_by_the_r
         assert (frame["bands"], frame["sensor"]) == ([band], lens.name.lower())
         assert frame["fl_x"] == pytest.approx(lens.focal_mm * 20.0, abs=0.01)
         assert frame["capture"].endswith("_0004")
-    evaluation = content["test_filenames"]  # releases stay together
+    evaluation = content["test_filenames"]
     assert (len(evaluation), len(content["train_filenames"])) == (4, 36)
     assert {path.rpartition("_")[0].rpartition("_")[2] for path in evaluation} == {"0004"}
+
+
+def test_an_orientation_that_is_ignored_is_said_once(scene):
     report = (scene / "report.txt").read_text()
     assert report.count("EXIF's orientation") == 1
     assert "EXIF's orientation of 40 of 40 pictures is ignored" in report
-    found = _beside_green(content, frames, "0006")
-    expected = [np.linalg.inv(lens_pose(6, LENSES[0])) @ lens_pose(6, x, at_its_place=False) for x in LENSES]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def _frames(scene):
@@ -106,21 +104,15 @@ def test_names_that_differ_in_zeros_or_case_alone_have_one_order():
         assert sorted(names, key=natural_order) == ["Shot_1", "shot_001", "shot_01", "shot_1"]
 
 
-def _beside_green(content, frames, release):
-    """Poses of all lenses of a release from the first one, in metres."""
-    poses = [
-        np.array(
-            next(
-                f["transform_matrix"]
-                for path, f in frames.items()
-                if path.endswith(f"_{release}_{lens.ending}.npy")
-            )
-        )
-        for lens in LENSES
-    ]
-    found = np.linalg.inv(poses[0]) @ np.stack(poses)
+def test_all_lenses_are_posed_by_the_rig(scene):
+    """From the first one, in metres."""
+    content, frames = _frames(scene)
+    poses = [frames[path]["transform_matrix"] for path in sorted(frames) if "_0006_" in path]
+    by_ending = dict(zip(("GRE", "NIR", "RED", "REG"), map(np.array, poses), strict=True))
+    found = np.linalg.inv(by_ending["GRE"]) @ np.stack([by_ending[lens.ending] for lens in LENSES])
     found[:, :3, 3] /= content.get("applied_scale", 1.0)
-    return found
+    expected = [np.linalg.inv(lens_pose(6, LENSES[0])) @ lens_pose(6, x, at_its_place=False) for x in LENSES]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_the_scene_holds_the_radiance_of_the_ground(scene):
@@ -250,7 +242,7 @@ def file_with(xmp, exif=EXIF) -> SpectralFile:
 
 def project(lens: Lens, x, y):
     """Through the lens that we keep, pixel centres at 0.5."""
-    (k1, k2, k3, k4), (p1, p2) = lens.radial, lens.tangential
+    (k1, k2, k3, k4), (p1, p2) = lens.radial, lens.distortion[2:]
     square = x * x + y * y
     factor = 1 + k1 * square + k2 * square**2 + k3 * square**3 + k4 * square**4
     bent_x = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.captures.capture_factory import process
 from tests.captures.file_factory import check_file, present, write_envi
 from tests.captures.layouts.data_sets import (
     LENS,
@@ -27,12 +28,9 @@ from tests.captures.layouts.data_sets import (
 )
 from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
 from unmix_plugin.captures.layouts.transforms import find_hs_nerf, find_nerfstudio, find_unmix_nerf
-from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.scene import Scene
 
 
 def edit(root, change):
@@ -187,12 +185,6 @@ def test_an_empty_folder_is_refused_by_every_layout(tmp_path, layout):
         find_views(layout, tmp_path, PLAIN)
 
 
-def process(layout, root, output, **given) -> Scene:
-    options = ProcessOptions(layout, data=root, output_dir=output, **given)
-    process_capture(options, lambda _: None, lambda _, views: views)
-    return load_scene(output)
-
-
 @pytest.mark.parametrize(
     ("layout", "write", "wavelengths", "said"),
     [
@@ -213,10 +205,11 @@ def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout
     write(tmp_path / "data")
     if said is not None:
         with pytest.raises(CaptureError, match=said):
-            process(layout, tmp_path / "data", tmp_path / "scene")
+            process(tmp_path / "data", tmp_path / "scene", layout)
     options = {"wavelengths": wavelengths, "scale": 2.0 if "nespof" in layout else 1.0}
     options |= {"mask": "none"} if layout == "unmix-nerf" else {}
-    scene = process(layout, tmp_path / "data", tmp_path / "scene", **options)
+    process(tmp_path / "data", tmp_path / "scene", layout, **options)
+    scene = load_scene(tmp_path / "scene")
     stokes = [[intensity(index, nm) / 2 for nm in (450, 460, 470)] for index in range(3)]
     match layout:
         case "nerfstudio":

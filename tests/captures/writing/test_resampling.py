@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.capture_factory import write_cube, write_poses
+from tests.captures.capture_factory import process, write_cube, write_poses
 from unmix_plugin.captures.calibration.calibration import CalibratedRows
-from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.poses.lens import Lens, Points, bend_fisheye, bend_ftheta, fit_lens
-from unmix_plugin.captures.process import process_capture
 from unmix_plugin.captures.writing.resampling import Resampling
 
 WIDTH, HEIGHT = 128, 96
@@ -134,10 +132,7 @@ def test_a_scene_of_an_ftheta_lens_shows_its_views_in_a_lens_that_trains(tmp_pat
     content |= {"ftheta_p3": 4e-7, "ftheta_p4": 0.0}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     output = tmp_path / "scene"
-    asked = ProcessOptions(
-        "cubes", tmp_path, output, poses="transforms.json", mask="none", scale=1.0, **options
-    )
-    process_capture(asked, lambda _: None, lambda _, views: views)
+    process(tmp_path, output, scale=1.0, **options)
     scene = json.loads((output / "transforms.json").read_text())
     assert scene["camera_model"] == "OPENCV"
     cube = np.load(output / "cubes" / "view_00.npy") / 65535.0

@@ -144,6 +144,9 @@ def test_a_long_formula_is_refused_and_the_longest_and_most_nested_is_read():
     with pytest.raises(ConfigError, match="at most 500 characters; this one has 504"):
         parse_formula(longest + "+r800")
     assert float(value("(" * 49 + "r800" + ")" * 49)) == 0.7
+
+
+def test_a_caret_is_the_power_operator_case_does_not_matter_and_wavelengths_may_have_decimals():
     assert value("R800^2^2*SQRT(R670)") == value("r800**2**2*sqrt(r670)")
     assert parse_formula("r800.5/(r670+r800.5)-r450").wavelengths_nm == (450.0, 670.0, 800.5)
 
@@ -213,11 +216,17 @@ def test_half_a_spacing_beyond_the_outermost_centres_is_the_outermost_band():
     assert parse_index("r705", VISIBLE)(spectrum) == 30
     with pytest.raises(SpectrumError, match=r"needs 705\.1 nm"):
         parse_index("r705.1", VISIBLE)
+    assert parse_index("r552-r547", Bands.of([550]))(torch.tensor([[0.25]])).tolist() == [0]
+
+
+def test_a_wavelength_on_a_centre_does_not_read_the_neighbour():
+    index = parse_index("r500", Bands.of([500, 600, 700]))
+    assert float(index(torch.tensor([0.2, torch.nan, torch.nan]))) == pytest.approx(0.2)
+
+
+def test_spectra_of_another_sampling_are_refused():
     with pytest.raises(SpectrumError, match=r"is made for 31 bands, 400-700 nm; found spectra of 61"):
         parse_index("pri", VISIBLE)(torch.zeros(2, 61))
-    assert parse_index("r552-r547", Bands.of([550]))(torch.tensor([[0.25]])).tolist() == [0]
-    on_centre = parse_index("r500", Bands.of([500, 600, 700]))
-    assert float(on_centre(torch.tensor([0.2, torch.nan, torch.nan]))) == pytest.approx(0.2)
 
 
 def test_a_wavelength_that_the_bands_do_not_reach_is_refused():
