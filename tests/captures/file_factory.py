@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tifffile
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from unmix_plugin.captures.camera_tags import band_of, camera_tags
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 
 
@@ -79,21 +77,6 @@ def write_band_file(
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels.astype(np.uint16)).save(path, format="TIFF", tiffinfo=directory)
     return path
-
-
-def open_band_file(path: Path) -> SpectralFile:
-    """A band file as a reader gives it."""
-    with tifffile.TiffFile(path) as stream:
-        pixels, metadata = stream.pages.first.asarray()[..., None], camera_tags(stream.pages.first.tags)
-    return SpectralFile(
-        path,
-        "tiff",
-        pixels.shape,
-        pixels.dtype,
-        lambda rows, bands: pixels[rows][..., bands],
-        band_of(metadata["xmp"]) or BandTable(),
-        metadata=metadata,
-    )
 
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12, "u4": 13, "i8": 14, "u8": 15}

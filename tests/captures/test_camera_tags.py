@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import open_band_file, present, write_band_file, xmp_packet
+from tests.captures.file_factory import present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
     RadiometricModel,
     band_of,
@@ -13,6 +13,7 @@ from unmix_plugin.captures.camera_tags import (
     radiometric_model,
     tag_numbers,
 )
+from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import CaptureError
 
@@ -66,7 +67,7 @@ def test_exif_rationals_become_numbers(tmp_path):
     exif = {"ExposureTime": 0.0004725, "FNumber": 2.8, "ISOSpeed": 400, "FocalPlaneXResolution": 266.667}
     levels = [4800, 4801, 4802, 4803]
     path = write_band_file(tmp_path / "a.tif", np.zeros((2, 3)), {}, exif, black_level=levels)
-    found = open_band_file(path).metadata["exif"]
+    found = open_spectral_file(path).metadata["exif"]
     assert {name: found[name] for name in exif} == pytest.approx(exif, rel=1e-6)
     assert found["BlackLevel"] == [4800.0, 4801.0, 4802.0, 4803.0]
     assert found["BitsPerSample"] == 16
@@ -108,7 +109,7 @@ def pixels():
 
 
 def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
-    return open_band_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
+    return open_spectral_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
 
 
 def model_of(file: SpectralFile) -> RadiometricModel:

@@ -52,43 +52,61 @@ NAN = math.nan
 
 
 @pytest.mark.parametrize(
-    ("pred", "true", "numbers", "matching", "miou", "macro_f1", "accuracy"),
+    ("pred", "true", "numbers", "matching", "iou", "macro_f1", "accuracy"),
     [
-        ([1, 1, 1, 0, 0, 0, 0, 1], [0, 0, 0, 0, 1, 1, 1, 1], (2, 2), {1: 0, 0: 1}, 3 / 5, 6 / 8, 6 / 8),
+        (
+            [1, 1, 1, 0, 0, 0, 0, 1],
+            [0, 0, 0, 0, 1, 1, 1, 1],
+            (2, 2),
+            {1: 0, 0: 1},
+            {0: 3 / 5, 1: 3 / 5},
+            6 / 8,
+            6 / 8,
+        ),
         # Materials count equally in means, pixels in accuracy.
         (
             [0] * 9 + [1],
             [0] * 8 + [1, 1],
             (2, 2),
             {0: 0, 1: 1},
-            (8 / 9 + 1 / 2) / 2,
+            {0: 8 / 9, 1: 1 / 2},
             (16 / 17 + 2 / 3) / 2,
             0.9,
         ),
         # Pixels without labels are ignored, missed ones are not.
-        ([0, 255, 0, 1, 1, 1], [0, 0, 255, 255, 1, 1], (2, 2), {0: 0, 1: 1}, 3 / 4, (2 / 3 + 1) / 2, 3 / 4),
+        (
+            [0, 255, 0, 1, 1, 1],
+            [0, 0, 255, 255, 1, 1],
+            (2, 2),
+            {0: 0, 1: 1},
+            {0: 1 / 2, 1: 1},
+            (2 / 3 + 1) / 2,
+            3 / 4,
+        ),
         # A surplus id is a miss of the material that it covers.
         (
             [2, 0, 0, 0, 1, 1],
             [0, 0, 0, 0, 1, 1],
             (3, 2),
             {0: 0, 1: 1},
-            (3 / 4 + 1) / 2,
+            {0: 3 / 4, 1: 1},
             (6 / 7 + 1) / 2,
             5 / 6,
         ),
         # A material without an id scores 0: ids that share no pixel with it are not matched to it.
-        ([0, 0, 0, 2], [0, 0, 1, 255], (3, 2), {0: 0}, 1 / 3, (4 / 5) / 2, 2 / 3),
+        ([0, 0, 0, 2], [0, 0, 1, 255], (3, 2), {0: 0}, {0: 2 / 3, 1: 0}, (4 / 5) / 2, 2 / 3),
         # Materials that never occur are left out of means.
-        ([3, 3, 1], [5, 5, 2], (4, 9), {3: 5, 1: 2}, 1, 1, 1),
-        ([0, 1], [255, 255], (2, 2), {}, NAN, NAN, NAN),
+        ([3, 3, 1], [5, 5, 2], (4, 9), {3: 5, 1: 2}, {5: 1, 2: 1}, 1, 1),
+        ([0, 1], [255, 255], (2, 2), {}, {}, NAN, NAN),
     ],
 )
-def test_figures_of_small_scenes_counted_by_hand(pred, true, numbers, matching, miou, macro_f1, accuracy):
+def test_figures_of_small_scenes_counted_by_hand(pred, true, numbers, matching, iou, macro_f1, accuracy):
     scores = scored(labels(*pred), labels(*true), *numbers)
     assert scores.matching == matching
+    assert scores.iou == pytest.approx(iou)
+    mean = sum(iou.values()) / len(iou) if iou else NAN
     figures = (scores.miou, scores.macro_f1, scores.accuracy)
-    assert figures == pytest.approx((miou, macro_f1, accuracy), nan_ok=True)
+    assert figures == pytest.approx((mean, macro_f1, accuracy), nan_ok=True)
 
 
 def test_of_two_materials_of_one_id_the_larger_has_it_and_the_other_scores_zero():

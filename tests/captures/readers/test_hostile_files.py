@@ -184,24 +184,21 @@ def test_a_long_header_takes_time_in_proportion_to_its_length(tmp_path, name):
 
 
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
-DESCRIPTIONS = {
-    "one word": ("wavelength" * LONG, 270),
-    "unclosed": ("wavelength <Channel " * (LONG // 4), 270),
-    "spaces": ("wavelength = " + " " * LONG + "x", 270),
-    "nested": (
-        f'<rdf:RDF xmlns:rdf="{RDF}">{"<rdf:Description>" * 20_000}{"</rdf:Description>" * 20_000}</rdf:RDF>',
-        700,
-    ),
-    "half a width": (
-        f'<rdf:RDF xmlns:rdf="{RDF}"><rdf:Description BandFreq="560+{" " * LONG}x"/></rdf:RDF>',
-        700,
-    ),
-}
+NESTED = f'<rdf:RDF xmlns:rdf="{RDF}">{"<rdf:Description>" * 20_000}{"</rdf:Description>" * 20_000}</rdf:RDF>'
+HALF = f'<rdf:RDF xmlns:rdf="{RDF}"><rdf:Description BandFreq="560+{" " * LONG}x"/></rdf:RDF>'
 
 
-@pytest.mark.parametrize("name", DESCRIPTIONS)
-def test_a_long_description_takes_time_in_proportion_to_its_length(tmp_path, name):
-    text, code = DESCRIPTIONS[name]
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        pytest.param("wavelength" * LONG, 270, id="one word"),
+        pytest.param("wavelength <Channel " * (LONG // 4), 270, id="unclosed"),
+        pytest.param("wavelength = " + " " * LONG + "x", 270, id="spaces"),
+        pytest.param(NESTED, 700, id="nested"),
+        pytest.param(HALF, 700, id="half a width"),
+    ],
+)
+def test_a_long_description_takes_time_in_proportion_to_its_length(tmp_path, text, code):
     tag = (code, "B" if code == 700 else "s", len(text) if code == 700 else 0, text.encode(), True)
     tifffile.imwrite(tmp_path / "a.tif", CUBE, photometric="minisblack", metadata=None, extratags=[tag])
     with quick():
