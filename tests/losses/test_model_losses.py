@@ -38,14 +38,20 @@ def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
     assert "rgb" not in losses[False]
 
 
-def test_a_bright_background_penalises_missing_opacity():
-    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
-    losses = {}
-    for background in ("black", "white"):
-        model = make_model(losses=LossConfig(background=background, abundances=0.0))
-        found = losses_of(model, batch, torch.zeros(4, NUM_BANDS), torch.zeros(4))
-        losses[background] = float(found["spectral"])
-    assert losses == {"black": 0.0, "white": 1.0}
+@pytest.mark.parametrize(
+    ("background", "has_alpha", "least", "most"),
+    [
+        ("black", True, 0.0, 0.0),
+        ("white", True, 1.0, 1.0),
+        ("auto", False, 0.0, 0.0),  # black
+        ("auto", True, 0.2, 0.5),  # random: the mean square of a grey drawn evenly from [0, 1]
+    ],
+)
+def test_a_bright_background_penalises_missing_opacity(background, has_alpha, least, most):
+    batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
+    model = make_model(has_alpha=has_alpha, losses=LossConfig(background=background, abundances=0.0))
+    found = losses_of(model, batch, batch["spectra"], torch.zeros(50))
+    assert least <= float(found["spectral"]) <= most
 
 
 def test_brighter_than_a_saturated_sensor_is_no_error_but_darker_is():
@@ -84,39 +90,25 @@ def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
     assert "opacity" not in losses_of(make_model(), batch, spectra, opacities)
 
 
-def test_the_automatic_background_is_black_without_alpha_and_random_with_it():
-    batch = {"spectra": torch.zeros(50, NUM_BANDS), "alpha": torch.ones(50)}
-    losses = [
-        float(losses_of(make_model(has_alpha=has), batch, batch["spectra"], torch.zeros(50))["spectral"])
-        for has in (False, True)
-    ]
-    assert losses[0] == 0
-    assert 0.2 < losses[1] < 0.5  # the mean square of a grey drawn evenly from [0, 1]
-
-
-def test_sparsity_is_asked_for_early_and_only_where_no_alpha_says_what_is_empty():
-    batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
-    model = make_model(has_alpha=False)
-    begin_step = model.get_training_callbacks()[0].func
-    found = []
-    for progress in (0.0, 0.125, 0.25, 1.0):
-        begin_step(1, progress)
-        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), sparsity=3.0)
-        found.append(float(losses.get("sparsity", 0.0)) / WITHOUT_ALPHA.sparsity_loss_weight)
-    assert found == pytest.approx([3.0, 0.75, 0.0, 0.0])
-    assert "sparsity" not in losses_of(make_model(), batch, batch["spectra"], torch.zeros(4), sparsity=3.0)
-
-
-@pytest.mark.parametrize("has_alpha", [True, False])
-def test_certain_abundances_cost_less_and_less(has_alpha):
+@pytest.mark.parametrize(
+    ("name", "has_alpha", "at", "expected"),
+    [
+        ("sparsity", False, (0.0, 0.125, 0.25, 1.0), (3.0, 0.75, 0.0, 0.0)),
+        ("sparsity", True, (0.0, 1.0), (0.0, 0.0)),  # where alpha says what is empty
+        ("certainty", False, (0.0, 0.25, 0.5, 1.0), (0.03, 0.0075, 0.0, 0.0)),
+        ("certainty", True, (0.0, 0.25, 0.5, 1.0), (0.03, 0.0075, 0.0, 0.0)),
+    ],
+)
+def test_sparsity_and_certainty_are_asked_for_less_and_less(name, has_alpha, at, expected):
     batch = {"spectra": torch.zeros(4, NUM_BANDS), "alpha": torch.ones(4)}
     model = make_model(has_alpha=has_alpha)
     begin_step, found = model.get_training_callbacks()[0].func, []
-    for progress in (0.0, 0.25, 0.5, 1.0):
+    weight = WITHOUT_ALPHA.sparsity_loss_weight if name == "sparsity" else 1.0
+    for progress in at:
         begin_step(1, progress)
-        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), certainty=3.0)
-        found.append(float(losses.get("certainty", 0.0)))
-    assert found == pytest.approx([0.03, 0.0075, 0.0, 0.0])
+        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), **{name: 3.0})
+        found.append(float(losses.get(name, 0.0)) / weight)
+    assert found == pytest.approx(expected)
 
 
 def test_abundances_are_drawn_to_those_that_measured_spectra_show():

@@ -47,21 +47,6 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
     assert torch.equal(taken[0][is_clear], taken[1][is_clear])
 
 
-def test_a_full_grid_is_sampled_at_every_step():
-    origins, directions = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
-    samples = march(
-        origins,
-        directions,
-        torch.ones(1),
-        2 * torch.ones(1),
-        torch.tensor([0.5]),
-        torch.zeros(4, 4, 4).byte(),
-        0.1,
-    )
-    assert_close(samples.t, torch.arange(10) * 0.1 + 1.05)
-    assert samples.packed_info.tolist() == [[0, 10]]
-
-
 @pytest.mark.parametrize("step", [1 / 64, 0.1, 0.05, 1 / 3, 0.013, 2.0])
 def test_every_lattice_point_in_front_of_the_far_end_is_taken_and_none_at_it(step):
     n = 200

@@ -180,12 +180,7 @@ def test_three_views_must_look_through_a_cell(num_views):
     shape = (num_views, cameras.height, cameras.width)
     depths = _SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
     empty = _seen_through(depths, cameras, BOX, 32)
-    space = UnitSpace(BOX, is_unbounded=True)
-
-    def is_empty(*point: float) -> bool:
-        return bool(empty[tuple((space.to_unit(torch.tensor(point)) * 32).long())])
-
-    assert is_empty(0.5, 0.0, 0.3) == (num_views == 3)
-    assert not is_empty(-0.5, 0.0, 0.3)  # the surface
-    assert not is_empty(-1.5, 0.0, 0.3)  # behind it
-    assert not is_empty(4.0, 0.0, 0.3)  # behind the cameras
+    # Before the surface, on it, behind it, and behind the cameras.
+    points = torch.tensor([[0.5, 0.0, 0.3], [-0.5, 0.0, 0.3], [-1.5, 0.0, 0.3], [4.0, 0.0, 0.3]])
+    cells = (UnitSpace(BOX, is_unbounded=True).to_unit(points) * 32).long()
+    assert empty[tuple(cells.T.numpy())].tolist() == [num_views == 3, False, False, False]

@@ -245,19 +245,6 @@ def test_indices_of_a_sensor_are_those_whose_wavelengths_it_sees():
     assert available_indices(VISIBLE) == ["pri", "mcari", "cri1", "ari1", "redness", "iron-oxide"]
 
 
-def test_every_named_index_is_finite_and_in_its_usual_range_on_vegetation():
-    nm = torch.tensor(FULL.centers_nm)
-    plateau = 0.45 * torch.sigmoid((nm - 718) / 12)
-    green = 0.07 * torch.exp(-(((nm - 552) / 30) ** 2))
-    water = sum(
-        depth * torch.exp(-(((nm - at) / 90) ** 2)) for at, depth in ((1200, 0.2), (1450, 0.7), (1940, 0.8))
-    )
-    spectrum = (0.04 + plateau + green) * (1 - water)  # a red edge, a green peak, water bands
-    for name, named in NAMED_INDICES.items():
-        low, high = named.usual_range
-        assert low <= float(parse_index(name, FULL)(spectrum)) <= high, name
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("rays", [(), (0,), (1,), (2, 3)])
 def test_the_result_has_the_rays_and_the_type_of_the_input(rays, dtype):
