@@ -97,7 +97,8 @@ def process(
     capture: Path,
     output: Path,
     layout: str = "cubes",
-    tell: Callable[[str], object] = lambda _: None,
+    tell: Callable[[str], None] = lambda _: None,
+    /,
     **options: Any,
 ) -> list[str]:
     """Make the scene of a capture, of the layout `cubes` with all of each image unless a mask is asked for; gives what

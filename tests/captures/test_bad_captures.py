@@ -107,7 +107,7 @@ SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
     (_cube("view_01", wavelength=f"{{{MOVED}}}"), {}, r"view_01\.hdr has 453 nm at band 0; expected 450 nm"),
     (_cube("view_01", COUNTS.astype(np.float32)), {}, "holds float32; expected uint16"),
     (
-        _cube("view_01", **{"reflectance scale factor": 10000}),
+        _cube("view_01", COUNTS, **{"reflectance scale factor": 10000}),
         {},
         r"view_00\.hdr has no gains or scale, .*factor",
     ),

@@ -1,5 +1,7 @@
 """What the losses of the model ask for, with alpha and without."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -104,9 +106,10 @@ def test_sparsity_and_certainty_are_asked_for_less_and_less(name, has_alpha, at,
     model = make_model(has_alpha=has_alpha)
     begin_step, found = model.get_training_callbacks()[0].func, []
     weight = WITHOUT_ALPHA.sparsity_loss_weight if name == "sparsity" else 1.0
+    given: dict[str, Any] = {name: 3.0}
     for progress in at:
         begin_step(1, progress)
-        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), **{name: 3.0})
+        losses = losses_of(model, batch, batch["spectra"], torch.zeros(4), **given)
         found.append(float(losses.get(name, 0.0)) / weight)
     assert found == pytest.approx(expected)
 

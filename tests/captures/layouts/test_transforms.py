@@ -61,7 +61,7 @@ def test_cubes_pictures_labels_and_poses_are_found_where_the_converter_left_them
 def test_lists_go_before_folders_and_one_folder_for_all_says_nothing(tmp_path):
     lists: dict[str, list[str]] = {"train_filenames": [f"./train/frame_0000{k}.png" for k in (0, 1)]}
     lists["test_filenames"] = ["train/frame_00002.npy"]
-    write_unmix(tmp_path / "lists", **lists)
+    write_unmix(tmp_path / "lists", "eval", "val", **lists)
     splits = [view.split for view in find_unmix_nerf(tmp_path / "lists", PLAIN).views]
     assert splits[:3] == ["train", "train", "eval"]
     write_unmix(tmp_path / "one", written="train", named="train")

@@ -1,6 +1,7 @@
 """Objects that were turned by known angles: what poses follow from outlines, and what is refused."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -148,7 +149,8 @@ def test_angles_that_do_not_fit_the_views_are_refused(tmp_path, text, said):
 def test_matches_by_chance_do_not_move_the_cameras():
     pictures, turns, masks, truth = turned(knobs())
     names, generator = sorted(pictures), np.random.default_rng(2)
-    evidence = gather(cv2, *([values[name] for name in names] for values in (pictures, turns, masks)))
+    columns: list[Any] = [[values[name] for name in names] for values in (pictures, turns, masks)]
+    evidence = gather(cv2, *columns)
     pairs = generator.integers(0, COUNT - 1, 600)
     points = generator.uniform(70, 130, (600, 2, 2))
     disturbed = replace(evidence, first=pairs, second=pairs + 1, points=points)

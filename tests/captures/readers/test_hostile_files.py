@@ -43,6 +43,7 @@ def looping_pages(path: Path, big: bool = False) -> None:
             file.write(CUBE[..., 0], metadata=None, contiguous=False)
     data = bytearray(path.read_bytes())
     size = struct.calcsize(number)
+    leads = 0
     first = page = struct.unpack(number, data[first_at : first_at + size])[0]
     for _ in range(1 if big else 2):
         tags = struct.unpack_from(count, data, page)[0]

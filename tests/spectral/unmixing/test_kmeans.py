@@ -67,8 +67,8 @@ def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
     ],
 )
 def test_spectra_are_scaled_to_lit_pixels_and_keep_their_shape(spectra, pixels, expected):
-    given = (torch.tensor(values, dtype=torch.float64) for values in (spectra, pixels))
-    assert_close(scale_to_lit_pixels(*given, torch.tensor([0])), torch.tensor(expected, dtype=torch.float64))
+    shapes, lit, scaled = (torch.tensor(x, dtype=torch.float64) for x in (spectra, pixels, expected))
+    assert_close(scale_to_lit_pixels(shapes, lit, torch.tensor([0])), scaled)
 
 
 def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes_and_the_largest_comes_first():
