@@ -44,8 +44,9 @@ def test_confidence_is_high_where_a_pixel_is_pure_and_low_at_a_tie():
     noise = 0.002 * torch.randn(1600, materials.shape[1], dtype=torch.float64, generator=seeded())
     cube = (share * materials[0] + (1 - share) * materials[1] + noise).clamp(min=0).reshape(40, 40, -1)
     found = unmix_image(cube.numpy(), 2, shares="light").confidence.ravel()
-    assert found[:1400].min() > 0.99
-    assert np.median(found[1400:]) < 0.9
+    assert found[:1400].min() > 0.9
+    assert found.max() < 0.96  # what all searches get wrong, their agreement doesn't show
+    assert np.median(found[1400:]) < 0.6
 
 
 def test_shares_of_area_and_of_light_differ_by_the_brightness_of_materials():

@@ -29,8 +29,9 @@ _LIT = 0.9
 """Value that the 99.9th percentile of the pixels' peaks is scaled to, so that few count as saturated."""
 _LIT_QUANTILE = 0.999
 _PIXELS_TO_COUNT_BY = 20_000
-_LEAST_MARGIN_ERROR = 0.02
-"""Standard error of a margin where all sets agree."""
+_SHARED_MARGIN_ERROR = 0.6
+"""Standard error of a margin where all sets agree: of what they get wrong alike. With it, of the pixels of artificial
+landscapes about as many are right as the confidence says; without, it was 0.96 in the mean where 0.81 were right."""
 
 Shares = Literal["auto", "area", "light"]
 """What abundances are shares of.
@@ -50,8 +51,8 @@ class UnmixedImage:
     abundances: Float32[np.ndarray, "H W K"]
     """Shares of each pixel, at least 0 with sum 1; zeros for black pixels and those left out."""
     confidence: Float32[np.ndarray, "H W"]
-    """Estimated probability that a pixel's largest abundance is its largest in truth, by how far the best searches
-    agree; 0 where there are no abundances."""
+    """Estimated probability that a pixel's largest abundance is its largest in truth, by its margin over the second and
+    how far the best searches agree, 0.95 at most; 0 where there are no abundances."""
     misfit: Float32[np.ndarray, "H W"]
     """Angle in radians between a pixel and its mixture; 0 where there are no abundances."""
     shares: Literal["area", "light"]
@@ -192,7 +193,7 @@ def _confidence(
         shares = _shares(nnls(pixels, other * compared.norm(dim=1, keepdim=True)))[:, order]
         first, second = shares.gather(1, largest.indices).unbind(1)
         squares += (margins - first + second).square()
-    error = (squares / len(found.others) + _LEAST_MARGIN_ERROR**2).sqrt()
+    error = (squares / len(found.others) + _SHARED_MARGIN_ERROR**2).sqrt()
     return torch.special.ndtr(margins / error)
 
 
