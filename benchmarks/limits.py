@@ -25,12 +25,12 @@ import scipy.io
 import tifffile
 import tyro
 
-from unmix_plugin.captures.readers import arrays, exr, hdf5, matlab, opening, tiff
+from unmix_plugin.captures.readers import arrays, containers, exr, opening, tiff
 from unmix_plugin.captures.readers.opening import open_spectral_file
 
 MOST_SHARE = 0.02
 CHECKS = ("allow_decoded", "allow_parts", "allow_depth")
-READERS = (arrays, exr, hdf5, matlab, opening, tiff)
+READERS = (arrays, containers, exr, opening, tiff)
 
 
 @dataclass(frozen=True)

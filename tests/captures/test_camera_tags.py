@@ -7,7 +7,7 @@ import pytest
 
 from tests.captures.file_factory import present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
-    RadiometricModel,
+    _RadiometricModel,
     band_of,
     parse_xmp,
     radiometric_model,
@@ -112,7 +112,7 @@ def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
     return open_spectral_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
 
 
-def model_of(file: SpectralFile) -> RadiometricModel:
+def model_of(file: SpectralFile) -> _RadiometricModel:
     return present(radiometric_model(file))
 
 

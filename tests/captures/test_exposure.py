@@ -5,7 +5,8 @@ import pytest
 
 from tests.captures.capture_factory import make_capture, process, write_cube
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.exposure import compare_exposures, exposure_facts, exposure_of
+from unmix_plugin.captures.calibration.references import compare_exposures, exposure_of
+from unmix_plugin.captures.header_values import exposure_facts
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from tests.captures.poses.pose_factory import (
     text_of,
     transforms,
 )
-from unmix_plugin.captures.poses.pose_set import match_poses
+from unmix_plugin.captures.names import match_poses
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _place_poses
 from unmix_plugin.formats.meshes import read_ply_points

@@ -182,7 +182,7 @@ def band_of(tags: XmpTags) -> BandTable | None:
 
 
 @dataclass(frozen=True)
-class RadiometricModel:
+class _RadiometricModel:
     """How the stored numbers of one file become radiance."""
 
     maker: str
@@ -210,7 +210,7 @@ class RadiometricModel:
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 
 
-def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
+def radiometric_model(file: SpectralFile) -> _RadiometricModel | None:
     """The calibration that a file carries in `metadata["xmp"]` and `metadata["exif"]`; None where there is none. Raises
     CaptureError: the file has a calibration that lacks a number, or one that can't be."""
     tags, exif = file.metadata.get("xmp") or {}, file.metadata.get("exif") or {}
@@ -227,7 +227,7 @@ def radiometric_model(file: SpectralFile) -> RadiometricModel | None:
     return model
 
 
-def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """MicaSense RedEdge and Altum: radiance in W/m2/sr/nm.
 
         L = 1 / V * a1 / (gain * exposure) * (p - pBL) / 2^bits / (1 + a2 y / exposure - a3 y)
@@ -251,18 +251,22 @@ def _micasense(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Ra
         polynomial = _xmp(file, tags, 6, "VignettingPolynomial")
         vignetting = partial(_radial_polynomial, polynomial, centre)
 
-    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return gain / (vignetting(y, x) * (1.0 + a2 * y / exposure - a3 * y))
-
     irradiance = tag_numbers(tags, "HorizontalIrradiance", "SpectralIrradiance")
     to_si = tag_numbers(tags, "IrradianceScaleToSIUnits")
     default = [0.01 if tag_numbers(tags, "HorizontalIrradiance") else 1.0]
     measured = None if irradiance is None else irradiance[0] * (to_si or default)[0]
     black = float(np.mean(levels))
-    return RadiometricModel("MicaSense", "W/m2/sr/nm", black, _SATURATED_12_BITS, factor_of, measured)
+    return _RadiometricModel(
+        "MicaSense",
+        "W/m2/sr/nm",
+        black,
+        _SATURATED_12_BITS,
+        lambda y, x: gain / (vignetting(y, x) * (1.0 + a2 * y / exposure - a3 * y)),
+        measured,
+    )
 
 
-def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """Parrot Sequoia: radiance in a unit of its own, the same for its four bands.
 
         I = f^2 (p - B) / (A * exposure * iso + C) / V(x / W, y / H)
@@ -275,12 +279,8 @@ def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Radi
     iso = _exif(file, exif, "ISOSpeedRatings", "PhotographicSensitivity", "ISOSpeed")
     gain = f_number**2 / (a * exposure * iso + c)
     vignetting = _vignetting_2d(file, tags)
-
-    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return gain / vignetting(y, x)
-
     saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
-    return RadiometricModel("Parrot Sequoia", "relative", b, saturated, factor_of)
+    return _RadiometricModel("Parrot Sequoia", "relative", b, saturated, lambda y, x: gain / vignetting(y, x))
 
 
 def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
@@ -306,7 +306,7 @@ def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
     return vignetting
 
 
-def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> RadiometricModel:
+def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _RadiometricModel:
     """DJI P4 Multispectral and Mavic 3 Multispectral: radiance in a unit of its own, the same for all bands.
 
         L = V(r) * (p - black level) / 2^bits / (gain * exposure) * gain adjustment
@@ -327,12 +327,12 @@ def _dji(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> Radiomet
         centre = _required(file, "XMP drone-dji:CalibratedOpticalCenterX, Y", middle or None, 2)
     scale = adjustment[0] / (gain * 1e-6 * microseconds) / _stored_range(exif)
 
-    def factor_of(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        return scale * _radial_polynomial(polynomial, centre, y, x)
-
     irradiance = tag_numbers(tags, "drone-dji:Irradiance")
     measured, black = irradiance[0] if irradiance else None, float(np.mean(levels))
-    return RadiometricModel("DJI", "relative", black, _SATURATED_12_BITS, factor_of, measured)
+    vignetting = partial(_radial_polynomial, polynomial, centre)
+    return _RadiometricModel(
+        "DJI", "relative", black, _SATURATED_12_BITS, lambda y, x: scale * vignetting(y, x), measured
+    )
 
 
 _MAKERS = {"RadiometricCalibration": _micasense, "SensorModel": _sequoia, "drone-dji:SensorGain": _dji}

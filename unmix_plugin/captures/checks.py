@@ -132,13 +132,8 @@ def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
             f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
         )
     findings += _pixels(views)
-    for found, said in (
-        _ring(views),
-        _overlap(views, points),
-        _blur(views),
-        _exposure(views, points),
-        _moving_light(views, points),
-    ):
+    for check in (_ring, _overlap, _blur, _exposure, _moving_light):
+        found, said = check(views, points)
         findings += found
         measured.append(said)
     return findings, measured
@@ -164,10 +159,6 @@ def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
 
 
-def _some(names: list[str]) -> str:
-    return name_some(names, 5)
-
-
 def _pixels(views: Sequence[SeenView]) -> list[str]:
     """Views with many saturated or missing pixels, or without matter."""
     findings = []
@@ -178,15 +169,17 @@ def _pixels(views: Sequence[SeenView]) -> list[str]:
         many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
         if many:
             findings.append(
-                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {_some(many)}"
+                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {name_some(many, 5)}"
             )
     empty = [view.name for view in views if view.record.matter_share == 0.0]
     if empty:
-        findings.append(f"{counted(len(empty), 'view')} without any matter, by the mask: {_some(empty)}")
+        findings.append(
+            f"{counted(len(empty), 'view')} without any matter, by the mask: {name_some(empty, 5)}"
+        )
     return findings
 
 
-def _ring(views: Sequence[SeenView]) -> tuple[list[str], str]:
+def _ring(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str], str]:
     """From which sides the cameras look, and what is missing."""
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = meeting_point(poses)
@@ -245,7 +238,7 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
     if not alone:
         return [], said
     worst = min(alone, key=lambda index: shares[index])
-    names = _some([views[index].name for index in alone])
+    names = name_some([views[index].name for index in alone], 5)
     finding = (
         f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of {views[worst].name} at "
         f"most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from {nearest[worst]:.0f} degrees away; "
@@ -267,7 +260,7 @@ def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
     return view.position + depth * rays
 
 
-def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
+def _blur(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str], str]:
     """Views with less fine detail than the others."""
     details = np.array([view.record.detail for view in views])
     middle = float(np.median(details))
@@ -281,7 +274,7 @@ def _blur(views: Sequence[SeenView]) -> tuple[list[str], str]:
     said = f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)"
     if not blurred:
         return [], said
-    return [f"{counted(len(blurred), 'view')} less sharp than the others: {_some(blurred)}"], said
+    return [f"{counted(len(blurred), 'view')} less sharp than the others: {name_some(blurred, 5)}"], said
 
 
 def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
@@ -312,7 +305,9 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[s
     ]
     if not jumps:
         return [], said
-    return [f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {_some(jumps)}"], said
+    return [
+        f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {name_some(jumps, 5)}"
+    ], said
 
 
 def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:

@@ -22,9 +22,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError, install_hint
-from unmix_plugin.formats.envi import HeaderValue, beside, header_bytes, wavelength_entries
+from unmix_plugin.formats.envi import UINT16, beside, cube_entries, header_bytes, wavelength_entries
 from unmix_plugin.scenes.demo.scene import (
     SIZE_BOUNDS,
     VIEWS_BOUNDS,
@@ -113,27 +112,37 @@ def make_demo_capture(
         SpectrumError: an unknown light, or one that is not known at all bands.
         SceneError: the folder can't be written, or the disk is full.
     """
+    from PIL import Image
+
     place = place or Place(speckled_things(), demo_cameras)
-    bounds = {
-        "size": (size, SIZE_BOUNDS),
-        "bands": (bands, _RAW_BANDS_BOUNDS),
-        "views": (views, VIEWS_BOUNDS),
-    }
-    check_bounds("a demo capture", bounds)
+    bounds = {"size": (size, SIZE_BOUNDS), "bands": (bands, _RAW_BANDS_BOUNDS)}
+    check_bounds("a demo capture", bounds | {"views": (views, VIEWS_BOUNDS)})
     sampling = Bands.of(band_centers_nm(bands))
     lamp = lamp_power(sampling.centers_nm, illuminant)
     cameras, spectra = place.cameras(size, views), reflectances(sampling.centers_nm)
-    frames = [
-        {"file_path": f"view_{index:03d}.hdr", "transform_matrix": transform_matrix(cameras, index)}
-        for index in range(views)
-    ]
     with staging_for(directory, "the demo capture", overwrite) as staging:
         truth = staging / "truth"
         truth.mkdir()
         write_spectra_csv(truth / "endmembers.csv", SpectraTable(sampling, MATERIALS, spectra))
         write_spectra_csv(truth / "illuminant.csv", SpectraTable(sampling, ("power",), lamp[None]))
-        instrument = _demo_line_camera(size, sampling.centers_nm, lamp)
-        _write_images(staging, cameras, place.things, spectra, instrument, sampling, backdrop, follow)
+        camera, generator = _demo_line_camera(size, sampling.centers_nm, lamp), np.random.default_rng(1)
+
+        def write(name: str, light: Float32[np.ndarray, "h W B"], what: str) -> None:
+            _write_counts(staging / name, camera.expose(light, generator), sampling, camera, what)
+
+        for name, level in (("dark", 0.0), ("white", 1.0)):
+            write(name, np.full((_REFERENCE_LINES, size, bands), level, np.float32), f"{name} reference")
+        frames = []
+        for index in follow("rendering views", range(views)):
+            view, name = render_view(cameras, index, things=place.things), f"view_{index:03d}"
+            light = reflected(view, spectra)
+            if backdrop is not None:
+                rays = cameras.image_rays(index)
+                behind = backdrop(rays.origins.double().numpy(), rays.directions.double().numpy())
+                light += ((1 - view.alpha) * behind.reshape(view.alpha.shape))[..., None].astype(np.float32)
+            write(name, light, "a view of the demo scene")
+            Image.fromarray(label_image(view)).save(truth / f"{name}.png")
+            frames.append({"file_path": f"{name}.hdr", "transform_matrix": transform_matrix(cameras, index)})
         content = json.dumps(lens_entries(cameras) | {"frames": frames}, indent=1) + "\n"
         (staging / POSES).write_text(content, encoding="utf-8")
         _move_files(staging, directory)
@@ -174,35 +183,6 @@ def _print_of_markers() -> Blend:
     return blend
 
 
-def _write_images(
-    folder: Path,
-    cameras: Cameras,
-    things: Sequence[Thing],
-    spectra: Float[np.ndarray, "K B"],
-    camera: _LineCamera,
-    bands: Bands,
-    backdrop: Backdrop | None,
-    follow: Callable[[str, Sequence[int]], Iterable[int]],
-) -> None:
-    """Dark, white, every view, and the labels of each."""
-    from PIL import Image
-
-    generator = np.random.default_rng(1)
-    shape = (_REFERENCE_LINES, len(camera.dark_counts), len(bands))
-    for name, light in (("dark", np.zeros(shape, np.float32)), ("white", np.ones(shape, np.float32))):
-        _write_counts(folder / name, camera.expose(light, generator), bands, camera, f"{name} reference")
-    for index in follow("rendering views", range(len(cameras))):
-        view, name = render_view(cameras, index, things=things), f"view_{index:03d}"
-        light = reflected(view, spectra)
-        if backdrop is not None:
-            rays = cameras.image_rays(index)
-            behind = backdrop(rays.origins.double().numpy(), rays.directions.double().numpy())
-            light += ((1 - view.alpha) * behind.reshape(view.alpha.shape))[..., None].astype(np.float32)
-        counts = camera.expose(light, generator)
-        _write_counts(folder / name, counts, bands, camera, "a view of the demo scene")
-        Image.fromarray(label_image(view)).save(folder / "truth" / f"{name}.png")
-
-
 def _write_counts(
     path_without_suffix: Path,
     counts: UInt16[np.ndarray, "h W B"],
@@ -212,19 +192,9 @@ def _write_counts(
 ) -> None:
     """Write NAME.hdr and NAME.raw, band-interleaved by line; the header marks some of the bad bands."""
     height, width, num_bands = counts.shape
-    entries: dict[str, HeaderValue] = {
-        "description": f"{what}, raw counts",
-        "file type": "ENVI Standard",
-        "samples": width,
-        "lines": height,
-        "bands": num_bands,
-        "header offset": 0,
-        "data type": 12,
-        "interleave": "bil",
-        "byte order": 0,
-        **wavelength_entries(bands),
-        "bbl": [str(int(band not in camera.marked)) for band in range(num_bands)],
-    }
+    entries = cube_entries("ENVI Standard", f"{what}, raw counts", width, height, num_bands, "bil", UINT16)
+    entries |= wavelength_entries(bands)
+    entries["bbl"] = [str(int(band not in camera.marked)) for band in range(num_bands)]
     beside(path_without_suffix, ".raw").write_bytes(counts.astype("<u2").transpose(0, 2, 1).tobytes())
     beside(path_without_suffix, ".hdr").write_bytes(header_bytes(entries))
 

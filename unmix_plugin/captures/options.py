@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from unmix_plugin.captures.layouts.registry import LAYOUTS
-from unmix_plugin.captures.spectral_file import Axes
+from unmix_plugin.captures.spectral_file import Axes, Capture, ReadOptions
+from unmix_plugin.errors import CaptureError
+
+_LAYOUTS = {
+    "cubes": "cubes:find_cubes",
+    "nespof": "transforms:find_nespof",
+    "nespof-real": "transforms:find_nespof_real",
+    "hs-nerf": "transforms:find_hs_nerf",
+    "unmix-nerf": "transforms:find_unmix_nerf",
+    "nerfstudio": "transforms:find_nerfstudio",
+    "rig": "rig:find_rig",
+}
+"""Module of layouts/, and the function in it that makes a `Capture` of a folder, imported when it is used."""
+
+LAYOUTS = tuple(_LAYOUTS)
 
 MaskKind = Literal["auto", "files", "white", "black", "none"]
 
@@ -85,3 +100,16 @@ class ProcessOptions:
 def plain_options(options: ProcessOptions) -> dict[str, Any]:
     """Options as JSON-able values."""
     return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+
+
+def find_views(layout: str, root: Path, options: ReadOptions) -> Capture:
+    """The views of a capture in one of `LAYOUTS`. Raises CaptureError: there is no such folder, or the layout finds no
+    views in it."""
+    if not root.is_dir():
+        found = "is a file" if root.is_file() else "is not there"
+        raise CaptureError(f"{root} {found}; give the folder of the capture with --data")
+    module, function = _LAYOUTS[layout].split(":")
+    find: Callable[[Path, ReadOptions], Capture] = getattr(
+        import_module(f"unmix_plugin.captures.layouts.{module}"), function
+    )
+    return find(root, options)

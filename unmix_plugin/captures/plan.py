@@ -2,28 +2,42 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
 from unmix_plugin import __version__
-from unmix_plugin.captures.calibration.calibration import is_srgb
-from unmix_plugin.captures.calibration.sensor import References, Sensor, choose_scale, prepare_sensor
-from unmix_plugin.captures.masks import BackgroundRule, background_rule, border_pixels, choose_mask
+from unmix_plugin.captures.calibration.references import is_srgb
+from unmix_plugin.captures.calibration.sensor import Sensor, choose_scale, prepare_sensor, sampled_rows
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
+from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
-from unmix_plugin.captures.writing.view_files import Colours, ViewRecipe, stamps
-from unmix_plugin.errors import name_some
+from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
+from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
+from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
 
 _LOOKED_AT, _ROWS_LOOKED_AT = 12, 96
 """Views that a backdrop is looked for in, and rows of each."""
+_WHITE_PERCENTILE = 99.0
+"""Of sampled pixels; shown as white in pictures."""
+_DEVIATIONS = 6.0
+"""Standard deviations of the background's noise between its level and the threshold."""
+_LEAST_DISTANCE = 0.02
+"""Between level and threshold, as a share of the brightest pixels; JPEG and shading vary a background by about this."""
+_LEAST_WHITE, _MOST_BLACK = 0.5, 0.2
+"""Level of a white or black background, as a share of the brightest pixels."""
+_BORDER_SHARE = 0.02
+"""Width of the border that a background is judged by, as a share of the view's."""
+_MOST_BORDER_PIXELS = 20000
+_BRIGHT_PERCENTILE = 99.0
 
 
 @dataclass(frozen=True)
@@ -51,30 +65,41 @@ class Plan:
         own = ["output_dir", "overwrite", "poses", "marker_size", "marker_family", "known_distance", "angles"]
         asked = {key: value for key, value in plain_options(options).items() if key not in own}
         files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
-        return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps(files)}
+        stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
+        for file in _files_of(files):
+            with reading(file):
+                facts = file.stat()
+            stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
+        return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps}
 
 
 def make_plan(
-    capture: Capture, views: Sequence[CaptureView], options: ProcessOptions, references: References
+    capture: Capture,
+    views: Sequence[CaptureView],
+    options: ProcessOptions,
+    references: tuple[SpectralFile | None, SpectralFile | None],
 ) -> Plan:
     """Look at some rows of every view and decide.
 
     Args:
         views: Those of the capture that become frames.
+        references: Dark frame and white reference that the user names.
     Raises:
         CaptureError: views don't fit each other or the references, or a file can't be read.
         ConfigError: an option does not fit the files.
     """
+    from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
+
     by_sensor: dict[str, list[CaptureView]] = defaultdict(list)
     for view in views:
         by_sensor[view.sensor].append(view)
     sensors: dict[str, Sensor] = {}
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
-        every = tuple(v for v in capture.views if v.sensor == name or not (name and v.release))
-        sensors[name] = prepare_sensor(name, same, options, replace(references, views=every))
+        every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
+        sensors[name] = prepare_sensor(name, same, options, references, every)
     scale, why = choose_scale(list(sensors.values()), options.scale)
-    mask, said_of_mask = choose_mask(views, options.mask)
+    mask, said_of_mask = _choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
     backdrops: dict[str, Backdrop | None] = {}
     if mask == "auto":
@@ -85,16 +110,19 @@ def make_plan(
     evidence: dict[str, dict[str, Any]] = {}
     for name, sensor in sensors.items():
         raster = sensor.calibration.raster
-        colours = Colours.of(Bands(sensor.centers_nm), samples[name])
+        to_rgb = rgb_matrix(Bands(sensor.centers_nm)).numpy()
+        shown = (samples[name] @ to_rgb).max(axis=1)
+        white = float(np.percentile(shown, _WHITE_PERCENTILE)) if len(shown) else 0.0
+        to_rgb = to_rgb / np.float32(white) if white > 0 else to_rgb
         rule: BackgroundRule | Backdrop | None = backdrops.get(name)
         if mask in ("white", "black"):
-            rule = background_rule(mask, border_pixels(sensor, by_sensor[name], scale), samples[name])
-        recipes[name] = ViewRecipe(sensor.calibration, scale, colours, rule, mask == "files")
+            rule = _background_rule(mask, _border_pixels(sensor, by_sensor[name], scale), samples[name])
+        recipes[name] = ViewRecipe(sensor.calibration, scale, to_rgb, rule, mask == "files")
         evidence[name or "all views"] = {
             "unit": sensor.unit,
             "bands": len(sensor.centers_nm),
             "size": [raster.height, raster.width],
-            "colours": colours.description,
+            "colours": describe_colour(Bands(sensor.centers_nm)),
             **sensor.evidence,
             "background": None if rule is None else rule.evidence,
         }
@@ -107,7 +135,7 @@ def make_plan(
         )
     said += _notes_on_pictures([view.cube for view in views])
     said += dict.fromkeys(note for view in views for note in view.cube.notes)
-    opened = [file for file in (references.dark, references.white) if file is not None]
+    opened = [file for file in references if file is not None]
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
         units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
@@ -131,6 +159,80 @@ def make_plan(
     )
 
 
+# Matter and background: from files of the capture, from a background that is white or black, or from a backdrop that
+# nobody has named. The border of the views tells how bright a background is and how much it varies; a threshold
+# between it and the rest follows from that.
+
+
+def _choose_mask(views: Sequence[CaptureView], asked: MaskKind) -> tuple[MaskKind, list[str]]:
+    """What tells matter from background, `auto` where files don't, and what a user should know of it; the views of a
+    rig are left whole. CaptureError where opacity is asked of files that some views don't have."""
+    if asked not in ("auto", "files"):
+        return asked, []
+    missing = [
+        view.name
+        for view in views
+        if not (view.alpha or alpha_picture(view) or (view.mask is not None and asked == "files"))
+    ]
+    if not missing:
+        return "files", []
+    if asked == "files":
+        raise CaptureError(
+            f"--mask files: view {missing[0]} has no mask; expected an alpha channel, or a mask that is white where "
+            "matter is, for every view"
+        )
+    # What the lenses of a rig see from above is ground: a field or water is as plain as a backdrop and is the scene.
+    otherwise: MaskKind = "none" if any(view.release for view in views) else "auto"
+    if len(missing) == len(views):
+        return otherwise, []
+    has = "has" if len(missing) == 1 else "have"
+    note = (
+        f"{len(missing)} of {len(views)} views {has} no alpha channel ({name_some(missing)}), so that of the others is "
+        "not used: give all views one, or choose --mask"
+    )
+    return otherwise, [note]
+
+
+def _background_rule(
+    kind: Literal["white", "black"], border: Float32[np.ndarray, "M c"], sample: Float32[np.ndarray, "N c"]
+) -> BackgroundRule:
+    """The rule that fits the border of the views, beside a sample of all their pixels. CaptureError where most of the
+    border is not of this kind."""
+    brightness = BackgroundRule.brightness(kind, border)
+    everywhere = np.concatenate([BackgroundRule.brightness(kind, sample), brightness])
+    brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHT_PERCENTILE))
+    level = float(np.median(brightness))
+    deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
+    distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)
+    share = level / brightest if brightest > 0 else 0.0
+    if (kind == "white" and share < _LEAST_WHITE) or (kind == "black" and share > _MOST_BLACK):
+        expected = f"more than {_LEAST_WHITE:.0%}" if kind == "white" else f"less than {_MOST_BLACK:.0%}"
+        raise CaptureError(
+            f"--mask {kind}: the border of the views is at {share:.0%} of the brightest pixels; expected {expected}, "
+            "as the background should reach to the border: choose another --mask"
+        )
+    threshold = level - distance if kind == "white" else level + distance
+    return BackgroundRule(kind, threshold, level, deviation)
+
+
+def _border_pixels(sensor: Sensor, views: Sequence[CaptureView], scale: float) -> Float32[np.ndarray, "M c"]:
+    """Pixels at the border of the views, in [0, 1]; saturated ones are 1, missing ones are left out."""
+    raster = sensor.calibration.raster
+    width = max(1, round(_BORDER_SHARE * raster.width))
+    columns = np.r_[0:width, raster.width - width : raster.width]
+    rows = sorted({0, raster.height - 1, *sampled_rows(raster.height)})
+    step = max(1, len(views) * (2 * raster.width + 2 * width * len(rows)) // _MOST_BORDER_PIXELS)
+    border = []
+    for view in views:
+        for row in rows:
+            part = sensor.calibration.rows(view.cube, row, row + 1)
+            shown = np.arange(raster.width) if row in (0, raster.height - 1) else columns
+            shown = shown[row % step :: step]
+            values = np.where(part.saturated[0, shown], np.float32(scale), part.values[0, shown])
+            border.append(values[~part.missing[0, shown]])
+    return np.clip(np.concatenate(border) / np.float32(scale), 0.0, 1.0)
+
+
 def _find_backdrop(
     sensor: Sensor, views: Sequence[CaptureView], scale: float, sample: Float32[np.ndarray, "N B"]
 ) -> Backdrop | None:
@@ -151,6 +253,21 @@ def input_files(view: CaptureView) -> list[Path]:
     more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
     references = [file for file in (view.dark, view.white) if file is not None]
     return [*view.cube.files, *more, *(path for file in references for path in file.files)]
+
+
+def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
+    """Path, size and SHA-256 of each file. CaptureError where one can't be read."""
+    found = []
+    for file in _files_of(paths):
+        with reading(file):
+            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
+    return found
+
+
+def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
+    """Files, and those of a folder that a reader takes as one."""
+    for path in paths:
+        yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
 
 
 def _warnings_of_files(files: Sequence[tuple[str, SpectralFile | None]]) -> list[str]:

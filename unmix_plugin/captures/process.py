@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.calibration.sensor import References
+from unmix_plugin.captures.calibration.calibration import Resampling
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
-from unmix_plugin.captures.known_distance import asked_distance
-from unmix_plugin.captures.layouts.registry import LAYOUTS, find_views
-from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.plan import Plan, input_files, make_plan
+from unmix_plugin.captures.header_values import parse_wavelengths
+from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
+from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.posing import FROM_PICTURES, MARKERS, PosedViews, given_poses, pose_views
+from unmix_plugin.captures.posing import (
+    FROM_PICTURES,
+    MARKERS,
+    PosedViews,
+    asked_distance,
+    given_poses,
+    pose_views,
+)
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
     Capture,
@@ -24,10 +34,15 @@ from unmix_plugin.captures.spectral_file import (
     SpectralFile,
     require_comparable,
 )
-from unmix_plugin.captures.wavelengths import parse_wavelengths
-from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.captures.writing.scene_files import write_scene_files
-from unmix_plugin.captures.writing.view_files import ViewRecord, WorkFolder, hashes, refuse_output, write_view
+from unmix_plugin.captures.writing.scene_files import RECORD_NAME, write_scene_files
+from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
+from unmix_plugin.engine.runs.atomic_files import (
+    make_folder,
+    remove_stale_temporaries,
+    write_errors_as,
+    write_file,
+)
+from unmix_plugin.engine.runs.run_folder import RunLock
 from unmix_plugin.errors import CaptureError, ConfigError, did_you_mean, name_some
 
 _Say = Callable[[str], None]
@@ -49,7 +64,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
         RunError: the folder can't be written.
     """
     _check(options)
-    refuse_output(options.output_dir, options.overwrite)
+    _refuse_output(options.output_dir, options.overwrite)
     capture = _open_capture(options)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture)
@@ -64,16 +79,17 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if options.poses == MARKERS:
         say("looking for markers ...")
         posed = pose_views(plan.views, marked_poses(plan, options), known)
-    folder = WorkFolder(options.output_dir)
+    folder = _WorkFolder(options.output_dir)
     resampled = {} if posed is None else _resampled_lenses(plan, posed)
-    if folder.begin({**plan.fingerprint(options), "lenses": sorted(map(_numbers_of, resampled.values()))}):
+    if folder.begin(
+        {**plan.fingerprint(options), "lenses": sorted(numbers for _, numbers in resampled.values())}
+    ):
         say(f"going on with {folder.path}")
     records: dict[str, ViewRecord] = {}
     for view in follow("writing views", plan.views if posed is None else posed.views):
         record = folder.done(view.name)
         if record is None:
-            lens = resampled.get(view.name)
-            into = None if lens is None else Resampling.into(lens)
+            into = Resampling.into(resampled[view.name][0]) if view.name in resampled else None
             record = write_view(view, plan.recipes[view.sensor], folder.path, into)
             record = replace(record, sources=hashes(input_files(view)))
             folder.note(record)
@@ -95,31 +111,28 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     return findings
 
 
-def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, Lens]:
-    """Lenses of the views whose pixels are brought into another lens, as the scene has them."""
-    found = {}
+def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, list[float]]]:
+    """Lenses of the views whose pixels are brought into another lens, as the scene has them, and numbers that tell each
+    from others."""
+    probe, found = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [-0.3, 0.2]]), {}
     for view in posed.views:
         lens = posed.poses.cameras[view.name].lens
         if lens is not None and lens.resampled_from is not None:
-            found[view.name] = plan.recipes[view.sensor].calibration.raster.lens(lens)
+            lens = plan.recipes[view.sensor].calibration.raster.lens(lens)
+            assert lens.resampled_from is not None
+            seen = lens.resampled_from.project(probe).ravel().tolist()
+            numbers = [*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen]
+            found[view.name] = lens, numbers
     return found
 
 
-def _refuse_late(lenses: dict[str, Lens]) -> None:
+def _refuse_late(lenses: Collection[str]) -> None:
     """Refuse lenses that pictures would have to be brought into, as they are written already."""
     if lenses:
         raise CaptureError(
             f"the lens of {name_some(list(lenses))} is not found in the pictures, and its own is not one that scenes "
             "have; give poses with --poses FILE, or leave these views out"
         )
-
-
-def _numbers_of(lens: Lens) -> list[float]:
-    """What tells a resampled lens from others."""
-    assert lens.resampled_from is not None
-    probe = np.array([[0.0, 0.0], [0.2, 0.0], [0.0, 0.3], [-0.3, 0.2]])
-    seen = lens.resampled_from.project(probe).ravel().tolist()
-    return [*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen]
 
 
 def _check(options: ProcessOptions) -> None:
@@ -174,14 +187,14 @@ def _by_size(capture: Capture) -> Capture:
     return replace(capture, views=tuple(views), notes=(*capture.notes, note))
 
 
-def _open_references(options: ProcessOptions) -> References:
-    opened = []
+def _open_references(options: ProcessOptions) -> tuple[SpectralFile | None, SpectralFile | None]:
+    opened: list[SpectralFile | None] = []
     for path, flag in ((options.dark, "--dark"), (options.white, "--white")):
         if path is not None and not path.exists():
             raise CaptureError(f"{flag} {path}: no such file; give the image of the reference")
         read = ReadOptions(options.dataset, None, options.axes)
         opened.append(None if path is None else open_spectral_file(path, read))
-    return References(*opened)
+    return opened[0], opened[1]
 
 
 def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
@@ -199,3 +212,108 @@ def _refuse_unlike(cube: SpectralFile, first: SpectralFile) -> None:
         raise CaptureError(
             f"{cube.path} holds {cube.dtype.name}; expected {first.dtype.name}, as {first.path} holds"
         )
+
+
+# The unfinished folder beside the output, in which the scene gathers.
+
+_PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
+
+
+class _WorkFolder:
+    """The unfinished scene of one output folder. Views that are done survive a kill, and nothing takes the folder for a
+    scene, as it has no transforms.json and is called unfinished."""
+
+    def __init__(self, output: Path) -> None:
+        self.output = output.resolve()
+        self.path = self.output.with_name(f"{self.output.name}.unfinished")
+        """Where files are written until the scene is complete."""
+        self._lock: RunLock | None = None
+        self.poses = self.path / _POSES
+        """Where files of the estimation of poses lie while it runs, or after it failed."""
+
+    def begin(self, plan: dict[str, Any]) -> bool:
+        """Make the folder, or go on in the one that an interrupted start left.
+
+        Views that were made with another plan (options, decisions and inputs) are thrown away.
+
+        Returns:
+            Whether an earlier start is gone on with.
+        Raises:
+            ConfigError: there is a folder of this name that is not ours.
+            RunError: it can't be written.
+        """
+        plan_file, text = self.path / _PLAN, _json(plan)
+        if plan_file.is_file():
+            self._hold()
+        if self.path.exists():
+            if not plan_file.is_file() and any(self.path.iterdir()):
+                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
+            if plan_file.is_file() and plan_file.read_bytes() == text:
+                for folder in ("cubes", "images", "masks", _VIEWS):
+                    remove_stale_temporaries(self.path / folder)
+                return True
+            if self._lock is not None:
+                self._lock.release()  # Windows removes no file that is open
+            with write_errors_as(self.path):
+                shutil.rmtree(self.path)
+        make_folder(self.path)
+        self._hold()
+        write_file(plan_file, text)
+        return False
+
+    def _hold(self) -> None:
+        """Let no other process write the same scene, until this one ends; RunError where another one does."""
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = RunLock(self.path / _LOCK, "unmix-process")
+
+    def done(self, name: str) -> ViewRecord | None:
+        """What is recorded of a view that is written; None if it is not."""
+        try:
+            return ViewRecord(**json.loads(self._record(name).read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            return None
+
+    def note(self, record: ViewRecord) -> None:
+        """Record that a view is written."""
+        write_file(self._record(record.name), _json(asdict(record)))
+
+    def finish(self, overwrite: bool) -> None:
+        """Give the scene its name; the record of how it was made stays in it. RunError where it can't be moved."""
+        with write_errors_as(self.output):
+            if self._lock is not None:
+                self._lock.release()
+            (self.path / _LOCK).unlink(missing_ok=True)
+            old = self.output.with_name(f"{self.output.name}.old")
+            if overwrite and self.output.exists():
+                self.output.rename(old)
+            elif self.output.exists():
+                self.output.rmdir()  # empty, see refuse_output
+            self.path.rename(self.output)
+            # After a kill here, the scene is whole and has some files too many.
+            for name in (_VIEWS, _POSES):
+                shutil.rmtree(self.output / name, ignore_errors=True)
+            (self.output / _PLAN).unlink()
+            shutil.rmtree(old, ignore_errors=True)
+
+    def _record(self, name: str) -> Path:
+        return self.path / _VIEWS / f"{name}.json"
+
+
+def _refuse_output(output: Path, overwrite: bool) -> None:
+    """Look before anything is computed whether the scene can get its name. Raises ConfigError: the folder holds
+    something; with `overwrite`, something that this command did not make."""
+    if not output.resolve().name:
+        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
+    if output.is_file():
+        raise ConfigError(f"{output} is a file; give a folder with --output-dir")
+    if not output.is_dir() or not any(output.iterdir()):
+        return
+    if not (output / RECORD_NAME).is_file():
+        raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
+    if not overwrite:
+        raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
+
+
+def _json(value: Any) -> bytes:
+    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()

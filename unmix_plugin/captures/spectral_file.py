@@ -247,7 +247,7 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
 
 
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
-    """Files of one view that hold some bands each, as one file with all of them, in the order given.
+    """Files of one view that hold one band each, as one file with all of them, in the order given.
 
     A no-data value and metadata are those that all parts share.
 
@@ -264,13 +264,31 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
                 f"{part.path} has {part.shape[0]} x {part.shape[1]} pixels; expected the "
                 f"{first.shape[0]} x {first.shape[1]} of {first.path}: the bands of one view have one size"
             )
-    owner = np.concatenate([np.full(part.shape[2], index) for index, part in enumerate(parts)])
-    within = np.concatenate([np.arange(part.shape[2]) for part in parts])
 
     def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        wanted = np.arange(len(owner))[bands]
-        return np.concatenate([parts[owner[band]].read(rows, within[[band]]) for band in wanted], axis=-1)
+        return np.concatenate([parts[band].read(rows) for band in np.arange(len(parts))[bands]], axis=-1)
 
+    def join(columns: list[Any]) -> np.ndarray | None:
+        """One column of several; lacking where one is."""
+        return None if any(column is None for column in columns) else np.concatenate(columns)
+
+    tables = [part.bands for part in parts]
+    num_known = sum(table.wavelengths_nm is not None for table in tables)
+    marks, names = [table.bad for table in tables], join([table.names for table in tables])
+    good = np.zeros(1, bool)
+    bands = BandTable(
+        join([table.wavelengths_nm for table in tables]),
+        tables[0].evidence if num_known in (0, len(tables)) else _PARTLY_KNOWN,
+        join([table.fwhm_nm for table in tables]),
+        None if all(mark is None for mark in marks) else join([good if m is None else m for m in marks]),
+        None if names is None else tuple(names.tolist()),
+    )
+    stated = [part.linear for part in parts if part.linear is not None]
+    linear = None
+    if stated:
+        each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
+        gains, offsets = (np.concatenate([getattr(x, name) for x in each]) for name in ("gains", "offsets"))
+        linear = Linear(gains, offsets, stated[0].evidence)
     no_data = {repr(part.no_data) for part in parts}
     ranges = {part.valid_range for part in parts}
     differing = ["no-data values"] * (len(no_data) > 1) + ["valid ranges"] * (len(ranges) > 1)
@@ -289,11 +307,11 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     return replace(
         first,
         path=path,
-        shape=(*first.shape[:2], len(owner)),
+        shape=(*first.shape[:2], len(parts)),
         dtype=np.result_type(*(part.dtype for part in parts)),
         read_part=read_part,
-        bands=_stack_tables(parts),
-        linear=_stack_linears(parts),
+        bands=bands,
+        linear=linear,
         no_data=None if len(no_data) > 1 else first.no_data,
         valid_range=None if len(ranges) > 1 else first.valid_range,
         metadata=same | ({"parts": own} if any(own) else {}),
@@ -301,39 +319,9 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         warnings=(
             *dict.fromkeys(warning for part in parts for warning in part.warnings),
             *(f"{what} differ between the files of one view and are not used" for what in differing),
-            *([_PARTLY_LINEAR] if len({part.linear is None for part in parts}) > 1 else []),
+            *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
         ),
         sources=tuple(source for part in parts for source in part.files),
-    )
-
-
-def _stack_linears(parts: list[SpectralFile]) -> Linear | None:
-    """Gains and offsets of all parts, those of parts without any being 1 and 0."""
-    stated = [part.linear.evidence for part in parts if part.linear is not None]
-    if not stated:
-        return None
-    each = [part.linear or Linear(np.ones(part.shape[2]), np.zeros(part.shape[2]), "") for part in parts]
-    gains, offsets = (np.concatenate([getattr(x, name) for x in each]) for name in ("gains", "offsets"))
-    return Linear(gains, offsets, stated[0])
-
-
-def _stack_tables(parts: list[SpectralFile]) -> BandTable:
-    """One table of several; a column that some table lacks is lacking, but bands without a mark are good."""
-
-    def join(columns: list[np.ndarray | None]) -> np.ndarray | None:
-        known = [column for column in columns if column is not None]
-        return np.concatenate(known) if len(known) == len(columns) else None
-
-    tables = [part.bands for part in parts]
-    marks = [np.zeros(part.shape[2], bool) if part.bands.bad is None else part.bands.bad for part in parts]
-    num_known = sum(table.wavelengths_nm is not None for table in tables)
-    has_names = all(table.names is not None for table in tables)
-    return BandTable(
-        join([table.wavelengths_nm for table in tables]),
-        tables[0].evidence if num_known in (0, len(tables)) else _PARTLY_KNOWN,
-        join([table.fwhm_nm for table in tables]),
-        np.concatenate(marks) if any(table.bad is not None for table in tables) else None,
-        tuple(name for table in tables for name in table.names or ()) if has_names else None,
     )
 
 

@@ -65,7 +65,7 @@ def image(argv: list[str]) -> None:
     """
     options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
-    from unmix_plugin.captures.calibration.calibration import find_missing, is_srgb, stated_values
+    from unmix_plugin.captures.calibration.references import find_missing, is_srgb, stated_values
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
     from unmix_plugin.products.unmixed_image import (

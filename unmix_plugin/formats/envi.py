@@ -29,7 +29,7 @@ from unmix_plugin.spectral.bands import Bands
 HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarray
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
-_FLOAT32 = 4
+_FLOAT32, UINT16 = 4, 12
 _COMPLEX_TYPES = (6, 9)
 _AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
@@ -337,7 +337,7 @@ def envi_cube_rows(
         if given is not None and len(given) != shape[2]:
             raise ValueError(f"{len(given)} {what} for {shape[2]} bands")
     height, width, num_bands = shape
-    entries = _entries("ENVI Standard", description, width, height, num_bands, "bip")
+    entries = cube_entries("ENVI Standard", description, width, height, num_bands, "bip")
     if wavelengths is not None:
         entries |= wavelength_entries(wavelengths)
     if names is not None:
@@ -371,7 +371,7 @@ def write_envi_library(
     """
     if spectra.shape != (len(names), len(bands)):
         raise ValueError(f"{len(names)} names and {len(bands)} wavelengths for spectra of {spectra.shape}")
-    entries = _entries("ENVI Spectral Library", description, len(bands), len(names), 1, "bsq")
+    entries = cube_entries("ENVI Spectral Library", description, len(bands), len(names), 1, "bsq")
     entries |= wavelength_entries(bands) | {"spectra names": list(names)}
     paths = envi_library_paths(path_without_suffix)
     with _rows(paths, spectra.shape, entries) as add:
@@ -396,10 +396,16 @@ def _rows(
     write_file(header_path, header_bytes(entries))
 
 
-def _entries(
-    kind: str, description: str, samples: int, lines: int, bands: int, interleave: str
+def cube_entries(
+    kind: str,
+    description: str,
+    samples: int,
+    lines: int,
+    bands: int,
+    interleave: str,
+    data_type: int = _FLOAT32,
 ) -> dict[str, HeaderValue]:
-    """What the file is and how its numbers lie: float32, little-endian, nothing before them."""
+    """What the file is and how its numbers lie: little-endian, nothing before them."""
     return {
         "description": description,
         "file type": kind,
@@ -407,7 +413,7 @@ def _entries(
         "lines": lines,
         "bands": bands,
         "header offset": 0,
-        "data type": _FLOAT32,
+        "data type": data_type,
         "interleave": interleave,
         "byte order": 0,
     }

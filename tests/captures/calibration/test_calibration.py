@@ -10,13 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.calibration import (
-    Calibration,
-    Raster,
-    find_missing,
-    open_reference,
-    panel_reference,
-)
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.references import _open_reference as open_reference
+from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
+from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import Linear
 from unmix_plugin.errors import CaptureError, ConfigError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.calibration import open_reference
+from unmix_plugin.captures.calibration.references import _open_reference as open_reference
 from unmix_plugin.captures.calibration.sensor import (
     _BandChoice,
     _clipped_bands,

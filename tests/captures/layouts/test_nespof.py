@@ -15,7 +15,12 @@ from tests.captures.layouts.data_sets import (
     write_nespof,
     write_real,
 )
-from unmix_plugin.captures.layouts.nespof import _open_intensity, _open_opacity, find_nespof, find_nespof_real
+from unmix_plugin.captures.layouts.transforms import (
+    _open_intensity,
+    _open_opacity,
+    find_nespof,
+    find_nespof_real,
+)
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError

@@ -23,8 +23,8 @@ from tests.captures.layouts.rig_flight import (
     write_poses,
 )
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
+from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
 

@@ -3,7 +3,8 @@
 import pytest
 
 from tests.captures.poses.pose_factory import ring_set
-from unmix_plugin.captures.poses.pose_set import PoseSet, match_poses
+from unmix_plugin.captures.names import match_poses
+from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.errors import CaptureError
 
 

@@ -12,7 +12,7 @@ import scipy.sparse
 import torch
 
 from tests.captures.file_factory import check_file, present, rows_and_bands_of
-from unmix_plugin.captures.readers import matlab
+from unmix_plugin.captures.readers import containers
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
@@ -133,7 +133,7 @@ def test_other_variables_of_matlab_are_passed_over(tmp_path, do_compression):
 
 
 def test_compressed_variables_of_matlab_are_unpacked_piece_by_piece(tmp_path, monkeypatch):
-    monkeypatch.setattr(matlab, "_PIECE_BYTES", 7)
+    monkeypatch.setattr(containers, "_PIECE_BYTES", 7)
     scipy.io.savemat(tmp_path / "a.mat", {"cube": CUBE}, do_compression=True)
     np.testing.assert_array_equal(open_spectral_file(tmp_path / "a.mat").read(), CUBE)
 

@@ -16,22 +16,21 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
-from unmix_plugin.captures.calibration.calibration import (
-    Calibration,
-    Raster,
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.references import (
+    Exposures,
     Reference,
+    References,
+    compare_exposures,
     find_missing,
+    find_references,
     is_srgb,
-    open_reference,
-    panel_reference,
-    white_reference,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.exposure import Exposures, compare_exposures
+from unmix_plugin.captures.header_values import in_ranges
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
-from unmix_plugin.captures.wavelengths import in_ranges
-from unmix_plugin.errors import CaptureError, ConfigError, counted, name_some
+from unmix_plugin.errors import CaptureError, ConfigError, name_some
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -136,24 +135,20 @@ class Sensor:
         return self.bands.centers_nm(self.calibration.bin_bands)
 
 
-@dataclass(frozen=True)
-class References:
-    """Files of the references, opened."""
-
-    dark: SpectralFile | None = None
-    white: SpectralFile | None = None
-    views: tuple[CaptureView, ...] = ()
-    """All views of the sensor, with those that have no pose: one may show a panel."""
-
-
 def prepare_sensor(
-    name: str, views: Sequence[CaptureView], options: ProcessOptions, references: References
+    name: str,
+    views: Sequence[CaptureView],
+    options: ProcessOptions,
+    references: tuple[SpectralFile | None, SpectralFile | None],
+    all_views: Sequence[CaptureView],
 ) -> Sensor:
     """Look at some rows of every view and decide how they are calibrated.
 
     Args:
         name: Of the sensor; empty where there is one.
         views: At least one; all have the same bands and size.
+        references: Dark frame and white reference that the user names.
+        all_views: With those that have no pose: one may show a panel.
     Raises:
         CaptureError: references don't fit, wavelengths are unknown, no band is left, or a file can't be read.
         ConfigError: an option does not fit the files.
@@ -161,60 +156,55 @@ def prepare_sensor(
     files = [view.cube for view in views]
     first, binning = files[0], options.bin_bands
     model = radiometric_model(first)
-    choice, notes, warnings = _stated_bands(files, options), [], []
-    dark, white = _references(views, choice, options, references)
-    own = _own_references(views, choice, options, dark, white)
-    whites = [one for one in (white, *(of_view for _, of_view in own.values())) if one is not None]
+    choice, warnings = _stated_bands(files, options), []
+    (dark, white), own = find_references(views, choice.wavelengths_nm, options, references, all_views)
+    pairs = list(own.values()) or [(dark, white)]
+    whites = [one for _, one in pairs if one is not None]
     if options.saturation is not None:
         saturation, how = options.saturation, "given with --saturation"
     elif model is not None:
         saturation, how = model.saturated, f"known of {model.maker}"
     else:
         saturation, how = _find_saturation(files, choice.kept)
-    raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     lamp = None
-    for used in whites:
-        its_dark = next((own_dark for own_dark, own_white in own.values() if own_white is used), dark)
-        signal = used.signal(its_dark)
-        lamp = signal / used.reflectance if lamp is None else lamp
-        choice, said = _lit_bands(choice, used, signal, saturation)
-        warnings += said
+    for its_dark, used in pairs:
+        if used is not None:
+            signal = used.signal(its_dark)
+            lamp = signal / used.reflectance if lamp is None else lamp
+            choice, said = _lit_bands(choice, used, signal, saturation)
+            warnings += said
     choice.require(binning, str(first.path))
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
     if model is None:
-        darks = [one.file for one in (dark, *(of_view for of_view, _ in own.values())) if one is not None]
+        darks = [one.file for one, _ in pairs if one is not None]
         exposures = compare_exposures(files, [one.file for one in whites], darks, is_srgb(first))
+    raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
-    notes += [*exposures.notes, *noted]
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
-    calibration = replace(calibration, bands=choice.kept, bin_bands=binning)
     if lamp is not None:
         lamp = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
         lamp = np.clip(lamp, 0.0, None) / lamp.max()
     # Floating-point numbers may have been brought to what stands for 1 already.
     has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
+    linear = None if model is not None else first.linear
+    states_one = linear is not None and (linear.scale is not None or "reflectance" in linear.evidence)
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
-    evidence |= _evidence(views, choice, dark, white)
-    if own:
-        for what, reference in zip(("dark", "white"), next(iter(own.values())), strict=True):
-            if reference is not None:
-                evidence[what] = {"file": "each view's own", "use": f"each view's own; {reference.how}"}
     return Sensor(
         name,
-        calibration,
+        replace(calibration, bands=choice.kept, bin_bands=binning),
         choice,
         "reflectance" if whites else _unit(first),
         bool(whites) or has_one,
         _binned(sample[0][:, still_kept], binning),
-        evidence,
+        evidence | _evidence(views, choice, (dark, white), own),
         lamp,
-        tuple(notes),
+        (*exposures.notes, *noted),
         (*warnings, *exposures.warnings),
-        bool(whites) or (model is None and _states_one(first)),
+        bool(whites) or states_one,
     )
 
 
@@ -240,78 +230,6 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
     return choice
 
 
-def _references(
-    views: Sequence[CaptureView], choice: _BandChoice, options: ProcessOptions, references: References
-) -> tuple[Reference | None, Reference | None]:
-    cube = views[0].cube
-    dark = None if references.dark is None else open_reference(references.dark, "dark frame", cube)
-    if options.white_rectangle is not None:
-        wanted, top, left, height, width = options.white_rectangle
-        shown = references.views or views
-        view = next((view for view in shown if wanted in (view.name, view.release)), None)
-        if view is None:
-            names = name_some([view.name for view in shown], 5)
-            raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
-        panel = panel_reference(view.cube, (top, left, height, width), view.name)
-    elif references.white is not None:
-        panel = open_reference(references.white, "white reference", cube)
-    else:
-        return dark, None
-    return dark, white_reference(panel, dark, options.white_reflectance, choice.wavelengths_nm)
-
-
-def _own_references(
-    views: Sequence[CaptureView],
-    choice: _BandChoice,
-    options: ProcessOptions,
-    dark: Reference | None,
-    white: Reference | None,
-) -> dict[Path, tuple[Reference | None, Reference | None]]:
-    """Dark and white of views that were taken with their own, by cube; what the user names goes before them.
-
-    Files that several views share are looked at once. CaptureError where some views have one and others have none.
-    """
-    own = {}
-    darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
-    whites = _each_view([view.white for view in views], views, "white reference", white is not None)
-    seen: dict[tuple[Path | None, Path | None], tuple[Reference | None, Reference | None]] = {}
-    for view, own_dark, own_white in zip(views, darks, whites, strict=True):
-        if own_dark is None and own_white is None:
-            continue
-        key = (own_dark and own_dark.path, own_white and own_white.path)
-        if key not in seen:
-            its_dark = dark if own_dark is None else open_reference(own_dark, "dark frame", view.cube)
-            its_white = white
-            if own_white is not None:
-                panel = open_reference(own_white, "white reference", view.cube)
-                its_white = white_reference(panel, its_dark, options.white_reflectance, choice.wavelengths_nm)
-            seen[key] = its_dark, its_white
-        own[view.cube.path] = seen[key]
-    return own
-
-
-def _each_view(
-    files: Sequence[SpectralFile | None], views: Sequence[CaptureView], what: str, is_given: bool
-) -> Sequence[SpectralFile | None]:
-    """A reference for each view: its own, or the only one that there is; none where the user gives one for all."""
-    known = {file.path: file for file in files if file is not None}
-    missing = [view.name for view, file in zip(views, files, strict=True) if file is None]
-    if is_given or not known:
-        return [None] * len(files)
-    if missing and len(known) > 1:
-        raise CaptureError(
-            f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {what} of their own, {len(known)} "
-            f"others have one; expected one for each, or one for all (--{what.split()[0]})"
-        )
-    only = next(iter(known.values()))
-    return [only if file is None else file for file in files]
-
-
-def _states_one(file: SpectralFile) -> bool:
-    linear = file.linear
-    return linear is not None and (linear.scale is not None or "reflectance" in linear.evidence)
-
-
 def _unit(file: SpectralFile) -> str:
     if is_srgb(file):
         return "linear light of pictures in sRGB"
@@ -326,14 +244,17 @@ def _unit(file: SpectralFile) -> str:
 
 
 def _evidence(
-    views: Sequence[CaptureView], choice: _BandChoice, dark: Reference | None, white: Reference | None
+    views: Sequence[CaptureView], choice: _BandChoice, common: References, own: dict[Path, References]
 ) -> dict[str, Any]:
     """References, bands, and what sunshine sensors measured, by view."""
-    found: dict[str, Any] = {
-        what: {"file": str(reference.file.path), "use": reference.how}
-        for what, reference in (("dark", dark), ("white", white))
-        if reference is not None
-    }
+    found: dict[str, Any] = {}
+    for what, of_all, of_view in zip(
+        ("dark", "white"), common, next(iter(own.values()), common), strict=True
+    ):
+        if own and of_view is not None:
+            found[what] = {"file": "each view's own", "use": f"each view's own; {of_view.how}"}
+        elif of_all is not None:
+            found[what] = {"file": str(of_all.file.path), "use": of_all.how}
     found["wavelengths"] = views[0].cube.bands.evidence
     found["dropped_bands"] = [
         {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
@@ -422,9 +343,8 @@ def _lit_bands(
         listed = name_some([f"{nm:g} nm" for nm in choice.wavelengths_nm[clipped]])
         warnings = [f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"]
     choice = choice.without(clipped, "the white reference is saturated there")
-    return choice.without(
-        signal < _LEAST_WHITE * signal.max(), "the white reference has no light there"
-    ), warnings
+    is_dark = signal < _LEAST_WHITE * signal.max()
+    return choice.without(is_dark, "the white reference has no light there"), warnings
 
 
 def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarray, " B"]:

@@ -21,8 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from unmix_plugin.captures.layouts.registry import view_names
-from unmix_plugin.captures.poses.pose_set import natural_order
+from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.readers.envi import described_image, header_beside
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, ReadOptions, SpectralFile
@@ -71,9 +70,8 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    return _capture_of_plain(
-        root, [path for path in pictures.values() if not _is_reference(path, ())], {}, options
-    )
+    shown = [path for path in pictures.values() if not _is_reference(path, ())]
+    return _capture_of_plain(root, shown, {}, options)
 
 
 def _capture_of_plain(

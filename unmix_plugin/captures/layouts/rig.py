@@ -26,10 +26,9 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
-from unmix_plugin.captures.layouts.registry import view_names
 from unmix_plugin.captures.layouts.transforms import Split
+from unmix_plugin.captures.names import natural_order, view_names
 from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
-from unmix_plugin.captures.poses.pose_set import natural_order
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted, name_some
@@ -38,11 +37,9 @@ _TIFF_SUFFIXES = (".tif", ".tiff")
 _COLOUR_SUFFIXES = (".jpg", ".jpeg")
 _THERMAL_NM = 3000.0
 """Bands from here on measure heat."""
-_BAND_ENDING = re.compile(
-    r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.IGNORECASE
-)
+_BAND_ENDING = re.compile(r"(?:_MS)?[_-](\d{1,2}|GRE|GREEN|RED|REG|REDEDGE|RE|NIR|BLUE|RGB|G|R|B|D|W)$", re.I)
 """Of a file's stem."""
-_DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.IGNORECASE)
+_DJI_NUMBER = re.compile(r"(DJI_\d+)(\d)$", re.I)
 """Of a Phantom 4 Multispectral: the last digit is the band, 0 the colour picture."""
 _EVAL_INTERVAL = 8
 """Every so many releases, one is for evaluation."""
@@ -62,9 +59,8 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
     opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in _TIFF_SUFFIXES]
     bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
-    bands = [
-        item for item in bands if options.wavelengths_nm is not None or not item.file.bands.is_broad.any()
-    ]
+    if options.wavelengths_nm is None:
+        bands = [item for item in bands if not item.file.bands.is_broad.any()]
     if not bands:
         raise CaptureError(
             f"{root} holds no TIFF files of single bands, such as IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: "
@@ -82,9 +78,7 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
         lens_notes.update((sensor, note) for note in said)
         views.append(CaptureView(name, item.file, sensor, lens=lens, release=release, split=splits[release]))
     _check_lenses(views)
-    notes += [
-        f"lens {sensor}: {note} ({counted(count, 'file')})" for (sensor, note), count in lens_notes.items()
-    ]
+    notes += [f"lens {sensor}: {note} ({counted(n, 'file')})" for (sensor, note), n in lens_notes.items()]
     views = _with_given_bands(views, options)
     ordered = sorted(views, key=lambda view: natural_order(view.name))
     return Capture("rig", root, tuple(ordered), notes=tuple(notes))
@@ -310,16 +304,14 @@ def _fit_fisheye(
 
     Remembered, as all files of a lens have the same.
     """
-    affine = np.array(matrix).reshape(2, 2)
+    affine, at_axis = np.array(matrix).reshape(2, 2), 2.0 / math.pi * polynomial[1]
 
     def project(ideal: Points) -> Points:
         radius = np.hypot(*ideal.T)
         bent = np.polynomial.polynomial.polyval(2.0 / math.pi * np.arctan(radius), polynomial)
-        ratio = np.divide(
-            bent, radius, out=np.full_like(radius, 2.0 / math.pi * polynomial[1]), where=radius > 1e-9
-        )
+        ratio = np.divide(bent, radius, out=np.full_like(radius, at_axis), where=radius > 1e-9)
         return (ideal * ratio[:, None]) @ affine.T + np.array(centre)
 
-    focal = 2.0 / math.pi * polynomial[1] * np.diag(affine)
+    focal = at_axis * np.diag(affine)
     start = Lens(*size, (float(focal[0]), float(focal[1])), centre)
     return fit_lens(project, start, "fisheye of Pix4D", _TAGS)

@@ -126,10 +126,9 @@ def read_colmap(folder: Path) -> PoseSet:
             )
         lenses[number], note = _lens(cameras[number], f"{cameras_path}: camera {number}")
         notes += [] if note is None else [note]
-    posed = [
-        (image.name, PosedCamera(_matrix(image, str(images_path)), lenses[image.camera])) for image in images
-    ]
-    return make_pose_set(posed, f"COLMAP model in {folder}", str(images_path), points, None, notes)
+    where = str(images_path)
+    posed = [(image.name, PosedCamera(_matrix(image, where), lenses[image.camera])) for image in images]
+    return make_pose_set(posed, f"COLMAP model in {folder}", where, points, None, notes)
 
 
 def _suffix(folder: Path) -> str | None:

@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
+from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.colmap import read_colmap
-from unmix_plugin.captures.poses.pose_set import PoseSet, natural_order
+from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.errors import CaptureError, install_hint, name_some
 
 _LEAST_VIEWS = 3
@@ -69,11 +70,7 @@ _WHAT_TO_DO = f"{_SMALLER_STEPS}; {_TEXTURE}; {_STILL}; {_OTHER_POSES}"
 
 
 def require_pycolmap() -> None:
-    """Look, before anything is computed, whether COLMAP is there.
-
-    Raises:
-        CaptureError: it is not.
-    """
+    """Look, before anything is computed, whether COLMAP is there. Raises CaptureError: it is not."""
     if importlib.util.find_spec("pycolmap") is None:
         raise CaptureError(
             f"poses can't be estimated: pycolmap is not installed: {install_hint('sfm')}, or give other poses"
@@ -118,13 +115,16 @@ def estimate_poses(
     sensors: dict[str, list[str]] = {}
     for name in ordered:
         sensors.setdefault((sensor_of or {}).get(name, ""), []).append(files[name])
+    digest = hashlib.sha256()  # what tells whether an earlier try looked at the same
+    for path in sorted([*(folder / "images").glob("*.png"), *(folder / "masks").glob("*.png")]):
+        digest.update(f"{path.parent.name}/{path.name}".encode() + path.read_bytes())
     settings = {
         "folder": str(folder.resolve()),
         "sensors": list(sensors.values()),
         "has_masks": masks is not None,
         "sequential": len(pictures) > _MOST_EXHAUSTIVE,
         "threads": threads or min(os.cpu_count() or 1, 8),
-        "pictures": _digest(folder),
+        "pictures": digest.hexdigest(),
     }
     found = _run(settings, folder)
     return _best(found["models"], found["views"], files, folder)
@@ -137,14 +137,6 @@ def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."
     place.mkdir(parents=True, exist_ok=True)
     for name, pixels in pictures.items():
         Image.fromarray(pixels).save(place / name)
-
-
-def _digest(folder: Path) -> str:
-    """Of all pictures and masks: what tells whether an earlier try looked at the same."""
-    found = hashlib.sha256()
-    for path in sorted([*(folder / "images").glob("*.png"), *(folder / "masks").glob("*.png")]):
-        found.update(f"{path.parent.name}/{path.name}".encode() + path.read_bytes())
-    return found.hexdigest()
 
 
 def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -276,7 +276,7 @@ def bend_opencv(
     return ideal * ratio[:, None] + _tangential(ideal, (p1, p2))
 
 
-def equidistant(ideal: Points) -> Points:
+def _equidistant(ideal: Points) -> Points:
     """Ideal points moved along their radius to the angle from the axis, radians."""
     radius = np.linalg.norm(ideal, axis=1)
     return ideal * _ratio(np.arctan(radius), radius)[:, None]
@@ -285,14 +285,14 @@ def equidistant(ideal: Points) -> Points:
 def bend_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
     """An equidistant lens bent as OpenCV bends a perspective one: with terms of theta^2, theta^4, ... (OPENCV_FISHEYE),
     and with tangential ones (Metashape's fisheye)."""
-    return _brown(equidistant(ideal), radial, tangential)
+    return _brown(_equidistant(ideal), radial, tangential)
 
 
 def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:
     """COLMAP's THIN_PRISM_FISHEYE: k1, k2, p1, p2, k3, k4, sx1, sy1."""
     k3, k4, across, down = more
     bent = bend_fisheye(ideal, k1, k2, k3, k4, tangential=(p1, p2))
-    return bent + _prism(equidistant(ideal), (across, 0.0, down, 0.0))
+    return bent + _prism(_equidistant(ideal), (across, 0.0, down, 0.0))
 
 
 def bend_fisheye_624(ideal: Points, *terms: float) -> Points:
@@ -306,7 +306,7 @@ def bend_fisheye_624(ideal: Points, *terms: float) -> Points:
 
 def bend_opensfm_624(ideal: Points, *terms: float) -> Points:
     """OpenSfM's fisheye62 and fisheye624: the same terms, all of which act on the points of an equidistant lens."""
-    return bend_fisheye(ideal, *terms[:6], tangential=terms[6:8]) + _prism(equidistant(ideal), terms[8:])
+    return bend_fisheye(ideal, *terms[:6], tangential=terms[6:8]) + _prism(_equidistant(ideal), terms[8:])
 
 
 def bend_fov(ideal: Points, omega: float) -> Points:
@@ -333,7 +333,7 @@ def bend_eucm(ideal: Points, alpha: float, beta: float) -> Points:
 
 def bend_dual(ideal: Points, transition: float, *radial: float) -> Points:
     """OpenSfM's dual: between a perspective lens (1) and an equidistant one (0)."""
-    return _brown(transition * ideal + (1.0 - transition) * equidistant(ideal), radial)
+    return _brown(transition * ideal + (1.0 - transition) * _equidistant(ideal), radial)
 
 
 def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:

@@ -35,7 +35,7 @@ from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, whe
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.scenes.placement import Placement
 
-LEAST_VIEWS = 3
+_LEAST_VIEWS = 3
 _FOCAL_FACTORS = (0.7, 1.0, 1.5, 2.3, 3.5, 6.0, 11.0)
 """First focal lengths to try, over the longer side."""
 _WORST_PX = 20.0
@@ -98,16 +98,15 @@ def poses_from_markers(
 
 def _followed(sightings: Sightings, lens_of: Mapping[str, Lens | None]) -> tuple[Sightings, int]:
     """Sightings whose corners known lenses can follow, and the number of the others."""
-    followed = {
-        name: {
-            number: corners
-            for number, corners in markers.items()
-            if (lens := lens_of[name]) is None or lens.ideal_of(corners) is not None
+    followed: Sightings = {}
+    for name, markers in sightings.items():
+        lens = lens_of[name]
+        seen = {
+            n: corners for n, corners in markers.items() if not lens or lens.ideal_of(corners) is not None
         }
-        for name, markers in sightings.items()
-    }
+        followed[name] = seen
     lost = sum(len(markers) - len(followed[name]) for name, markers in sightings.items())
-    if lost and (left := sum(map(bool, followed.values()))) < LEAST_VIEWS:
+    if lost and (left := sum(map(bool, followed.values()))) < _LEAST_VIEWS:
         where = f"{counted(lost, 'sighting')} of markers, which leaves {left} of {len(followed)} views"
         raise CaptureError(f"a lens folds its picture over at {where}: calibrate it again")
     return followed, lost
@@ -118,11 +117,11 @@ def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
     views_of = Counter(number for markers in sightings.values() for number in markers)
     shared = {number for number, count in views_of.items() if count > 1}
     views = [name for name, markers in sightings.items() if shared & set(markers)]
-    if len(views) < LEAST_VIEWS:
+    if len(views) < _LEAST_VIEWS:
         alone = sum(bool(markers) for markers in sightings.values())
         raise CaptureError(
             f"markers are seen in {alone} of {len(sightings)} views, the same ones in {len(views)}; expected at least "
-            f"{LEAST_VIEWS}: take the board into every picture, larger or sharper, or give --poses estimate"
+            f"{_LEAST_VIEWS}: take the board into every picture, larger or sharper, or give --poses estimate"
         )
     numbers = sorted(shared)
     rows = [
@@ -150,7 +149,7 @@ def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> 
         )
         start = _Chain(seen, tried).grow()
         usable = _usable(start, seen)
-        if usable.sum() >= LEAST_VIEWS:
+        if usable.sum() >= _LEAST_VIEWS:
             misses = np.minimum(rms(start.errors(seen.part(usable))), _WORST_PX)
             begun.append((float(usable.mean()), float(misses.mean()), start))
     if not begun:
@@ -160,19 +159,18 @@ def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> 
     most = max(share for share, _, _ in begun)
     ranked = sorted((miss, index) for index, (share, miss, _) in enumerate(begun) if share > 0.95 * most)
     tried_out = [_adjust(begun[index][2], seen, free, steps=15)[0] for _, index in ranked[:3]]
-    return min(tried_out, key=lambda found: _robust_cost(found, seen))
+
+    def robust_cost(found: MarkerMap) -> float:
+        usable = _usable(found, seen)
+        return float(np.minimum(rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
+
+    return min(tried_out, key=robust_cost)
 
 
 def _usable(found: MarkerMap, seen: Seen) -> Bool[np.ndarray, " S"]:
     """Sightings whose view and marker are in the map."""
-    return np.isfinite(found.camera_from_world[seen.view, 0, 0]) & np.isfinite(
-        found.world_from_marker[seen.marker, 0, 0]
-    )
-
-
-def _robust_cost(found: MarkerMap, seen: Seen) -> float:
-    usable = _usable(found, seen)
-    return float(np.minimum(rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
+    cameras, markers = found.camera_from_world[seen.view], found.world_from_marker[seen.marker]
+    return np.isfinite(cameras[:, 0, 0] + markers[:, 0, 0])
 
 
 class _Chain:
@@ -220,17 +218,12 @@ class _Chain:
 
     def _look_again(self, view: int) -> None:
         """The pose of a view that is best for all markers that are placed, or both of a single one."""
-        known = self._known(view)
-        placed = [self._placed[self._seen.marker[s]] for s in known]
-        options = np.concatenate(
-            [self._squares[s] @ np.linalg.inv(pose) for s, pose in zip(known, placed, strict=True)]
-        )
+        known = [(s, self._placed[self._seen.marker[s]]) for s in self._known(view)]
+        options = np.concatenate([self._squares[s] @ np.linalg.inv(pose) for s, pose in known])
         if len(known) > 1:
-            misses = np.sum(
-                [self._misses(options @ pose, s) for s, pose in zip(known, placed, strict=True)], axis=0
-            )
-            corners = np.concatenate([transformed(pose, SQUARE) for pose in placed])
-            ideal = np.concatenate([self._ideal[s] for s in known])
+            misses = np.sum([self._misses(options @ pose, s) for s, pose in known], axis=0)
+            corners = np.concatenate([transformed(pose, SQUARE) for _, pose in known])
+            ideal = np.concatenate([self._ideal[s] for s, _ in known])
             options = _resected(options[int(np.argmin(misses))], corners, ideal)[None]
         self._options[view] = options
 
@@ -267,10 +260,8 @@ def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4
     _, turns, shifts, _ = cv2.solvePnPGeneric(
         SQUARE, ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    for pose, turn, shift in zip(poses, turns, shifts, strict=False):
-        pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
-    return poses
+    poses = [_transform(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
+    return np.stack([*poses, np.eye(4), np.eye(4)][:2])
 
 
 def _resected(
@@ -278,11 +269,14 @@ def _resected(
 ) -> Float64[np.ndarray, "4 4"]:
     """The camera with the least squares for points, from a first one."""
     cv2 = require_opencv()
-    turn, shift = cv2.solvePnPRefineLM(
-        points, ideal[:, None].copy(), np.eye(3), None, cv2.Rodrigues(first[:3, :3])[0], first[:3, 3:].copy()
-    )
+    turn = cv2.Rodrigues(first[:3, :3])[0]
+    found = cv2.solvePnPRefineLM(points, ideal[:, None].copy(), np.eye(3), None, turn, first[:3, 3:].copy())
+    return _transform(*found)
+
+
+def _transform(turn: np.ndarray, shift: np.ndarray) -> Float64[np.ndarray, "4 4"]:
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
+    pose[:3, :3], pose[:3, 3] = require_opencv().Rodrigues(turn)[0], np.ravel(shift)
     return pose
 
 
@@ -360,13 +354,11 @@ def _pose_set(
     views = np.unique(seen.view[kept])
     markers = np.unique(seen.marker[kept])
     corners = transformed(found.world_from_marker[markers], np.broadcast_to(SQUARE, (len(markers), 4, 3)))
-    to_board, up, how_up = stand_on_markers(corners, marker_size or 1.0)
+    to_board, up, how_up = _stand_on_markers(corners, marker_size or 1.0)
     cameras = {}
     for view in views:
-        pose = np.linalg.inv(found.camera_from_world[view])
-        camera = PosedCamera(
-            np.column_stack([pose[:3, :3] @ FLIP, pose[:3, 3]]), found.lenses[seen.sensor[view]]
-        )
+        pose, lens = np.linalg.inv(found.camera_from_world[view]), found.lenses[seen.sensor[view]]
+        camera = PosedCamera(np.column_stack([pose[:3, :3] @ FLIP, pose[:3, 3]]), lens)
         cameras[seen.views[view]] = camera.moved(to_board)
     error = float(np.sqrt(np.mean(rms(found.errors(seen.part(kept))) ** 2)))
     found_in = f"{counted(len(markers), 'marker')} in {len(seen.view[kept])} sightings"
@@ -396,7 +388,7 @@ def _how_large(marker_size: float | None) -> str:
     return f"the scale is that of markers with sides of {marker_size:g} m"
 
 
-def stand_on_markers(
+def _stand_on_markers(
     corners: Float64[np.ndarray, "M 4 3"], marker_size: float
 ) -> tuple[Placement, Float64[np.ndarray, "3"] | None, str]:
     """The way to the world that stands on the markers, in which their sides have a length.
@@ -441,7 +433,7 @@ def metric_poses(poses: PoseSet, sightings: Sightings, marker_size: float) -> Po
             f"--marker-size: {counted(len(views_of), 'marker')} in the views, none of them seen by two cameras that "
             "agree; take the same one, sharp, into more pictures, or leave --marker-size out"
         )
-    way, up, how_up = stand_on_markers(np.stack(corners), marker_size)
+    way, up, how_up = _stand_on_markers(np.stack(corners), marker_size)
     notes = (*poses.notes, how_up, _how_large(marker_size))
     return replace(poses.moved(way), up=up, has_world=True, metres_per_unit=1.0, notes=notes)
 

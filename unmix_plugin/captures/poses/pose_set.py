@@ -1,5 +1,5 @@
-"""Cameras by the name of their image, with the sparse points that came with them; which of them took which view; and
-the JSON and XML that they are read from.
+"""Cameras by the name of their image, with the sparse points that came with them; and the JSON and XML that they are
+read from.
 
 World space is the source's, less an offset, so that float32 has digits enough for geo-referenced cameras. Readers hand
 over what is written; `make_pose_set` refuses what is no pose and makes the others rigid.
@@ -7,13 +7,10 @@ over what is written; `make_pose_set` refuses what is no pose and makes the othe
 
 from __future__ import annotations
 
-import re
-import unicodedata
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree import ElementTree
 
@@ -105,9 +102,8 @@ class PoseSet:
     def moved(self, way: Placement) -> PoseSet:
         """Cameras and points in the world that a similarity leads to."""
         cameras = {name: camera.moved(way) for name, camera in self.cameras.items()}
-        return replace(
-            self, cameras=cameras, points=None if self.points is None else way.to_scene(self.points)
-        )
+        points = None if self.points is None else way.to_scene(self.points)
+        return replace(self, cameras=cameras, points=points)
 
 
 def where_rays_meet(
@@ -125,26 +121,6 @@ def where_rays_meet(
     points = np.linalg.solve(table + 1e-9 * np.eye(3), wanted[..., None])[..., 0]
     misses = [np.linalg.norm(camera.pixels_of(points) - pixels, axis=1) for camera, pixels in seen]
     return points, np.stack(misses)
-
-
-def path_text(text: str) -> str:
-    """A path of a JSON file with slashes between folders and without a leading `./`.
-
-    >>> path_text(".\\\\images\\\\0001.png")
-    'images/0001.png'
-    """
-    return text.strip().replace("\\", "/").removeprefix("./")
-
-
-def natural_order(name: str) -> list[tuple[int, str]]:
-    """A key that sorts numbers in names by their size; no two names have one.
-
-    >>> sorted(["view_10", "view_9"], key=natural_order)
-    ['view_9', 'view_10']
-    """
-    parts = re.split(r"(\d+)", name.lower())
-    keys = [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
-    return [*keys, (-2, name)]
 
 
 def make_pose_set(
@@ -269,7 +245,7 @@ def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
     return None
 
 
-# JSON and XML of unknown origin, and numbers in XML.
+# JSON and XML of unknown origin.
 
 
 @contextmanager
@@ -297,162 +273,3 @@ def load_xml(path: Path) -> ElementTree.Element:
             return parse_xml(read_bounded(path, MOST_TABLE_BYTES))
     except ValueError as error:
         raise CaptureError(f"{path} is not valid XML ({error}); was it cut short?") from error
-
-
-def numbers_of(
-    element: ElementTree.Element | None, count: int, where: str
-) -> Float64[np.ndarray, " count"] | None:
-    """Numbers in the text of an element; None without an element or text, CaptureError for other than `count` finite
-    ones."""
-    if element is None or not (element.text or "").strip():
-        return None
-    texts = (element.text or "").split()
-    try:
-        values = np.array([float(text) for text in texts])
-    except ValueError:
-        values = np.full(count, np.nan)
-    if len(texts) != count or not np.isfinite(values).all():
-        found = " ".join(texts)[:60]
-        raise CaptureError(f"{where}: <{element.tag}> holds {found!r}; expected {count} finite numbers")
-    return values
-
-
-def number_of(parent: ElementTree.Element, tag: str, where: str, default: float = 0.0) -> float:
-    """The number in a child; the default without one."""
-    values = numbers_of(parent.find(tag), 1, where)
-    return default if values is None else float(values[0])
-
-
-# Which camera took which view, by the names of files.
-
-BY_ORDER = "#"
-"""Names of cameras whose source gives none begin with it; they are matched in the order of names, sorted as texts as
-LLFF does."""
-_IN_ORDER = "by their order, as the poses have no names"
-
-
-def match_poses(
-    poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]
-) -> tuple[dict[str, PosedCamera], list[str]]:
-    """Find the camera of each view.
-
-    Names are compared whole, then as folder and name, file name, and name without suffix, each only where it is unique
-    on both sides; if all that finds nothing, by what is left of the names without what they all begin and end with.
-
-    Args:
-        views: Name and files of each view; the files as paths, of which the trailing parts count.
-    Returns:
-        Cameras by the name of the view, without views that have none; how they were matched and what is odd, one
-        sentence each.
-    Raises:
-        CaptureError: no view has a pose.
-    """
-    owners = {name: [name, *camera.other_names] for name, camera in poses.cameras.items()}
-    wanted = {name: [name, *(str(file) for file in files)] for name, files in views}
-    found, how = _by_order(list(owners), list(wanted)), _IN_ORDER
-    if found is None:
-        found, how = _by_names(owners, wanted), "by name"
-    if not found:
-        cameras, named = _cores(owners), _cores(wanted)
-        found = {named[core]: cameras[core] for core in named if core in cameras}
-        how = "by the part of the names that differs"
-    if not found:
-        raise CaptureError(
-            f"no view has a pose: views are called {name_some(list(wanted)) or '(none)'}, the cameras of "
-            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes"
-        )
-    unposed = [name for name in wanted if name not in found]
-    unused = [name for name in owners if name not in set(found.values())]
-    cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
-    shared = [  # several views or cameras have one name
-        view
-        for view in unposed
-        if any(
-            cameras_of.get(_stem(name)) and len(cameras_of[_stem(name)]) + len(views_of[_stem(name)]) > 2
-            for name in wanted[view]
-        )
-    ]
-    notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
-    if how == _IN_ORDER and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
-        notes.append(
-            f"names were sorted as texts: {', '.join(ordered[:3])}; if poses go by numbers, give these leading zeros"
-        )
-    if unposed:
-        notes.append(f"views without pose: {', '.join(unposed)}")
-    if unused:
-        notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
-    if shared:
-        notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
-    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes
-
-
-def _by_order(owners: list[str], wanted: list[str]) -> dict[str, str] | None:
-    """Pairs in the order of names, if the cameras have no names; None if they have."""
-    if not all(name.startswith(BY_ORDER) for name in owners):
-        return None
-    if len(owners) != len(wanted):
-        raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
-    return dict(zip(sorted(wanted), sorted(owners), strict=True))
-
-
-def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for key in _KEYS:
-        cameras, views = _owners_of(owners, key), _owners_of(wanted, key)
-        for view, names in wanted.items():
-            hits = (cameras.get(key(name), set()) for name in names if len(views[key(name)]) == 1)
-            hit = next((next(iter(those)) for those in hits if len(those) == 1), None)
-            if view not in found and hit is not None and hit not in found.values():
-                found[view] = hit
-    return found
-
-
-def _cores(names: Iterable[str]) -> dict[str, str]:
-    """Names by what differs among them; numbers without leading zeros. Empty if that is not unique."""
-    stems = {name: _stem(name) for name in names}
-    start = _common_length(list(stems.values()))
-    end = _common_length([stem[start:][::-1] for stem in stems.values()])
-    cores: dict[str, str] = {}
-    for name, stem in stems.items():
-        first = start
-        while first > 0 and stem[first - 1].isdigit():
-            first -= 1
-        last = len(stem) - end
-        while last < len(stem) and stem[last].isdigit():
-            last += 1
-        core = stem[first:last]
-        cores[str(int(core)) if core.isdecimal() else core] = name
-    return cores if len(cores) == len(stems) else {}
-
-
-def _common_length(texts: list[str]) -> int:
-    """Number of characters that all texts begin with."""
-    alike = [len(set(column)) == 1 for column in zip(*texts, strict=False)]
-    return alike.index(False) if False in alike else len(alike)
-
-
-def _owners_of(names: dict[str, list[str]], key: Callable[[str], str]) -> dict[str, set[str]]:
-    by_key: dict[str, set[str]] = defaultdict(set)
-    for owner, all_names in names.items():
-        for name in all_names:
-            by_key[key(name)].add(owner)
-    return by_key
-
-
-def _stem(name: str) -> str:
-    """File name without its suffix; a dot before digits is not a suffix, as in `view.0001`."""
-    path = _path(name)
-    return path.name if path.suffix[1:].isdecimal() else path.stem
-
-
-def _path(name: str) -> PurePosixPath:
-    return PurePosixPath(unicodedata.normalize("NFC", name.replace("\\", "/")))
-
-
-_KEYS: tuple[Callable[[str], str], ...] = (
-    lambda name: str(_path(name)),
-    lambda name: f"{_path(name).parent.name}/{_stem(name)}",
-    lambda name: _path(name).name,
-    _stem,
-)
-"""What names are compared by, in turn."""

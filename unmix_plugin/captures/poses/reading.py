@@ -13,23 +13,21 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
+from unmix_plugin.captures.names import BY_ORDER, path_text
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
 from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_unfolded
-from unmix_plugin.captures.poses.metashape import read_metashape
-from unmix_plugin.captures.poses.micmac import find_orientations, read_micmac
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
 from unmix_plugin.captures.poses.pose_set import (
-    BY_ORDER,
     PosedCamera,
     PoseSet,
     SparsePoints,
     load_json,
     load_xml,
     make_pose_set,
-    path_text,
     reading,
 )
+from unmix_plugin.captures.poses.xml_cameras import find_orientations, read_metashape, read_micmac
 from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
@@ -289,7 +287,9 @@ def _read_frames(
                 notes += [note for note in lenses[key][1:] if note is not None]
             lens = lenses[key][0]
         read.append((names, matrix, lens))
-        missing += [] if _is_there(path.parent, names[0]) else [names[0]]
+        # Blender's files leave out the suffix.
+        is_there = find_named(path.parent, names[0]) or find_named(path.parent, f"{names[0]}.png")
+        missing += [] if is_there else [names[0]]
     if missing:
         notes.append(
             f"{path.name}: {len(missing)} of {len(read)} frames name files that are not there ({name_some(missing)}); "
@@ -298,11 +298,6 @@ def _read_frames(
     if any(lens is None for _, _, lens in read):
         notes.append(f"{path.name}: frames without a focal length or picture size have no lens")
     return read
-
-
-def _is_there(folder: Path, name: str) -> bool:
-    """Whether a file exists, also where Blender's files leave out the suffix."""
-    return find_named(folder, name) is not None or find_named(folder, f"{name}.png") is not None
 
 
 def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | None:

@@ -74,7 +74,12 @@ def poses_from_turntable(
     """
     cv2 = require_opencv()
     names = sorted(pictures, key=lambda name: (turns[name].camera, name))
-    _refuse_few(turns)
+    counts = np.bincount([turn.camera for turn in turns.values()])
+    if counts.min() < _LEAST_VIEWS:
+        raise CaptureError(
+            f"{counts.min()} views were taken from place {counts.argmin() + 1} of the camera; expected {_LEAST_VIEWS} "
+            "or more of each"
+        )
     evidence = gather(
         cv2,
         [pictures[name] for name in names],
@@ -85,15 +90,6 @@ def poses_from_turntable(
     fitted = _fit(evidence)
     _refuse_unexplained(fitted, evidence)
     return _pose_set(fitted, evidence, names)
-
-
-def _refuse_few(turns: Mapping[str, Turn]) -> None:
-    counts = np.bincount([turn.camera for turn in turns.values()])
-    if counts.min() < _LEAST_VIEWS:
-        place = int(counts.argmin()) + 1
-        raise CaptureError(
-            f"{counts.min()} views were taken from place {place} of the camera; expected {_LEAST_VIEWS} or more of each"
-        )
 
 
 # Cameras from few numbers, and what of the evidence they leave unexplained.
@@ -346,18 +342,16 @@ def _fit(evidence: Evidence) -> _Numbers:
     best = _solve(best, fine, everyone, steps=40)
     fits = np.abs(best.errors(fine)[0]) < _FITS_PX
     if len(fits) and fits.mean() < _ENOUGH_FIT and len(fine.touched) and evidence.likeness <= _MOST_ALIKE:
+        none = evidence.first[:0]
         # On plain things most matches are chance, such as highlights, and would pull the cameras with them.
-        return _fit(evidence.without_matches())
+        return _fit(replace(evidence, first=none, second=none, points=evidence.points[:0]))
     bent = _solve(best, fine, everyone, steps=20, bent=True)
-    if bent.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and abs(_bend(bent, evidence.size)) < _GREATEST_BEND:
+    # By how much of half the diagonal distortion moves the corners of a picture.
+    moved = abs(bent.k1) * (np.hypot(*evidence.size) / 2 / bent.focal_px) ** 2
+    if bent.cost(fine) < (1.0 - _GAIN) * best.cost(fine) and moved < _GREATEST_BEND:
         best = bent
     loose = _solve(best, fine, everyone, steps=20, bent=bool(best.k1), slack=True)
     return loose if loose.cost(fine) < (1.0 - _SLACK_GAIN) * best.cost(fine) else best
-
-
-def _bend(numbers: _Numbers, size: tuple[int, int]) -> float:
-    """By how much of half the diagonal distortion moves the corners of a picture."""
-    return numbers.k1 * (np.hypot(*size) / 2 / numbers.focal_px) ** 2
 
 
 def _begin(evidence: Evidence, focal_px: float, sense: float) -> _Numbers:

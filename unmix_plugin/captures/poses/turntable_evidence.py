@@ -135,14 +135,7 @@ class Evidence:
     def part(self, views: Bool[np.ndarray, " N"]) -> Evidence:
         """That between some views alone; the numbers of views stay."""
         keep = views[self.first] & views[self.second]
-        touched = self.touched[views[self.touched].all(axis=1)]
-        return replace(
-            self, first=self.first[keep], second=self.second[keep], points=self.points[keep], touched=touched
-        )
-
-    def without_matches(self) -> Evidence:
-        """That of the outlines alone."""
-        return replace(self, first=self.first[:0], second=self.second[:0], points=self.points[:0])
+        return self._kept(keep, np.asarray(views[self.touched].all(axis=1)))
 
     def thinned(self, most: tuple[int, int]) -> Evidence:
         """At most so many matches and pairs of outlines, drawn at random."""
@@ -151,13 +144,11 @@ class Evidence:
             np.sort(generator.permutation(count)[:limit])
             for count, limit in zip((len(self.first), len(self.touched)), most, strict=True)
         )
-        return replace(
-            self,
-            first=self.first[keep],
-            second=self.second[keep],
-            points=self.points[keep],
-            touched=self.touched[pairs],
-        )
+        return self._kept(keep, pairs)
+
+    def _kept(self, matches: np.ndarray, pairs: np.ndarray) -> Evidence:
+        found = {name: getattr(self, name)[matches] for name in ("first", "second", "points")}
+        return replace(self, **found, touched=self.touched[pairs])
 
 
 def gather(
@@ -245,9 +236,7 @@ def _hulls(cv2: Any, masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float64[np.nda
         hull = (cv2.convexHull(middles)[:, 0][:, None] + 0.5 * around).reshape(-1, 2)
         found.append(cv2.convexHull(hull)[:, 0].astype(np.float64))
     longest = max(map(len, found))
-    return np.stack(
-        [np.concatenate([hull, np.repeat(hull[-1:], longest - len(hull), axis=0)]) for hull in found]
-    )
+    return np.stack([np.pad(hull, ((0, longest - len(hull)), (0, 0)), mode="edge") for hull in found])
 
 
 def _likeness(masks: Bool[np.ndarray, "N H W"], camera: Int[np.ndarray, " N"]) -> float:

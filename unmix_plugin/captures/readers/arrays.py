@@ -1,15 +1,11 @@
-"""Files that hold arrays by name: which is the image, which describe its bands, and how NumPy, torch and NetCDF-3
-store them.
+"""Files that hold arrays by name: which of them is the image, and which describe its bands.
 
 Notation: `H` rows, `W` columns, `B` bands.
 """
 
 from __future__ import annotations
 
-import pickle
-import pickletools
 import re
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import prod
@@ -18,7 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unmix_plugin.captures.exposure import exposure_facts, is_exposure
+from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts, is_exposure
 from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
@@ -28,19 +24,9 @@ from unmix_plugin.captures.spectral_file import (
     choose_axes,
     image_shape,
     linear_values,
-    loaded,
     take_part,
 )
-from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError, name_some
-from unmix_plugin.limits import allow_decoded, allow_parts, open_zip, refuse
-from unmix_plugin.scenes.reading.cubes import (
-    READ_HEADER,
-    UnreadableArrayError,
-    map_array,
-    parse_header,
-    read_array_header,
-)
 
 _TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
 """(h, W, b) numbers of a stored array whose axes are these."""
@@ -88,12 +74,12 @@ class FoundArray:
     """Names of its axes."""
 
     @property
-    def own_name(self) -> str:
+    def _own_name(self) -> str:
         """Without groups, in lower case."""
         return self.name.rpartition("/")[2].lower()
 
     @property
-    def all_attributes(self) -> dict[str, Any]:
+    def _all_attributes(self) -> dict[str, Any]:
         """Its own attributes, and those inherited that it lacks."""
         return {**self.inherited, **self.attributes}
 
@@ -137,8 +123,8 @@ def image_of_arrays(
     linear = _linear(path, image, of_image[2])
     exposure, exposure_warnings = _exposure(arrays, image)
 
-    dtype, no_data = image.dtype, _first_number(image.all_attributes, _NO_DATA)
-    valid = _valid_range(image.all_attributes)
+    dtype, no_data = image.dtype, _first_number(image._all_attributes, _NO_DATA)
+    valid = _valid_range(image._all_attributes)
     if dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true":
         dtype, more = np.dtype(dtype.str.replace("i", "u")), 256.0**dtype.itemsize  # attributes are signed
         no_data = no_data + more if no_data is not None and no_data < 0 else no_data
@@ -155,9 +141,9 @@ def image_of_arrays(
         one.name
         for one in arrays
         if one is not image
-        and not is_exposure(one.own_name)
-        and one.own_name not in _AXES
-        and not any(names.fullmatch(one.own_name) for names in known)
+        and not is_exposure(one._own_name)
+        and one._own_name not in _AXES
+        and not any(names.fullmatch(one._own_name) for names in known)
     ]
     return SpectralFile(
         path=path,
@@ -202,7 +188,7 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
     if not images:
         images = [array for array in numeric if _pixel_list_size(array, arrays, options) is not None]
     if len(images) > 1:
-        images = [image for image in images if not _QUALITY.search(image.own_name)] or images
+        images = [image for image in images if not _QUALITY.search(image._own_name)] or images
     if len(images) > 1:
         images = [image for image in images if _find_vector(arrays, image, _CENTRES) is not None] or images
     if not images:
@@ -224,7 +210,7 @@ def _pixel_list_size(
     Files of unmixing scenes give them as numbers `nRow` and `nCol`.
     """
     size = options.size
-    numbers = {one.own_name.rstrip("s"): one for one in arrays if one.is_vector and prod(one.shape) == 1}
+    numbers = {one._own_name.rstrip("s"): one for one in arrays if one.is_vector and prod(one.shape) == 1}
     if size is None and "nrow" in numbers and "ncol" in numbers:
         rows, columns = (float(numbers[name].whole().reshape(-1)[0]) for name in ("nrow", "ncol"))
         size = (int(rows), int(columns)) if 1 <= rows < 2**31 and 1 <= columns < 2**31 else None
@@ -248,8 +234,8 @@ def _find_vector(
         for array in arrays
         if array.is_vector
         and prod(array.shape) in image.shape
-        and names.fullmatch(array.own_name)
-        and not (array.own_name == "bands" and _counts(array))
+        and names.fullmatch(array._own_name)
+        and not (array._own_name == "bands" and _counts(array))
     ]
     return max(found, key=lambda array: common_groups(array.name), default=None)
 
@@ -270,7 +256,7 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
     of_image = [_find_attribute(image, names) for names in (_CENTRES, _WIDTHS, _GOOD)]
     if centres is not None:
         where, listed = f"data set '{centres.name}'", numbers(centres)
-        name, attributes = centres.own_name, centres.attributes
+        name, attributes = centres._own_name, centres.attributes
     else:
         name, listed = of_image[0]
         where, attributes = f"attribute '{name}'", {}
@@ -284,10 +270,10 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
 
 def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, list[object] | None]:
     """The attribute with such a name that fits an axis; of several the one whose name has a word of the image's."""
-    words = set(re.split(r"[\W_]+", image.own_name))
+    words = set(re.split(r"[\W_]+", image._own_name))
     found = {
         key: values.tolist()
-        for key, value in image.all_attributes.items()
+        for key, value in image._all_attributes.items()
         if names.fullmatch(key.lower())
         and (values := np.atleast_1d(value)).ndim == 1
         and values.dtype.kind in "iufb"
@@ -304,8 +290,8 @@ def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     """
     columns, evidence = [], []
     for names, own_names in ((_GAINS, _OWN_GAINS), (_OFFSETS, _OWN_OFFSETS)):
-        key = _first_key(image.all_attributes, names) or _first_key(image.attributes, own_names)
-        numbers = [] if key is None else _numbers(image.all_attributes[key])
+        key = _first_key(image._all_attributes, names) or _first_key(image.attributes, own_names)
+        numbers = [] if key is None else _numbers(image._all_attributes[key])
         columns.append(numbers)
         evidence += [f"'{key}'"] if numbers else []
     gains, offsets = columns
@@ -326,15 +312,15 @@ def _prisma(image: FoundArray) -> tuple[float, float, str] | None:
     Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`).
     """
     for part in ("Vnir", "Swir"):
-        if part.lower() not in image.own_name:
+        if part.lower() not in image._own_name:
             continue
         low, high = (
-            _first_number(image.all_attributes, (f"l2scale{part.lower()}{end}",)) for end in ("min", "max")
+            _first_number(image._all_attributes, (f"l2scale{part.lower()}{end}",)) for end in ("min", "max")
         )
         if low is not None and high is not None and high > low:
             return (high - low) / 65535.0, low, f"'L2Scale{part}Min' and 'L2Scale{part}Max'"
         factor, offset = (
-            _first_number(image.all_attributes, (f"{name}_{part.lower()}",))
+            _first_number(image._all_attributes, (f"{name}_{part.lower()}",))
             for name in ("scalefactor", "offset")
         )
         if factor:
@@ -363,11 +349,11 @@ def _valid_range(attributes: Mapping[str, Any]) -> tuple[float, float] | None:
 
 def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Exposure among attributes, and single numbers or lists of one a band beside the image."""
-    entries: dict[str, Any] = dict(image.all_attributes)
+    entries: dict[str, Any] = dict(image._all_attributes)
     for array in arrays:
-        if array.is_vector and prod(array.shape) in (1, *image.shape) and is_exposure(array.own_name):
+        if array.is_vector and prod(array.shape) in (1, *image.shape) and is_exposure(array._own_name):
             unit, numbers = _unit_of(array.attributes) or "", array.whole().reshape(-1).tolist()
-            entries[array.own_name] = ",".join(f"{number} {unit}" for number in numbers)
+            entries[array._own_name] = ",".join(f"{number} {unit}" for number in numbers)
     return exposure_facts(entries, "data set or attribute")
 
 
@@ -381,148 +367,3 @@ def _first_number(attributes: Mapping[str, Any], names: Sequence[str]) -> float 
     key = _first_key(attributes, names)
     numbers = [] if key is None else _numbers(attributes[key])
     return numbers[0] if numbers else None
-
-
-# NumPy: .npy is mapped, of .npz the member that is an image is loaded. No pickle is ever read.
-
-
-def open_npy(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open an array of three axes, or of two for one band, by its header. Raises CaptureError: it is cut short, holds
-    objects or no numbers, or has another number of axes."""
-    try:
-        header = read_array_header(path)
-    except UnreadableArrayError as error:
-        raise CaptureError(f"{path}: {error}") from error
-    image = FoundArray("", header.shape, header.dtype, lambda: map_array(path))
-    return image_of_arrays(path, "npy", [image], options)
-
-
-def open_npz(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the image among the arrays of an archive; a list of wavelengths beside it is found by its name. Raises
-    CaptureError: a member is damaged or holds objects, or none can be the image."""
-    with open_zip(path, CaptureError) as archive:
-        arrays = [_npz_member(path, archive, info) for info in archive.infolist()]
-    return image_of_arrays(path, "npy", arrays, options)
-
-
-def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
-    """A member by its header."""
-    with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in READ_HEADER:
-            raise CaptureError(f"{path}: {info.filename} is .npy of version {version}; use numpy.savez")
-        shape, _, dtype = parse_header(file, version)
-    needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if not dtype.hasobject and info.file_size < needed:
-        held = f"holds {info.file_size} bytes"
-        raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
-    allow_decoded(path, info.file_size, CaptureError, info.compress_size)
-    name = info.filename.removesuffix(".npy")
-    return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
-
-
-def _load_npz_member(path: Path, name: str) -> np.ndarray:
-    with zipfile.ZipFile(path) as archive, archive.open(name) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
-
-
-# Tensors that torch.save wrote: read with weights_only, which loads no code.
-
-
-def open_torch(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open a tensor, or the image among the tensors of a dictionary. Raises CaptureError: the file is damaged, holds
-    other objects than tensors, or none can be the image."""
-    import torch
-
-    _check_pickle(path)
-
-    def tensors() -> dict[str, Any]:
-        """By name, mapped where the file allows it."""
-        with path.open("rb") as file:
-            is_mappable = file.read(2) == b"PK"
-        try:
-            content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
-        except pickle.UnpicklingError as error:
-            raise CaptureError(
-                f"{path}: holds other objects than tensors, which are never loaded because they can run code"
-            ) from error
-        named = content if isinstance(content, dict) else {"": content}
-        return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
-
-    def numbers(tensor: torch.Tensor) -> np.ndarray:
-        """What NumPy has no type for becomes float32."""
-        tensor = tensor.detach()
-        return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
-
-    found = tensors()
-    allow_parts(path, len(found), "tensors", CaptureError)
-    for tensor in found.values():  # of which many numbers can be one in the file
-        allow_decoded(path, tensor.numel() * tensor.element_size(), CaptureError)
-    arrays = [
-        FoundArray(
-            name,
-            tuple(tensor.shape),
-            numbers(tensor[:0] if tensor.ndim else tensor).dtype,
-            lambda name=name: numbers(tensors()[name]),
-        )
-        for name, tensor in found.items()
-    ]
-    return image_of_arrays(path, "torch", arrays, options)
-
-
-_MOST_OPERATIONS, _LONGEST_WORD = 1 << 20, 1024
-"""Of a pickle of tensors. What torch says of words that it refuses takes time that grows with the square of them."""
-_PICKLES = 5
-"""In a row, in files of old torch: two numbers, facts of the machine, the tensors, the names of their numbers."""
-
-
-def _check_pickle(path: Path) -> None:
-    """Look through what the file would have loaded, without loading any of it; `stream` is any binary stream."""
-
-    def look(stream: Any) -> None:
-        for number, (_, word, _) in enumerate(pickletools.genops(stream)):
-            if number >= _MOST_OPERATIONS:
-                refuse(path, f"more than {number} steps of a pickle", "those of tensors", CaptureError)
-            if isinstance(word, str | bytes) and len(word) > _LONGEST_WORD:
-                refuse(path, f"a word of {len(word)} letters", f"at most {_LONGEST_WORD}", CaptureError)
-
-    with path.open("rb") as file:
-        if file.read(2) == b"PK":
-            with open_zip(path, CaptureError) as archive:
-                name = next(name for name in archive.namelist() if name.endswith("/data.pkl"))
-                with archive.open(name) as stream:
-                    look(stream)
-            return
-        file.seek(0)
-        for _ in range(_PICKLES):
-            look(file)
-
-
-# NetCDF of the classic kind, mapped by SciPy.
-
-
-def open_netcdf3(path: Path, options: ReadOptions) -> SpectralFile:
-    """Open the variable that is the image. Raises CaptureError: the file is damaged, or no variable, or more than one,
-    can be the image."""
-    from scipy.io import netcdf_file
-
-    def found(name: str, variable: Any) -> FoundArray:
-        """A variable, without holding on to the map of its file."""
-
-        def whole() -> np.ndarray:
-            with netcdf_file(str(path), "r", mmap=True) as file:
-                return np.array(file.variables[name].data)
-
-        def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-            with netcdf_file(str(path), "r", mmap=True) as file:
-                return take_part(file.variables[name].data, axes, rows, bands)
-
-        attributes = dict(variable._attributes)
-        kind = variable.data.dtype
-        return FoundArray(name, variable.shape, kind, whole, take, attributes, root, variable.dimensions)
-
-    with netcdf_file(str(path), "r", mmap=True) as file:
-        allow_parts(path, len(file.variables), "variables", CaptureError)
-        root = dict(file._attributes)
-        arrays = [found(name, variable) for name, variable in file.variables.items()]
-    return image_of_arrays(path, "netcdf", arrays, options)

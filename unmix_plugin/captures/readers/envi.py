@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.exposure import exposure_facts
+from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts
 from unmix_plugin.captures.spectral_file import (
     BandIndex,
     Linear,
@@ -18,7 +18,6 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
     take_part,
 )
-from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
@@ -160,9 +159,16 @@ def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear 
     found: list[Linear] = []
     for kind in ("data reflectance", "data"):
         keys = [f"{kind} gain values", f"{kind} offset values"]
-        gains, offsets = ([_float(path, key, item) for item in header_items(header, key)] for key in keys)
-        named = zip(keys, (gains, offsets), strict=True)
-        stated = " and ".join(f"'{key}'" for key, column in named if column)
+        columns: list[list[float]] = []
+        for key in keys:
+            items = header_items(header, key)
+            try:
+                columns.append([float(item) for item in items])
+            except ValueError as error:
+                found_is = str(error).partition(": ")[2]
+                raise CaptureError(f"{path}: '{key}' has {found_is}; expected numbers, one a band") from None
+        gains, offsets = columns
+        stated = " and ".join(f"'{key}'" for key, column in zip(keys, columns, strict=True) if column)
         if one := linear_values(path, num_bands, gains, offsets, f"header field {stated}"):
             found.append(one)
     key, warnings = "reflectance scale factor", ()
@@ -179,13 +185,6 @@ def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear 
     if len(found) > 1:
         warnings = (f"{found[0].evidence} is applied, not {found[1].evidence}",)
     return (found[0] if found else None), warnings
-
-
-def _float(path: Path, key: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise CaptureError(f"{path}: '{key}' has {text!r}; expected numbers, one a band") from None
 
 
 def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandIndex) -> np.ndarray:

@@ -25,10 +25,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.exposure import exposure_facts
-from unmix_plugin.captures.poses.pose_set import natural_order
+from unmix_plugin.captures.header_values import exposure_facts, wavelengths_in_names
+from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
-from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 
@@ -150,11 +149,8 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
 
 
 def channel_names(path: Path) -> list[str]:
-    """Names of the channels in the order of the file, read without the library, which damaged headers end.
-
-    Raises:
-        CaptureError: the header is damaged.
-    """
+    """Names of the channels in the order of the file, read without the library, which damaged headers end. Raises
+    CaptureError: the header is damaged."""
     with path.open("rb") as file:
         begin = file.read(_HEADER_BYTES)
     try:
@@ -220,11 +216,8 @@ def _choose(
         bands.sort(key=lambda name: (_COLOURS.index(name) if name in _COLOURS else -1, natural_order(name)))
         found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
         if found is not None:
-            table = replace(
-                table,
-                wavelengths_nm=found[0],
-                evidence=f"names of channels, such as {bands[0]!r}: {found[1]}",
-            )
+            evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
+            table = replace(table, wavelengths_nm=found[0], evidence=evidence)
         return table, [by_name[name] for name in bands], ()
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
@@ -251,33 +244,31 @@ def _spectral_channels(names: Sequence[str]) -> list[_SpectralChannel]:
     >>> [channel.nm for channel in _spectral_channels(["R", "T.390,000000nm", "T.380,5nm"])]
     [380.5, 390.0]
     """
-    with_unit = [channel for name in names if (channel := _with_unit(name))]
-    plain = [
-        channel
-        for name in names
-        if (match := _PLAIN.fullmatch(name)) and (channel := _checked(match, _number(match[2])))
-    ]
-    return sorted(with_unit or plain, key=lambda channel: (channel.layer, channel.nm))
+    for patterns in ((_RANGE, _LENGTH, _FREQUENCY), (_PLAIN,)):
+        found = [channel for name in names if (channel := _spectral_channel(name, patterns))]
+        if found:
+            return sorted(found, key=lambda channel: (channel.layer, channel.nm))
+    return []
 
 
-def _with_unit(name: str) -> _SpectralChannel | None:
-    if match := _RANGE.fullmatch(name):
-        low, high = sorted((_number(match[2]), _number(match[3])))
-        return _SpectralChannel(name, match["layer"] or "", (low + high) / 2, high - low or None)
-    if match := _LENGTH.fullmatch(name):
-        return _checked(match, _number(match[2]) * 10.0 ** _POWERS[match[3]] * 1e9)
-    if (match := _FREQUENCY.fullmatch(name)) and _number(match[2]) > 0:
-        return _checked(match, _METRES_PER_SECOND / (_number(match[2]) * 10.0 ** _POWERS[match[3]]) * 1e9)
-    return None
-
-
-def _checked(match: re.Match[str], nm: float) -> _SpectralChannel | None:
+def _spectral_channel(name: str, patterns: Sequence[re.Pattern[str]]) -> _SpectralChannel | None:
     """None for what no camera records: a plain number that counts, or light that comes back at another wavelength."""
-    layer = match["layer"] or ""
+    match = next(filter(None, (pattern.fullmatch(name) for pattern in patterns)), None)
+    if match is None:
+        return None
+    layer, number = match["layer"] or "", _number(match[2])
+    if match.re is _RANGE:
+        low, high = sorted((number, _number(match[3])))
+        return _SpectralChannel(name, layer, (low + high) / 2, high - low or None)
+    nm = number if match.re is _PLAIN else number * 10.0 ** _POWERS[match[3]]
+    if match.re is _LENGTH:
+        nm *= 1e9
+    elif match.re is _FREQUENCY:
+        nm = _METRES_PER_SECOND / nm * 1e9 if nm > 0 else 0.0
     is_reradiated = _LENGTH.fullmatch(layer) or _FREQUENCY.fullmatch(layer)
     if is_reradiated or not 100.0 <= nm <= 30_000.0:
         return None
-    return _SpectralChannel(match[0], layer, round(nm, 6), None)
+    return _SpectralChannel(name, layer, round(nm, 6), None)
 
 
 def _number(text: str) -> float:
@@ -286,27 +277,19 @@ def _number(text: str) -> float:
 
 def _load_exr(path: Path, keys: tuple[tuple[int, str], ...]) -> np.ndarray:
     """Channels (B, H, W) by part and name, on the display window; NaN where a part has no pixels."""
-    parts = _opened(path).parts
+    parts, channels = _opened(path).parts, []
     frame = _window(parts[keys[0][0]].header, "displayWindow")
-    channels = []
     for index, name in keys:
         pixels, window = parts[index].channels[name].pixels, _window(parts[index].header, "dataWindow")
         if (window != frame).any():
-            pixels = _on_frame(pixels, window, frame)
+            placed = np.full((frame[1] - frame[0])[::-1], np.nan, np.result_type(pixels.dtype, np.float16))
+            low, high = np.maximum(window[0], frame[0]), np.minimum(window[1], frame[1])
+            (x, y), (right, bottom) = low - frame[0], high - frame[0]
+            (left, top), (width, height) = low - window[0], high - low
+            placed[y:bottom, x:right] = pixels[top : top + height, left : left + width]
+            pixels = placed
         channels.append(pixels)
     return np.stack(channels)
-
-
-def _on_frame(
-    pixels: np.ndarray, window: Int[np.ndarray, "2 2"], frame: Int[np.ndarray, "2 2"]
-) -> np.ndarray:
-    """Pixels of a window where they lie in the frame; NaN elsewhere."""
-    placed = np.full((frame[1] - frame[0])[::-1], np.nan, np.result_type(pixels.dtype, np.float16))
-    low, high = np.maximum(window[0], frame[0]), np.minimum(window[1], frame[1])
-    (x, y), (right, bottom) = low - frame[0], high - frame[0]
-    (left, top), (width, height) = low - window[0], high - low
-    placed[y:bottom, x:right] = pixels[top : top + height, left : left + width]
-    return placed
 
 
 def _opened(path: Path, **options: bool) -> Any:

@@ -8,12 +8,13 @@ import math
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.readers.arrays import open_netcdf3, open_npy, open_npz, open_torch
+from unmix_plugin.captures.readers.containers import KINDS, open_container, open_hdf5
 from unmix_plugin.captures.readers.envi import (
     described_by_header,
     described_image,
@@ -22,8 +23,7 @@ from unmix_plugin.captures.readers.envi import (
     open_envi,
 )
 from unmix_plugin.captures.readers.exr import open_exr
-from unmix_plugin.captures.readers.hdf5 import open_hdf5
-from unmix_plugin.captures.readers.matlab import open_matlab
+from unmix_plugin.captures.readers.gdal import with_xml_beside
 from unmix_plugin.captures.readers.pictures import open_band_folder, open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
 from unmix_plugin.captures.spectral_file import (
@@ -31,11 +31,10 @@ from unmix_plugin.captures.spectral_file import (
     BandTable,
     ReadOptions,
     SpectralFile,
-    linear_values,
     unreadable,
 )
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import open_regular, open_zip, parse_xml, read_bounded
+from unmix_plugin.limits import open_regular, open_zip
 
 _BEGINNINGS = {
     b"II*\0": "tiff",
@@ -70,15 +69,9 @@ _HDF5_STARTS = (512, 1024, 2048, 4096)
 _LARGEST_PROOF = 2**28
 """Bytes of a row that is read as a proof; of larger ones a single band, or nothing."""
 _LONGEST_TEXT = 500
-_ENMAP_IMAGE = "SPECTRAL_IMAGE"
-_OF_BANDS = {
-    "Scale": 1.0,
-    "GainOfBand": 1.0,
-    "Offset": 0.0,
-    "OffsetOfBand": 0.0,
-    **dict.fromkeys(("wavelengthCenterOfBand", "FWHMOfBand", "NoDataValue"), math.nan),
-}
-"""What XML beside a file says of a band, and what counts where it doesn't."""
+_OF_ARRAYS = ("npy", "torch", "matlab", "hdf5", "netcdf")
+_USED_BY = {"dataset": (*_OF_ARRAYS, "exr"), "axes": (*_OF_ARRAYS, "tiff"), "size": _OF_ARRAYS}
+"""Options that change nothing in files of other readers."""
 _LLFF_COLUMNS = 17
 _POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
 
@@ -101,7 +94,12 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
             raise CaptureError(f"{path}: the image has no pixels: {size}")
         if opened.dtype.kind not in "iuf":
             raise CaptureError(f"{path}: the image holds {opened.dtype.name}; expected real numbers")
-        opened = replace(opened, notes=(*opened.notes, *_unused(options, opened)))
+        unused = [
+            f"--{name} does nothing: the format {opened.reader} leaves no choice"
+            for name, readers in _USED_BY.items()
+            if opened.reader not in readers and getattr(options, name) is not None
+        ]
+        opened = replace(opened, notes=(*opened.notes, *unused))
         given = options.wavelengths_nm
         if given is None:
             return opened
@@ -115,18 +113,6 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
         raise unreadable(path, error) from error
 
 
-def _unused(options: ReadOptions, opened: SpectralFile) -> list[str]:
-    """Notes of options that change nothing in a file of this kind."""
-    of_arrays = ("npy", "torch", "matlab", "hdf5", "netcdf")
-    used_by = {"dataset": (*of_arrays, "exr"), "axes": (*of_arrays, "tiff"), "size": of_arrays}
-    unused = [name for name, readers in used_by.items() if opened.reader not in readers]
-    return [
-        f"--{name} does nothing: the format {opened.reader} leaves no choice"
-        for name in unused
-        if getattr(options, name) is not None
-    ]
-
-
 def _opened(path: Path, options: ReadOptions) -> SpectralFile:
     """The file by its reader, with what lies beside it: an ENVI header, or an XML of GDAL or EnMAP."""
     kind = _file_kind(path)
@@ -135,55 +121,8 @@ def _opened(path: Path, options: ReadOptions) -> SpectralFile:
         path, kind = described, _file_kind(described)
     opened = _READERS[kind](path, options)
     if kind in ("envi", "folder"):
-        return opened if kind == "folder" else _with_xml_beside(opened)
-    return _with_xml_beside(described_by_header(opened))
-
-
-def _with_xml_beside(file: SpectralFile) -> SpectralFile:
-    """The file with what an XML beside it says of its bands, where it says nothing itself.
-
-    GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; EnMAP's NAME-SPECTRAL_IMAGE.TIF has wavelengths,
-    widths, gains and offsets in NAME-METADATA.XML. Raises CaptureError: gains are impossible.
-    """
-    beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
-    beside += [
-        path.with_name(path.stem.removesuffix(_ENMAP_IMAGE) + ending)
-        for path in file.files
-        if path.stem.endswith(_ENMAP_IMAGE)
-        for ending in ("METADATA.XML", "METADATA.xml")
-    ]
-    for path in filter(Path.is_file, beside):
-        file = _with_xml(file, path)
-    return file
-
-
-def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
-    try:
-        root = parse_xml(read_bounded(found))
-    except ValueError:
-        return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: what it says is not used"))
-    columns = {name: np.full(file.shape[2], usual) for name, usual in _OF_BANDS.items()}
-    for element in [*root.iter("PAMRasterBand"), *root.iterfind(".//bandCharacterisation/bandID")]:
-        index = int(element.get("band") or element.get("number") or 0) - 1
-        for name, column in columns.items():
-            text = element.findtext(name)
-            if text and 0 <= index < len(column):
-                column[index] = float(text)
-    gains, offsets = columns["Scale"] * columns["GainOfBand"], columns["Offset"] + columns["OffsetOfBand"]
-    centres, no_data = columns["wavelengthCenterOfBand"], columns["NoDataValue"][0]
-    bands = file.bands
-    if bands.wavelengths_nm is None and np.isfinite(centres).all():
-        bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
-        widths = columns["FWHMOfBand"]
-        bands = replace(bands, fwhm_nm=widths if ((widths > 0) & (widths < np.inf)).all() else bands.fwhm_nm)
-    return replace(
-        file,
-        bands=bands,
-        linear=file.linear
-        or linear_values(file.path, file.shape[2], gains.tolist(), offsets.tolist(), found.name),
-        no_data=float(no_data) if file.no_data is None and not np.isnan(no_data) else file.no_data,
-        sources=(*file.sources, found),
-    )
+        return opened if kind == "folder" else with_xml_beside(opened)
+    return with_xml_beside(described_by_header(opened))
 
 
 def _file_kind(path: Path) -> str:
@@ -302,16 +241,12 @@ def _plain(value: Any) -> Any:
 
 
 _READERS: dict[str, Callable[[Path, ReadOptions], SpectralFile]] = {
+    **{kind: partial(open_container, kind) for kind in KINDS},
+    "hdf5": open_hdf5,
     "envi": open_envi,
     "tiff": open_tiff,
     "exr": open_exr,
-    "npy": open_npy,
-    "npz": open_npz,
-    "matlab": open_matlab,
-    "hdf5": open_hdf5,
-    "netcdf": open_netcdf3,
     "picture": open_picture,
-    "torch": open_torch,
     "folder": lambda path, options: open_band_folder(
         path, lambda band: _READERS[_file_kind(band)](band, options)
     ),

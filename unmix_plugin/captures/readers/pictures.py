@@ -6,7 +6,7 @@ Numbers are as they are stored: what is gamma-encoded stays so, and `metadata["e
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, parse_xmp
-from unmix_plugin.captures.poses.pose_set import natural_order
+from unmix_plugin.captures.header_values import exif_exposure, wavelengths_in_names
+from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     BandTable,
@@ -24,7 +25,6 @@ from unmix_plugin.captures.spectral_file import (
     loaded,
     stack_bands,
 )
-from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 
@@ -67,7 +67,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         metadata["encoding"] = "sRGB"
     if orientation in range(2, 9):
         metadata["orientation"] = orientation
-    metadata |= _exposure(taken)
+    metadata |= exif_exposure(taken.get(_EXPOSURE_TIME), taken.get(_ISO_SPEED))
     if alpha:
         metadata["has_alpha"] = True
     return SpectralFile(
@@ -75,7 +75,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         reader="picture",
         shape=(height, width, num_bands),
         dtype=dtype,
-        read_part=lambda rows, wanted: loaded(_load_deep if is_deep else _load, path)[rows][..., wanted],
+        read_part=lambda rows, wanted: loaded(_load, path, is_deep)[rows][..., wanted],
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
@@ -84,29 +84,17 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     )
 
 
-def _exposure(taken: Mapping[int, Any]) -> dict[str, Any]:
-    """Time and gain of EXIF's directory."""
-    try:
-        time_s, speed = (float(taken.get(code, 0)) for code in (_EXPOSURE_TIME, _ISO_SPEED))
-    except (TypeError, ValueError, ZeroDivisionError):
-        return {}
-    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"} if time_s > 0 else {}
-    return facts | ({"gain": speed / 100} if facts and speed > 0 else {})
-
-
-def _load(path: Path) -> np.ndarray:
+def _load(path: Path, is_deep: bool) -> np.ndarray:
     """Numbers (H, W, 1 or 3), neither turned nor linearised."""
     from PIL import Image
 
+    if is_deep:
+        return import_extra("imagecodecs").png_decode(path.read_bytes())[..., :3]
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         if picture.mode in _GREY:
             grey = picture.convert("L") if picture.mode in ("1", "LA") else picture
             return np.asarray(grey).astype(_GREY[picture.mode])[..., None]
         return np.asarray(picture.convert("RGB"))
-
-
-def _load_deep(path: Path) -> np.ndarray:
-    return import_extra("imagecodecs").png_decode(path.read_bytes())[..., :3]
 
 
 _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".jpg": "JPEG", ".jpeg": "JPEG"}
@@ -132,8 +120,14 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     for band in bands:
         if band.shape[2] != 1:
             raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
-    if any(band.bands.wavelengths_nm is None for band in bands):
-        bands = _with_wavelengths_of_names(bands)
+    named = wavelengths_in_names([band.path.stem for band in bands])
+    if named is not None and any(band.bands.wavelengths_nm is None for band in bands):
+        evidence = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
+        tables = [
+            replace(band.bands, wavelengths_nm=nm, evidence=evidence)
+            for band, nm in zip(bands, named[0][:, None], strict=True)
+        ]
+        bands = [replace(band, bands=table) for band, table in zip(bands, tables, strict=True)]
     centres = [band.bands.wavelengths_nm[0] for band in bands if band.bands.wavelengths_nm is not None]
     if len(centres) == len(bands):
         bands = [bands[index] for index in np.argsort(centres, kind="stable")]
@@ -141,14 +135,3 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     noun = "picture of another kind" if others == 1 else "pictures of other kinds"
     notes = (f"{others} {noun} than {kind} in the folder left out",) if others else ()
     return replace(stack, interleave="bsq", notes=stack.notes + notes)
-
-
-def _with_wavelengths_of_names(bands: list[SpectralFile]) -> list[SpectralFile]:
-    found = wavelengths_in_names([band.path.stem for band in bands])
-    if found is None:
-        return bands
-    evidence = f"names of files, such as {bands[0].path.name!r}: {found[1]}"
-    return [
-        replace(band, bands=replace(band.bands, wavelengths_nm=np.array([nm]), evidence=evidence))
-        for band, nm in zip(bands, found[0].tolist(), strict=True)
-    ]

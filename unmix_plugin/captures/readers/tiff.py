@@ -23,24 +23,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
-from unmix_plugin.captures.exposure import exposure_facts
+from unmix_plugin.captures.header_values import StatedBands, check_bands, exif_exposure, exposure_facts
+from unmix_plugin.captures.readers.gdal import (
+    GdalItem,
+    bands_of_items,
+    gdal_items,
+    gdal_number,
+    linear_of_items,
+)
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     Axes,
     BandIndex,
     BandTable,
-    Linear,
     ReadOptions,
     SpectralFile,
     choose_axes,
     image_shape,
     import_extra,
-    linear_values,
     take_part,
 )
-from unmix_plugin.captures.wavelengths import StatedBands, check_bands
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import allow_decoded, allow_parts, parse_xml, refuse
+from unmix_plugin.limits import allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
 if TYPE_CHECKING:
@@ -61,15 +65,8 @@ _NO_NUMBERS = {
 _OPACITY = (1, 2)
 """Kinds of extra numbers of a pixel. Programs give it to fourth bands that are none, so that nothing is dropped."""
 _GDAL_METADATA, _GDAL_NODATA, _DESCRIPTION, _PAGE_NAME = 42112, 42113, 270, 285
-_CENTRES = ("wavelength", "wavelengths", "center_wavelength", "central_wavelength", "centre_wavelength")
 _MOST_TAGS = 4096
 """What TIFF libraries take."""
-_UNITS = ("wavelength_units", "wavelength_unit")
-_GAIN_ITEMS = {
-    "scale": ("scale", "scale_factor", "gain", "data_gain_values"),
-    "offset": ("offset", "add_offset", "bias", "data_offset_values"),
-}
-"""Names of gains and offsets in GDAL's metadata, by the role that GDAL itself marks them with."""
 _LIST = re.compile(
     r"""["']?wavelengths?(?: ?\(?(?P<unit>[a-zµμ]{1,20})\)?)?["']?\s{0,9}[=:]\s*[\[{(]?(?P<list>[\d.,;\s]+)""",
     re.I,
@@ -90,18 +87,6 @@ class _Stack:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class _GdalItem:
-    """One entry of GDAL's metadata."""
-
-    name: str
-    """In lower case."""
-    value: str
-    sample: int | None
-    """Band from 0; None for the whole file."""
-    role: str | None
-
-
 def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     """Open an image whose bands are pages, planes or samples. Raises CaptureError: pages contradict each other, or the
     file is cut short."""
@@ -114,10 +99,10 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         tags = camera_tags(first.tags)
         # What holds for the whole file stands in its first page, which may be a preview.
         top: Any = file.pages.first
-        items = _gdal_items(first) or _gdal_items(top)
-        stated = _from_gdal(items) or _from_description(first) or _from_description(top)
+        items = next(filter(None, (gdal_items(_text(page, _GDAL_METADATA)) for page in (first, top))), [])
+        stated = bands_of_items(items) or _from_description(first) or _from_description(top)
         stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
-        no_data = _number(str(first.tags.valueof(_GDAL_NODATA) or ""))
+        no_data = gdal_number(_text(first, _GDAL_NODATA))
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
@@ -130,6 +115,9 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     shape = image_shape(stack.shape, axes)
     bands, band_warnings = check_bands(stated, shape[2])
     exposure, exposure_warnings = _exposure(tags, items)
+    # A picture is as bright as its numbers to the eye only.
+    is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
+    may_be_picture = is_colour and first.dtype in (np.uint8, np.uint16)
     return SpectralFile(
         path=path,
         reader="tiff",
@@ -138,32 +126,19 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         read_part=lambda rows, wanted: _read_part(path, stack, axes, rows, wanted),
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
-        linear=_linear(path, items, shape[2]),
+        linear=linear_of_items(path, items, shape[2]),
         no_data=no_data,
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
         warnings=stack.warnings
         + axis_warnings
         + band_warnings
         + exposure_warnings
-        + _not_decoded(first, bands),
+        + ((COLOURS_AS_STORED,) if may_be_picture else ()),
         metadata={name: value for name, value in tags.items() if value}
         | exposure
-        | _orientation(tags)
+        | ({"orientation": turned} if (turned := tags["exif"].get("Orientation")) in range(2, 9) else {})
         | ({"geo_reference": "GeoTIFF"} if on_map else {}),
     )
-
-
-def _not_decoded(page: TiffPage, bands: BandTable) -> tuple[str, ...]:
-    """A warning of colours that may be a picture's, which is as bright as its numbers to the eye only."""
-    is_colour = (
-        page.photometric in _COLOURS and bands.wavelengths_nm is None and page.dtype in (np.uint8, np.uint16)
-    )
-    return (COLOURS_AS_STORED,) if is_colour else ()
-
-
-def _orientation(tags: dict[str, Any]) -> dict[str, int]:
-    found = tags["exif"].get("Orientation")
-    return {"orientation": found} if found in range(2, 9) else {}
 
 
 def _check_directories(path: Path) -> None:
@@ -220,7 +195,13 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
     groups: dict[Any, list[TiffPage]] = defaultdict(list)
     for page in pages:
         groups[page.shape, page.dtype].append(page)
-    like = max(groups.values(), key=_size_of_group)
+
+    def size_of(group: list[TiffPage]) -> tuple[int, int]:
+        """Bands that pages hold together, and pixels of each."""
+        planes, _, height, width, samples = group[0].shaped
+        return len(group) * planes * samples, height * width
+
+    like = max(groups.values(), key=size_of)
     first, size = like[0], path.stat().st_size
     for page in like:
         _check_page(path, page, size)
@@ -263,12 +244,6 @@ def _image_pages(file: TiffFile) -> list[TiffPage]:
         listed = [page for page in file.series[0].pages if page is not None]
     below = [sub for page in listed for sub in (page.pages or ())]
     return [page for page in [*listed, *below] if not (page.is_reduced or page.is_mask)]
-
-
-def _size_of_group(pages: list[TiffPage]) -> tuple[int, int]:
-    """Bands that the pages hold together, and pixels of each."""
-    planes, _, height, width, samples = pages[0].shaped
-    return len(pages) * planes * samples, height * width
 
 
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
@@ -352,82 +327,13 @@ def _decode_into(block: np.ndarray, first_row: int, file: Any, page: TiffPage, i
     block[to : to + len(part), left : left + part.shape[1]] = part
 
 
-def _gdal_items(page: TiffPage) -> list[_GdalItem]:
-    """Entries of GDAL's metadata; none if there is no such tag or it is damaged."""
-    text = str(page.tags.valueof(_GDAL_METADATA) or "").strip("\0 \n")
-    try:
-        items = list(parse_xml(text).iter("Item"))
-    except ValueError:
-        return []
-    return [
-        _GdalItem(
-            item.get("name", "").lower(),
-            (item.text or "").strip(),
-            int(sample) if (sample := item.get("sample", "")).isdecimal() and len(sample) < 9 else None,
-            item.get("role"),
-        )
-        for item in items
-    ]
-
-
-def _linear(path: Path, items: list[_GdalItem], num_bands: int) -> Linear | None:
-    """Gains and offsets in GDAL's metadata: by their role, by names that ENVI and NetCDF give them, or one factor."""
-    columns = []
-    for role, names in _GAIN_ITEMS.items():
-        by_role = [item for item in items if item.role == role]
-        by_name = [item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names]
-        chosen = by_role or by_name
-        own = {item.sample: item.value for item in chosen if item.sample is not None}
-        whole = next((item.value for item in chosen if item.sample is None), None)
-        usual = "1" if role == "scale" else "0"
-        texts = re.findall(r"[^\s,{}]+", whole or "")
-        if own:
-            texts = [own.get(sample, whole or usual) for sample in range(num_bands)]
-        numbers = [_number(text) for text in texts]
-        if None in numbers:
-            found = texts[numbers.index(None)]
-            raise CaptureError(f"{path}: GDAL's {role} is {found!r}; expected a number a band")
-        columns.append([number for number in numbers if number is not None])
-    named = [_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
-    factor = named[0] if named and named[0] else 1.0
-    linear = linear_values(path, num_bands, columns[0], columns[1], "GDAL's scales and offsets")
-    if factor != 1 and linear is not None:
-        raise CaptureError(
-            f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; take one of them out, as "
-            "it is unclear which the numbers need"
-        )
-    return linear or linear_values(path, num_bands, [1.0 / factor], [], "GDAL's reflectance_scale_factor")
-
-
-def _from_gdal(items: list[_GdalItem]) -> StatedBands | None:
-    def of_samples(*names: str, role: str | None = None) -> list[str]:
-        """Values of one entry for each band in the order of bands, or the list in one for the whole file."""
-        found = {
-            item.sample: item.value
-            for item in items
-            if item.sample is not None and (item.name in names or (role and item.role == role))
-        }
-        if found:
-            return [found[sample] for sample in sorted(found)]
-        whole = [item.value for item in items if item.sample is None and item.name in names]
-        return re.findall(r"[^\s,{}]+", whole[0]) if whole else []
-
-    names = of_samples(role="description") or of_samples("band_name", "bandname")
-    names = names or [item.value for item in items if re.fullmatch(r"band_\d+", item.name)]
-    units = [item.value for item in items if item.name in _UNITS]
-    centres, fwhm = of_samples(*_CENTRES), of_samples("fwhm")
-    if not centres:
-        centres, fwhm = of_samples("central_wavelength_um"), of_samples("fwhm_um")
-        units = ["Micrometers"] if centres else units
-    if not centres and not names:
-        return None
-    good, unit = of_samples("bbl") or None, units[0] if units else None
-    return StatedBands("GDAL metadata", centres or None, unit, fwhm or None, good, names or None)
+def _text(page: TiffPage, tag: int) -> str:
+    return str(page.tags.valueof(tag) or "").strip("\0 \n")
 
 
 def _from_description(page: TiffPage) -> StatedBands | None:
     """Wavelengths in OME-XML, in JSON, or in text as `wavelengths = 450, 460`."""
-    text = str(page.tags.valueof(_DESCRIPTION) or "")[: 2**20]
+    text = _text(page, _DESCRIPTION)[: 2**20]
     if "wavelength" not in text.lower():
         return None
     if listed := re.findall(r'<Channel\b[^<>]*?\bEmissionWavelength="([^"]+)"', text):
@@ -459,7 +365,7 @@ def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
     if labels := imagej.get("Labels"):
         return StatedBands("labels of ImageJ", names=[str(label) for label in labels])
     for tag, what in ((_PAGE_NAME, "names of pages"), (_DESCRIPTION, "descriptions of pages")):
-        names = [" ".join(str(page.tags.valueof(tag) or "").split()) for page in pages]
+        names = [" ".join(_text(page, tag).split()) for page in pages]
         if all(0 < len(name) < 200 for name in names) and len(set(names)) == len(names):
             return StatedBands(what, names=names)
     return StatedBands("the file")
@@ -478,23 +384,13 @@ def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> 
     return replace(found, names=table.names, bad=table.bad) if is_fitting else table
 
 
-def _exposure(tags: dict[str, Any], items: list[_GdalItem]) -> tuple[dict[str, Any], tuple[str, ...]]:
+def _exposure(tags: dict[str, Any], items: list[GdalItem]) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Time and gain out of EXIF or GDAL's metadata, and warnings."""
     exif = tags["exif"]
-    time_s, iso = exif.get("ExposureTime"), exif.get("ISOSpeedRatings", exif.get("ISOSpeed"))
-    if isinstance(time_s, int | float) and time_s > 0:
-        facts: dict[str, Any] = {"exposure_s": float(time_s), "exposure_evidence": "EXIF ExposureTime"}
-        return facts | ({"gain": iso / 100} if isinstance(iso, int | float) and iso > 0 else {}), ()
+    facts = exif_exposure(exif.get("ExposureTime"), exif.get("ISOSpeedRatings", exif.get("ISOSpeed")))
+    if facts:
+        return facts, ()
     texts: dict[str, Any] = defaultdict(list)
     for item in items:
         texts[item.name.removeprefix("exif_")].append(item.value)
     return exposure_facts({name: ",".join(values) for name, values in texts.items()}, "GDAL metadata")
-
-
-def _number(text: str) -> float | None:
-    """A number, which may be NaN but not infinite; None for other text."""
-    try:
-        number = float(text.strip("\0 "))
-    except ValueError:
-        return None
-    return number if not math.isinf(number) else None

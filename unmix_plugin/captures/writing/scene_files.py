@@ -20,15 +20,14 @@ from jaxtyping import Float64, UInt8
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.sensor import Sensor
 from unmix_plugin.captures.checks import SeenView, angles_between, check_views, report_text
-from unmix_plugin.captures.masks import BackgroundRule
 from unmix_plugin.captures.match_checks import check_matches
 from unmix_plugin.captures.options import ProcessOptions, plain_options
-from unmix_plugin.captures.plan import Plan
+from unmix_plugin.captures.plan import Plan, hashes
 from unmix_plugin.captures.poses.pose_set import PoseSet
 from unmix_plugin.captures.posing import PosedViews
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
-from unmix_plugin.captures.writing.view_files import FULL_SCALE, RECORD_NAME, ViewRecord, hashes
+from unmix_plugin.captures.writing.view_files import FULL_SCALE, BackgroundRule, ViewRecord
 from unmix_plugin.engine.runs.atomic_files import write_file
 from unmix_plugin.errors import counted, name_some
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout, columns_for
@@ -38,6 +37,7 @@ from unmix_plugin.scenes.backdrops import Backdrop
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 
+RECORD_NAME = "process.json"
 _SCENE_NAME, _SHEET_NAME, _REPORT_NAME = "transforms.json", "contact-sheet.png", "report.txt"
 _ILLUMINANT_NAME, _FLAT_LIGHT_NAME, _POINTS_NAME = "illuminant.csv", "flat-light.csv", "points.ply"
 _MOST_BANDS = 8
@@ -248,11 +248,9 @@ def _what_was_done(plan: Plan, posed: PosedViews, views: Sequence[ViewRecord]) -
     negative = sum(view.negative_values for view in views) / max(num_values, 1)
     # Noise around black takes up to half of what is not matter below 0.
     dark = _NOISE_BELOW + 0.5 * float(np.mean([1 - view.matter_share for view in views]))
-    judged = (
-        "as noise around black does"
-        if negative <= dark
-        else "more than noise explains: is the dark frame right?"
-    )
+    judged = "as noise around black does"
+    if negative > dark:
+        judged = "more than noise explains: is the dark frame right?"
     lines.append(
         f"{total('saturated_pixels')} with saturated bands, which are written as 1; {total('clipped_values')} above 1, "
         f"written as 1 too; {total('negative_values')} below 0 ({negative:.1%} of all, {judged}), written as 0; "

@@ -1,88 +1,75 @@
-"""The files of one view: cube, picture, mask; and the unfinished folder beside the output in which they gather.
+"""The files of one view: cube, picture, mask. Rows stream through; only pictures of one view are in memory.
 
-Rows stream through; only pictures of one view are in memory. Views that are done survive a kill, and nothing takes the
-folder for a scene, as it has no transforms.json and is called unfinished.
+Masks are those of the capture's files, or of a background that is known; specks are removed and small holes are filled.
 
 Notation: `H x W` pixels and `B` bands of the scene; `h` some rows; values in [0, 1].
 """
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
-from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration
-from unmix_plugin.captures.masks import (
-    HALF,
-    OPAQUE,
-    BackgroundRule,
-    ViewMasks,
-    clean,
-    read_labels,
-    read_view_masks,
-)
-from unmix_plugin.captures.poses.pose_set import reading
+from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster, Resampling
 from unmix_plugin.captures.spectral_file import CaptureView
-from unmix_plugin.captures.writing.resampling import Resampling
-from unmix_plugin.engine.runs.atomic_files import (
-    make_folder,
-    remove_stale_temporaries,
-    whole_file,
-    write_errors_as,
-    write_file,
-)
-from unmix_plugin.engine.runs.run_folder import RunLock
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes
 from unmix_plugin.scenes.backdrops import Backdrop
-from unmix_plugin.scenes.reading.faults import sha256_of
-from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_picture, white_of
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 
+if TYPE_CHECKING:
+    from PIL import Image
+
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "GIF", "WEBP")
+"""Pillow reads more, some of them with other programs."""
+HALF, OPAQUE = 127, 255
+"""Opacity above which a pixel counts as matter; that of matter that covers a pixel."""
+_SMALL_SHARE = 5e-4
+"""Specks and holes smaller than this share of the picture are removed."""
 FULL_SCALE = 65535
 """Stored number that stands for 1; saturated values have it too."""
 _BLOCK_VALUES = 1 << 22
 """Values of a file that are calibrated together: 16 MiB as float32."""
 _WEIGHTS_A_PIXEL = 64
 """What the weights of a resampled pixel take, in values."""
-_BRIGHT_PERCENTILE = 99.0
-"""Of sampled pixels; shown as white."""
 UNLABELLED = 255
 """In pictures of true materials."""
 
 
 @dataclass(frozen=True)
-class Colours:
-    """How spectra become sRGB, the same for all views of a sensor."""
+class BackgroundRule:
+    """Which pixels are background."""
 
-    matrix: Float32[np.ndarray, "B 3"]
-    """To linear red, green and blue."""
-    gain: float
-    """Brings bright pixels to white."""
-    description: str
-    """True colour, or which bands are shown as red, green and blue."""
+    kind: Literal["white", "black"]
+    threshold: float
+    """Background is at least this bright in every band (white), or at most this bright in the mean (black)."""
+    level: float
+    """Median of the border."""
+    deviation: float
+    """Robust standard deviation of the border."""
+
+    @property
+    def evidence(self) -> dict[str, Any]:
+        """For the record."""
+        return asdict(self)
+
+    def matter(self, values: Float32[np.ndarray, "h W B"]) -> Bool[np.ndarray, "h W"]:
+        """Pixels that are not background."""
+        brightness = self.brightness(self.kind, values)
+        return brightness < self.threshold if self.kind == "white" else brightness > self.threshold
 
     @staticmethod
-    def of(bands: Bands, sample: Float32[np.ndarray, "N B"]) -> Colours:
-        """Colours for spectra like those of the sample."""
-        from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
-
-        matrix = rgb_matrix(bands).numpy()
-        brightest = np.percentile((sample @ matrix).max(axis=1), _BRIGHT_PERCENTILE) if len(sample) else 0.0
-        return Colours(matrix, 1.0 / float(brightest) if brightest > 0 else 1.0, describe_colour(bands))
-
-    def linear_rgb(self, values: Float32[np.ndarray, "*pixels B"]) -> Float32[np.ndarray, "*pixels 3"]:
-        """Linear light, 1 is white; not clipped."""
-        return np.asarray((values @ self.matrix) * np.float32(self.gain), dtype=np.float32)
+    def brightness(kind: str, values: Float32[np.ndarray, "*pixels B"]) -> np.ndarray:
+        """What tells background from matter: white is bright in every band, black is dark in the mean."""
+        return values.min(axis=-1) if kind == "white" else values.mean(axis=-1)
 
 
 @dataclass(frozen=True)
@@ -128,7 +115,8 @@ class ViewRecipe:
     calibration: Calibration
     scale: float
     """Calibrated value that is written as 1."""
-    colours: Colours
+    to_rgb: Float32[np.ndarray, "B 3"]
+    """From spectra to linear red, green and blue, 1 is white; the same for all views of a sensor."""
     background: BackgroundRule | Backdrop | None = None
     use_opacity: bool = False
     """Whether files of the capture say what is matter."""
@@ -140,9 +128,11 @@ def write_view(
     """Write cube, picture and mask of a view, its pixels brought into another lens where there is a resampling. Raises
     CaptureError: a file of the view can't be read. Raises RunError: the folder can't be written."""
     raster = recipe.calibration.raster
-    masks, labels = read_view_masks(view, raster, recipe.use_opacity), read_labels(view, raster)
+    masks, labels = _read_view_masks(view, raster, recipe.use_opacity), _read_labels(view, raster)
     if resampling is not None:
-        masks = _resampled_masks(masks, resampling)
+        # A pixel is valid where all are that it is made of.
+        valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
+        masks = _ViewMasks(valid, None if masks.opacity is None else resampling.smooth(masks.opacity))
         labels = None if labels is None else resampling.nearest(labels, outside=UNLABELLED)
     paths = {"file_path": f"images/{view.name}.png", "hyperspectral_file_path": f"cubes/{view.name}.npy"}
     tally = _Tally(raster.height, raster.width, recipe.calibration.num_bands, masks)
@@ -177,16 +167,10 @@ def write_view(
     return tally.record(view, paths)
 
 
-def _resampled_masks(masks: ViewMasks, resampling: Resampling) -> ViewMasks:
-    """Masks in another lens; a pixel is valid where all are that it is made of."""
-    valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
-    return ViewMasks(valid, None if masks.opacity is None else resampling.smooth(masks.opacity))
-
-
 class _Tally:
     """What is gathered while rows stream by."""
 
-    def __init__(self, height: int, width: int, bands: int, masks: ViewMasks) -> None:
+    def __init__(self, height: int, width: int, bands: int, masks: _ViewMasks) -> None:
         self.rgb: Float32[np.ndarray, "H W 3"] = np.zeros((height, width, 3), np.float32)
         self.brightness: Float32[np.ndarray, "H W"] = np.zeros((height, width), np.float32)
         self.missing: Bool[np.ndarray, "H W"] = ~masks.valid
@@ -218,7 +202,7 @@ class _Tally:
             self.features[rows] = features
         elif recipe.background is not None:
             self.opacity[rows] = np.where(recipe.background.matter(values), OPAQUE, 0)
-        self.rgb[rows] = recipe.colours.linear_rgb(values)
+        self.rgb[rows] = values @ recipe.to_rgb
         self.brightness[rows] = values.mean(axis=-1)
         counted = (self.opacity[rows] > HALF) & ~self.missing[rows]
         self.sum += counted.ravel().astype(np.float32) @ values.reshape(-1, values.shape[-1])
@@ -231,11 +215,11 @@ class _Tally:
             assert self.features is not None
             seen = recipe.background.find(self.features, ~self.missing)
             if seen is not None:
-                matter, self.specks, self.holes = clean(~seen.shown)
+                matter, self.specks, self.holes = _clean(~seen.shown)
                 self.opacity = np.rint(seen.opacity(matter) * OPAQUE).astype(np.uint8)
                 self.features = seen.behind
         elif recipe.background is not None:
-            matter, self.specks, self.holes = clean(self.opacity > 0)
+            matter, self.specks, self.holes = _clean(self.opacity > 0)
             self.opacity = np.where(matter, OPAQUE, 0).astype(np.uint8)
         self.opacity[self.missing] = OPAQUE
 
@@ -328,132 +312,126 @@ def _finest_contrast(picture: Float32[np.ndarray, "H W"], seen: Bool[np.ndarray,
     return float(np.sqrt(np.mean(np.square(differences, dtype=np.float64)))) if inside.any() else 0.0
 
 
-# The unfinished folder, and the files that views are made of.
-
-RECORD_NAME = "process.json"
-_PLAN, _VIEWS, _POSES, _LOCK = "plan.json", "views", "poses", "process.lock"
+# Masks: what the files of a view say, and what is left of them and of a background that is known.
 
 
-class WorkFolder:
-    """The unfinished scene of one output folder."""
+@dataclass(frozen=True)
+class _ViewMasks:
+    """Masks of one view on the scene's raster."""
 
-    def __init__(self, output: Path) -> None:
-        self.output = output.resolve()
-        self.path = self.output.with_name(f"{self.output.name}.unfinished")
-        """Where files are written until the scene is complete."""
-        self._lock: RunLock | None = None
-        self.poses = self.path / _POSES
-        """Where files of the estimation of poses lie while it runs, or after it failed."""
-
-    def begin(self, plan: dict[str, Any]) -> bool:
-        """Make the folder, or go on in the one that an interrupted start left.
-
-        Views that were made with another plan (options, decisions and inputs) are thrown away.
-
-        Returns:
-            Whether an earlier start is gone on with.
-        Raises:
-            ConfigError: there is a folder of this name that is not ours.
-            RunError: it can't be written.
-        """
-        plan_file, text = self.path / _PLAN, _json(plan)
-        if plan_file.is_file():
-            self._hold()
-        if self.path.exists():
-            if not plan_file.is_file() and any(self.path.iterdir()):
-                raise ConfigError(f"{self.path} is in the way and was not made by unmix-process; rename it")
-            if plan_file.is_file() and plan_file.read_bytes() == text:
-                for folder in ("cubes", "images", "masks", _VIEWS):
-                    remove_stale_temporaries(self.path / folder)
-                return True
-            if self._lock is not None:
-                self._lock.release()  # Windows removes no file that is open
-            with write_errors_as(self.path):
-                shutil.rmtree(self.path)
-        make_folder(self.path)
-        self._hold()
-        write_file(plan_file, text)
-        return False
-
-    def _hold(self) -> None:
-        """Let no other process write the same scene, until this one ends; RunError where another one does."""
-        if self._lock is not None:
-            self._lock.release()
-        self._lock = RunLock(self.path / _LOCK, "unmix-process")
-
-    def done(self, name: str) -> ViewRecord | None:
-        """What is recorded of a view that is written; None if it is not."""
-        try:
-            return ViewRecord(**json.loads(self._record(name).read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):
-            return None
-
-    def note(self, record: ViewRecord) -> None:
-        """Record that a view is written."""
-        write_file(self._record(record.name), _json(asdict(record)))
-
-    def finish(self, overwrite: bool) -> None:
-        """Give the scene its name; the record of how it was made stays in it. RunError where it can't be moved."""
-        with write_errors_as(self.output):
-            if self._lock is not None:
-                self._lock.release()
-            (self.path / _LOCK).unlink(missing_ok=True)
-            old = self.output.with_name(f"{self.output.name}.old")
-            if overwrite and self.output.exists():
-                self.output.rename(old)
-            elif self.output.exists():
-                self.output.rmdir()  # empty, see refuse_output
-            self.path.rename(self.output)
-            # After a kill here, the scene is whole and has some files too many.
-            for name in (_VIEWS, _POSES):
-                shutil.rmtree(self.output / name, ignore_errors=True)
-            (self.output / _PLAN).unlink()
-            shutil.rmtree(old, ignore_errors=True)
-
-    def _record(self, name: str) -> Path:
-        return self.path / _VIEWS / f"{name}.json"
+    valid: Bool[np.ndarray, "H W"]
+    """Pixels that are not to be ignored."""
+    opacity: UInt8[np.ndarray, "H W"] | None
+    """255 where matter covers a pixel; None where no file says so."""
 
 
-def refuse_output(output: Path, overwrite: bool) -> None:
-    """Look before anything is computed whether the scene can get its name. Raises ConfigError: the folder holds
-    something; with `overwrite`, something that this command did not make."""
-    if not output.resolve().name:
-        raise ConfigError(f"{output} can't be a scene; give a folder of its own with --output-dir")
-    if output.is_file():
-        raise ConfigError(f"{output} is a file; give a folder with --output-dir")
-    if not output.is_dir() or not any(output.iterdir()):
-        return
-    if not (output / RECORD_NAME).is_file():
-        raise ConfigError(f"{output} is not empty; give a new folder with --output-dir")
-    if not overwrite:
-        raise ConfigError(f"{output} holds a scene already; replace it with --overwrite, or choose another")
+def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _ViewMasks:
+    """The masks of a view.
+
+    Args:
+        view: It may have an alpha channel. Its mask is black where pixels are ignored, or, if opacity is looked for and
+            there is no alpha channel, where background is; see `white_of`.
+        raster: Of the scene; a square of pixels is valid where all of it is, and as opaque as its mean.
+        use_opacity: Whether to look for it.
+    Raises:
+        CaptureError: a file can't be read or has another size than the cube.
+    """
+    valid, opacity = np.ones((raster.height, raster.width), bool), None
+    alpha = _alpha(view) if use_opacity else None
+    if alpha is not None:
+        opacity = np.rint(raster.averaged(_cut(alpha, raster).astype(np.float32))).astype(np.uint8)
+    if view.mask is not None:
+        is_black = raster.any_in_square(~_cut(_read(view.mask, white_of, view), raster))
+        if use_opacity and opacity is None:
+            opacity = np.where(is_black, 0, OPAQUE).astype(np.uint8)
+        else:
+            valid = ~is_black
+    return _ViewMasks(valid, opacity)
 
 
-def _json(value: Any) -> bytes:
-    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
+def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
+    """True materials of a view; None if it has none, or if pixels are averaged. Raises CaptureError: the file can't be
+    read, has another size than the cube, or is a picture in colour."""
+    if view.labels is None or raster.binning > 1:
+        return None
+    labels = _read(view.labels, np.asarray, view)
+    if (
+        labels.ndim != 2
+        or labels.dtype.kind not in "bui"
+        or not 0 <= int(labels.min()) <= int(labels.max()) <= 255
+    ):
+        channels = counted(1 if labels.ndim == 2 else labels.shape[2], "channel")
+        raise CaptureError(
+            f"{view.labels}: {channels} of {labels.dtype.name}; expected labels of 0 to 255 in one channel"
+        )
+    return _cut(labels, raster).astype(np.uint8)
 
 
-def stamps(paths: Iterable[Path]) -> list[list[Any]]:
-    """Path, size and time of change of each file: what tells quickly whether it is still the same. CaptureError where
-    one is gone."""
-    found = []
-    for file in _files_of(paths):
-        with reading(file):
-            facts = file.stat()
-        found.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
-    return found
+def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
+    if view.alpha is not None:
+        if view.alpha.shape[:2] != view.cube.shape[:2]:
+            raise CaptureError(
+                f"{view.alpha.path} has {view.alpha.shape[0]} x {view.alpha.shape[1]} pixels; expected "
+                f"{view.cube.shape[0]} x {view.cube.shape[1]}, as the cube has"
+            )
+        return np.rint(np.clip(view.alpha.read()[..., 0], 0.0, 1.0) * OPAQUE).astype(np.uint8)
+    if (picture := alpha_picture(view)) is None:
+        return None
+    return _read(picture, lambda image: np.asarray(image.convert("RGBA"))[..., 3], view)
 
 
-def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:
-    """Path, size and SHA-256 of each file. CaptureError where one can't be read."""
-    found = []
-    for file in _files_of(paths):
-        with reading(file):
-            found.append({"path": os.fspath(file), "bytes": file.stat().st_size, "sha256": sha256_of(file)})
-    return found
+def alpha_picture(view: CaptureView) -> Path | None:
+    """The picture with an alpha channel: the one beside the cube, or the view itself if it is one."""
+    from PIL import Image
+
+    picture = view.cube.path if view.cube.reader == "picture" else view.picture
+    if picture is None:
+        return None
+    try:
+        with Image.open(picture, formats=_FORMATS) as opened:
+            has_alpha = "A" in opened.getbands() or "transparency" in opened.info
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise CaptureError(f"{picture} can't be read as a picture ({error}); mend or remove it") from error
+    return picture if has_alpha else None
 
 
-def _files_of(paths: Iterable[Path]) -> Iterator[Path]:
-    """Files, and those of a folder that a reader takes as one."""
-    for path in paths:
-        yield from sorted(child for child in path.iterdir() if child.is_file()) if path.is_dir() else [path]
+def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
+    return pixels[raster.file_rows(0, raster.height), raster.columns]
+
+
+def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: CaptureView) -> np.ndarray:
+    """What `pixels_of` makes of a picture with the pixels of the cube."""
+    try:
+        return read_picture(path, view.cube.shape[:2], pixels_of, _FORMATS)
+    except UnreadableImageError as error:
+        raise CaptureError(f"{path} of view {view.name} {error}") from error
+
+
+def _clean(matter: Bool[np.ndarray, "H W"]) -> tuple[Bool[np.ndarray, "H W"], int, int]:
+    """Remove specks, then fill holes, each connected by edges and smaller than `_SMALL_SHARE` of the picture.
+
+    Returns:
+        The mask, and how many specks were removed and holes filled.
+
+    >>> mask = np.zeros((100, 100), bool)
+    >>> mask[20:80, 20:80] = True
+    >>> mask[40, 40] = False
+    >>> mask[5, 5] = True
+    >>> cleaned, specks, holes = _clean(mask)
+    >>> int(cleaned.sum()), specks, holes
+    (3600, 1, 1)
+    """
+    smallest = max(4, round(_SMALL_SHARE * matter.size))
+    kept, specks = _without_small(matter, smallest)
+    background, holes = _without_small(~kept, smallest)
+    return ~background, specks, holes
+
+
+def _without_small(mask: Bool[np.ndarray, "H W"], smallest: int) -> tuple[Bool[np.ndarray, "H W"], int]:
+    from scipy import ndimage
+
+    parts = np.empty(mask.shape, np.int32)
+    ndimage.label(mask, output=parts)
+    is_small = np.bincount(parts.ravel()) < smallest
+    is_small[0] = False
+    return mask & ~is_small[parts], int(is_small.sum())

@@ -1,4 +1,8 @@
-"""Wavelengths: as a user writes them, as a file states them, and in the names of bands, channels and files.
+"""What headers say, with units under many names: wavelengths, also as a user writes them and in the names of bands,
+channels and files; exposure times and gains.
+
+Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
+Only ratios between files count, so a missing unit matters only where some files have one.
 
 Notation: `B` bands; wavelengths in nm.
 """
@@ -8,13 +12,15 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.spectral_file import BandTable
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.limits import read_bounded
@@ -184,23 +190,18 @@ def wavelengths_in_names(names: Sequence[str]) -> tuple[Float64[np.ndarray, " B"
 def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
     """Of each name the numbers outside of what all names begin with and end in, except counters."""
 
-    def common_begin(texts: Sequence[str]) -> str:
-        first, last = min(texts), max(texts)
-        differs = (index for index, pair in enumerate(zip(first, last, strict=False)) if pair[0] != pair[1])
-        return first[: next(differs, len(first))]
-
-    begin = len(common_begin(names).rstrip("0123456789.,"))
-    end = len(common_begin([other[::-1] for other in names])[::-1].lstrip("0123456789.,"))
-
-    def varying(name: str) -> list[str]:
-        inside = [
-            match
+    begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
+    backwards = [name[::-1] for name in names]
+    end = len(backwards[0][: common_length(backwards)].rstrip("0123456789.,"))
+    return [
+        [
+            match[1]
             for match in _NUMBER.finditer(name)
             if begin <= match.start() and match.end() <= len(name) - end
+            if not _COUNTER.search(name, 0, match.start())
         ]
-        return [match[1] for match in inside if not _COUNTER.search(name, 0, match.start())]
-
-    return [varying(name) for name in names]
+        for name in names
+    ]
 
 
 def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
@@ -281,3 +282,118 @@ def _read_words(path: Path) -> list[str]:
     if column is not None:
         return [row[column] if column < len(row) else "" for row in rows[1:]]
     return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]
+
+
+# Exposure time and gain, under whichever name and unit a header, a tag or an attribute has them.
+
+_TIMES = {
+    "tint": 1e-3,
+    **dict.fromkeys(
+        ("integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"), 1e-3
+    ),
+    **dict.fromkeys(("exptime", "shutterspeed"), 1.0),
+}
+"""Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
+_GAINS = ("gain", "analoggain", "analoguegain", "digitalgain")
+_OWNERS = ("camera", "sensor", "detector", "imager")
+"""Words before a name that change nothing."""
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "msecs", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
+}
+_LONGEST_VALUE = 64
+_MOST_DB = 200.0
+_VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.I)
+"""`20`, `20 ms`, `1/50 s`."""
+
+
+def exposure_facts(entries: Mapping[str, Any], where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """What entries of a file say of its exposure.
+
+    Args:
+        entries: Texts, numbers or lists (one number a band) by name.
+        where: What they are, for people: `header field`.
+    Returns:
+        Metadata `exposure_s`, `gain` and `exposure_evidence`, as far as they are known; and warnings.
+
+    >>> exposure_facts({"tint": "20"}, "header field")[0]["exposure_s"]
+    0.02
+    >>> exposure_facts({"Exposure Time (us)": "500"}, "header field")[0]["exposure_s"]
+    0.0005
+    """
+    facts: dict[str, Any] = {}
+    warnings: list[str] = []
+    named = {name: _split(name) for name in entries}
+    units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
+    for key, (name, unit) in named.items():
+        is_time = name in _TIMES
+        if unit == "unit" or not (is_time or name in _GAINS):
+            continue
+        what = "exposure_s" if is_time else "gain"
+        stated: Any = entries[key]  # one, or one a band
+        stated = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else stated
+        if isinstance(stated, str):
+            items = [item for item in re.split(r"[,;{}\[\]()]+", stated) if item.strip()]
+        else:
+            items = [str(item) for item in np.asarray(stated).reshape(-1).tolist()]
+        values = [_quantity(item, unit or units.get(name, ""), name) for item in items]
+        if not values or None in values:
+            warnings.append(
+                f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood: exposures may differ"
+            )
+        elif what not in facts:
+            numbers = [value[0] for value in values if value is not None]
+            facts[what] = numbers[0] if len(set(numbers)) == 1 else numbers
+            has_unit = all(value is not None and value[1] for value in values)
+            assumed = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if is_time else "a factor"
+            taken = "" if has_unit else f", no unit: taken as {assumed}"
+            facts[f"{what.removesuffix('_s')}_evidence"] = f"{where} '{key}'{taken}"
+    return facts, tuple(warnings)
+
+
+def is_exposure(name: str) -> bool:
+    """Whether an entry of this name is an exposure time or a gain."""
+    return _split(name)[0] in (*_TIMES, *_GAINS)
+
+
+def _split(key: str) -> tuple[str, str]:
+    """A name without what owns it, and the unit that it ends with.
+
+    >>> _split("Integration_Time [ms]"), _split("camera gain"), _split("exposure time units")
+    (('integrationtime', 'ms'), ('gain', ''), ('exposuretime', 'unit'))
+    """
+    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", key).lower())
+    unit = ""
+    if len(words) > 1 and (words[-1] in _SECONDS or words[-1] in ("unit", "units", "db")):
+        unit = words.pop().replace("units", "unit")
+    while len(words) > 1 and words[0] in _OWNERS:
+        words.pop(0)
+    return "".join(words), unit
+
+
+def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
+    """A time in seconds or a gain as a factor, and whether a unit was there; None for anything else."""
+    match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
+    if match is None:
+        return None
+    number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
+    unit = (match[3] or unit).strip().lower()
+    if name in _TIMES:
+        factor = _SECONDS.get(unit, None if unit else _TIMES[name])
+        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
+    if unit == "db":
+        return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
+    # A gain of 0 without a unit can only be in decibels.
+    return None if unit or not number >= 0 else (number or 1.0, False)
+
+
+def exif_exposure(time_s: Any, iso_speed: Any) -> dict[str, Any]:
+    """The same metadata by EXIF's exposure time and speed; none without a time above 0."""
+    try:
+        time_s, speed = float(time_s or 0), float(iso_speed or 0)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return {}
+    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"} if time_s > 0 else {}
+    return facts | ({"gain": speed / 100} if facts and speed > 0 else {})

@@ -1,10 +1,17 @@
-"""Poses of Agisoft Metashape: the XML of File > Export > Export Cameras.
+"""Poses of programs that write XML.
+
+Agisoft Metashape: the XML of File > Export > Export Cameras.
 
 A camera's matrix leads from the camera (OpenCV axes) to its component; the component's or the chunk's similarity leads
 to the world, often geocentric (metres from the middle of the Earth).
 
 A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
 which are OpenCV's p2, p1.
+
+MicMac: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it.
+
+Rotations lead from camera (OpenCV axes) to world. Distortion is in pixels about its own centre and acts on ideal
+pixels. Pixels are counted from the centre of the first one.
 """
 
 from __future__ import annotations
@@ -28,18 +35,20 @@ from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
     PoseSet,
+    find_offset,
+    load_xml,
     make_pose_set,
-    number_of,
-    numbers_of,
 )
 from unmix_plugin.errors import CaptureError, counted, name_some
+
+_Element = ElementTree.Element
 
 _EARTH_RADII = (6.2e6, 6.6e6)
 """Metres from the middle of the Earth between which a position is geocentric."""
 _RADIAL = ("k1", "k2", "k3", "k4")
 
 
-def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
+def read_metashape(path: Path, root: _Element) -> PoseSet:
     """Poses of all enabled cameras with a transform, in or out of groups. Raises CaptureError: no chunk, no aligned
     camera, several components without a common world, or a lens that can't be represented."""
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled", "true") != "false"]
@@ -64,7 +73,7 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     raw = []
     for camera in aligned:
         world = worlds.get(camera.get("component_id"), worlds[None])
-        values = numbers_of(camera.find("transform"), 16, f"{path}: camera {camera.get('label')}")
+        values = _numbers_of(camera.find("transform"), 16, f"{path}: camera {camera.get('label')}")
         if values is None:
             raise CaptureError(f"{path}: camera {camera.get('label')}: <transform> is empty")
         scale = np.cbrt(np.abs(np.linalg.det(world[:3, :3]))) or 1.0
@@ -81,7 +90,7 @@ def read_metashape(path: Path, root: ElementTree.Element) -> PoseSet:
     return replace(found, metres_per_unit=1.0 if is_geocentric else None)
 
 
-def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[ElementTree.Element]:
+def _aligned(chunk: _Element, path: Path, notes: list[str]) -> list[_Element]:
     cameras = [camera for group in chunk.findall("cameras") for camera in group.iter("camera")]
     enabled = [camera for camera in cameras if camera.get("enabled", "true") != "false"]
     if len(enabled) < len(cameras):
@@ -100,27 +109,27 @@ def _aligned(chunk: ElementTree.Element, path: Path, notes: list[str]) -> list[E
     return aligned
 
 
-def _similarity(element: ElementTree.Element, path: Path) -> Float64[np.ndarray, "4 4"]:
+def _similarity(element: _Element, path: Path) -> Float64[np.ndarray, "4 4"]:
     """rotation, translation and scale of an element, or its 16 numbers."""
     where = str(path)
     if len(element) == 0:
-        values = numbers_of(element, 16, where)
+        values = _numbers_of(element, 16, where)
         return np.eye(4) if values is None else values.reshape(4, 4)
     rotation, translation = (
-        numbers_of(element.find(tag), count, where) for tag, count in (("rotation", 9), ("translation", 3))
+        _numbers_of(element.find(tag), count, where) for tag, count in (("rotation", 9), ("translation", 3))
     )
     matrix = np.eye(4)
     matrix[:3, :3] = np.eye(3) if rotation is None else rotation.reshape(3, 3)
-    matrix[:3, :3] *= number_of(element, "scale", where, default=1.0)
+    matrix[:3, :3] *= _number_of(element, "scale", where, default=1.0)
     matrix[:3, 3] = 0.0 if translation is None else translation
     return matrix
 
 
 def _of_one_world(
-    cameras: list[ElementTree.Element], worlds: dict[str | None, Float64[np.ndarray, "4 4"]], notes: list[str]
-) -> list[ElementTree.Element]:
+    cameras: list[_Element], worlds: dict[str | None, Float64[np.ndarray, "4 4"]], notes: list[str]
+) -> list[_Element]:
     """Cameras whose components share a world; without a transform, a component's world is its own."""
-    by_component: dict[str | None, list[ElementTree.Element]] = {}
+    by_component: dict[str | None, list[_Element]] = {}
     for camera in cameras:
         by_component.setdefault(camera.get("component_id"), []).append(camera)
     loose = [component for component in by_component if component not in worlds]
@@ -133,7 +142,7 @@ def _of_one_world(
     return kept
 
 
-def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | None, list[str]]:
+def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str]]:
     """The lens of a sensor, None without any focal length; and what is not exactly as in the file."""
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
@@ -149,10 +158,10 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
         around, said = bent_lens(bend_equirectangular, (), start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
     tags = ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
-    values = {tag: number_of(calibration, tag, where) for tag in tags}
-    f_x = number_of(calibration, "fx", where, values["f"] + values["b1"])
-    f_y = number_of(calibration, "fy", where, values["f"])
-    skew = number_of(calibration, "skew", where, values["b2"])
+    values = {tag: _number_of(calibration, tag, where) for tag in tags}
+    f_x = _number_of(calibration, "fx", where, values["f"] + values["b1"])
+    f_y = _number_of(calibration, "fy", where, values["f"])
+    skew = _number_of(calibration, "skew", where, values["b2"])
     if min(f_x, f_y) <= 0:
         raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
     center, tangential = (width / 2 + values["cx"], height / 2 + values["cy"]), (values["p2"], values["p1"])
@@ -172,9 +181,7 @@ def _lens_metashape(sensor: ElementTree.Element, where: str) -> tuple[Lens | Non
     return fitted, [f"sensor {name}: {note}"]
 
 
-def _calibration_metashape(
-    sensor: ElementTree.Element, where: str
-) -> tuple[ElementTree.Element | None, tuple[int, int]]:
+def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | None, tuple[int, int]]:
     """The adjusted calibration, otherwise the first one, and the size of the picture."""
     found = sorted(sensor.findall("calibration"), key=lambda one: one.get("class") != "adjusted")
     calibration = found[0] if found else None
@@ -188,7 +195,7 @@ def _calibration_metashape(
     raise CaptureError(f"{where} has no resolution; expected its width and height in pixels")
 
 
-def _from_physical(sensor: ElementTree.Element, size: tuple[int, int]) -> Lens | None:
+def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
     """A pinhole from focal length and pixel size in mm."""
     texts = {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
     try:
@@ -199,3 +206,144 @@ def _from_physical(sensor: ElementTree.Element, size: tuple[int, int]) -> Lens |
         return None
     x, y = (focal / side for side in sides)
     return Lens(*size, (x, y), (size[0] / 2, size[1] / 2))
+
+
+# MicMac.
+
+_PREFIX = "Orientation-"
+_CONVENTION = "eConvApero_DistM2C"
+
+
+def find_orientations(folder: Path) -> list[Path]:
+    """Orientation files of a folder, otherwise of the only folder `Ori-...` in it."""
+    own = sorted(folder.glob(f"{_PREFIX}*.xml"))
+    below = [sorted(place.glob(f"{_PREFIX}*.xml")) for place in sorted(folder.glob("Ori-*"))]
+    below = [files for files in below if files]
+    if own or not below:
+        return own
+    if len(below) > 1:
+        names = ", ".join(files[0].parent.name for files in below)
+        raise CaptureError(f"{folder} has several orientations: {names}; give the folder of one")
+    return below[0]
+
+
+def read_micmac(paths: list[Path]) -> PoseSet:
+    """Poses of orientation files. Raises CaptureError: a file is damaged, of another convention, or its calibration is
+    missing or can't be represented."""
+    lenses: dict[str, Lens] = {}
+    notes: list[str] = []
+    raw = []
+    for path in paths:
+        root = load_xml(path)
+        orientation = root if root.tag == "OrientationConique" else root.find("OrientationConique")
+        if orientation is None:
+            raise CaptureError(f"{path} holds no <OrientationConique> of MicMac")
+        lens = _lens_micmac(orientation, path, lenses, notes)
+        name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
+        raw.append((name, PosedCamera(_pose_micmac(orientation, str(path)), lens)))
+    is_far = find_offset(np.stack([camera.camera_to_world[:, 3] for _, camera in raw])).any()
+    up = np.array([0.0, 0.0, 1.0]) if is_far else None
+    folder = paths[0].parent
+    return make_pose_set(raw, f"MicMac's {folder.name}", str(folder), None, up, dict.fromkeys(notes))
+
+
+def _pose_micmac(orientation: _Element, where: str) -> Float64[np.ndarray, "3 4"]:
+    stated = [orientation.findtext(f"{holder}/KnownConv") for holder in ("ConvOri", "Externe")]
+    convention = next(filter(None, stated), _CONVENTION)
+    if convention.strip() != _CONVENTION:
+        raise CaptureError(f"{where} has the convention {convention.strip()}; expected {_CONVENTION}")
+    center = _numbers_of(orientation.find("Externe/Centre"), 3, where)
+    code = orientation.find("Externe/ParamRotation/CodageMatr")
+    rows = [None if code is None else _numbers_of(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
+    if center is None or any(row is None for row in rows):
+        raise CaptureError(f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing")
+    return np.column_stack([np.array(rows) @ FLIP, center])
+
+
+def _lens_micmac(orientation: _Element, path: Path, lenses: dict[str, Lens], notes: list[str]) -> Lens:
+    inner = orientation.find("Interne")
+    name = (orientation.findtext("FileInterne") or "").strip()
+    key = name if inner is None else str(path)
+    if key not in lenses:
+        where = str(path)
+        if inner is None:
+            file = path.parent / Path(name.replace("\\", "/")).name  # whatever folder it was written in
+            if not name or not file.is_file():
+                raise CaptureError(f"{path} names the calibration {name!r}; copy it into {path.parent}")
+            where, root = str(file), load_xml(file)
+            inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
+        if inner is None:
+            raise CaptureError(f"{where} holds no <CalibrationInternConique> of MicMac")
+        lenses[key], said = _calibration_micmac(inner, where)
+        notes += said
+    return lenses[key]
+
+
+def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
+    center, size = _numbers_of(inner.find("PP"), 2, where), _numbers_of(inner.find("SzIm"), 2, where)
+    focal = _number_of(inner, "F", where)
+    if center is None or size is None or focal <= 0 or size.min() < 1 or size.max() > 1e6:
+        raise CaptureError(f"{where}: <PP>, <F> or <SzIm> are missing or not above 0")
+    width, height = (int(side) for side in size)
+    start = Lens(width, height, (focal, focal), (float(center[0]) + 0.5, float(center[1]) + 0.5))
+    bends = [model for model in inner.iterfind("CalibDistortion/*") if model.tag != "ModNoDist"]
+    unknown = [model.tag for model in bends if model.tag not in ("ModRad", "ModPhgrStd")]
+    if unknown:
+        raise CaptureError(
+            f"{where}: the distortion {unknown[0]} is not supported; calibrate with RadialStd or Fraser, or use Drunk"
+        )
+    if not bends:
+        return start, []
+
+    def project(ideal: Points) -> Points:
+        pixels = focal * ideal + center
+        for model in reversed(bends):
+            pixels = _bend(pixels, model, where)
+        return pixels + 0.5
+
+    lens, note = fit_lens(project, start, " and ".join(model.tag for model in bends), where)
+    return lens, [note]
+
+
+def _bend(pixels: Points, model: _Element, where: str) -> Points:
+    """ModRad: radial terms of r^2, r^4, ... about a centre; ModPhgrStd adds P1, P2, b1, b2."""
+    radial = model if model.tag == "ModRad" else model.find("RadiaPart")
+    middle = None if radial is None else _numbers_of(radial.find("CDist"), 2, where)
+    if radial is None or middle is None:
+        raise CaptureError(f"{where}: <{model.tag}> has no centre <CDist>; the file is damaged")
+    terms = [_numbers_of(element, 1, where) for element in radial.findall("CoeffDist")]
+    away = pixels - middle
+    squared = (away**2).sum(axis=1)
+    factor = 1.0 + sum(
+        term[0] * squared ** (power + 1) for power, term in enumerate(terms) if term is not None
+    )
+    x, y = away.T
+    p1, p2, b1, b2 = (_number_of(model, tag, where) for tag in ("P1", "P2", "b1", "b2"))
+    bent_x = x * factor + p1 * (squared + 2 * x**2) + 2 * p2 * x * y + b1 * x + b2 * y
+    bent_y = y * factor + p2 * (squared + 2 * y**2) + 2 * p1 * x * y
+    return np.column_stack([bent_x, bent_y]) + middle
+
+
+# Numbers in XML.
+
+
+def _numbers_of(element: _Element | None, count: int, where: str) -> Float64[np.ndarray, " count"] | None:
+    """Numbers in the text of an element; None without an element or text, CaptureError for other than `count` finite
+    ones."""
+    if element is None or not (element.text or "").strip():
+        return None
+    texts = (element.text or "").split()
+    try:
+        values = np.array([float(text) for text in texts])
+    except ValueError:
+        values = np.full(count, np.nan)
+    if len(texts) != count or not np.isfinite(values).all():
+        found = " ".join(texts)[:60]
+        raise CaptureError(f"{where}: <{element.tag}> holds {found!r}; expected {count} finite numbers")
+    return values
+
+
+def _number_of(parent: _Element, tag: str, where: str, default: float = 0.0) -> float:
+    """The number in a child; the default without one."""
+    values = _numbers_of(parent.find(tag), 1, where)
+    return default if values is None else float(values[0])

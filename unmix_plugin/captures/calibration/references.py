@@ -1,0 +1,440 @@
+"""What stored numbers stand for, and the measured references that they are compared with: dark frames and white panels,
+and how long these and the views were exposed.
+
+Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` bands are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.spectral_file import BandIndex, CaptureView, SpectralFile, require_comparable
+from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError, counted, name_some
+from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.spectral.colour.srgb import decode_srgb
+from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
+
+_BLOCK_VALUES = 1 << 22
+"""Values read together."""
+_PATTERN_BLOCK_PX = 8
+_MOST_PATTERN = 4.0
+"""Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
+
+
+def is_srgb(file: SpectralFile) -> bool:
+    """Whether the file is a picture for people."""
+    return file.metadata.get("encoding") == "sRGB"
+
+
+def stated_values(
+    file: SpectralFile, stored: np.ndarray, rows: slice, bands: BandIndex = slice(None)
+) -> Float32[np.ndarray, "h W b"]:
+    """Values of some whole rows: pictures decoded, and the calibration applied that the file carries itself.
+
+    Args:
+        stored: Numbers (h, W, b) that were read of these rows and bands.
+    """
+    if is_srgb(file):
+        top = np.iinfo(stored.dtype).max
+        return decode_srgb(np.arange(top + 1) / top).astype(np.float32)[stored]
+    model = radiometric_model(file)
+    if model is not None:
+        return model.apply(stored.astype(np.float32), rows)
+    return stored.astype(np.float32) if file.linear is None else file.linear.apply(stored, bands)
+
+
+def _measured(
+    file: SpectralFile, rows: slice, bands: BandIndex = slice(None)
+) -> Float32[np.ndarray, "h W b"]:
+    """Values of some rows, NaN where nothing was measured."""
+    stored = file.read(rows, bands)
+    values = stated_values(file, stored, rows, bands)
+    values[find_missing(stored, file)] = np.nan
+    return values
+
+
+def find_missing(stored: np.ndarray, file: SpectralFile) -> Bool[np.ndarray, "h W"]:
+    """Pixels without a measurement: no number in some band, the file's no-data value, or out of its valid range.
+
+    A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
+    """
+    missing = np.zeros(stored.shape[:2], bool)
+    if stored.dtype.kind == "f":
+        missing |= ~np.isfinite(stored).all(axis=-1)
+    if file.valid_range is not None:
+        low, high = file.valid_range
+        missing |= ((stored < low) | (stored > high)).any(axis=-1)
+    no_data = file.no_data
+    if no_data is not None and np.isfinite(no_data):
+        limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
+        if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
+            same = stored == stored.dtype.type(no_data)
+            missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
+    return missing
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A measured reference, brought to the columns of the cubes."""
+
+    file: SpectralFile
+    what: str
+    """dark frame or white reference, for messages."""
+    mean: Float32[np.ndarray, "1 columns B"]
+    """Mean over its lines; one column where it stands for all."""
+    is_per_pixel: bool
+    """Whether each pixel has its own value, read from the file when needed."""
+    how: str
+    """How it is used, for people."""
+    reflectance: Float64[np.ndarray, " B"] | None = None
+    """Of a white panel at every band of the file, above 0."""
+    is_view: bool = False
+    """Whether the file is a view that shows it."""
+
+    @property
+    def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
+        """The mean in numbers as the file stores them."""
+        linear = self.file.linear
+        if linear is None or is_srgb(self.file):
+            return self.mean.astype(np.float64)
+        return (self.mean - linear.offsets) / linear.gains
+
+    def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
+        """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
+        if self.is_per_pixel:
+            return _measured(self.file, rows, bands)[:, columns]
+        mean = self.mean[:, :, bands]
+        return mean if mean.shape[1] == 1 else mean[:, columns]
+
+    def signal(self, dark: Reference | None) -> Float64[np.ndarray, " B"]:
+        """Mean counts above dark at each band of the file."""
+        own = self.mean.astype(np.float64).mean(axis=(0, 1))
+        return own if dark is None else own - dark.signal(None)
+
+
+def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
+    """A reference for the cubes of one sensor.
+
+    A file with as many rows and columns as the cubes is used pixel by pixel if its rows differ by more than noise (a
+    camera that takes whole images), and by the mean of its lines otherwise (a line camera). Pixels without a
+    measurement are left out of it, where 0 in a dark frame is one whatever its header says. Raises CaptureError: other
+    bands than the cubes, other units, or a column without a measurement.
+    """
+    if what == "dark frame" and file.no_data == 0:  # software writes one value into all headers of a capture
+        file = replace(file, no_data=None)
+    height, width, bands = file.shape
+    if bands != cube.shape[2]:
+        raise CaptureError(
+            f"{file.path}: the {what} has {bands} bands, the cubes have {cube.shape[2]} ({cube.path}); expected as many"
+        )
+    require_comparable(file, cube)
+    mean, pattern = _column_means(file)
+    if not np.isfinite(mean).all():
+        raise CaptureError(
+            f"{file.path}: the {what} has columns without a measurement (NaN, infinite or no-data); take it again"
+        )
+    if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
+        how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
+        return Reference(file, what, mean, True, how)
+    lines = f"mean of {height} line{'s' if height > 1 else ''}"
+    if width == cube.shape[1]:
+        return Reference(file, what, mean, False, f"{lines}, column by column")
+    ratio = max(width, cube.shape[1]) / min(width, cube.shape[1])
+    wider = f"it is {width} columns wide and the cubes {cube.shape[1]}"
+    if ratio == int(ratio) and width > 1:
+        how = f"{lines}, interpolated along the line: {wider}, as with another binning"
+        return Reference(file, what, _stretched(mean, cube.shape[1]), False, how)
+    how = f"{lines} and of all columns: {wider}, so its columns can't be those of the cubes"
+    return Reference(file, what, mean.mean(axis=1, keepdims=True), False, how)
+
+
+def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], view: str) -> Reference:
+    """The mean of a rectangle of a view as the white reference of all.
+
+    Args:
+        rectangle: First row and column, height and width.
+    Raises:
+        CaptureError: nothing was measured there.
+        ConfigError: it leaves the image.
+    """
+    top, left, height, width = rectangle
+    refuse_outside(f"--white-rectangle {view}", rectangle, cube.shape[:2])
+    lines = slice(top, top + height)
+    values = _measured(cube, lines)[:, left : left + width].astype(np.float64)
+    if np.isnan(values[..., 0]).all():
+        raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
+    mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
+    how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
+    return Reference(cube, "white reference", mean, False, how, is_view=True)
+
+
+def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    """Refuse a rectangle (first row and column, height and width) that leaves an image. Raises ConfigError: it does."""
+    top, left, height, width = rectangle
+    is_empty = min(top, left) < 0 or min(height, width) < 1
+    if is_empty or top + height > size[0] or left + width > size[1]:
+        where = f"{what} {top} {left} {height} {width} (row, column, height, width)"
+        raise ConfigError(f"{where} leaves the image of {size[0]} rows and {size[1]} columns")
+
+
+def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], float]:
+    """Mean over lines, and how much more than noise the rows differ, judged on a few bands."""
+    height, width, bands = file.shape
+    total, count = np.zeros((width, bands)), np.zeros((width, bands))
+    missing = np.zeros((height, width), bool)
+    step = max(1, _BLOCK_VALUES // (width * bands))
+    for first in range(0, height, step):
+        lines = slice(first, min(first + step, height))
+        stored = file.read(lines)
+        missing[lines] = find_missing(stored, file)
+        values = stated_values(file, stored, lines)
+        values[missing[lines]] = np.nan
+        total += np.nansum(values, axis=0, dtype=np.float64)
+        count += np.isfinite(values).sum(axis=0)
+    mean = total / np.where(count > 0, count, np.nan)
+    judged = np.unique(np.linspace(0, bands - 1, 5).astype(int))
+    every, patterns = slice(0, height), []
+    for band in judged:
+        index = np.array([band])
+        values = stated_values(file, file.read(every, index), every, index)[..., 0]
+        patterns.append(_pattern(np.nan_to_num(np.where(missing, 0.0, values - mean[:, band]))))
+    return mean[None].astype(np.float32), float(np.median(patterns))
+
+
+def _pattern(residual: Float64[np.ndarray, "H W"]) -> float:
+    """Variance of the means of square blocks, as a multiple of what pixels that differ by noise alone would give."""
+    side = _PATTERN_BLOCK_PX
+    height, width = (length // side * side for length in residual.shape)
+    variance = residual.var()
+    if height == 0 or width == 0 or not variance > 0:
+        return 0.0
+    blocks = residual[:height, :width].reshape(height // side, side, width // side, side).mean(axis=(1, 3))
+    return float(blocks.var() * side * side / variance)
+
+
+def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.ndarray, "1 W B"]:
+    """Linear interpolation along the line; both lines span the same field."""
+    found = mean.shape[1]
+    at = (np.arange(width) + 0.5) * found / width - 0.5
+    if found > width:  # finer than the cubes: average what falls into each of their pixels
+        return mean.reshape(1, width, found // width, -1).mean(axis=2)
+    low = np.clip(np.floor(at).astype(int), 0, found - 1)
+    high = np.minimum(low + 1, found - 1)
+    part = np.clip(at - low, 0.0, 1.0)[None, :, None].astype(np.float32)
+    return mean[:, low] * (1 - part) + mean[:, high] * part
+
+
+def _as_white(
+    reference: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
+) -> Reference:
+    """A white panel that is brighter than the dark, with its reflectance: a number, or that of a CSV file."""
+    light = reference.signal(dark)
+    if not (light > 0).mean() > 0.5:
+        dark_name = "0" if dark is None else f"the dark frame {dark.file.path}"
+        raise CaptureError(
+            f"{reference.file.path}: the white reference is not brighter than {dark_name} in "
+            f"{(light <= 0).mean():.0%} of its bands; are white and dark swapped?"
+        )
+    try:
+        values = np.full(len(wavelengths_nm), float(reflectance))
+    except ValueError:
+        if not Path(reflectance).is_file():
+            raise ConfigError(
+                f"--white-reflectance {reflectance}: expected a number such as 0.99, or a CSV file"
+            ) from None
+        table = read_spectra_csv(Path(reflectance))
+        if len(table.names) != 1:
+            found = f"found {len(table.names)}"
+            raise SpectrumError(f"{reflectance}: expected one column beside 'wavelength'; {found}") from None
+        distinct, back = np.unique(wavelengths_nm, return_inverse=True)
+        values = table.resampled(Bands(distinct)).spectra[0][back]
+    if not (np.isfinite(values).all() and values.min() > 0.0 and values.max() <= 1.5):
+        raise ConfigError(
+            f"--white-reflectance {reflectance} is {values.min():g} to {values.max():g}; expected a reflectance above "
+            "0, such as 0.99 (per cent are divided by 100 first)"
+        )
+    return replace(reference, reflectance=values)
+
+
+References: TypeAlias = tuple[Reference | None, Reference | None]
+"""Dark frame and white reference."""
+
+
+def find_references(
+    views: Sequence[CaptureView],
+    wavelengths_nm: Float64[np.ndarray, " B"],
+    options: ProcessOptions,
+    files: tuple[SpectralFile | None, SpectralFile | None],
+    all_views: Sequence[CaptureView],
+) -> tuple[References, dict[Path, References]]:
+    """References of all views of a sensor, and those of views that were taken with their own, by cube.
+
+    Args:
+        wavelengths_nm: Of all bands of the files.
+        files: Dark frame and white reference that the user names; they go before those of views.
+        all_views: With those that have no pose: one may show a panel.
+    Raises:
+        CaptureError: a reference does not fit the views, or some have one of their own and others have none.
+        ConfigError: the rectangle of the panel, or its reflectance, is wrong.
+    """
+    cube, (dark_file, white_file) = views[0].cube, files
+    dark = None if dark_file is None else _open_reference(dark_file, "dark frame", cube)
+    panel = None
+    if options.white_rectangle is not None:
+        panel = _panel_in_view(all_views, *options.white_rectangle)
+    elif white_file is not None:
+        panel = _open_reference(white_file, "white reference", cube)
+    white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
+    own: dict[Path, References] = {}
+    darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
+    whites = _each_view([view.white for view in views], views, "white reference", white is not None)
+    seen: dict[tuple[Path | None, Path | None], References] = {}  # files that several views share
+    for view, own_dark, own_white in zip(views, darks, whites, strict=True):
+        if own_dark is None and own_white is None:
+            continue
+        key = (own_dark and own_dark.path, own_white and own_white.path)
+        if key not in seen:
+            its_dark = dark if own_dark is None else _open_reference(own_dark, "dark frame", view.cube)
+            its_white = white
+            if own_white is not None:
+                panel = _open_reference(own_white, "white reference", view.cube)
+                its_white = _as_white(panel, its_dark, options.white_reflectance, wavelengths_nm)
+            seen[key] = its_dark, its_white
+        own[view.cube.path] = seen[key]
+    return (dark, white), own
+
+
+def _panel_in_view(
+    views: Sequence[CaptureView], wanted: str, top: int, left: int, height: int, width: int
+) -> Reference:
+    """The panel in the view, or the release of a rig, of this name."""
+    view = next((view for view in views if wanted in (view.name, view.release)), None)
+    if view is None:
+        names = name_some([view.name for view in views], 5)
+        raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
+    return _panel_reference(view.cube, (top, left, height, width), view.name)
+
+
+def _each_view(
+    files: Sequence[SpectralFile | None], views: Sequence[CaptureView], what: str, is_given: bool
+) -> Sequence[SpectralFile | None]:
+    """A reference for each view: its own, or the only one that there is; none where the user gives one for all."""
+    known = {file.path: file for file in files if file is not None}
+    missing = [view.name for view, file in zip(views, files, strict=True) if file is None]
+    if is_given or not known:
+        return [None] * len(files)
+    if missing and len(known) > 1:
+        raise CaptureError(
+            f"{counted(len(missing), 'view')} ({name_some(missing)}) without a {what} of their own, {len(known)} "
+            f"others have one; expected one for each, or one for all (--{what.split()[0]})"
+        )
+    only = next(iter(known.values()))
+    return [only if file is None else file for file in files]
+
+
+# Exposures of views and references.
+
+
+def exposure_of(file: SpectralFile) -> Float64[np.ndarray, " b"] | None:
+    """Exposure time times gain, one number or one a band; None where the file does not say the time."""
+    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
+    try:
+        exposure = np.atleast_1d(np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64))
+    except (TypeError, ValueError):
+        return None
+    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
+    return exposure if is_usable else None
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """What becomes of the exposures of views and references."""
+
+    common: Float64[np.ndarray, " b"] | None = None
+    """Exposure time times gain that all are brought to, one number or one a band; None where they are not compared."""
+    notes: tuple[str, ...] = ()
+    """What was done."""
+    warnings: tuple[str, ...] = ()
+    """What may be wrong."""
+
+
+def compare_exposures(
+    views: Sequence[SpectralFile],
+    whites: Sequence[SpectralFile],
+    darks: Sequence[SpectralFile],
+    is_bent: bool,
+) -> Exposures:
+    """The exposure of the white reference, to which views are brought; without one, that of the first view.
+
+    Args:
+        views: At least one.
+        whites, darks: References of all views, or one a view.
+        is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
+    """
+    known, of_whites, of_darks = (
+        [exposure for file in files if (exposure := exposure_of(file)) is not None]
+        for files in (views, whites, darks)
+    )
+    warnings = _missing_units([*views, *whites])
+    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
+    if len(known) < len(views):
+        missing = (
+            f"{counted(len(views) - len(known), 'view')} without exposure time: exposures are not compared"
+        )
+        return Exposures(warnings=(*warnings, missing) if known or of_whites else tuple(warnings))
+    taken = f"were exposed {_in_words(known)} s times gain"
+    if is_bent:
+        bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
+        return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
+    if len(of_whites) < len(whites) and differs:
+        warnings.append(
+            f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
+        )
+    if any(len({tuple(exposure), *map(tuple, [*known, *of_whites])}) > 1 for exposure in of_darks):
+        warnings.append(
+            f"the dark frame was exposed {_in_words(of_darks)} s times gain, views and white reference "
+            f"{_in_words([*known, *of_whites])}: dark current grows with exposure, so take a dark frame at each"
+        )
+    common, of_whom = np.median(known[0], keepdims=True), "that of the first view"
+    if of_whites:
+        common, of_whom = (
+            of_whites[0],
+            "that of the white reference" if len(whites) == 1 else "that of its white reference",
+        )
+    is_same = len({tuple(exposure) for exposure in [*known, *of_whites, common]}) == 1
+    brought = f"views {taken}: each is brought to {of_whom}, {_in_words(of_whites or [common])}"
+    return Exposures(common, () if is_same else (brought,), tuple(warnings))
+
+
+def _in_words(exposures: Iterable[Float64[np.ndarray, " b"]]) -> str:
+    """The range of exposures.
+
+    >>> _in_words([np.array([0.01]), np.array([0.02])])
+    '0.01 to 0.02'
+    """
+    every = np.concatenate(list(exposures))
+    low, high = every.min(), every.max()
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _missing_units(files: Iterable[SpectralFile]) -> list[str]:
+    """Warnings where units are missing and matter."""
+    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
+    warnings = []
+    for what, kind in (("exposure", "exposure times"), ("gain", "gains")):
+        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
+        guessed = [text for text in evidence if "no unit" in text]
+        gains = {repr(own.get("gain", 1.0)) for own in metadata}
+        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
+            warnings.append(
+                f"{kind} have no unit in some files ({'; '.join(evidence)}): values may be off by a factor"
+            )
+    return warnings

@@ -1,0 +1,217 @@
+"""Names of files and views: their order, the files that a list names, and which camera took which view."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path, PurePosixPath
+
+from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
+from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.formats.files import NOT_PLAIN, safe_name
+from unmix_plugin.scenes.reading.faults import find_named
+
+
+def path_text(text: str) -> str:
+    """A path of a JSON file with slashes between folders and without a leading `./`.
+
+    >>> path_text(".\\\\images\\\\0001.png")
+    'images/0001.png'
+    """
+    return text.strip().replace("\\", "/").removeprefix("./")
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """A key that sorts numbers in names by their size; no two names have one.
+
+    >>> sorted(["view_10", "view_9"], key=natural_order)
+    ['view_9', 'view_10']
+    """
+    parts = re.split(r"(\d+)", name.lower())
+    keys = [(int(part), "") if part.isdecimal() and len(part) < 19 else (-1, part) for part in parts]
+    return [*keys, (-2, name)]
+
+
+def common_length(texts: Sequence[str]) -> int:
+    """Number of characters that all texts begin with."""
+    alike = [len(set(column)) == 1 for column in zip(*texts, strict=False)]
+    return alike.index(False) if False in alike else len(alike)
+
+
+def view_names(texts: Sequence[str], where: str) -> list[str]:
+    """Names of views from the paths of their files: the stems, or with their folders where stems repeat. Raises
+    CaptureError: two paths give the same name."""
+    paths = [PurePosixPath(text.replace("\\", "/")) for text in texts]
+    stems = [path.name if path.suffix[1:].isdecimal() else path.stem for path in paths]
+    if len(set(stems)) < len(stems):
+        stems = ["_".join([*path.parent.parts, stem]) for path, stem in zip(paths, stems, strict=True)]
+    names = [safe_name(re.sub(NOT_PLAIN, "_", stem).strip("._"), fallback="view") for stem in stems]
+    seen: dict[str, str] = {}
+    for name, text in zip(names, texts, strict=True):
+        other = seen.setdefault(name.casefold(), text)
+        if other is not text:
+            raise CaptureError(f"{where}: {other} and {text} would both be the view '{name}'; rename one")
+    return names
+
+
+class FoundFiles:
+    """Looks for the files of a capture and tells of all that are missing in one message."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root.resolve()
+        self._missing: list[str] = []
+
+    def look(self, where: str, *texts: str, least_parts: int = 1) -> Path | None:
+        """The first of some paths in the folder that is a file; None if none is. Paths of other systems are followed
+        as `find_named` does. CaptureError where a path leaves the folder."""
+        for text in texts:
+            path = self._root / text
+            try:
+                is_inside = path.resolve().is_relative_to(self._root) and not Path(text).is_absolute()
+                is_file = path.is_file()
+            except (OSError, RuntimeError, ValueError) as error:
+                raise CaptureError(f"{where}: {text!r} can't be followed ({error})") from error
+            if is_inside and is_file:
+                return path
+            if found := find_named(self._root, text, least_parts):
+                return found
+            if not is_inside:
+                raise CaptureError(f"{where}: {text!r} leaves the folder {self._root}; copy the file into it")
+        return None
+
+    def find(self, where: str, text: str, *others: str, least_parts: int = 1) -> Path | None:
+        """The same; noted as missing if none is."""
+        path = self.look(where, text, *others, least_parts=least_parts)
+        self._missing += [] if path else [text]
+        return path
+
+    def refuse_missing(self, advice: str) -> None:
+        """CaptureError if a file was missing, which names a few of them."""
+        if self._missing:
+            lacking = f"lacks {counted(len(self._missing), 'file')} of its views"
+            raise CaptureError(f"{self._root} {lacking}: {name_some(self._missing)}; {advice}")
+
+
+# Which camera took which view, by the names of files.
+
+BY_ORDER = "#"
+"""Names of cameras whose source gives none begin with it; they are matched in the order of names, sorted as texts as
+LLFF does."""
+_IN_ORDER = "by their order, as the poses have no names"
+
+
+def match_poses(
+    poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]
+) -> tuple[dict[str, PosedCamera], list[str]]:
+    """Find the camera of each view.
+
+    Names are compared whole, then as folder and name, file name, and name without suffix, each only where it is unique
+    on both sides; if all that finds nothing, by what is left of the names without what they all begin and end with.
+
+    Args:
+        views: Name and files of each view; the files as paths, of which the trailing parts count.
+    Returns:
+        Cameras by the name of the view, without views that have none; how they were matched and what is odd, one
+        sentence each.
+    Raises:
+        CaptureError: no view has a pose.
+    """
+    owners = {name: [name, *camera.other_names] for name, camera in poses.cameras.items()}
+    wanted = {name: [name, *(str(file) for file in files)] for name, files in views}
+    if all(name.startswith(BY_ORDER) for name in owners):
+        if len(owners) != len(wanted):
+            raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
+        found, how = dict(zip(sorted(wanted), sorted(owners), strict=True)), _IN_ORDER
+    else:
+        found, how = _by_names(owners, wanted), "by name"
+    if not found:
+        cameras, named = _cores(owners), _cores(wanted)
+        found = {named[core]: cameras[core] for core in named if core in cameras}
+        how = "by the part of the names that differs"
+    if not found:
+        raise CaptureError(
+            f"no view has a pose: views are called {name_some(list(wanted)) or '(none)'}, the cameras of "
+            f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes"
+        )
+    unposed = [name for name in wanted if name not in found]
+    unused = [name for name in owners if name not in set(found.values())]
+    cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
+    shared = [  # several views or cameras have one name
+        view
+        for view in unposed
+        if any(
+            cameras_of.get(_stem(name)) and len(cameras_of[_stem(name)]) + len(views_of[_stem(name)]) > 2
+            for name in wanted[view]
+        )
+    ]
+    notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
+    if how == _IN_ORDER and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
+        notes.append(
+            f"names were sorted as texts: {', '.join(ordered[:3])}; if poses go by numbers, give these leading zeros"
+        )
+    if unposed:
+        notes.append(f"views without pose: {', '.join(unposed)}")
+    if unused:
+        notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
+    if shared:
+        notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
+    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes
+
+
+def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for key in _KEYS:
+        cameras, views = _owners_of(owners, key), _owners_of(wanted, key)
+        for view, names in wanted.items():
+            hits = (cameras.get(key(name), set()) for name in names if len(views[key(name)]) == 1)
+            hit = next((next(iter(those)) for those in hits if len(those) == 1), None)
+            if view not in found and hit is not None and hit not in found.values():
+                found[view] = hit
+    return found
+
+
+def _cores(names: Iterable[str]) -> dict[str, str]:
+    """Names by what differs among them; numbers without leading zeros. Empty if that is not unique."""
+    stems = {name: _stem(name) for name in names}
+    start = common_length(list(stems.values()))
+    end = common_length([stem[start:][::-1] for stem in stems.values()])
+    cores: dict[str, str] = {}
+    for name, stem in stems.items():
+        first = start
+        while first > 0 and stem[first - 1].isdigit():
+            first -= 1
+        last = len(stem) - end
+        while last < len(stem) and stem[last].isdigit():
+            last += 1
+        core = stem[first:last]
+        cores[str(int(core)) if core.isdecimal() else core] = name
+    return cores if len(cores) == len(stems) else {}
+
+
+def _owners_of(names: dict[str, list[str]], key: Callable[[str], str]) -> dict[str, set[str]]:
+    by_key: dict[str, set[str]] = defaultdict(set)
+    for owner, all_names in names.items():
+        for name in all_names:
+            by_key[key(name)].add(owner)
+    return by_key
+
+
+def _stem(name: str) -> str:
+    """File name without its suffix; a dot before digits is not a suffix, as in `view.0001`."""
+    path = _path(name)
+    return path.name if path.suffix[1:].isdecimal() else path.stem
+
+
+def _path(name: str) -> PurePosixPath:
+    return PurePosixPath(unicodedata.normalize("NFC", name.replace("\\", "/")))
+
+
+_KEYS: tuple[Callable[[str], str], ...] = (
+    lambda name: str(_path(name)),
+    lambda name: f"{_path(name).parent.name}/{_stem(name)}",
+    lambda name: _path(name).name,
+    _stem,
+)
+"""What names are compared by, in turn."""

@@ -1,0 +1,390 @@
+"""How NumPy, torch, NetCDF-3, HDF5 (with NetCDF-4 and MATLAB 7.3) and MATLAB 5 to 7 store arrays by name.
+
+Files are opened for each part that is read and closed again, so that many can be in use at a time.
+"""
+
+from __future__ import annotations
+
+import pickle
+import pickletools
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from itertools import accumulate, count
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from unmix_plugin.captures.readers.arrays import FoundArray, image_of_arrays
+from unmix_plugin.captures.spectral_file import (
+    Axes,
+    BandIndex,
+    ReadOptions,
+    SpectralFile,
+    import_extra,
+    loaded,
+    take_part,
+)
+from unmix_plugin.errors import CaptureError
+from unmix_plugin.limits import allow_decoded, allow_depth, allow_parts, open_zip, refuse
+from unmix_plugin.scenes.reading.cubes import (
+    READ_HEADER,
+    UnreadableArrayError,
+    map_array,
+    parse_header,
+    read_array_header,
+)
+
+# NumPy: .npy is mapped, of .npz the member that is an image is loaded. No pickle is ever read.
+
+
+def open_container(kind: str, path: Path, options: ReadOptions) -> SpectralFile:
+    """Open the image of a file of one of `KINDS`, by its headers. Raises CaptureError: the file is damaged or cut
+    short, holds objects, or no array of it, or more than one, can be the image."""
+    reader, list_arrays = KINDS[kind]
+    return image_of_arrays(path, reader, list_arrays(path), options)
+
+
+def _list_npy(path: Path) -> list[FoundArray]:
+    try:
+        header = read_array_header(path)
+    except UnreadableArrayError as error:
+        raise CaptureError(f"{path}: {error}") from error
+    return [FoundArray("", header.shape, header.dtype, lambda: map_array(path))]
+
+
+def _list_npz(path: Path) -> list[FoundArray]:
+    with open_zip(path, CaptureError) as archive:
+        return [_npz_member(path, archive, info) for info in archive.infolist()]
+
+
+def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
+    """A member by its header."""
+    with archive.open(info) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in READ_HEADER:
+            raise CaptureError(f"{path}: {info.filename} is .npy of version {version}; use numpy.savez")
+        shape, _, dtype = parse_header(file, version)
+    needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
+    if not dtype.hasobject and info.file_size < needed:
+        held = f"holds {info.file_size} bytes"
+        raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
+    allow_decoded(path, info.file_size, CaptureError, info.compress_size)
+    name = info.filename.removesuffix(".npy")
+    return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
+
+
+def _load_npz_member(path: Path, name: str) -> np.ndarray:
+    with zipfile.ZipFile(path) as archive, archive.open(name) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+# Tensors that torch.save wrote: read with weights_only, which loads no code.
+
+
+def _list_torch(path: Path) -> list[FoundArray]:
+    """A tensor, or the tensors of a dictionary."""
+    import torch
+
+    _check_pickle(path)
+
+    def tensors() -> dict[str, Any]:
+        """By name, mapped where the file allows it."""
+        with path.open("rb") as file:
+            is_mappable = file.read(2) == b"PK"
+        try:
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=is_mappable)
+        except pickle.UnpicklingError as error:
+            raise CaptureError(
+                f"{path}: holds other objects than tensors, which are never loaded because they can run code"
+            ) from error
+        named = content if isinstance(content, dict) else {"": content}
+        return {str(name): value for name, value in named.items() if isinstance(value, torch.Tensor)}
+
+    def numbers(tensor: torch.Tensor) -> np.ndarray:
+        """What NumPy has no type for becomes float32."""
+        tensor = tensor.detach()
+        return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor.resolve_neg()).numpy()
+
+    found, arrays = tensors(), []
+    allow_parts(path, len(found), "tensors", CaptureError)
+    for name, tensor in found.items():  # of which many numbers can be one in the file
+        allow_decoded(path, tensor.numel() * tensor.element_size(), CaptureError)
+        dtype = numbers(tensor[:0] if tensor.ndim else tensor).dtype
+        arrays.append(
+            FoundArray(name, tuple(tensor.shape), dtype, lambda name=name: numbers(tensors()[name]))
+        )
+    return arrays
+
+
+_MOST_OPERATIONS, _LONGEST_WORD = 1 << 20, 1024
+"""Of a pickle of tensors. What torch says of words that it refuses takes time that grows with the square of them."""
+_PICKLES = 5
+"""In a row, in files of old torch: two numbers, facts of the machine, the tensors, the names of their numbers."""
+
+
+def _check_pickle(path: Path) -> None:
+    """Look through what the file would have loaded, without loading any of it."""
+
+    def look(stream: Any) -> None:
+        for number, (_, word, _) in enumerate(pickletools.genops(stream)):
+            if number >= _MOST_OPERATIONS:
+                refuse(path, f"more than {number} steps of a pickle", "those of tensors", CaptureError)
+            if isinstance(word, str | bytes) and len(word) > _LONGEST_WORD:
+                refuse(path, f"a word of {len(word)} letters", f"at most {_LONGEST_WORD}", CaptureError)
+
+    with path.open("rb") as file:
+        if file.read(2) == b"PK":
+            with open_zip(path, CaptureError) as archive:
+                name = next(name for name in archive.namelist() if name.endswith("/data.pkl"))
+                with archive.open(name) as stream:
+                    look(stream)
+            return
+        file.seek(0)
+        for _ in range(_PICKLES):
+            look(file)
+
+
+# NetCDF of the classic kind, mapped by SciPy; nothing holds on to the map of a file.
+
+
+def _list_netcdf3(path: Path) -> list[FoundArray]:
+    from scipy.io import netcdf_file
+
+    def numbers(name: str, take: Callable[[np.ndarray], np.ndarray] = np.array) -> np.ndarray:
+        with netcdf_file(str(path), "r", mmap=True) as file:
+            return take(file.variables[name].data)
+
+    def found(name: str, variable: Any, root: dict[str, Any]) -> FoundArray:
+        def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+            return numbers(name, lambda data: take_part(data, axes, rows, bands))
+
+        shape, axes, attributes = variable.shape, variable.dimensions, dict(variable._attributes)
+        whole, kind = partial(numbers, name), variable.data.dtype
+        return FoundArray(name, shape, kind, whole, take, attributes, root, axes)
+
+    with netcdf_file(str(path), "r", mmap=True) as file:
+        allow_parts(path, len(file.variables), "variables", CaptureError)
+        return [found(name, variable, dict(file._attributes)) for name, variable in file.variables.items()]
+
+
+# HDF5, read by h5py in slices.
+
+
+def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
+    """Open the data set that is the image; MATLAB's have their axes in reverse order, which is undone. Raises
+    CaptureError: the file is damaged, or no data set, or more than one, can be the image."""
+    h5py = import_extra("h5py")
+    with path.open("rb") as begin:
+        is_matlab = begin.read(10) == b"MATLAB 7.3"
+    arrays: list[FoundArray] = []
+    groups: dict[str, dict[str, Any]] = {}
+    visited = count(1)
+
+    def visit(name: str, item: Any) -> None:
+        allow_parts(path, next(visited), "groups and data sets", CaptureError)
+        allow_depth(path, name.count("/") + 1, CaptureError)
+        arrays.extend(_found_in_hdf5(path, name, item, is_matlab))
+        if not hasattr(item, "shape"):
+            groups[name] = _attributes(path, item)
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)
+        groups[""] = _attributes(path, file)
+    for index, array in enumerate(
+        arrays
+    ):  # attributes of the file and of groups, the nearest, hold for images in them
+        if len(array.shape) == 3:
+            inside = ["", *accumulate(array.name.split("/")[:-1], "{}/{}".format)]
+            inherited = {key: value for name in inside for key, value in groups.get(name, {}).items()}
+            arrays[index] = replace(array, inherited=inherited)
+    opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
+    name = opened.metadata.get("dataset") or arrays[0].name
+    with h5py.File(path, "r") as file:
+        image = file[name]
+        if image.external or image.is_virtual:
+            raise CaptureError(f"{path}: the numbers of {name} lie in other files; write them into this one")
+        of_chunk = prod(image.chunks) if image.chunks else 0
+        allow_decoded(path, max(image.size, of_chunk) * image.dtype.itemsize, CaptureError)
+    return opened
+
+
+def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray]:
+    if not hasattr(item, "shape") or item.shape is None or "#refs#" in name:
+        return []
+    shape = tuple(item.shape[::-1] if is_matlab else item.shape)
+    is_cube = len(shape) == 3
+    if not is_cube and (item.external or item.is_virtual):
+        return []
+
+    def whole() -> np.ndarray:
+        with import_extra("h5py").File(path, "r") as file:
+            stored = file[name][()]
+        return stored.T if is_matlab else stored
+
+    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+        stored_axes = axes[::-1] if is_matlab else axes
+        wanted, order = bands, slice(None)
+        if not isinstance(bands, slice):  # h5py wants each index once, in rising order
+            wanted, order = np.unique(bands, return_inverse=True)
+        selection = {"y": rows, "x": slice(None), "b": wanted}
+        with import_extra("h5py").File(path, "r") as file:
+            part = file[name][tuple(selection[axis] for axis in stored_axes)]
+        return part.transpose([stored_axes.index(axis) for axis in "yxb"])[..., order]
+
+    names = []  # of the axes, by NetCDF's dimension scales or by labels
+    for dimension in item.dims:
+        scales = [scale.name for scale in dimension.values()] if len(dimension) else []
+        names.append((scales[0] or "") if scales else dimension.label)
+    dimensions, faster = tuple(names) if any(names) else None, take if is_cube else None
+    attributes = _attributes(path, item)
+    return [FoundArray(name, shape, item.dtype, whole, faster, attributes, dimensions=dimensions)]
+
+
+def _attributes(path: Path, item: Any) -> dict[str, Any]:
+    """Attributes that h5py can read; files of other programs hold types that it has no word for."""
+    attributes = {}
+    allow_parts(path, len(item.attrs), "attributes", CaptureError)
+    for name in item.attrs:
+        with suppress(OSError, TypeError, ValueError, RuntimeError):
+            attributes[name] = item.attrs[name]
+    return attributes
+
+
+# MATLAB 5 to 7, read here rather than by SciPy, which ends the process on some damaged files and can't map numbers.
+# Those that lie open are mapped, compressed ones are unpacked when the first of them are asked for.
+# Source: The MathWorks, MAT-File Format, chapter 1 (level 5).
+
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_MATRIX, _COMPRESSED = 14, 15
+_IS_COMPLEX = 0x0800
+_HEAD_BYTES = 2**16
+"""Enough for what precedes the numbers of an array."""
+_PIECE_BYTES = 2**20
+
+
+def _list_matlab(path: Path) -> list[FoundArray]:
+    """Variables; cells, structures, texts and complex numbers are passed over."""
+    arrays: list[FoundArray] = []
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:128])
+            if order is None:
+                raise ValueError("the header is damaged")
+            elements = list(_elements(file, order, size))
+            allow_parts(path, len(elements), "variables", CaptureError)
+            for element in elements:
+                arrays += _found_in_matlab(path, file, order, *element)
+    except (ValueError, zlib.error) as error:
+        raise CaptureError(f"{path}: a damaged MATLAB file: {error}; copy it again") from error
+    return arrays
+
+
+def _elements(file: BinaryIO, order: str, size: int) -> Iterator[tuple[int, int, int]]:
+    """Start of the content, type and length of each element at the top."""
+    position = 128
+    while position + 8 <= size:
+        file.seek(position)
+        kind, length = struct.unpack(order + "II", file.read(8))
+        start = position + 8
+        if start + length > size:
+            raise ValueError(f"cut short: an element reaches to byte {start + length} of {size}")
+        yield start, kind, length
+        position = start + length + (-length % 8 if kind != _COMPRESSED else 0)
+    if position < size and size - position != -position % 8:
+        raise ValueError("cut short within the head of an element")
+
+
+def _found_in_matlab(
+    path: Path, file: BinaryIO, order: str, start: int, kind: int, length: int
+) -> list[FoundArray]:
+    """An array of real numbers by the first bytes of its element; none for anything else.
+
+    Axes are in MATLAB's order, the first axis fastest. Files may hold a smaller type than the variable has.
+    """
+    file.seek(start)
+    head, packed = file.read(min(length, _HEAD_BYTES)), None
+    if kind == _COMPRESSED:
+        head, packed = zlib.decompressobj().decompress(head, _HEAD_BYTES), (start, length)
+        kind, length = _tag(head, order, 0)[:2]
+        head, start = head[8:], 8
+    if kind != _MATRIX:
+        return []
+    _, _, at, end = _tag(head, order, 0)
+    (flags,) = struct.unpack_from(order + "I", head, at)
+    if flags & 0xFF not in _CLASSES or flags & _IS_COMPLEX:
+        return []
+    _, size, at, end = _tag(head, order, end)
+    shape = struct.unpack_from(f"{order}{size // 4}i", head, at)
+    _, size, at, end = _tag(head, order, end)
+    name = head[at : at + size].decode("utf-8", "replace")
+    kind, size, at, _ = _tag(head, order, end)
+    if kind not in _STORED or min(shape, default=-1) < 0:
+        raise ValueError(f"variable '{name}' has the type {kind} and the shape {shape}")
+    stored, dtype, offset = np.dtype(order + _STORED[kind]), np.dtype(_CLASSES[flags & 0xFF]), start + at
+    if prod(shape) * stored.itemsize != size or at + size > length:
+        raise ValueError(f"variable '{name}' of {shape} {stored.name} has {size} bytes")
+    if packed is not None:
+        needed = prod(shape) * max(stored.itemsize, dtype.itemsize)
+        allow_decoded(path, needed, CaptureError, packed[1])
+
+    def numbers() -> np.ndarray:
+        if packed is not None:
+            return loaded(_unpack, path, name, shape, stored, offset, packed)
+        return np.memmap(path, stored, "r", offset, shape, order="F")
+
+    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
+        return take_part(numbers(), axes, rows, bands).astype(dtype)
+
+    return [FoundArray(name, shape, dtype, lambda: numbers().astype(dtype), take)]
+
+
+def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
+    """Type and length of an element; where its content begins, and where the next element does."""
+    if position + 8 > len(head):
+        raise ValueError("cut short within a variable")
+    kind, length = struct.unpack_from(order + "II", head, position)
+    if kind >> 16:  # a small element has its content in its head
+        return kind & 0xFFFF, kind >> 16, position + 4, position + 8
+    return kind, length, position + 8, position + 8 + length + (-length % 8)
+
+
+def _unpack(
+    path: Path, name: str, shape: tuple[int, ...], stored: np.dtype, offset: int, packed: tuple[int, int]
+) -> np.ndarray:
+    """The numbers of a compressed variable, unpacked piece by piece to where they stay, and no more than it needs."""
+    start, left = packed
+    numbers = np.zeros(prod(shape), stored)
+    target, at, unpacking = numbers.view(np.uint8), -offset, zlib.decompressobj()
+    with path.open("rb") as file:
+        file.seek(start)
+        while at < len(target):
+            part = unpacking.unconsumed_tail
+            if not part:
+                part = file.read(min(_PIECE_BYTES, left))
+                left -= len(part)
+            piece = unpacking.decompress(part, _PIECE_BYTES)
+            if not part and not piece:
+                raise CaptureError(f"{path}: variable '{name}' is cut short; copy the file again")
+            wanted = piece[max(0, -at) : len(target) - at]
+            target[max(0, at) : max(0, at) + len(wanted)] = np.frombuffer(wanted, np.uint8)
+            at += len(piece)
+    return numbers.reshape(shape, order="F")
+
+
+KINDS: dict[str, tuple[str, Callable[[Path], list[FoundArray]]]] = {
+    "npy": ("npy", _list_npy),
+    "npz": ("npy", _list_npz),
+    "torch": ("torch", _list_torch),
+    "netcdf": ("netcdf", _list_netcdf3),
+    "matlab": ("matlab", _list_matlab),
+}
+"""Name of the reader, and what lists the arrays of a file, by the kind of file."""
