@@ -5,6 +5,7 @@ From the folder of each layout to a scene that loads, with the values and splits
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -185,50 +186,50 @@ def test_an_empty_folder_is_refused_by_every_layout(tmp_path, layout):
         find_views(layout, tmp_path, PLAIN)
 
 
-@pytest.mark.parametrize(
-    ("layout", "write", "wavelengths", "said"),
-    [
-        (
-            "nerfstudio",
-            lambda root: write_unmix(root, written="val"),
-            "610,550,465",
-            "--wavelengths 610,550,465",
-        ),
-        ("hs-nerf", write_hs, "450,500,550,600", "wavelengths of its 4 bands are unknown .*--wavelengths"),
-        ("unmix-nerf", write_unmix, None, None),
-        ("nespof", write_nespof, None, None),
-        ("nespof-real", lambda root: write_real(root, views=("a", "b", "c")), None, None),
-    ],
-)
-def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout, write, wavelengths, said):
+def linear_picture(root):
+    pixels = np.asarray(Image.open(root / "train/frame_00002.png"))[..., ::-1] / 255
+    return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
+
+
+def halves_of(view, wavelengths):
+    return np.stack([intensity(view, nm) / 2 for nm in wavelengths], axis=-1)
+
+
+OPACITY = np.linspace(0, 1, 35).reshape(5, 7)
+NM = [450, 500, 550, 600]
+SCENES = {
+    "nerfstudio": (partial(write_unmix, written="val"), {"wavelengths": "610,550,465"}, [465, 550, 610]),
+    "hs-nerf": (write_hs, {"wavelengths": "450,500,550,600"}, NM),
+    "unmix-nerf": (write_unmix, {"mask": "none"}, NM),
+    "nespof": (write_nespof, {"scale": 2.0}, [450, 460, 470]),
+    "nespof-real": (partial(write_real, views=("a", "b", "c")), {"scale": 2.0}, [450, 460]),
+}
+VALUES = {
+    "nerfstudio": linear_picture,
+    "hs-nerf": lambda _: cube(2),
+    "unmix-nerf": lambda _: cube(2),
+    "nespof": lambda _: (OPACITY > 0)[..., None] * halves_of(2, (450, 460, 470)),
+    "nespof-real": lambda _: halves_of(2, (450, 460)),
+}
+
+
+@pytest.mark.parametrize("layout", SCENES)
+def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout):
     """Or asks for the wavelengths that it lacks."""
+    write, options, nm = SCENES[layout]
     write(tmp_path / "data")
-    if said is not None:
-        with pytest.raises(CaptureError, match=said):
+    if "wavelengths" in options:
+        with pytest.raises(CaptureError, match="--wavelengths"):
             process(tmp_path / "data", tmp_path / "scene", layout)
-    options = {"wavelengths": wavelengths, "scale": 2.0 if "nespof" in layout else 1.0}
-    options |= {"mask": "none"} if layout == "unmix-nerf" else {}
-    process(tmp_path / "data", tmp_path / "scene", layout, **options)
+    process(tmp_path / "data", tmp_path / "scene", layout, **{"scale": 1.0, **options})
     scene = load_scene(tmp_path / "scene")
-    stokes = [[intensity(index, nm) / 2 for nm in (450, 460, 470)] for index in range(3)]
-    match layout:
-        case "nerfstudio":
-            pixels = np.asarray(Image.open(tmp_path / "data/train/frame_00002.png"))[..., ::-1] / 255
-            linear = np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
-            index, expected, nm, atol = 2, linear, [465, 550, 610], 1e-4
-        case "hs-nerf":
-            index, expected, nm, atol = 2, cube(2), [450, 500, 550, 600], 1.01 / 255
-        case "unmix-nerf":
-            index, expected, nm, atol = 1, cube(1), [450, 500, 550, 600], 1e-4
-            assert (present(scene.labels(4)) == 4).all()
-        case "nespof":
-            index = [frame.name for frame in scene.frames].index("r_2")
-            alpha = present(scene.alpha(index))
-            np.testing.assert_allclose(alpha, np.linspace(0, 1, 35).reshape(5, 7), atol=0.003)
-            expected, nm, atol = (alpha > 0)[..., None] * np.stack(stokes[2], axis=-1), [450, 460, 470], 1e-4
-        case _:
-            index, expected, nm, atol = 1, np.stack(stokes[1][:2], axis=-1), [450, 460], 1e-4
-    np.testing.assert_allclose(scene.cube(index), expected, atol=atol)
+    atol = 1.01 / 255 if layout == "hs-nerf" else 1e-4
+    np.testing.assert_allclose(scene.cube(2), VALUES[layout](tmp_path / "data"), atol=atol)
     assert scene.wavelengths_nm.tolist() == nm
-    evaluated = {"unmix-nerf": ["frame_00003", "frame_00004"], "nespof": ["r_0"]}.get(layout)
-    assert evaluated is None or [scene.frames[i].name for i in scene.eval_indices] == evaluated
+    evaluated = [scene.frames[index].name for index in scene.eval_indices]
+    if layout == "unmix-nerf":
+        assert (present(scene.labels(4)) == 4).all()
+        assert evaluated == ["frame_00003", "frame_00004"]
+    elif layout == "nespof":
+        np.testing.assert_allclose(present(scene.alpha(2)), OPACITY, atol=0.003)
+        assert evaluated == ["r_0"]
