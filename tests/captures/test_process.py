@@ -289,12 +289,12 @@ NAMES = ["view_00", "view_01", "view_02", "view_03"]
 ORIENTATION = 0x0112
 
 
-def write_views(root: Path, ground: int, alpha: tuple[str, ...] = (), turned: tuple[str, ...] = ()) -> None:
+def write_views(root: Path, alpha: tuple[str, ...] = (), turned: tuple[str, ...] = ()) -> None:
     """Pictures of a textured square on a noisy grey ground."""
     generator = np.random.default_rng(0)
     (root / "images").mkdir(parents=True)
     for name in NAMES:
-        pixels = generator.integers(ground - 9, ground + 1, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+        pixels = generator.integers(81, 91, (HEIGHT, WIDTH, 3)).astype(np.uint8)
         pixels[8:16, 8:20] = generator.integers(40, 120, (8, 12, 3))
         if name in alpha:
             pixels = np.dstack([pixels, np.full((HEIGHT, WIDTH), 255, np.uint8)])
@@ -312,14 +312,14 @@ def notes_of(root: Path, output: Path, wavelengths: str = "610,550,465", **optio
 
 
 def test_alpha_that_some_views_lack_is_not_dropped_in_silence(tmp_path: Path):
-    write_views(tmp_path / "capture", 90, alpha=("view_00", "view_01", "view_03"))
+    write_views(tmp_path / "capture", alpha=("view_00", "view_01", "view_03"))
     said = "1 of 4 views has no alpha channel (view_02), so that of the others is not used"
     assert said in notes_of(tmp_path / "capture", tmp_path / "scene")
     assert "alpha channel" not in notes_of(tmp_path / "capture", tmp_path / "asked", mask="none")
 
 
 def test_wavelengths_from_short_to_long_are_questioned(tmp_path: Path):
-    write_views(tmp_path / "capture", 90)
+    write_views(tmp_path / "capture")
     told = notes_of(tmp_path / "capture", tmp_path / "scene", "465,550,610")
     assert "465 nm is taken for red, 550 nm for green, 610 nm for blue" in told
     assert "give --wavelengths 610,550,465" in told
@@ -327,7 +327,7 @@ def test_wavelengths_from_short_to_long_are_questioned(tmp_path: Path):
 
 
 def test_turned_pictures_are_read_as_stored_with_a_note_and_their_poses_name_the_orientation(tmp_path: Path):
-    write_views(tmp_path / "capture", 90, turned=("view_01", "view_02"))
+    write_views(tmp_path / "capture", turned=("view_01", "view_02"))
     told = notes_of(tmp_path / "capture", tmp_path / "scene")
     assert "EXIF's orientation of 2 of 4 pictures is ignored" in told
     write_poses(tmp_path / "capture" / "transforms.json", NAMES[1:3], width=HEIGHT, height=WIDTH)
