@@ -5,11 +5,12 @@ A file may lie about itself, lead nowhere (a pipe that nobody writes to), or hol
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import zipfile
 from pathlib import Path
-from typing import BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn
 from xml.etree import ElementTree
 
 from unmix_plugin.errors import UnmixError
@@ -25,6 +26,15 @@ MOST_TEXT_BYTES = 1 << 24
 
 MOST_TABLE_BYTES = 1 << 28
 """Bytes of a text or table that has an entry for each view, row or point."""
+
+_PARSED_BYTES = 10**9
+"""That the values of a text may take. Small texts aren't counted."""
+
+_BYTES_OF = {"{": 200, "[": 80, ",": 60}
+"""What Python takes for the value that a letter of JSON stands for, at most."""
+
+_MOST_TAGS = 1 << 21
+"""Of one XML text, opening and closing ones."""
 
 _FREE_BYTES = 1 << 28
 """Decoded bytes that any file may have, however small it is."""
@@ -141,15 +151,35 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     return data
 
 
+def parse_json(text: str) -> Any:
+    """The value in a text of JSON.
+
+    Raises:
+        ValueError: it is none, or has so many values that they would take far more memory than the text.
+        RecursionError: values lie too deep in one another.
+    """
+    if len(text) > MOST_TEXT_BYTES:
+        needed = sum(text.count(letter) * size for letter, size in _BYTES_OF.items())
+        if needed > _PARSED_BYTES:
+            raise ValueError(
+                f"its values would take up to {needed:,} bytes, and at most {_PARSED_BYTES:,} are read"
+            )
+    return json.loads(text)
+
+
 def parse_xml(data: bytes | str) -> ElementTree.Element:
     """The root of an XML text.
 
     Raises:
         ValueError: it is damaged, or declares entities, which can grow without end.
     """
-    found = data.encode() if isinstance(data, str) else data
+    found = (
+        data.encode() if isinstance(data, str) else data.replace(b"\0", b"")
+    )  # as UTF-16 has between letters
     if b"<!DOCTYPE" in found or b"<!ENTITY" in found:
         raise ValueError("it declares a DOCTYPE or entities")
+    if (tags := found.count(b"<")) > _MOST_TAGS:
+        raise ValueError(f"it has {tags:,} tags; at most {_MOST_TAGS:,} are read")
     try:
         return ElementTree.fromstring(data)
     except (ElementTree.ParseError, LookupError) as error:  # LookupError: an unknown encoding

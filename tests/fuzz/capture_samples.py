@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,8 +17,9 @@ import tifffile
 import torch
 from PIL import Image
 
-from tests.captures.file_factory import header_text
+from tests.captures.file_factory import header_text, write_band_file
 from unmix_plugin.captures.readers.opening import open_spectral_file
+from unmix_plugin.formats.files import array_bytes
 
 CUBE = np.random.default_rng(0).integers(0, 200, (5, 4, 3)).astype(np.uint16)
 NM = np.array([450.0, 550.0, 650.0])
@@ -109,18 +111,55 @@ def _envi() -> bytes:
     return (header_text(CUBE, "bil", {}) + more).encode()
 
 
-def _matlab(path: Path) -> None:
-    scipy.io.savemat(path, {"cube": CUBE, "wavelengths": NM, "name": "x"}, do_compression=False)
+def _matlab(path: Path, **options: bool) -> None:
+    scipy.io.savemat(path, {"cube": CUBE, "wavelengths": NM, "name": "x"}, **options)
+
+
+def _of_rig() -> bytes:
+    tags: dict[str, Any] = {"BandName": "Red", "CentralWavelength": "660", "WavelengthFWHM": "40"}
+    tags = {f"Camera:{name}": value for name, value in tags.items()}
+    more = {"Camera:SensorModel": "4.1e5,2000.0,100.0", "Camera:VignettingPolynomial": ["0.55", "1.5"]}
+    exif = {"FNumber": 2.2, "ISOSpeedRatings": 100, "FocalPlaneXResolution": 20.0}
+    return _on_disk("a.tif", lambda path: write_band_file(path, CUBE[..., 0], tags | more, exif))
+
+
+def xml_beside() -> tuple[bytes, ...]:
+    """What GDAL and EnMAP's processor put beside an image."""
+    gdal = "".join(
+        f'<PAMRasterBand band="{i}"><NoDataValue>0</NoDataValue><Offset>0.5</Offset><Scale>0.01</Scale></PAMRasterBand>'
+        for i in (1, 2, 3)
+    )
+    enmap = "".join(
+        f'<bandID number="{i}"><wavelengthCenterOfBand>{nm}</wavelengthCenterOfBand><FWHMOfBand>6</FWHMOfBand>'
+        f"<GainOfBand>0.01</GainOfBand><OffsetOfBand>0</OffsetOfBand></bandID>"
+        for i, nm in enumerate(NM, 1)
+    )
+    enmap = f"<level_X><bandCharacterisation>{enmap}</bandCharacterisation></level_X>"
+    return (f"<PAMDataset>{gdal}</PAMDataset>".encode(), enmap.encode())
+
+
+def read_with_xml(path: Path) -> None:
+    """Read an image by what lies beside it."""
+    read_capture(path.with_name("cube.tif"))
 
 
 ENVI_DATA = CUBE.transpose(0, 2, 1).tobytes()
 SAMPLES: dict[str, Callable[[], tuple[bytes, ...]]] = {
     "cube.hdr": lambda: (_envi(),),
-    "cube.tif": lambda: (_tiff(), _tiff(compression="zlib", rowsperstrip=2), _tiff_pages(), _gdal()),
+    "cube.tif": lambda: (
+        _tiff(),
+        _tiff(compression="zlib", rowsperstrip=2),
+        _tiff_pages(),
+        _gdal(),
+        _of_rig(),
+    ),
     "cube.exr": lambda: (_on_disk("a.exr", _exr),),
-    "cube.mat": lambda: (_on_disk("a.mat", _matlab),),
+    "cube.mat": lambda: tuple(
+        _on_disk("a.mat", partial(_matlab, do_compression=packed)) for packed in (False, True)
+    ),
     "cube.h5": lambda: (_on_disk("a.h5", _hdf5),),
     "cube.nc": lambda: (_on_disk("a.nc", _netcdf),),
+    "cube.npy": lambda: tuple(array_bytes(cube) for cube in (CUBE, CUBE.astype(">f4"), CUBE[..., 0])),
     "cube.npz": lambda: (_npz(),),
     "cube.pt": lambda: (_torch(), _torch(_use_new_zipfile_serialization=False)),
     "cube.png": lambda: (_picture("PNG"), _picture("JPEG")),

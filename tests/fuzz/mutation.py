@@ -6,8 +6,10 @@ A mutation depends on the generator alone, so a seed and the number of a case re
 from __future__ import annotations
 
 import copy
+import io
 import json
 import random
+import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -73,6 +75,20 @@ def mutate_png(samples: Sequence[bytes], generator: random.Random) -> bytes:
         data[end : end + 4] = zlib.crc32(data[start + 4 : end]).to_bytes(4, "big")
         start = end + 4
     return bytes(data)
+
+
+def mutate_zip(samples: Sequence[bytes], generator: random.Random) -> bytes:
+    """Damage to a member of an archive before it is packed, so that its checksum is right; or to the archive."""
+    data = generator.choice(samples)
+    if generator.random() < 0.3 or not zipfile.is_zipfile(io.BytesIO(data)):
+        return mutate_bytes([data], generator)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as found, zipfile.ZipFile(buffer, "w") as damaged:
+        spoiled = generator.choice(found.infolist())
+        for info in found.infolist():
+            content = found.read(info)
+            damaged.writestr(info, mutate_bytes([content], generator) if info is spoiled else content)
+    return buffer.getvalue()
 
 
 def mutate_json(samples: Sequence[bytes], generator: random.Random) -> bytes:

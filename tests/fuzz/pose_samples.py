@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,27 @@ COLMAP_IMAGES = (
     b"3 0 1 0 0 1 0 4 1 d.jpg\n\n"
 )
 COLMAP_POINTS = b"1 0.5 0.25 1 255 0 7 0.3 1 0 2 0\n2 1 2 3 1 2 3 0.5\n"
+
+
+COLMAP_PARTS = ("cameras", "images", "points3D")
+
+
+def colmap_files(is_binary: bool) -> dict[str, bytes]:
+    """The model as files of either kind, by their names."""
+    files = dict(zip(COLMAP_PARTS, (COLMAP_CAMERAS, COLMAP_IMAGES, COLMAP_POINTS), strict=True))
+    if not is_binary:
+        return {f"{name}.txt": data for name, data in files.items()}
+    opencv, fisheye = (500, 510, 320, 240, 0.01, -0.02, 0.001, 0), (90, 90, 32, 24, 0, 0, 0, 0)
+    cameras = struct.pack("<QiiQQ8diiQQ8d", 2, 1, 4, 640, 480, *opencv, 2, 5, 64, 48, *fisheye)
+    images = (
+        struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 4, 1)
+        + b"a b.jpg\0"
+        + struct.pack("<Q2dQ", 1, 1.5, 2, 7)
+    )
+    images += struct.pack("<I7dI", 2, 0.7, 0.1, 0, 0.7, 1, 2, 3, 2) + b"c.jpg\0" + struct.pack("<Q", 0)
+    points = struct.pack("<QQ3d3BdQII", 2, 7, 0.5, 0.25, 1, 255, 0, 7, 0.3, 1, 1, 0)
+    points += struct.pack("<Q3d3BdQ", 8, 1, 2, 3, 1, 2, 3, 0.5, 0)
+    return {"cameras.bin": cameras, "images.bin": images, "points3D.bin": points}
 
 
 def read_and_place(path: Path) -> None:

@@ -9,15 +9,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from tests.fuzz import pose_samples, run_readers, scene_readers
-from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture
-from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json
+from tests.fuzz import object_readers, pose_samples, run_readers, scene_readers
+from tests.fuzz.capture_samples import ENVI_DATA, SAMPLES, read_capture, read_with_xml, xml_beside
+from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json, mutate_zip
 from unmix_plugin.errors import CaptureError
 
 
 def _capture(file_name: str) -> Reader:
     beside = (("cube", ENVI_DATA),) if file_name == "cube.hdr" else ()
-    return Reader(SAMPLES[file_name](), file_name, read_capture, (CaptureError,), companions=beside)
+    mutate = mutate_zip if file_name.endswith((".npz", ".pt")) else mutate_bytes
+    return Reader(SAMPLES[file_name](), file_name, read_capture, (CaptureError,), mutate, beside)
+
+
+def _xml_beside(file_name: str) -> Reader:
+    beside = (("cube.tif", SAMPLES["cube.tif"]()[0]),)
+    return Reader(xml_beside(), file_name, read_with_xml, (CaptureError,), companions=beside)
 
 
 def _poses(
@@ -30,12 +36,8 @@ def _poses(
 
 
 def _colmap(name: str) -> Reader:
-    """One of COLMAP's text files, damaged, beside the others."""
-    files = {
-        "cameras.txt": pose_samples.COLMAP_CAMERAS,
-        "images.txt": pose_samples.COLMAP_IMAGES,
-        "points3D.txt": pose_samples.COLMAP_POINTS,
-    }
+    """One of COLMAP's files, damaged, beside the others."""
+    files = pose_samples.colmap_files(name.endswith(".bin"))
     beside = tuple((other, content) for other, content in files.items() if other != name)
     return _poses(name, lambda: (files[name],), companions=beside)
 
@@ -44,6 +46,7 @@ def _ply() -> Reader:
     return Reader(pose_samples.ply_samples(), "points.ply", pose_samples.read_points, (ValueError,))
 
 
+_ORIENTATION = (("Orientation-a.tif.xml", pose_samples.micmac_samples()[0]),)
 _CALIBRATION = (("AutoCal.xml", pose_samples.CALIBRATED),)
 READERS: dict[str, Callable[[], Reader]] = {
     "transforms.json": scene_readers.transforms_reader,
@@ -68,12 +71,32 @@ READERS: dict[str, Callable[[], Reader]] = {
     "poses MicMac": partial(
         _poses, "Orientation-a.tif.xml", pose_samples.micmac_samples, companions=_CALIBRATION
     ),
+    "poses MicMac AutoCal.xml": partial(
+        _poses, "AutoCal.xml", lambda: (pose_samples.CALIBRATED,), companions=_ORIENTATION
+    ),
     "poses LLFF": partial(_poses, "poses_bounds.npy", pose_samples.llff_samples),
     **{
         f"poses COLMAP {name}": partial(_colmap, name)
-        for name in ("cameras.txt", "images.txt", "points3D.txt")
+        for name in (f"{part}.{suffix}" for suffix in ("txt", "bin") for part in pose_samples.COLMAP_PARTS)
     },
     "points (.ply)": _ply,
     **{f"capture {file_name}": partial(_capture, file_name) for file_name in SAMPLES},
+    "capture cube.tif.aux.xml": partial(_xml_beside, "cube.tif.aux.xml"),
+    "sensor CSV": scene_readers.responses_reader,
+    "library text": scene_readers.library_text_reader,
+    "wavelengths CSV": scene_readers.wavelengths_reader,
+    "angles CSV": scene_readers.angles_reader,
+    "run measures": run_readers.measures_reader,
+    **{
+        f"object mesh.{suffix}": partial(object_readers.mesh_reader, suffix)
+        for suffix in ("ply", "obj", "glb", "gltf")
+    },
+    **{
+        f"object environment.{suffix}": partial(object_readers.environment_reader, suffix)
+        for suffix in ("exr", "hdr")
+    },
+    "object picture.exr": partial(object_readers.picture_reader, "images/000.exr"),
+    "object picture.npy": partial(object_readers.picture_reader, "spectral/cubes/000.npy"),
+    "object transforms.json": object_readers.transforms_reader,
 }
 """By name, for messages and tables."""

@@ -29,13 +29,17 @@ from unmix_plugin.engine.training.progress import _keep_until
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.trained.measures import read_measures
+from unmix_plugin.trained.regions import Box, OfMaterial, region_to_json
 from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.connections import _is_heard
 
 
 def config_reader() -> Reader:
-    content = {"format_version": RUN_FORMAT, "config": config_to_json(find_method("unmix-nerf").config)}
-    samples = (json.dumps(content).encode(),)
+    configs = (config_to_json(find_method(name).config) for name in ("unmix-nerf", "neumatex"))
+    samples = tuple(
+        json.dumps({"format_version": RUN_FORMAT, "config": config}).encode() for config in configs
+    )
     beside = (("scene.json", b"{}"),)
     return Reader(samples, "config.json", _read_config, (RunError,), mutate_json, beside)
 
@@ -45,10 +49,14 @@ def _read_config(path: Path) -> None:
     assert config.pipeline.model.eval_num_rays_per_chunk > 0
 
 
-def scene_record_reader() -> Reader:
+def _cameras(count: int = 1) -> Cameras:
     pose = torch.tensor(look_at(np.array([3.0, 1.0, 1.5]), np.zeros(3))[:3], dtype=torch.float32)
-    ones = torch.ones(2, 2)
-    cameras = Cameras(torch.stack([pose, pose]), 28 * ones, 8 * ones, torch.zeros(2, 4), 20, 16).to_json()
+    ones = torch.ones(count, 2)
+    return Cameras(pose.expand(count, 3, 4), 28 * ones, 8 * ones, torch.zeros(count, 4), 20, 16)
+
+
+def scene_record_reader() -> Reader:
+    cameras = _cameras(2).to_json()
     metadata = {
         "wavelengths_nm": [450.0, 520.0, 680.0],
         "illuminant": [1.0, 0.9, 0.8],
@@ -124,6 +132,21 @@ def _read_checkpoint(path: Path) -> None:
     if found is None:
         raise RunError("none")
     TrainingRecord.from_json(found.record)
+
+
+def measures_reader() -> Reader:
+    regions = {"crown": Box((0.0, 0.1, 0.2), (0.5, 0.6, 1.0)), "leaves": OfMaterial(1)}
+    content = {
+        "format_version": RUN_FORMAT,
+        "scale": {"metres_per_unit": 0.5, "how": "a ruler"},
+        "regions": {name: region_to_json(region) for name, region in regions.items()},
+    }
+    content["regions"]["seen"] = {"kind": "view", "camera": _cameras().to_json(), "runs": [3, 4, 313]}
+
+    def read(path: Path) -> None:
+        read_measures(RunFolder(path.parent))
+
+    return Reader((json.dumps(content).encode(),), "measures.json", read, (RunError,), mutate_json)
 
 
 def metrics_reader() -> Reader:

@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
+from unmix_plugin.captures.wavelengths import parse_wavelengths
 
 from tests.fuzz.mutation import Reader, mutate_json, mutate_png
 from tests.scenes.scene_factory import look_at
+from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
@@ -24,8 +26,10 @@ from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.settings import SceneOptions
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.maps.indices import parse_formula
+from unmix_plugin.spectral.sensor import read_sensor
 from unmix_plugin.trained.camera_files import read_camera_file
 
 _SIZE = (16, 20)
@@ -152,8 +156,15 @@ def _read_picture(path: Path) -> None:
 
 
 def labels_reader() -> Reader:
-    colour = picture_reader()
-    return replace(colour, file_name="labels.png", read=lambda path: read_labels(path, _SIZE))
+    labels = Image.fromarray(np.random.default_rng(0).integers(0, 5, _SIZE, dtype=np.uint8))
+    samples = [_encoded(labels, name) for name in ("PNG", "TIFF", "JPEG")]
+    samples += [_encoded(labels.convert("P"), "PNG"), *picture_reader().samples[:2]]
+    return replace(
+        picture_reader(),
+        samples=tuple(samples),
+        file_name="labels.png",
+        read=lambda path: read_labels(path, _SIZE),
+    )
 
 
 def envi_header_reader() -> Reader:
@@ -181,6 +192,35 @@ def spectra_csv_reader() -> Reader:
         b'\xef\xbb\xbfwavelength_nm,"power, relative"\r\n\r\n400.5,1\r\n500,2e-3\r\n',
     )
     return Reader(samples, "spectra.csv", read_spectra_csv, (SpectrumError,))
+
+
+def responses_reader() -> Reader:
+    samples = (b"wavelength,red,green\n450,0,0.1\n520,0.2,1\n600,1,0.1\n",)
+    bands = Bands(np.array([450.0, 500.0, 550.0, 600.0]))
+
+    def read(path: Path) -> None:
+        assert np.isfinite(read_sensor(path).seen_by(bands).matrix).all()
+
+    return Reader(samples, "sensor.csv", read, (SpectrumError,))
+
+
+def library_text_reader() -> Reader:
+    head = "Name: oak\nX Units: Wavelength (micrometers)\nY Units: Reflectance (percent)\n\n"
+    usgs = "USGS Digital Spectral Library splib06a\nline\nOak_Leaf\nfir\n 0.45 0.1 0.01\n 0.55 -1.23e34 0\n"
+    record = " splib07a Record=1234: Oak_Leaf-1 fresh\n 0.1\n 0.25\n -1.23e+034\n"
+    samples = (f"{head}0.45\t10\n0.55\t25.5\n0.65\t50\n".encode(), usgs.encode(), record.encode())
+    beside = (("s07_Wavelengths_1.txt", b" Record=1: Wavelengths\n 0.45\n 0.55\n 0.65\n"),)
+    return Reader(samples, "oak.txt", read_library, (SpectrumError,), companions=beside)
+
+
+def wavelengths_reader() -> Reader:
+    samples = (b"wavelength,width\n450,5\n520.5,5\n", b"450\n520\n600\n", b"450.5,520,600\n")
+    return Reader(samples, "bands.csv", lambda path: parse_wavelengths(str(path)), (ConfigError,))
+
+
+def angles_reader() -> Reader:
+    samples = (b"view,angle,camera\na,0,1\nb.png,120,1\nc,240.5,2\n",)
+    return Reader(samples, "angles.csv", lambda path: parse_angles(str(path), "abc"), (ConfigError,))
 
 
 def cameras_reader() -> Reader:

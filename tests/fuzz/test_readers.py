@@ -1,5 +1,7 @@
 """Readers of files that strangers make either read them or refuse them with the error that they promise."""
 
+import contextlib
+
 import pytest
 
 from tests.fuzz.fuzzing import fuzz, prepare
@@ -10,6 +12,29 @@ CASES = 200
 SLOWEST_S, MOST_BYTES = 5.0, 10**9
 WITH_REFUSED_SAMPLES = ("picture", "label picture")
 """Some of their samples are of a format or a mode that isn't accepted."""
+_SIGNALLING = b"\x01\0\0\0\0\0\xf0\x7f"
+"""A NaN at which the processor says that it is none, as float64; its second half for float32."""
+FOUND = (
+    ("cube (.npy)", 2, b"", _SIGNALLING),
+    ("camera file", 0, b'"fov": 50.0', b'"fov": 1e-320'),
+    ("run metrics", 0, b'{"step": 0', b'\xef\xbb\xbf{"step": 0'),
+    ("run metrics", 0, b'{"step": 1', b'\xef\xbb\xbf{"step": 1'),
+    ("poses MicMac", 0, b"AutoCal.xml", b"AutoCal.xml" + 400 * b"9"),
+    ("poses LLFF", 1, b"", b"\x01\0\x80\x7f"),
+    ("poses COLMAP cameras.txt", 0, b"64 48 90 90", b"64 48 90 1e90"),
+    ("poses COLMAP cameras.txt", 0, b"64 48 90 90", b"64 48 1e-320 90"),
+    ("poses COLMAP images.txt", 0, b"1 1 0 0 0 0", b"1 1 0 0 1e200 0"),
+    ("poses COLMAP points3D.txt", 0, b"2 1 2 3", b"2 -1e308 2 3"),
+    ("points (.ply)", 0, b"vertex 2", b"vertex"),
+    ("points (.ply)", 0, b"255 0 3", b"255 0 nan"),
+    ("object mesh.obj", 0, b"v 0.0", b"v 1e300 0.0"),
+    ("object mesh.obj", 0, b"\nf", b"\nvn 1\nf"),
+    ("object mesh.gltf", 0, b'"mesh":0', b'"mesh":0,"scale":[NaN,1,1]'),
+    ("object environment.hdr", 0, b"-Y 8", b"\xd0Y 8"),
+    ("object picture.exr", 0, b"scanlineimage", b"scanlineimagf"),
+)
+"""What fuzzing found once: reader, sample, and what was exchanged for what; the end of the sample where the former is
+empty."""
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -22,6 +47,17 @@ def test_valid_samples_are_read_or_refused_as_promised(name, tmp_path):
             reader.read(path)
         except reader.allowed:
             assert name in WITH_REFUSED_SAMPLES
+
+
+@pytest.mark.parametrize(("name", "sample", "old", "new"), FOUND)
+def test_what_was_found_once_is_read_or_refused_as_promised(name, sample, old, new, tmp_path):
+    reader = READERS[name]()
+    data = reader.samples[sample]
+    assert old in data
+    path = prepare(reader, tmp_path)
+    path.write_bytes(data.replace(old, new, 1) if old else data[: -len(new)] + new)
+    with contextlib.suppress(*reader.allowed):
+        reader.read(path)
 
 
 @pytest.mark.slow

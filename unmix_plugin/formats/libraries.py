@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import SpectrumError, name_some
 from unmix_plugin.formats.envi import data_beside, header_items, read_header, read_layout
-from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
@@ -188,7 +188,7 @@ def _read_csv(path: Path) -> _Table:
     names = [_PERCENT.sub("", name) for name in header[1:]]
     percent = [name != given for name, given in zip(names, header[1:], strict=True)]
     if not all(names) or len(set(names)) < len(names):
-        raise SpectrumError(f"each spectrum needs a name of its own; found {names}")
+        raise SpectrumError(f"each spectrum needs a name of its own; found {name_some(names, 8)}")
     return names, values[:, 0] * factor, values[:, 1:].T, np.where(percent, 100.0, 1.0)[:, None]
 
 
@@ -286,7 +286,7 @@ def _read_text(path: Path) -> _Table:
 
 def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
     """Lines of text before the numbers, and the numbers of each line after; empty lines left out."""
-    text = read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig", "replace")
+    text = read_bounded(path).decode("utf-8-sig", "replace")
     words: list[str] = []
     numbers: list[list[float]] = []
     for line in filter(str.strip, text.splitlines()):

@@ -87,16 +87,17 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
     """
     data = read_bounded(path, MOST_TABLE_BYTES)
     end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
+    start = data.find(b"\n", end) + 1
+    if not data.startswith(b"ply") or end < 0 or start == 0:
         raise ValueError("no PLY header")
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
-    start = data.find(b"\n", end) + 1
     order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
     kinds = [line[1] for line in lines if line[:1] == ["format"] and len(line) > 1]
     elements = [index for index, line in enumerate(lines) if line[:1] == ["element"]]
-    if not kinds or kinds[0] not in order or not elements or lines[elements[0]][1:2] != ["vertex"]:
-        raise ValueError("its format is unknown, or vertices are not its first element")
-    count = int(lines[elements[0]][2])
+    first = lines[elements[0]] if elements else []
+    if not kinds or kinds[0] not in order or first[1:2] != ["vertex"] or len(first) != 3:
+        raise ValueError("its format is unknown, or vertices and their number are not its first element")
+    count = int(first[2])
     stop = elements[1] if len(elements) > 1 else len(lines)
     named = [line for line in lines[elements[0] + 1 : stop] if line[:1] == ["property"]]
     if any(len(line) != 3 or line[1] not in _READ_TYPES for line in named):
@@ -104,21 +105,26 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
     names = [line[2] for line in named]
     if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise ValueError("vertices have no x, y, z")
-    dtype = np.dtype([(line[2], (order[kinds[0]] or "<") + _READ_TYPES[line[1]]) for line in named])
-    body = data[start:]
-    if kinds[0] == "ascii":
-        numbers = np.array(body.split()[: count * len(names)], dtype=np.float64).reshape(-1, len(names))
-        table = {name: numbers[:, index] for index, name in enumerate(names)}
-    else:
-        body = body[: max(count, 0) * dtype.itemsize]
-        numbers = np.frombuffer(body[: len(body) // dtype.itemsize * dtype.itemsize], dtype)
-        table = {name: numbers[name] for name in names}
-    if len(numbers) != count:
-        raise ValueError(f"{len(numbers)} vertices; its header promises {count}")
-    positions = np.column_stack([table[axis].astype(np.float64) for axis in "xyz"])
+    is_text = kinds[0] == "ascii"
+    dtype = np.dtype(
+        [(line[2], "f8" if is_text else order[kinds[0]] + _READ_TYPES[line[1]]) for line in named]
+    )
+    body, held = io.BytesIO(data), min(count, (len(data) - start) // dtype.itemsize)
+    body.seek(start)
+    table = (
+        np.loadtxt(filter(bytes.strip, body), dtype, comments=None, max_rows=max(count, 1), ndmin=1)
+        if is_text
+        else np.frombuffer(data, dtype, max(held, 0), start)
+    )
+    if len(table) != count:
+        raise ValueError(f"{len(table)} vertices; its header promises {count}")
+    positions = np.stack([table[axis] for axis in "xyz"], axis=1, dtype=np.float64)
     if not {"red", "green", "blue"} <= set(names):
         return positions, None
-    return positions, np.column_stack([table[name].astype(np.uint8) for name in ("red", "green", "blue")])
+    colours = np.column_stack([table[name] for name in ("red", "green", "blue")])
+    if not ((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all():
+        raise ValueError("its colours are not whole numbers from 0 to 255")
+    return positions, colours.astype(np.uint8)
 
 
 def obj_paths(path_without_suffix: Path) -> list[Path]:

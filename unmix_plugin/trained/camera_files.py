@@ -41,6 +41,8 @@ from unmix_plugin.trained.run_views import RunView
 _FORMAT_VERSION = 1
 """Of the camera files that we write."""
 _GREATEST_SIDE_PX = 16_384
+_LEAST_DEG = 1e-4
+"""Of a field of view, and from 180 degrees on: beyond, focal lengths leave float32."""
 _GREATEST_FPS, _USUAL_FPS = 1000, 24
 _LENS_KEYS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
 
@@ -162,7 +164,7 @@ def _read_camera_path(path: Path, content: dict[str, Any]) -> _CameraFile:
         if isinstance(values, list) and len(values) == 16:
             values = [values[row : row + 4] for row in range(0, 16, 4)]
         fov_deg = _needed_number(entry, "fov", f"{path}: camera_path[{index}]")
-        if not 0 < fov_deg < 180:
+        if not _LEAST_DEG <= fov_deg <= 180 - _LEAST_DEG:
             raise ConfigError(
                 f"{path}: camera_path[{index}]: 'fov' is {fov_deg:g}; expected degrees between 0 and 180, vertical"
             )

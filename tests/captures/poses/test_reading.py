@@ -255,3 +255,11 @@ def test_other_arrays_and_damaged_files_are_refused(tmp_path):
     path.write_bytes(write(tmp_path).read_bytes()[:300])
     with pytest.raises(CaptureError, match="is cut short"):
         read_poses(path)
+
+
+def test_sparse_points_that_are_too_far_are_left_out_and_said(tmp_path):
+    points = np.array([[0.1, 0.2, 0.3], [1e300, 2.0, 3.0], [np.nan, 0, 0]])
+    write_ply(tmp_path / "sparse.ply", {axis: points[:, index] for index, axis in enumerate("xyz")})
+    found = read(tmp_path, transforms(ring(), ply_file_path="sparse.ply"))
+    np.testing.assert_array_equal(found.points, points[:1])
+    assert any("2 sparse points are not finite, or more than 1e9 units away" in note for note in found.notes)

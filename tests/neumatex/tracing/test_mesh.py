@@ -1,5 +1,7 @@
 """Meshes from files, and rays against them."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -98,6 +100,31 @@ def test_inward_triangles_are_turned_and_said(tmp_path):
     assert_close(mesh.normals, mesh.vertices, atol=0.05, rtol=0)
     a, b, c = mesh.corners().unbind(1)
     assert bool(((torch.linalg.cross(b - a, c - a) * a).sum(-1) > 0).all())
+
+
+def test_a_vertex_of_no_triangle_changes_nothing_however_far_it_is(tmp_path):
+    box, notes = trimesh.creation.box(), []
+    vertices = np.vstack([box.vertices, [[np.nan, 1e30, 0]]])
+    read = read_mesh(_ply(tmp_path / "box.ply", vertices, box.faces[:, ::-1]), notes)
+    assert "turned outwards" in notes[0]
+    assert_close(read.vertices.amax(dim=0).double(), torch.full((3,), 0.5, dtype=torch.float64))
+
+
+def test_no_file_outside_the_folder_is_read_for_a_mesh_and_no_pipe(tmp_path):
+    exported = trimesh.creation.box().export(file_type="gltf")
+    folder = tmp_path / "mesh"
+    folder.mkdir()
+    for name, data in exported.items():
+        (folder / name).write_bytes(data)
+    assert len(read_mesh(folder / "model.gltf").faces) == 12
+    buffer = next(folder.glob("*0.bin"))
+    buffer.rename(tmp_path / buffer.name)
+    text = (folder / "model.gltf").read_text()
+    os.mkfifo(buffer)
+    for named in (buffer.name, f"../{buffer.name}", str(tmp_path / buffer.name)):
+        (folder / "model.gltf").write_text(text.replace(buffer.name, named))
+        with pytest.raises(SceneError, match="there is no file"):
+            read_mesh(folder / "model.gltf")
 
 
 def test_an_open_mesh_is_noted(tmp_path):

@@ -28,7 +28,7 @@ import numpy as np
 from unmix_plugin.captures.camera_tags import XmpTags, exif_number, tag_numbers, tag_text
 from unmix_plugin.captures.layouts.transforms import Split
 from unmix_plugin.captures.names import natural_order, view_names
-from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_unfolded
+from unmix_plugin.captures.poses.lens import Lens, Points, fit_lens, require_possible
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import BandTable, Capture, CaptureView, ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError, counted, name_some
@@ -226,8 +226,7 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
             lens, notes = _dji_lens(file, tags), ()
         else:
             lens, notes = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
-        numbers = (*lens.focal_px, *lens.center_px, *lens.distortion)
-        if not np.isfinite(numbers).all() or min(lens.focal_px) <= 0.0:
+        if not lens.is_possible:
             raise _NoLensError("its numbers make no sense")
     except _NoLensError as why:
         return None, (f"no lens in the file's tags: {why}",)
@@ -289,7 +288,7 @@ def _lens(
     height, width = file.shape[:2]
     lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
     if lens.higher_radial[0]:
-        require_unfolded(lens, f"{file.path}, {_TAGS}")
+        require_possible(lens, f"{file.path}, {_TAGS}")
     return lens
 
 

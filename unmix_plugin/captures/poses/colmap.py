@@ -139,6 +139,7 @@ def _suffix(folder: Path) -> str | None:
     return None
 
 
+@np.errstate(all="ignore")  # what is not finite is refused where all poses are looked at
 def _matrix(image: _Image, where: str) -> Float64[np.ndarray, "3 4"]:
     """Camera to world, OpenGL axes."""
     from scipy.spatial.transform import Rotation
@@ -148,8 +149,7 @@ def _matrix(image: _Image, where: str) -> Float64[np.ndarray, "3 4"]:
         raise CaptureError(f"{where}: {image.name} has the quaternion {image.quaternion}; expected length 1")
     w, x, y, z = image.quaternion
     to_world = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    with np.errstate(invalid="ignore"):  # what is not finite is refused where all poses are looked at
-        return np.column_stack([to_world @ FLIP, -to_world @ np.array(image.translation)])
+    return np.column_stack([to_world @ FLIP, -to_world @ np.array(image.translation)])
 
 
 def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:

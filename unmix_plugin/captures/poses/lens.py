@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.transforms_json import GREATEST_PX
 
 Points = Float64[np.ndarray, "P 2"]
 Project: TypeAlias = Callable[[Points], Points]
@@ -69,6 +70,12 @@ class Lens:
     def radial(self) -> tuple[float, float, float, float]:
         """k1 to k4."""
         return (*self.distortion[:2], *self.higher_radial)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether its numbers are finite and such as some lens has."""
+        numbers = (*self.focal_px, *self.center_px, *self.distortion, *self.higher_radial)
+        return min(self.focal_px) >= 1 / GREATEST_PX and bool((np.abs(numbers) <= GREATEST_PX).all())
 
     def pixels_of(self, ideal: Points) -> Points:
         """Where ideal points are seen."""
@@ -130,6 +137,7 @@ _STEP = 1e-6
 _CALIBRATE = "calibrate the camera again, or undistort the images and give poses with a pinhole lens"
 
 
+@np.errstate(all="ignore")  # whatever comes of it is judged by where pixels fall
 def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
     """The OPENCV lens that stands for one of another model.
 
@@ -142,8 +150,9 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         The nearest lens; if it is not near enough, pixels are to be resampled into it. Of a lens too wide for it, a
         pinhole that shows its middle. And a sentence that says what was done.
     Raises:
-        CaptureError: the model is not to be followed even in the middle of the image.
+        CaptureError: the model is not to be followed even in the middle of the image, or its numbers are impossible.
     """
+    require_possible(start, where)
     pixels = _pixel_grid(start.width, start.height)
     ideal = _invert(project, pixels, start)
     if ideal is not None and np.linalg.norm(ideal, axis=1).max() < np.tan(np.radians(_WIDEST_DEG)):
@@ -215,10 +224,16 @@ def _widest_pinhole(project: Project, start: Lens) -> tuple[Lens, float] | None:
     return None
 
 
-def require_unfolded(lens: Lens, where: str) -> None:
-    """Refuse a lens that maps two directions to one pixel of its image. Raises CaptureError: it does."""
-    if _folds(lens):
-        terms = [*lens.radial, *lens.distortion[2:]]
+def require_possible(lens: Lens, where: str) -> None:
+    """Refuse a lens whose numbers no lens has, or that maps two directions to one pixel of its image by terms that few
+    files have. Raises CaptureError: it does."""
+    terms = [*lens.radial, *lens.distortion[2:]]
+    if not lens.is_possible:
+        raise CaptureError(
+            f"{where}: a lens has the focal length {lens.focal_px}, the centre {lens.center_px} and the distortion "
+            f"{terms}; expected pixels from {1 / GREATEST_PX:g} to {GREATEST_PX:g}: {_CALIBRATE}"
+        )
+    if any(lens.higher_radial) and _folds(lens):
         raise CaptureError(f"{where}: the distortion {terms} folds the image's corners over; {_CALIBRATE}")
 
 
@@ -235,8 +250,8 @@ def _pixel_grid(width: int, height: int) -> Points:
 
 def _invert(project: Project, pixels: Points, start: Lens) -> Points | None:
     """Ideal points that `project` maps to the pixels, by Newton's method; None if there are none."""
-    ideal = (pixels - np.array(start.center_px)) / np.array(start.focal_px)
     with np.errstate(all="ignore"):
+        ideal = (pixels - np.array(start.center_px)) / np.array(start.focal_px)
         for _ in range(50):
             missing = pixels - project(ideal)
             if not np.isfinite(missing).all():

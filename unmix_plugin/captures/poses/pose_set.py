@@ -153,9 +153,11 @@ def make_pose_set(
         said.append(f"coordinates are large: less the offset {', '.join(f'{value:.0f}' for value in offset)}")
     positions, colours = points if points is not None and len(points[0]) else (None, None)
     if positions is not None:
-        good = np.isfinite(positions).all(axis=1)
+        good = (np.abs(positions) <= _GREATEST_POSITION).all(axis=1)  # false for NaN
         if not good.all():
-            said.append(f"{(~good).sum()} sparse points are not finite: left out")
+            said.append(
+                f"{(~good).sum()} sparse points are not finite, or more than 1e9 units away: left out"
+            )
         positions, colours = positions[good] - offset, None if colours is None else colours[good]
     return PoseSet(
         {name: replace(camera, camera_to_world=rigid[name] - moved) for name, camera in unique.items()},

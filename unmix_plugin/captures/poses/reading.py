@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.names import BY_ORDER, path_text
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
-from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_unfolded
+from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_possible
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
 from unmix_plugin.captures.poses.pose_set import (
     PosedCamera,
@@ -63,8 +63,8 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
     read = _read_folder if path.is_dir() else _read_file
     poses = read(path, picture_sizes or {})
     for lens in {camera.lens for camera in poses.cameras.values()}:
-        if lens is not None and any(lens.higher_radial):
-            require_unfolded(lens, str(path))
+        if lens is not None:
+            require_possible(lens, str(path))
     return poses
 
 
@@ -156,7 +156,7 @@ def _read_llff(path: Path) -> PoseSet:
     Cameras have the names of the pictures beside it, where there are as many.
     """
     try:
-        with reading(path):
+        with reading(path), np.errstate(invalid="ignore"):  # NaN is refused with all that is no pose
             shape = read_array_header(path).shape
             is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
             table = np.array(map_array(path), dtype=np.float64) if is_table else None

@@ -40,6 +40,7 @@ from unmix_plugin.captures.poses.pose_set import (
     make_pose_set,
 )
 from unmix_plugin.errors import CaptureError, counted, name_some
+from unmix_plugin.scenes.reading.faults import find_named
 
 _Element = ElementTree.Element
 
@@ -267,8 +268,10 @@ def _lens_micmac(orientation: _Element, path: Path, lenses: dict[str, Lens], not
     if key not in lenses:
         where = str(path)
         if inner is None:
-            file = path.parent / Path(name.replace("\\", "/")).name  # whatever folder it was written in
-            if not name or not file.is_file():
+            file = find_named(
+                path.parent, name.replace("\\", "/").rpartition("/")[2]
+            )  # whatever folder it was in
+            if file is None:
                 raise CaptureError(f"{path} names the calibration {name!r}; copy it into {path.parent}")
             where, root = str(file), load_xml(file)
             inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")

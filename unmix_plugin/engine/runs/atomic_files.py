@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from unmix_plugin.errors import RunError
-from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.limits import DEEPEST, MOST_TABLE_BYTES, parse_json, read_bounded
 
 _CHUNK_BYTES = 1 << 26
 """Bytes handed to one write."""
@@ -249,7 +249,7 @@ def read_plain_json(path: Path) -> Any:
         RunError: it is no regular file, too long, cut off, or holds what no run writes.
     """
     try:
-        return parse_plain_json(read_bounded(path, MOST_TABLE_BYTES))
+        return parse_plain_json(read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -258,14 +258,14 @@ def read_plain_json(path: Path) -> Any:
         raise RunError(f"can't read {path}: {error}; the run is damaged") from error
 
 
-def parse_plain_json(data: bytes) -> Any:
+def parse_plain_json(text: str) -> Any:
     """The value in a text of JSON.
 
     Raises:
         ValueError: it is none, or holds what no run writes.
     """
     try:
-        value = json.loads(data)
+        value = parse_json(text)
         _require_plain(value, DEEPEST)
     except RecursionError as error:
         raise ValueError(f"nested more than {DEEPEST} levels deep") from error

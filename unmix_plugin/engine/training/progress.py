@@ -290,7 +290,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 def _lines(path: Path) -> list[bytes]:
     try:
-        return read_bounded(path, MOST_TABLE_BYTES).splitlines()
+        return read_bounded(path, MOST_TABLE_BYTES).removeprefix(b"\xef\xbb\xbf").splitlines()
     except FileNotFoundError:
         return []
     except OSError as error:
@@ -300,7 +300,7 @@ def _lines(path: Path) -> list[bytes]:
 def _record(line: bytes) -> dict[str, Any] | None:
     """The object in a line; None where it is not one that `MetricsWriter` wrote."""
     try:
-        record = parse_plain_json(line)
+        record = parse_plain_json(line.decode())
     except ValueError:
         return None
     is_known = isinstance(record, dict) and type(record.get("step")) is int

@@ -86,18 +86,18 @@ def _read_display(path: Path) -> Picture:
 
 
 def _read_exr(path: Path) -> Picture:
-    from unmix_plugin.captures.readers.exr import open_exr
+    from unmix_plugin.captures.readers.exr import channel_names
+    from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.captures.spectral_file import ReadOptions
 
-    everything = (slice(None), slice(None))
-    file = open_exr(path, ReadOptions())
-    numbers = np.array(file.read_part(*everything), dtype=np.float32, order="C")
+    channels = channel_names(path)  # refuses other files
+    numbers = open_spectral_file(path).read().astype(np.float32)
     if numbers.shape[2] < 3:
         raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
-    if "A" not in file.metadata.get("other_channels", []):
+    if "A" not in channels:
         return Picture(numbers, None)
-    alpha = open_exr(path, ReadOptions(dataset="A")).read_part(*everything)
-    return Picture(numbers, np.asarray(alpha, dtype=np.float32)[..., 0].clip(0, 1))
+    alpha = open_spectral_file(path, ReadOptions(dataset="A")).read()
+    return Picture(numbers, alpha[..., 0].astype(np.float32).clip(0, 1))
 
 
 def _read_npy(path: Path, value_scale: float | None) -> Picture:

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from unmix_plugin.errors import SceneError, SpectrumError, counted
+from unmix_plugin.errors import CaptureError, SceneError, SpectrumError, counted
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.limits import MOST_TABLE_BYTES, allow_decoded, read_bounded
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -63,17 +63,21 @@ def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: floa
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    import OpenEXR
+    from unmix_plugin.captures.readers.exr import channel_names
+    from unmix_plugin.captures.readers.opening import open_spectral_file
+    from unmix_plugin.captures.spectral_file import ReadOptions
 
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:
-        raise SceneError(f"{path}: can't be read as OpenEXR; copy or export it again") from error
-    names = next((names for names in (("R", "G", "B"), ("Y", "Y", "Y")) if set(names) <= set(channels)), None)
-    if names is None:
-        raise SceneError(f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B")
-    return np.stack([channels[name].astype(np.float32) for name in names], axis=-1)
+        channels = channel_names(path)
+        names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
+        if names is None:
+            raise SceneError(
+                f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B"
+            )
+        planes = [open_spectral_file(path, ReadOptions(dataset=name)).read()[..., 0] for name in names]
+    except CaptureError as error:
+        raise SceneError(str(error)) from error
+    return np.stack(3 // len(planes) * planes, axis=-1).astype(np.float32)
 
 
 def _check_environment(path: Path, image: np.ndarray) -> None:
@@ -133,7 +137,7 @@ def _header(path: Path, data: bytes) -> tuple[int, int, int]:
         raise SceneError(f"{path}: holds XYZ colours; convert it to RGB")
     if (match[1], match[3]) != (b"-Y", b"+X"):
         raise SceneError(
-            f"{path}: has its rows in the order {match[0].decode().strip()!r}, not -Y +X; convert it"
+            f"{path}: has its rows in the order {match[0].strip()[:80]!r}, not -Y +X; convert it"
         )
     return int(match[2]), int(match[4]), match.end()
 
@@ -255,15 +259,13 @@ def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -
 
 def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
     """Channels that are wavelengths, at the bands; None where there are none."""
-    from unmix_plugin.captures.readers.exr import open_exr
-    from unmix_plugin.captures.spectral_file import ReadOptions
-    from unmix_plugin.errors import CaptureError
+    from unmix_plugin.captures.readers.opening import open_spectral_file
 
     try:
-        file = open_exr(path, ReadOptions())
+        file = open_spectral_file(path)
         if file.bands.wavelengths_nm is None:
             return None
-        values = np.asarray(file.read_part(slice(None), slice(None)), dtype=np.float64)
+        values = file.read().astype(np.float64)
     except CaptureError as error:
         raise SceneError(str(error)) from error
     order = np.argsort(file.bands.wavelengths_nm)

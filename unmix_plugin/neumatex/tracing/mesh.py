@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -20,12 +20,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.limits import (
+    MOST_TABLE_BYTES,
+    MOST_TEXT_BYTES,
+    open_regular,
+    parse_json,
+    read_bounded,
+    refuse,
+)
 from unmix_plugin.scenes.placement import METRES_RANGE
+from unmix_plugin.scenes.reading.faults import find_named
 
 MAX_TRIANGLES = 5_000_000
 """More are refused: the tree over them and the memory of a training would not fit common machines."""
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 """Formats that are read."""
+_FAR = 1e9
+"""Positions, texture coordinates and normals beyond it are damage, as positions of cameras are."""
 _SMALLEST_FACE = 1e-14
 """Part of the squared bounding box diagonal; triangles of less area are dropped, since they have no normal."""
 
@@ -93,6 +104,7 @@ def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
     return torch.where(lengths > 1e-30, sums / lengths.clamp(min=1e-30), upwards).float()
 
 
+@np.errstate(all="ignore")  # what is not finite is refused by name
 def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     """The triangles of a file in units of the world, all objects of its scene graph in one mesh.
 
@@ -105,7 +117,7 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
         SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
             are not finite, or too many triangles.
     """
-    vertices, faces, normals, uv = _joined([_placed(*part) for part in _parts(path)])
+    vertices, faces, normals, uv = _joined([_placed(path, *part) for part in _parts(path)])
     _check(path, vertices, faces)
     faces = _with_area(path, vertices, faces)
     notes = [] if notes is None else notes
@@ -123,6 +135,21 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     )
 
 
+@dataclass(frozen=True)
+class _Beside:
+    """Files that a mesh names: those of its own folder, which are read with the same care."""
+
+    folder: Path
+
+    def __getitem__(self, name: str) -> bytes:
+        found = find_named(self.folder, name)
+        if found is None:
+            raise FileNotFoundError(f"there is no file {name[:80]!r} in {self.folder}")
+        return read_bounded(found, MOST_TABLE_BYTES)
+
+    get = __getitem__
+
+
 def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     """The meshes of a file's scene graph, each with its 4 x 4 transform to the world."""
     import trimesh
@@ -133,8 +160,11 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
         raise SceneError(
             f"{path}: is not a mesh format that is read here; convert it to one of {', '.join(MESH_SUFFIXES)}"
         )
+    if path.suffix.lower() in (".glb", ".gltf"):
+        _allow_numbers(path)
     try:
-        scene = trimesh.load_scene(path, process=False, maintain_order=True)
+        beside = cast("Any", _Beside(path.parent))
+        scene = trimesh.load_scene(path, resolver=beside, process=False, maintain_order=True)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
@@ -145,7 +175,38 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
     if not parts:
         raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
+    _allow_triangles(path, sum(len(mesh.faces) for mesh, _ in parts))  # which may be the same mesh many times
     return parts
+
+
+def _allow_numbers(path: Path) -> None:
+    """Ask glTF before it is decoded how many numbers it has without any bytes in the file: they would be zeros."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(20)
+            is_binary = head.startswith(b"glTF")
+            text = (
+                file.read(int.from_bytes(head[12:16], "little"))
+                if is_binary
+                else head + file.read(MOST_TEXT_BYTES)
+            )
+        content = parse_json(text.decode("utf-8-sig"))
+        zeros = sum(
+            int(one.get("count", 0)) for one in content.get("accessors", ()) if "bufferView" not in one
+        )
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        raise SceneError(
+            f"{path}: can't be read as a mesh ({type(error).__name__}); export it again"
+        ) from error
+    if zeros > MAX_TRIANGLES:
+        refuse(path, f"{zeros:,} numbers that are not in the file", f"at most {MAX_TRIANGLES:,}", SceneError)
+
+
+def _allow_triangles(path: Path, number: int) -> None:
+    if number > MAX_TRIANGLES:
+        raise SceneError(
+            f"{path}: has {number:,} triangles, at most {MAX_TRIANGLES:,} are read; decimate the mesh"
+        )
 
 
 def _without_metres(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
@@ -156,16 +217,21 @@ def _without_metres(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndar
     return np.diag([1 / metres] * 3 + [1.0]) @ transform
 
 
-def _placed(loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
+def _placed(path: Path, loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
     """Positions, triangles, and normals and texture coordinates if the file has them, in the world."""
-    linear = transform[:3, :3]
-    vertices = np.asarray(loaded.vertices, dtype=np.float64) @ linear.T + transform[:3, 3]
+    linear, vertices = transform[:3, :3], np.asarray(loaded.vertices, dtype=np.float64)
+    if vertices.shape[1:] != (3,) or not np.isfinite(transform).all():
+        raise SceneError(
+            f"{path}: positions of shape {vertices.shape}, moved by {transform.tolist()}; expected 3 finite numbers "
+            "each: export the mesh again"
+        )
+    vertices = vertices @ linear.T + transform[:3, 3]
     faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     normals = _file_normals(loaded)
     if normals is not None:
         normals = normals @ np.linalg.pinv(linear)
-    uv = getattr(loaded.visual, "uv", None)
-    uv = None if uv is None or len(uv) != len(vertices) else np.asarray(uv)
+    uv: Any = getattr(loaded.visual, "uv", None)
+    uv = None if np.shape(uv) != (len(vertices), 2) or not (np.abs(uv) < _FAR).all() else np.asarray(uv)
     return vertices, faces[:, ::-1] if np.linalg.det(linear) < 0 else faces, normals, uv
 
 
@@ -188,16 +254,16 @@ def _joined(
 def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     if not len(faces):
         raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
-    if len(faces) > MAX_TRIANGLES:
-        raise SceneError(
-            f"{path}: has {len(faces):,} triangles, at most {MAX_TRIANGLES:,} are read; decimate the mesh"
-        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneError(f"{path}: a triangle names vertex {faces.max()} of {len(vertices)}; export it again")
-    finite = np.isfinite(vertices.sum(axis=1))
-    if not finite[faces].all():
-        index = int(np.flatnonzero(~finite)[0])
-        raise SceneError(f"{path}: the position of vertex {index} is not finite: {vertices[index].tolist()}")
+    sound = np.all(np.abs(vertices) < _FAR, axis=1)  # false for NaN
+    if not sound[faces].all():
+        index, found = int(np.flatnonzero(~sound)[0]), vertices[~sound][0].tolist()
+        raise SceneError(
+            f"{path}: the position of vertex {index} is not finite, or too far away: {found}; expected numbers below "
+            f"{_FAR:g}: export the mesh again"
+        )
+    vertices[~sound] = vertices[faces[0, 0]]  # those of no triangle
 
 
 def _with_area(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -217,8 +283,8 @@ def _file_normals(loaded: Any) -> np.ndarray | None:
     if "vertex_normals" not in loaded._cache.cache:
         return None
     normals = np.array(loaded.vertex_normals, dtype=np.float64)
-    usable = np.isfinite(normals).all() and (np.linalg.norm(normals, axis=1) > 1e-6).all()
-    return normals if usable else None
+    lengths = np.linalg.norm(normals, axis=1) if normals.shape == np.shape(loaded.vertices) else np.zeros(1)
+    return normals if ((lengths > 1e-6) & (lengths < _FAR)).all() else None
 
 
 def _is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:

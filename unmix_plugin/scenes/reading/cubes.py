@@ -156,7 +156,9 @@ def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: Invalid
         raw = cube[first : first + rows]
         if is_in_file_order:
             digest.update(raw.view(np.uint8).data)
-        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite and is counted as such
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # beyond float32 is infinite; both are counted as such
             compared = raw if cube.dtype.kind in "iu" else np.asarray(raw, dtype=np.float32)
             low, high = np.float32(compared.min()), np.float32(compared.max())
             if low >= 0.0 and high <= scale:  # false with any NaN; most blocks of a sound scene end here
@@ -227,7 +229,7 @@ def read_invalid(
 def _read_scaled(
     path: Path, value_scale: float | None, part: tuple[slice | np.ndarray, ...] = ()
 ) -> Float32[np.ndarray, "*pixels B"]:
-    with np.errstate(over="ignore"):  # a float64 beyond float32 is infinite, hence invalid
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, hence invalid as NaN is
         values = np.array(map_array(path)[part], dtype=np.float32, order="C")
     return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
 

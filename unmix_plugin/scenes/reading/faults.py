@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from unmix_plugin.errors import SceneError, name_some
-from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
 
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
@@ -71,13 +71,15 @@ def read_json_file(path: Path) -> Any:
         raise UnreadableJsonError("is empty; expected JSON")
     try:
         is_utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        content = json.loads(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
+        content = parse_json(data.decode("utf-16" if is_utf16 else "utf-8-sig"))
         json.dumps(content, ensure_ascii=False).encode()  # fails on lone surrogates, which no name can hold
     except json.JSONDecodeError as error:
         at = f"line {error.lineno}, column {error.colno}"
         raise UnreadableJsonError(f"is not valid JSON ({error.msg} at {at}); was it cut short?") from error
-    except (ValueError, RecursionError) as error:  # no UTF-8, surrogates, numbers of thousands of digits
+    except (UnicodeError, RecursionError) as error:
         raise UnreadableJsonError(f"is not readable as JSON ({type(error).__name__})") from error
+    except ValueError as error:  # far too many values, numbers of thousands of digits
+        raise UnreadableJsonError(f"is not readable as JSON ({str(error).partition(';')[0]})") from error
     return content
 
 
@@ -100,6 +102,8 @@ def read_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
+_MOST_FOLDERS = 64
+"""In a path; each is where it may go on in another folder."""
 _DRIVE = re.compile(r"[A-Za-z]:/")
 
 
@@ -114,6 +118,8 @@ def find_named(root: Path, text: str, least_parts: int = 1) -> Path | None:
     """
     path = text.replace("\\", "/").removeprefix("file://")
     parts = [part for part in path.split("/") if part not in ("", ".")]
+    if len(parts) > _MOST_FOLDERS:
+        return None
     is_absolute = path.startswith("/") or _DRIVE.match(path) is not None
     tails = [parts[start:] for start in range(1, len(parts) - least_parts + 1)] if is_absolute else []
     candidates = [parts, *tails]

@@ -36,7 +36,7 @@ _FILE_KEYS += ("abundance_file_path", "responses_path")
 _SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-_GREATEST_PX = 1e9
+GREATEST_PX = 1e9
 """Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
 _SMALLEST_ANGLE = 1e-6
 """Field of view in radians that is still one, and how much less than pi it must be."""
@@ -123,19 +123,19 @@ def read_lens(
         source = own if key in own else common
         value = source.get(key)
         number, owner = read_number(value), FILE_NAME if source is common else where
-        if value is not None and (number is None or abs(number) > _GREATEST_PX):
+        if value is not None and (number is None or abs(number) > GREATEST_PX):
             faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
         elif number is not None and (not low <= number <= high or (is_whole and number != int(number))):
             faults.add(owner, f"'{key}' is {number:g}; expected {expected}")
         return number
 
-    sides = [read(key, 1.0, _GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
+    sides = [read(key, 1.0, GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
     focal_px, angles, center_px = (
         (read(f"{key}x", low, high, expected), read(f"{key}y", low, high, expected))
         for key, low, high, expected in (
-            ("fl_", 1 / _GREATEST_PX, _GREATEST_PX, "a focal length above 0 in pixels"),
+            ("fl_", 1 / GREATEST_PX, GREATEST_PX, "a focal length above 0 in pixels"),
             ("camera_angle_", _SMALLEST_ANGLE, math.pi - _SMALLEST_ANGLE, "radians between 0 and pi"),
-            ("c", -_GREATEST_PX, _GREATEST_PX, _A_NUMBER),
+            ("c", -GREATEST_PX, GREATEST_PX, _A_NUMBER),
         )
     )
     fields = [read(key, 1e-4, 180 - 1e-4, "degrees between 0 and 180") for key in ("x_fov", "y_fov")]
@@ -143,11 +143,11 @@ def read_lens(
         angle if angle is not None or field is None else math.radians(field)
         for angle, field in zip(angles, fields, strict=True)
     )
-    bending = [read(key, -_GREATEST_PX, _GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
+    bending = [read(key, -GREATEST_PX, GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
     listed = own.get("distortion_params", common.get("distortion_params"))
     if listed is not None:
         bending = [read_number(value) for value in listed] if isinstance(listed, list) else []
-        are_sound = all(number is not None and abs(number) <= _GREATEST_PX for number in bending)
+        are_sound = all(number is not None and abs(number) <= GREATEST_PX for number in bending)
         if len(bending) != len(_BENDING_KEYS) or not are_sound:
             names = ", ".join(_BENDING_KEYS)
             faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")

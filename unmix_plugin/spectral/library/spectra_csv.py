@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+from array import array
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.engine.runs.atomic_files import write_file
-from unmix_plugin.errors import SpectrumError
-from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.errors import SpectrumError, name_some
+from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import Bands, require_nanometres
+
+_MOST_BYTES = 1 << 26
+"""Of a table; two thousand spectra in as many bands have 40 MB."""
 
 TOLERANCE_NM = 1e-3
 """What tables lose of wavelengths by rounding them: centres that differ by no more are the same, and a reach beyond the
@@ -112,11 +116,27 @@ def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]
     Raises:
         SpectrumError: missing, unreadable or empty; a row of another length; a value that is not a number.
     """
-    header, rows = _read_rows(path)
-    values = np.array([_parse_row(row, line, header) for line, row in rows], dtype=np.float64)
-    if len(values) == 0:
+    header, values = [], array("d")  # a value takes 8 bytes so, and 60 as a text
+    try:
+        with io.TextIOWrapper(io.BytesIO(read_bounded(path, _MOST_BYTES)), "utf-8-sig", newline="") as file:
+            reader = csv.reader(file)
+            for row in reader:
+                if any(cell.strip() for cell in row):
+                    if header:
+                        values.extend(_parse_row(row, reader.line_num, header))
+                    else:
+                        header = [cell.strip() for cell in row]
+    except OSError as error:
+        raise SpectrumError(f"can't read spectra: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise SpectrumError(f"not a CSV file in UTF-8: {error}") from error
+    if not header:
+        raise SpectrumError(
+            "the file is empty; expected a header 'wavelength,name,...' and one row a wavelength"
+        )
+    if not values:
         raise SpectrumError("there is a header but no row of values")
-    return header, values
+    return header, np.frombuffer(values).reshape(-1, len(header))
 
 
 def write_spectra_csv(path: Path, table: SpectraTable) -> None:
@@ -131,25 +151,6 @@ def write_spectra_csv(path: Path, table: SpectraTable) -> None:
     for wavelength_nm, values in zip(table.bands.centers_nm, table.spectra.T, strict=True):
         writer.writerow([f"{value:.9g}" for value in (wavelength_nm, *values)])
     write_file(path, text.getvalue().encode())
-
-
-def _read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Header, and each row with its line number; blank lines left out."""
-    try:
-        with io.TextIOWrapper(
-            io.BytesIO(read_bounded(path, MOST_TABLE_BYTES)), "utf-8-sig", newline=""
-        ) as file:
-            reader = csv.reader(file)
-            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except OSError as error:
-        raise SpectrumError(f"can't read spectra: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise SpectrumError(f"not a CSV file in UTF-8: {error}") from error
-    if not rows:
-        raise SpectrumError(
-            "the file is empty; expected a header 'wavelength,name,...' and one row a wavelength"
-        )
-    return [cell.strip() for cell in rows[0][1]], rows[1:]
 
 
 def _parse_row(row: list[str], line: int, header: list[str]) -> list[float]:
@@ -175,7 +176,7 @@ def is_number(cell: str) -> bool:
 
 def _validate_names(names: tuple[str, ...]) -> None:
     if not names or not all(name.strip() for name in names):
-        raise SpectrumError(f"each spectrum needs a name; found {list(names)}")
+        raise SpectrumError(f"each spectrum needs a name; found {name_some(names, 8)}")
     repeated = [name for name, count in Counter(names).items() if count > 1]
     if repeated:
         raise SpectrumError(
