@@ -1,5 +1,7 @@
 """What the field guarantees at every point."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -16,8 +18,6 @@ PIXELS = (0.02, 0.01, 0.006, 0.0045, 0.003, 0.001)
 def make_field(
     num_specular: int = 2, scale: str = "shared", temperature: float = 1.0, **settings
 ) -> UnmixField:
-    from dataclasses import replace
-
     torch.manual_seed(0)
     config = replace(CONFIG.field, scale=scale, temperature=temperature)
     field = UnmixField(config, BOX, 3, num_specular, initial_density=2.0, pixel_size=0.087, **settings)
@@ -56,20 +56,9 @@ def test_a_lower_temperature_makes_purer_abundances():
     assert hard > soft + 0.1
 
 
-def test_only_the_specular_part_depends_on_direction():
-    field = make_field()
-    positions = torch.rand(20, 3) * 2 - 1
-    _, features = field.get_density(positions)
-    up, down = (
-        field.get_outputs(positions, torch.tensor([[0.0, 0.0, z]]).repeat(20, 1), features) for z in (1, -1)
-    )
-    assert_close(up["scaled_abundances"], down["scaled_abundances"])
-    assert (up["specular_coefficients"] - down["specular_coefficients"]).abs().max() > 1e-3
-    assert (up["specular_coefficients"] > 0).all()
-
-
-def test_where_the_light_moves_shading_depends_on_direction_and_abundances_do_not():
-    field = make_field(lit_by_camera=True)
+@pytest.mark.parametrize("lit_by_camera", [False, True])
+def test_only_the_specular_part_depends_on_direction_and_shading_where_the_light_moves(lit_by_camera):
+    field = make_field(lit_by_camera=lit_by_camera)
     positions = torch.rand(20, 3) * 2 - 1
     _, features = field.get_density(positions)
     up, down = (
@@ -77,7 +66,10 @@ def test_where_the_light_moves_shading_depends_on_direction_and_abundances_do_no
     )
     assert_close(up["abundances"], down["abundances"])
     assert_close(up["abundances"], field.abundances_of(features))
-    assert (up["scaled_abundances"] - down["scaled_abundances"]).abs().max() > 1e-3
+    assert ((up["scaled_abundances"] - down["scaled_abundances"]).abs().max() > 1e-3) == lit_by_camera
+    assert (up["specular_coefficients"] - down["specular_coefficients"]).abs().max() > 1e-3
+    assert (up["specular_coefficients"] > 0).all()
+    assert evaluate(make_field(num_specular=0))[1]["specular_coefficients"].shape == (50, 0)
 
 
 def test_the_view_dependent_part_of_a_dark_scene_starts_as_much_darker():
@@ -103,10 +95,6 @@ def test_a_lamp_can_be_so_bright_that_a_small_part_of_a_pixel_saturates_it():
     assert_close(brightness, torch.full((1, 2), 4.0), atol=0.1, rtol=0)
 
 
-def test_without_a_specular_part_there_are_no_coefficients():
-    assert evaluate(make_field(num_specular=0))[1]["specular_coefficients"].shape == (50, 0)
-
-
 def test_a_point_that_grew_too_dense_can_still_be_thinned():
     field = make_field()
     field.log_initial_density = 40.0
@@ -125,29 +113,19 @@ def test_direction_features_are_orthogonal_over_the_sphere():
     assert features.mean(0).abs().max() < 0.02
 
 
-def test_the_finest_level_follows_the_size_of_a_pixel():
+def test_levels_have_more_rows_where_a_scene_is_many_pixels_large_unless_their_number_is_set():
+    def rows(config):
+        return [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
+
+    sizes = rows(UnmixFieldConfig())
+    assert (sizes[0], sizes[-1]) == (16, 19)
+    assert sizes == sorted(sizes)
+    assert len(set(sizes)) == 4
+    assert set(rows(UnmixFieldConfig(log2_rows_per_level=12))) == {12}
     sharp, blurred = (
         _cells_of_finest_level(UnmixFieldConfig(cells_per_pixel=2.0), BOX, size) for size in (0.01, 0.04)
     )
     assert (sharp, blurred) == (400, 100)
-
-
-def test_levels_have_more_rows_where_a_scene_is_many_pixels_large():
-    config = UnmixFieldConfig()
-    sizes = [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
-    assert sizes[0] == 16
-    assert sizes[-1] == 19
-    assert sizes == sorted(sizes)
-    assert len(set(sizes)) == 4
-
-
-def test_an_asked_for_number_of_rows_is_kept_whatever_the_scene():
-    config = UnmixFieldConfig(log2_rows_per_level=12)
-    found = [_rows_of_level(config, _cells_of_finest_level(config, BOX, pixel)) for pixel in PIXELS]
-    assert set(found) == {12}
-
-
-@pytest.mark.parametrize("rows", [3, 25])
-def test_impossible_numbers_of_rows_are_refused(rows):
-    with pytest.raises(ConfigError, match="log2-rows-per-level of 4 to 24 or auto"):
-        UnmixFieldConfig(log2_rows_per_level=rows)
+    for number in (3, 25):
+        with pytest.raises(ConfigError, match="log2-rows-per-level of 4 to 24 or auto"):
+            UnmixFieldConfig(log2_rows_per_level=number)

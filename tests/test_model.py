@@ -6,13 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import (
-    CAMERA,
-    CONFIG,
-    NUM_BANDS,
-    make_model,
-    make_rays,
-)
+from tests.method_factory import CAMERA, CONFIG, NUM_BANDS, make_model, make_rays
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.operators.compositing import volume_weights_twin
@@ -48,18 +42,16 @@ def test_deferred_composition_equals_compositing_a_spectrum_a_sample(specular, s
         assert_close(spectra, naive_spectra(model, rays), rtol=1e-5, atol=1e-6)
 
 
-def test_where_no_alpha_is_known_highlights_may_have_the_colours_of_all_materials():
+def test_highlights_have_the_lights_colour_and_where_no_alpha_is_known_those_of_all_materials():
     lamp = [0.2, 0.4, 0.6, 0.8, 1.0]
     alone, coloured = (make_model(has_alpha=has_alpha, light=lamp) for has_alpha in (True, False))
     assert_close(alone.specular_spectra.detach(), torch.tensor([lamp]))
     assert_close(coloured.specular_spectra[0].detach(), torch.tensor(lamp))
     assert_close(coloured.specular_spectra[1:].detach(), coloured.endmembers.detach())
-
-
-def test_a_model_without_spectra_to_learn_still_compiles_its_kernels():
-    model = make_model(specular="none", train_endmembers=False)
-    assert model.get_param_groups()["spectra"] == []
-    model.warm_up()
+    assert_close(make_model(light=None).specular_spectra[0].detach(), torch.ones(NUM_BANDS))
+    bare = make_model(specular="none", train_endmembers=False)
+    assert bare.get_param_groups()["spectra"] == []
+    bare.warm_up()  # compiles kernels without spectra to learn
 
 
 def test_samples_without_weight_change_little_when_left_out():
@@ -89,12 +81,6 @@ def test_normals_point_out_of_a_density_that_grows_inwards():
     normals = model.renderer.normals(model.field, rays, torch.full((11,), 2.5))
     outward = rays.origins + 2.5 * rays.directions - centre
     assert_close(normals, torch.nn.functional.normalize(outward, dim=-1), atol=1e-5, rtol=0)
-
-
-def test_the_first_specular_spectrum_is_the_light():
-    light = [0.5, 0.6, 0.7, 0.8, 1.0]
-    assert_close(make_model(light=light).specular_spectra[0].detach(), torch.tensor(light))
-    assert_close(make_model(light=None).specular_spectra[0].detach(), torch.ones(NUM_BANDS))
 
 
 def test_spectra_stay_physical_after_an_update():

@@ -5,13 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import (
-    NUM_BANDS,
-    WAVELENGTHS_NM,
-    initial_data,
-    make_model,
-    make_rays,
-)
+from tests.method_factory import NUM_BANDS, WAVELENGTHS_NM, initial_data, make_model, make_rays
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.settings import LossConfig, UnmixModelConfig
 
@@ -59,6 +53,7 @@ def test_more_endmembers_than_bands_or_distinct_pixels_are_refused():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"num_endmembers": "auto"}, "num-endmembers is auto"),
         ({"num_endmembers": 0}, r"num-endmembers of 1 to 255 or auto \(got 0\)$"),
         ({"endmember_init": "file"}, r"is file \(got endmember-init file, endmember-file none\)$"),
         ({"initial_opacity": 1.0}, r"initial-opacity in \(0, 1\) or auto"),
@@ -83,24 +78,6 @@ def test_without_a_number_there_are_six_endmembers_or_as_many_as_bands(num_bands
     assert ("num-endmembers is 3" in reasons) == (num_bands == 3)
 
 
-def test_settings_without_auto_read_no_data():
-    def unread():
-        raise AssertionError
-
-    config = UnmixModelConfig(
-        num_endmembers=4,
-        light="fixed",
-        poses="fixed",
-        losses=LossConfig(exposure=1.0, band_weights=(), relative=0.0),
-    )
-    assert config.resolve_auto(unread, torch.Generator()) == (config, "")
-
-
-def test_no_model_is_made_before_its_number_of_endmembers_is_resolved():
-    with pytest.raises(ConfigError, match="num-endmembers is auto"):
-        make_model(num_endmembers="auto")
-
-
 def test_given_endmembers_get_the_brightness_of_the_scene(tmp_path):
     """The pixels are materials of the file at 1.9 times its brightness: amounts above 1 would be needed."""
     shapes = np.eye(3, NUM_BANDS, dtype=np.float32) * 0.6 + 0.1
@@ -119,24 +96,22 @@ def test_given_endmembers_get_the_brightness_of_the_scene(tmp_path):
     assert_close(model.endmembers.detach(), torch.from_numpy(1.4 / 0.75 * shapes), rtol=0.02, atol=0)
 
 
-def test_the_light_and_the_exposure_follow_from_the_data():
-    dark = {**initial_data(), "light": np.array("camera")}
-    dark["exposure"] = np.array(7.3456)
-    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: dark, torch.Generator())
-    assert config.light == "camera"
-    assert config.losses.exposure == 7.346
+def test_light_exposure_and_relative_errors_follow_from_the_data_unless_they_are_set():
+    def resolved(**data):
+        given = {**initial_data(), **{name: np.array(value) for name, value in data.items()}}
+        return UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: given, torch.Generator())
+
+    config, reasons = resolved()
+    assert (config.light, config.losses.exposure, config.losses.relative, reasons) == ("fixed", 1.0, 0.0, "")
+    config, reasons = resolved(light="camera", exposure=7.3456, relative=1.5)
+    assert (config.light, config.losses.exposure, config.losses.relative) == ("camera", 7.346, 1.5)
     assert "the scene is dark" in reasons
     assert "the light moves with the camera" in reasons
-
-
-def test_a_bright_scene_in_a_fixed_light_is_left_as_it_is():
-    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(initial_data, torch.Generator())
-    assert (config.light, config.losses.exposure, reasons) == ("fixed", 1.0, "")
-    assert config.losses.relative == 0.0
-
-
-def test_errors_count_relatively_where_part_of_the_scene_is_much_brighter_than_the_rest():
-    uneven = {**initial_data(), "relative": np.array(1.5)}
-    config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: uneven, torch.Generator())
-    assert config.losses.relative == 1.5
     assert "squared errors are divided by the brightness to the power of 1.5 (relative)" in reasons
+
+    def unread():
+        raise AssertionError
+
+    losses = LossConfig(exposure=1.0, band_weights=(), relative=0.0)
+    config = UnmixModelConfig(num_endmembers=4, light="fixed", poses="fixed", losses=losses)
+    assert config.resolve_auto(unread, torch.Generator()) == (config, "")

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands.running import SMALL_METHOD, Ended, run
+from tests.commands.running import SMALL_METHOD, Ended, done, run_of
+from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.train import train
+from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
 
@@ -25,9 +27,8 @@ def small_run(folder: Path, *words: str) -> Trained:
     """Make the scene and train on it, with further words."""
     make_demo_scene(folder / "scene", 16, 8, 8)
     given = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 20]
-    ended = run(train, "unmix-nerf", *given, *SMALL_METHOD, *words)
-    assert ended.status == 0, ended.err
-    return Trained(Path(ended.last_line.removeprefix("run: ")), folder / "scene", folder / "outputs", ended)
+    ended = done(train, "unmix-nerf", *given, *SMALL_METHOD, *words)
+    return Trained(run_of(ended), folder / "scene", folder / "outputs", ended)
 
 
 @pytest.fixture(scope="session")
@@ -48,3 +49,39 @@ def solid(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 def run_copy(trained: Trained, tmp_path: Path) -> Path:
     """A copy of the trained run that a test may damage."""
     return Path(shutil.copytree(trained.run, tmp_path / "copy" / "demo" / "unmix-nerf" / trained.run.name))
+
+
+EXPORT_WORDS = {
+    "cubes": ["--formats", "envi", "exr", "npy"],
+    "mesh": ["--formats", "ply", "obj", "glb", "--resolution", 24],
+    "page": ["--resolution", 24, "--title", "pots </script><b>"],
+    "point-cloud": ["--num-points", 500],
+    "splats": ["--resolution", 24],
+    "report": ["--max-views", 1],
+    "spectrum": ["--view", "eval_002", "--pixel", "8,8"],
+    "volume": ["--resolution", 8],
+}
+
+
+PRODUCT_NAMES = [product.name for product in PRODUCTS if isinstance(product, RunProduct)]
+
+
+def export_words(name, *more):
+    return [name, *EXPORT_WORDS.get(name, []), "--device", "cpu", *more]
+
+
+@pytest.fixture
+def solid_copy(solid, tmp_path):
+    """A copy of the run that a test may damage."""
+    return Path(shutil.copytree(solid.run, tmp_path / "copy" / solid.run.name))
+
+
+@pytest.fixture(scope="session")
+def exported(solid, tmp_path_factory):
+    """A folder of every product."""
+    root = tmp_path_factory.mktemp("exported")
+    said = {}
+    for name in PRODUCT_NAMES:
+        ended = done(export, *export_words(name, "--run", solid.run, "--output", root / name))
+        said[name] = ended.out
+    return root, said

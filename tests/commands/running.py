@@ -48,6 +48,25 @@ def run(command: Callable[[list[str]], object], *words: object, out: io.StringIO
     return Ended(status, out.getvalue(), err.getvalue())
 
 
+def done(command: Callable[[list[str]], object], *words: object) -> Ended:
+    """Run a command that must succeed."""
+    ended = run(command, *words)
+    assert ended.status == 0, ended.err
+    return ended
+
+
+def refused(command: Callable[[list[str]], object], *words: object) -> str:
+    """The message, in one line, of a command that must refuse its words."""
+    ended = run(command, *words)
+    assert (ended.status, "Traceback" in ended.err) == (2, False), ended.err
+    return " ".join(ended.err.split())
+
+
+def run_of(ended: Ended) -> Path:
+    """The run folder that training named last."""
+    return Path(ended.last_line.removeprefix("run: "))
+
+
 def picture_size(path: Path) -> tuple[int, int]:
     """Width and height of a picture that can be decoded to its end."""
     with Image.open(path) as picture:

@@ -25,12 +25,7 @@ def ended(work: str, folder: Path, before: str = "", **environment: str) -> subp
     )
     kept = {name: value for name, value in {**os.environ, **environment}.items() if value}
     return subprocess.run(
-        [sys.executable, "-c", code],
-        env=kept,
-        cwd=folder,
-        capture_output=True,
-        encoding="utf-8",
-        check=False,
+        [sys.executable, "-c", code], env=kept, cwd=folder, capture_output=True, encoding="utf-8", check=False
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.commands.running import SMALL_METHOD, run
+from tests.commands.running import SMALL_METHOD, done
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
@@ -22,14 +22,12 @@ def rig_run(tmp_path_factory):
     folder.edit(lambda content: content.update(train_filenames=names[1:4] + names[5:]))
     folder.edit(lambda content: content.update(test_filenames=[names[0], names[4]]))
     words = ["unmix-nerf", "--data", folder.root, "--output-dir", root / "outputs", *SMALL_METHOD]
-    ended = run(train, *words, "--max-num-iterations=30", "--endmembers=1", "--viewer.no-enabled")
-    assert ended.status == 0, ended.err
+    ended = done(train, *words, "--max-num-iterations=30", "--endmembers=1", "--viewer.no-enabled")
     return ended.last_line.removeprefix("run: ").strip()
 
 
 def test_figures_are_given_by_sensor(rig_run):
-    ended = run(evaluate, "--run", rig_run)
-    assert ended.status == 0, ended.err
+    done(evaluate, "--run", rig_run)
     metrics = json.loads((Path(rig_run) / "eval/metrics.json").read_text())
     assert list(metrics["per_sensor"]) == ["4-bands-20x16", "small"]
     whole, small = metrics["per_sensor"].values()
@@ -44,15 +42,11 @@ def test_figures_are_given_by_sensor(rig_run):
 
 
 def test_every_band_is_rendered_and_exported_from_every_view(rig_run, tmp_path):
-    ended = run(
-        render, "--run", rig_run, "--outputs", "spectral", "--formats", "npy", "--output", tmp_path / "r"
-    )
-    assert ended.status == 0, ended.err
+    done(render, "--run", rig_run, "--outputs", "spectral", "--formats", "npy", "--output", tmp_path / "r")
     shapes = {np.load(path).shape for path in (tmp_path / "r").rglob("*.npy")}
     assert shapes == {(16, 20, 4)}
     for product in ("cubes", "report", "spectrum"):
         words = ["--view", "view_4", "--pixel", "5,4"] if product == "spectrum" else []
-        ended = run(export, product, "--run", rig_run, *words)
-        assert ended.status == 0, (product, ended.err)
+        done(export, product, "--run", rig_run, *words)
     [cube] = Path(rig_run).glob("exports/cubes/view_4.hdr")
     assert "samples = 20" in cube.read_text()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.commands.running import run
+from tests.commands.running import done, refused, run
 from tests.formats.video_reading import read_video
 from unmix_plugin.commands.export import PRODUCTS, _write, export
 from unmix_plugin.commands.render import render
@@ -23,8 +23,7 @@ def test_a_video_and_stills_are_the_same_from_two_processes_even_of_an_odd_numbe
     found = {}
     for count in (1, 2):
         folder = tmp_path / str(count)
-        ended = run(render, *words, "--output", folder, "--num-devices", count)
-        assert ended.status == 0, ended.err
+        done(render, *words, "--output", folder, "--num-devices", count)
         found[count] = written(folder)
     assert found[1].keys() == found[2].keys()
     for name, content in found[1].items():
@@ -39,23 +38,15 @@ def test_a_video_and_stills_are_the_same_from_two_processes_even_of_an_odd_numbe
 def test_maps_are_the_same_from_two_processes_which_overwrite_nothing(trained, tmp_path):
     words = ["segmentation", "--run", trained.run, "--device", "cpu", "--output"]
     for count in (1, 2):
-        ended = run(export, *words, tmp_path / str(count), "--num-devices", count)
-        assert ended.status == 0, ended.err
+        done(export, *words, tmp_path / str(count), "--num-devices", count)
     before = written(tmp_path / "1")
     assert written(tmp_path / "2") == before
     assert run(export, *words, tmp_path / "1", "--num-devices", 2).status == 2
     assert written(tmp_path / "1") == before
 
 
-@pytest.mark.parametrize("command", [export, render])
-def test_no_process_at_all_is_refused(trained, command):
-    words = ["cubes"] if command is export else []
-    ended = run(command, *words, "--run", trained.run, "--num-devices", 0)
-    assert ended.status == 2
-    assert "num-devices" in ended.err
-
-
-def test_products_that_are_made_as_a_whole_refuse_several_processes():
+def test_no_process_at_all_and_several_for_what_is_made_as_a_whole_are_refused(trained):
+    assert "num-devices" in refused(render, "--run", trained.run, "--num-devices", 0)
     mesh = next(product for product in PRODUCTS if product.name == "mesh")
     with pytest.raises(ConfigError, match="mesh runs in one process"):
         _write(mesh, {}, Processes(1, 2))

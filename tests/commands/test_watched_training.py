@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from tests.commands.running import SMALL_METHOD, run
+from tests.commands.running import SMALL_METHOD, done, refused
 from tests.commands.watching import START_S, address, looking, started, visited
 from tests.systems import needs_posix
 from tests.viewer_page import Page
@@ -45,8 +45,7 @@ def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_pa
 
 
 def test_without_keep_open_the_process_ends_with_the_training(trained, tmp_path):
-    ended = run(train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
-    assert ended.status == 0
+    ended = done(train, *training_argv(trained, tmp_path, "--max-num-iterations", 3))
     assert "viewer: http://127.0.0.1:" in ended.out
     assert ended.last_line.startswith("run: ")
     assert not [thread for thread in threading.enumerate() if "viewer" in thread.name]
@@ -81,6 +80,8 @@ def test_the_viewer_stays_as_long_as_a_page_is_open_and_the_run_is_printed_last(
 
 def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
     def visit(printed):
+        with looking(address(printed)):  # a page that is loaded again
+            pass
         with looking(address(printed)) as page:
             page.wait_until(lambda: any(one.get("label") == "really stop" for one in page.controls.values()))
             page.set("really stop", True)
@@ -92,20 +93,7 @@ def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
     assert stopped.status == 130
     assert "go on with: unmix-train unmix-nerf --load-run" in stopped.err
     path = stopped.last_line.removeprefix("run: ")
-    resumed = run(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
-    assert resumed.status == 0
-
-
-def test_a_page_that_is_loaded_again_while_training_goes_on(trained, tmp_path):
-    def visit(printed):
-        for _ in range(3):
-            with looking(address(printed)):
-                pass
-        signal.raise_signal(signal.SIGINT)
-
-    ended = visited(visit, train, *training_argv(trained, tmp_path, "--max-seconds", "300"))
-    assert ended.status == 130
-    assert "Traceback" not in ended.out + ended.err
+    done(train, "unmix-nerf", "--load-run", path, "--max-num-iterations", 2)
 
 
 def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):
@@ -133,9 +121,8 @@ def test_words_of_the_viewer_are_no_settings_of_the_training(trained):
 
 
 def test_impossible_words_of_the_viewer_end_before_training(trained, tmp_path):
-    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.share", "2"))
-    assert ended.status == 2
-    assert "--viewer.share is a part" in ended.err
-    ended = run(train, *training_argv(trained, tmp_path / "out", "--viewer.host", "203.0.113.7"))
-    assert ended.status == 2
-    assert "can't listen" in ended.err
+    for words, said in (
+        (("--viewer.share", "2"), "--viewer.share is a part"),
+        (("--viewer.host", "203.0.113.7"), "can't listen"),
+    ):
+        assert said in refused(train, *training_argv(trained, tmp_path / "out", *words))

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from tests.method_factory import make_model, scene_of
+from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.editing import Recipe, edit_scene, recipe_from_yaml
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import UnmixField
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 LIGHT = [0.5, 0.7, 1.0, 0.9, 0.6]
 
-CAMERAS = Cameras(
-    camera_to_world=torch.tensor(
-        [
-            [[1.0, 0, 0, 0.2], [0, 1, 0, 0], [0, 0, 1, 4.0]],
-            [[0.0, 0, 1, 4.0], [0, 1, 0, 0.3], [-1, 0, 0, 0]],
-        ]
-    ),
-    focal_px=torch.full((2, 2), 20.0),
-    center_px=torch.tensor([[6.0, 5.0]] * 2),
-    distortion=torch.zeros(2, 4),
-    width=12,
-    height=10,
-)
+POSES = [np.eye(4), np.array([[0.0, 0, 1, 4.0], [0, 1, 0, 0.3], [-1, 0, 0, 0], [0, 0, 0, 1]])]
+POSES[0][:3, 3] = 0.2, 0.0, 4.0
+CAMERAS = cameras_at(POSES, 12, 10, 20.0)
 """Two views of the box, from the front and from the side."""
 
 OUTPUTS = ("spectral", "diffuse", "specular", "abundances", "accumulation", "rgb")

@@ -11,7 +11,6 @@ from torch.testing import assert_close
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
 from unmix_plugin.editing.edited_field import EditedField, MaterialState, _Appearance, appearance_of
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Coefficients
@@ -101,12 +100,6 @@ def test_edits_over_edits_are_one():
     assert_close(both.gloss, torch.tensor([[2.0, 1, 0.5], [0, 0, 2]]))
 
 
-def test_nothing_removed_costs_no_look_at_the_materials():
-    field = GivenField(MIXTURES)
-    field.abundances_of = None  # type: ignore[method-assign,assignment]
-    assert_close(EditedField(field, ALL, PLAIN).get_density(torch.zeros(5, 3))[0], torch.full((5,), 5.0))
-
-
 def seen_pixels(shading: list[float], share: float = 1.0) -> Coefficients:
     """Opaque pixels, all of endmember 0 and without gloss."""
     strengths = torch.tensor(shading)
@@ -124,18 +117,14 @@ def own_srgb(spectrum: torch.Tensor, bands) -> torch.Tensor:
     return linear_to_srgb(spectrum.double() @ rgb_matrix(bands, torch.float64))
 
 
-def test_a_spectrum_gets_the_colour_itself_where_the_picture_is_not_known_or_not_meant():
-    scene = lit_scene()
+@pytest.mark.parametrize(
+    ("index", "more", "seen"), [(0, "", None), (0, ", match: spectrum", [0.4] * 50), (1, "", [0.4] * 50)]
+)
+def test_a_spectrum_gets_the_colour_itself_where_the_picture_is_not_known_or_not_meant(index, more, seen):
+    edit = f"retint: {{endmember: {index}, colour: '#807040'{more}}}"
+    result = edited(lit_scene(), edit, seen=None if seen is None else seen_pixels(seen))
     asked = torch.tensor([0x80, 0x70, 0x40], dtype=torch.float64) / 255
-    for result in (
-        edited(scene, "retint: {endmember: 0, colour: '#807040'}"),
-        edited(
-            scene, "retint: {endmember: 0, colour: '#807040', match: spectrum}", seen=seen_pixels([0.4] * 50)
-        ),
-        edited(scene, "retint: {endmember: 1, colour: '#807040'}", seen=seen_pixels([0.4] * 50)),
-    ):
-        index = 1 if result.materials.endmembers[0].equal(scene.materials.endmembers[0]) else 0
-        assert_close(own_srgb(result.materials.endmembers[index], result.bands), asked, atol=1e-4, rtol=0)
+    assert_close(own_srgb(result.materials.endmembers[index], result.bands), asked, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
@@ -149,22 +138,14 @@ def test_pixels_get_the_colour_in_the_mean_where_the_picture_is_known(share):
 
 
 def test_highlights_count_in_the_mean_and_mixtures_hardly():
-    scene = lit_scene()
     pure, mixed = seen_pixels([0.6] * 30), seen_pixels([0.6] * 30, 0.55)
     pure.specular[:] = 0.1
     pixels = Coefficients.concatenate([pure, mixed])
-    result = edited(scene, "retint: {endmember: 0, colour: '#a09080'}", seen=pixels)
-    materials = result.materials
+    materials = edited(lit_scene(), "retint: {endmember: 0, colour: '#a09080'}", seen=pixels).materials
     asked = torch.tensor([0xA0, 0x90, 0x80]).double() / 255
-    shown = [
-        own_srgb(
-            part.scaled_abundances @ materials.endmembers + part.specular @ materials.specular_spectra,
-            result.bands,
-        )
-        for part in (pure, mixed)
-    ]
-    assert_close(shown[0][0], asked, atol=0.02, rtol=0)
-    assert (shown[1][0] - asked).abs().max() > 0.05
+    of_pure, of_mixed = (own_srgb(materials.spectra(part), materials.bands)[0] for part in (pure, mixed))
+    assert_close(of_pure, asked, atol=0.02, rtol=0)
+    assert (of_mixed - asked).abs().max() > 0.05
 
 
 def test_a_shaded_material_may_be_brighter_than_white_in_full_light_but_not_where_it_is_seen():
@@ -190,28 +171,19 @@ def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
     )  # all that the bound allows
 
 
-def test_endmembers_that_are_hardly_seen_have_no_appearance():
-    materials = lit_scene().materials
-    appearances = [
-        appearance_of(MaterialState.of(materials, None, seen_pixels([0.5] * count)), index)
-        for count, index in ((15, 0), (16, 0), (50, 2))
-    ]
-    assert [appearance is None for appearance in appearances] == [True, False, True]
-    assert appearance_of(MaterialState.of(materials, None, None), 0) is None
+@pytest.mark.parametrize(
+    ("count", "index", "is_seen"), [(15, 0, False), (16, 0, True), (50, 2, False), (None, 0, False)]
+)
+def test_endmembers_that_are_hardly_seen_have_no_appearance(count, index, is_seen):
+    seen = None if count is None else seen_pixels([0.5] * count)
+    state = MaterialState.of(lit_scene().materials, None, seen)
+    assert (appearance_of(state, index) is not None) is is_seen
 
 
 def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():
-    scene = lit_scene()
+    scene, wide = lit_scene(), CAMERAS.resized(96, 80)
     seen = sample_seen(scene)
     assert seen.abundances.shape == (2 * 12 * 10, 3)
-    wide = Cameras(
-        CAMERAS.camera_to_world,
-        CAMERAS.focal_px * 8,
-        CAMERAS.center_px * 8,
-        CAMERAS.distortion,
-        96,
-        80,
-    )
     views = tuple(RunView(f"wide_{view}", wide[view], "train") for view in range(2))
     coarse = sample_seen(replace(scene, views=views))
     assert coarse.abundances.shape == (2 * 32 * 26, 3)

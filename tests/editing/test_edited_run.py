@@ -8,8 +8,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.commands.running import SMALL_METHOD, done, run_of
 from tests.editing.scenes import lit_scene, tensors_of
 from tests.method_factory import make_model
+from unmix_plugin.commands.train import train
 from unmix_plugin.editing import Light, Recipe, Rename, Scale, edited_run
 from unmix_plugin.editing.apply import edit_scene, light_factors
 from unmix_plugin.editing.edited_run import load_edited_run, requested_recipe
@@ -23,16 +25,10 @@ from unmix_plugin.trained.open_run import load_run
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A run of one step."""
-    from tests.commands.running import SMALL_METHOD
-    from tests.commands.running import run as run_command
-    from unmix_plugin.commands.train import train
-
     folder = tmp_path_factory.mktemp("run")
     make_demo_scene(folder / "scene", 16, 8, 4)
     argv = ["--data", folder / "scene", "--output-dir", folder / "outputs", "--max-num-iterations", 1]
-    ended = run_command(train, "unmix-nerf", *argv, *SMALL_METHOD)
-    assert ended.status == 0, ended.err
-    return Path(ended.last_line.removeprefix("run: "))
+    return run_of(done(train, "unmix-nerf", *argv, *SMALL_METHOD))
 
 
 def write_recipe(folder: Path, text: str) -> Path:
@@ -71,16 +67,13 @@ def test_the_command_lines_light_overrides_the_recipes(tmp_path):
     assert requested_recipe(path, "D65") == Recipe((Scale(0, 2.0),), Light("D65"))
 
 
-def test_what_is_wrong_is_said_before_the_run_is_read(tmp_path):
+def test_what_is_wrong_is_said_before_the_run_is_read_and_what_does_not_fit_it_with_its_line(run, tmp_path):
     with pytest.raises(SpectrumError, match="there is no light 'moon'"):
         load_edited_run(tmp_path, "cpu", None, "moon")
     with pytest.raises(ConfigError, match=r"edits\.yml, line 1: a recipe has no 'edit'"):
         load_edited_run(tmp_path, "cpu", write_recipe(tmp_path, "edit: []"))
     with pytest.raises(RunError):
         load_edited_run(tmp_path, "cpu", None, "A")
-
-
-def test_a_recipe_that_does_not_fit_names_its_file_and_line(run, tmp_path):
     path = write_recipe(tmp_path, "edits:\n- remove: endmember_9\n")
     with pytest.raises(ConfigError, match=r"edits\.yml, line 2 \(remove\): .* did you mean endmember_"):
         load_edited_run(run, "cpu", path)
@@ -104,14 +97,3 @@ def test_a_scene_without_materials_is_refused(run, tmp_path, monkeypatch):
     for illuminant, camera in (("A", None), (None, sensor)):
         with pytest.raises(ConfigError, match="the method unmix-nerf makes no scene of mixed materials"):
             load_edited_run(run, "cpu", illuminant=illuminant, sensor=camera)
-
-
-def test_a_light_that_is_not_recorded_is_noted(tmp_path):
-    scene, lamp = lit_scene(), Recipe(illuminant=Light("A"))
-    assert edit_scene(scene, lamp).notes == ()
-    unlit = replace(scene, materials=replace(scene.materials, light=None))
-    [note] = edit_scene(unlit, lamp).notes
-    assert "taken as flat" in note
-    removal = requested_recipe(write_recipe(tmp_path, "edits:\n- remove: 0\n"), None)
-    assert removal is not None
-    assert edit_scene(unlit, removal).notes == ()

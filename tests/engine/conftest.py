@@ -33,17 +33,10 @@ def short_config(tmp_path: Path, registered: list) -> TrainerConfig:  # noqa: AR
 
 
 def short_training(folder: Path) -> TrainerConfig:
-    scene = folder / "ball"
+    scene, out = folder / "ball", folder / "outputs"
     scene.mkdir()
-    return replace(
-        rgb_nerf.config,
-        data=scene,
-        output_dir=folder / "outputs",
-        max_num_iterations=12,
-        steps_per_save=4,
-        steps_per_log=1,
-        device="cpu",
-    )
+    every = {"max_num_iterations": 12, "steps_per_save": 4, "steps_per_log": 1}
+    return replace(rgb_nerf.config, data=scene, output_dir=out, device="cpu", **every)
 
 
 @pytest.fixture(scope="session")

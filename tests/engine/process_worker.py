@@ -31,16 +31,10 @@ STEPS = 12
 
 def config_for(folder: Path) -> Any:
     """A short training of the second method."""
-    scene = folder / "ball"
+    scene, out = folder / "ball", folder / "outputs"
     scene.mkdir(exist_ok=True)
-    return replace(
-        rgb_nerf.config,
-        data=scene,
-        output_dir=folder / "outputs",
-        max_num_iterations=STEPS,
-        steps_per_save=4,
-        device="cpu",
-    )
+    limits = {"max_num_iterations": STEPS, "steps_per_save": 4}
+    return replace(rgb_nerf.config, data=scene, output_dir=out, device="cpu", **limits)
 
 
 def train(folder: Path, config: Any) -> None:

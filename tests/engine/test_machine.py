@@ -5,8 +5,6 @@ import random
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from unmix_plugin.engine.machine import resolve_device, seed_everything, step_generator, step_seed
 from unmix_plugin.errors import ConfigError
@@ -27,24 +25,14 @@ def test_cuda_without_cuda_is_refused_with_what_to_do(monkeypatch, built_for: st
     monkeypatch.setattr(torch.version, "cuda", built_for)
     with pytest.raises(ConfigError, match=f"--device cuda, but .*{advice}.*leave --device at auto"):
         resolve_device("cuda")
-
-
-def test_another_word_is_refused():
     with pytest.raises(ConfigError, match="must be auto, cpu or cuda; got 'tpu'"):
         resolve_device("tpu")
-
-
-integers = st.integers(0, 2**40)
-
-
-@given(integers, integers, integers)
-def test_a_seed_fits_a_generator_and_repeats(seed: int, step: int, stream: int):
-    assert 0 <= step_seed(seed, step, stream) == step_seed(seed, step, stream) < 2**63
 
 
 def test_neighbouring_seeds_steps_and_streams_are_all_different():
     found = {step_seed(seed, step, stream) for seed in range(20) for step in range(50) for stream in range(5)}
     assert len(found) == 20 * 50 * 5
+    assert all(0 <= seed < 2**63 for seed in found)
 
 
 def test_a_steps_generator_draws_the_same_whatever_was_drawn_before():

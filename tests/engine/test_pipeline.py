@@ -8,8 +8,8 @@ import torch
 
 from tests.engine.stopped_runs import finished, quiet_trainer
 from unmix_plugin.engine.configs import TrainerConfig
-from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation, run_callbacks
-from unmix_plugin.engine.pipeline import Pipeline, evaluating
+from unmix_plugin.engine.model import TrainingCallback, TrainingCallbackLocation
+from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.errors import ConfigError
 
@@ -30,13 +30,9 @@ def test_a_whole_image_is_its_rays_rendered_in_any_chunks(pipeline: Pipeline):
     assert image["rgb"].shape == (20, 20, 3)
     assert image["accumulation"].shape == (20, 20)
     torch.testing.assert_close(image["rgb"].reshape(-1, 3), at_once["rgb"], rtol=0, atol=1e-6)
-
-
-def test_only_the_outputs_asked_for_are_rendered_and_unknown_ones_are_refused(pipeline: Pipeline):
-    camera = pipeline.datamanager.eval_cameras[0]
-    assert set(pipeline.model.get_outputs_for_camera(camera, ["rgb"])) == {"rgb"}
+    assert set(model.get_outputs_for_camera(camera, ["rgb"])) == {"rgb"}
     with pytest.raises(ConfigError, match="no output depht; it has accumulation, rgb"):
-        pipeline.model.get_outputs_for_camera(camera, ["depht"])
+        model.get_outputs_for_camera(camera, ["depht"])
 
 
 def test_average_metrics_are_the_mean_over_the_evaluation_views_that_have_them(
@@ -66,41 +62,17 @@ def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pi
     assert loss(5) == loss(5) != loss(6)
 
 
-def test_a_training_step_has_outputs_metrics_and_losses_with_gradients(pipeline: Pipeline):
-    outputs, losses, metrics = pipeline.get_train_loss_dict(0)
-    assert losses["rgb_loss"].requires_grad
-    assert set(outputs) == {"rgb", "accumulation"}
-    torch.testing.assert_close(metrics["psnr"], -10 * losses["rgb_loss"].detach().log10())
-
-
-def test_evaluating_gives_back_the_mode_it_found():
-    module = torch.nn.Linear(1, 1)
-    for mode in (True, False):
-        module.train(mode)
-        with evaluating(module):
-            assert not module.training
-        assert module.training is mode
-
-
-def test_callbacks_run_at_their_place_in_order_with_step_and_progress():
+def test_training_calls_the_callbacks_of_every_step_in_order_with_rising_progress(
+    short_config: TrainerConfig,
+):
+    trainer = quiet_trainer(short_config)
     seen: list[tuple[str, int, float]] = []
     before, after = TrainingCallbackLocation
-    callbacks = [
-        TrainingCallback(where, lambda step, progress, name=name: seen.append((name, step, progress)))
-        for where, name in ((after, "a"), (before, "b"), (after, "c"))
-    ]
-    run_callbacks(callbacks, before, 3, 0.5)
-    run_callbacks(callbacks, after, 3, 0.5)
-    assert seen == [("b", 3, 0.5), ("a", 3, 0.5), ("c", 3, 0.5)]
-
-
-def test_training_calls_the_callbacks_of_every_step_with_rising_progress(short_config: TrainerConfig):
-    trainer = quiet_trainer(short_config)
-    seen: list[tuple[int, float]] = []
-    where = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
-    trainer.callbacks.append(TrainingCallback(where, lambda step, progress: seen.append((step, progress))))
+    for where, name in ((after, "b"), (before, "a"), (after, "c")):
+        call = lambda step, progress, name=name: seen.append((name, step, progress))  # noqa: E731
+        trainer.callbacks.append(TrainingCallback(where, call))
     trainer.train()
-    assert seen == [(step, step / 12) for step in range(12)]
+    assert seen == [(name, step, step / 12) for step in range(12) for name in "abc"]
 
 
 def test_a_model_takes_its_first_values_from_the_scene_only_when_a_run_starts(

@@ -42,6 +42,10 @@ def test_stopped_and_resumed_equals_straight_to_the_bit(
     assert stopped.step == 6
     resumed = quiet_trainer(load_config(stopped.run))
     assert resumed.step == 6
+    assert [float(state["step"]) for state in resumed.optimizer.state.values()] == [6.0]
+    log = resumed.log.path.read_text()
+    assert "stopped at step 6: on request" in log
+    assert "failed" not in log
     resumed.train()
     assert resumed.run.path == stopped.run
     expected, actual = newest(straight.run.path), newest(resumed.run.path)
@@ -53,13 +57,6 @@ def test_stopped_and_resumed_equals_straight_to_the_bit(
     for key in ("learning_rates", "num_rays", "total_rays", "skipped_steps", "average_updates", "progress"):
         assert actual.record[key] == expected.record[key], key
     assert train_lines(resumed.run.path) == train_lines(straight.run.path)
-
-
-def test_resuming_takes_back_every_step_counter_of_the_optimiser(short_config: TrainerConfig):
-    stopped = stop_at(short_config, 5)
-    resumed = quiet_trainer(load_config(stopped.run))
-    counters = [float(state["step"]) for state in resumed.optimizer.state.values()]
-    assert counters == [5.0]
 
 
 def test_a_killed_run_goes_on_from_its_last_checkpoint_and_forgets_later_metrics(short_config: TrainerConfig):
@@ -86,75 +83,66 @@ def train_lines_until_cut(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
 
 
-def test_a_longer_limit_lets_a_finished_run_go_on(short_config: TrainerConfig):
-    first = finished(short_config)
-    finished(replace(load_config(first.run.path), max_num_iterations=15))
-    assert newest(first.run.path).step == 15
-    assert load_config(first.run.path).max_num_iterations == 15
-
-
-def test_a_finished_run_resumed_is_left_as_it_is(short_config: TrainerConfig):
+def test_a_finished_run_resumed_is_left_as_it_is_and_goes_on_to_a_longer_limit(short_config: TrainerConfig):
     first = finished(short_config)
     before = newest(first.run.path)
     record = quiet_trainer(load_config(first.run.path)).train()
     assert record.steps == 12
     assert newest(first.run.path).record == before.record
+    finished(replace(load_config(first.run.path), max_num_iterations=15))
+    assert newest(first.run.path).step == 15
+    assert load_config(first.run.path).max_num_iterations == 15
 
 
-def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(short_config: TrainerConfig):
+@pytest.mark.parametrize(("step", "saved", "said"), [(6, 4, None), (2, None, "no checkpoint")])
+def test_a_second_ctrl_c_stops_within_the_step_and_names_the_last_checkpoint(
+    short_config: TrainerConfig, step: int, saved: int | None, said: str | None
+):
     trainer = quiet_trainer(short_config)
-    call_after_step(trainer, 6, press_ctrl_c_twice)
-    with pytest.raises(Interrupted) as caught:
+    call_after_step(trainer, step, press_ctrl_c_twice)
+    with pytest.raises(Interrupted, match=said) as caught:
         trainer.train()
-    assert caught.value.step == 4
-    assert checkpoint_steps(trainer.run.checkpoints) == [4]
+    assert caught.value.step == saved
+    assert checkpoint_steps(trainer.run.checkpoints) == ([] if saved is None else [saved])
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @needs_posix
-def test_a_lost_terminal_may_say_so_twice(short_config: TrainerConfig):
-    trainer = quiet_trainer(short_config)
-
+def test_a_lost_terminal_may_say_so_twice_and_under_nohup_changes_nothing(short_config: TrainerConfig):
     def hang_up_twice() -> None:
         for _ in range(2):
             signal.raise_signal(signal.SIGHUP)
 
+    trainer = quiet_trainer(short_config)
     call_after_step(trainer, 6, hang_up_twice)
     with pytest.raises(Interrupted) as caught:
         trainer.train()
     assert caught.value.step == 6
-
-
-@needs_posix
-def test_under_nohup_a_lost_terminal_changes_nothing(short_config: TrainerConfig):
     previous = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         trainer = quiet_trainer(short_config)
-        call_after_step(trainer, 6, lambda: signal.raise_signal(signal.SIGHUP))
+        call_after_step(trainer, 6, hang_up_twice)
         assert trainer.train().steps == 12
     finally:
         signal.signal(signal.SIGHUP, previous)
 
 
-def test_a_requested_stop_is_no_failure_in_the_log(short_config: TrainerConfig):
-    log = (stop_at(short_config, 6).run / "run.log").read_text()
-    assert "stopped at step 6: on request" in log
-    assert "failed" not in log
+TAKING = """import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock
+lock = RunLock(Path(sys.argv[1]))
+"""
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
     run = stop_at(short_config, 6).run
     before = (run / "metrics.jsonl").read_bytes()
-    holding = (
-        "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock; "
-    )
-    holding += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
-    with subprocess.Popen(
-        [sys.executable, "-c", holding, str(run / "run.lock")],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as other:
+    words = [
+        sys.executable,
+        "-c",
+        TAKING + "print('held', flush=True); sys.stdin.read()",
+        str(run / "run.lock"),
+    ]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(words, text=True, **pipes) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(RunError, match=rf"another training writes to {run}; stop it"):
@@ -169,20 +157,10 @@ def test_a_lock_that_is_let_go_twice_leaves_that_of_another_holder(tmp_path: Pat
     first.release()
     first.release()
     del first
-    taking = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock; "
-    taking += "RunLock(Path(sys.argv[1]))"
-    words = [sys.executable, "-c", taking, str(tmp_path / "lock")]
+    words = [sys.executable, "-c", TAKING, str(tmp_path / "lock")]
     assert b"another training writes to" in subprocess.run(words, capture_output=True, check=False).stderr
     second.release()
     assert subprocess.run(words, capture_output=True, check=False).returncode == 0
-
-
-def test_a_ctrl_c_before_any_checkpoint_says_there_is_none(short_config: TrainerConfig):
-    trainer = quiet_trainer(short_config)
-    call_after_step(trainer, 2, press_ctrl_c_twice)
-    with pytest.raises(Interrupted, match="no checkpoint") as caught:
-        trainer.train()
-    assert caught.value.step is None
 
 
 def test_resuming_on_another_scene_is_refused(short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch):

@@ -18,6 +18,9 @@ from unmix_plugin.engine.runs.load_run import load_model, load_pipeline
 @pytest.mark.usefixtures("registered")
 @pytest.mark.parametrize("device", ["cpu"] + ["cuda"] * torch.cuda.is_available())
 def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path: Path, device: str):
+    tree = ast.parse(Path(rgb_nerf_plugin.__file__).read_text())
+    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert [name for name in modules if name.startswith("unmix_plugin")] == ["unmix_plugin.engine"]
     (tmp_path / "ball").mkdir()
     config = replace(
         find_method("rgb-nerf").config, data=tmp_path / "ball", output_dir=tmp_path, device=device
@@ -28,13 +31,6 @@ def test_a_plain_rgb_nerf_trains_from_its_entry_point_to_23_db(tmp_path: Path, d
     loaded = load_pipeline(trainer.run.path, "cpu")
     assert loaded.training.steps == record.steps == 200
     assert loaded.pipeline.get_average_eval_image_metrics_and_images()[0]["psnr"] > 23
-
-
-def test_the_second_method_imports_nothing_of_ours_but_the_public_engine():
-    tree = ast.parse(Path(rgb_nerf_plugin.__file__).read_text())
-    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    ours = [module for module in modules if module.startswith("unmix_plugin")]
-    assert ours == ["unmix_plugin.engine"]
 
 
 def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfig, tmp_path: Path):
@@ -70,14 +66,6 @@ def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, mo
     assert float(trainer.optimizer.state[param]["step"]) == steps - 3
     assert trainer.average is not None
     assert trainer.average.updates == 5  # one a step up to the eighth, of which three are forgotten
-
-
-def test_a_model_is_warmed_up_once(short_config, monkeypatch):
-    trainer, warmed = quiet_trainer(short_config), []
-    monkeypatch.setattr(trainer.pipeline.model, "warm_up", lambda: warmed.append(trainer.step))
-    trainer.warm_up()
-    trainer.train()
-    assert warmed == [0]
 
 
 def test_training_json_says_how_long_and_how_much_was_trained(short_config: TrainerConfig):

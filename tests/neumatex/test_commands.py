@@ -1,12 +1,10 @@
 """Export and relit renders of a trained object from the command line; and its scene as a value."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from tests.commands.running import run
+from tests.commands.running import done, refused, run, run_of
 from tests.neumatex.factory import SMALL, write_light, write_object
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -23,25 +21,20 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("object")
     write_object(folder / "ball")
     words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 2]
-    ended = run(train, "neumatex", *words, *SMALL, "--pipeline.model.material=neural")
-    assert ended.status == 0, ended.err
-    return Path(ended.last_line.removeprefix("run: "))
+    ended = done(train, "neumatex", *words, *SMALL, "--pipeline.model.material=neural")
+    return run_of(ended)
 
 
 def test_the_material_is_exported_with_its_latents_and_decoder(trained, tmp_path):
     words = ["material", "--run", trained, "--output", tmp_path, "--device", "cpu", "--texture-size", 64]
-    ended = run(export, *words)
-    assert ended.status == 0, ended.err
+    done(export, *words)
     scene = load_run(trained, "cpu").scene
     assert isinstance(scene, TrainedObject)
     expected = set(material_paths(tmp_path, scene.surface.family))
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == expected
     assert {"decoder.glsl", "latents_a.png", "latents_b.exr"} <= {path.name for path in expected}
-    ended = run(export, *words)
-    assert ended.status == 2
-    assert "--overwrite" in ended.err
-    ended = run(export, *words, "--overwrite", "--texture-size", 3)
-    assert (ended.status, "choose 16 to 8192" in ended.err) == (2, True)
+    assert "--overwrite" in refused(export, *words)
+    assert "choose 16 to 8192" in refused(export, *words, "--overwrite", "--texture-size", 3)
 
 
 def test_products_of_mixed_materials_are_refused_in_one_sentence(trained, tmp_path):
@@ -57,14 +50,12 @@ def test_a_view_is_rendered_under_a_map_from_a_file(trained, tmp_path):
     words = ["--run", trained, "--device", "cpu", "--view", 0, "--outputs", "linear_rgb", "--formats", "npy"]
     pictures = []
     for name, rest in (("own", []), ("brighter", ["--environment", light])):
-        ended = run(render, *words, "--output", tmp_path / name, *rest)
-        assert ended.status == 0, ended.err
+        done(render, *words, "--output", tmp_path / name, *rest)
         pictures.append(np.load(next((tmp_path / name / "linear_rgb").glob("*.npy"))))
     assert pictures[0].max() > 0.01
     np.testing.assert_allclose(pictures[1], 3 * pictures[0], rtol=1e-3, atol=1e-5)
-    ended = run(render, *words, "--output", tmp_path / "none", "--environment", tmp_path / "none.hdr")
-    assert ended.status == 2
-    assert "there is no such environment map" in " ".join(ended.err.split())
+    said = refused(render, *words, "--output", tmp_path / "none", "--environment", tmp_path / "none.hdr")
+    assert "there is no such environment map" in said
 
 
 def test_training_that_goes_on_does_not_change_a_scene(trained):

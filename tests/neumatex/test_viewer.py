@@ -113,18 +113,3 @@ def test_the_strips_of_a_screenshot_have_the_scale_of_the_picture_on_screen(sour
             whole = maker.paint(scene.look(camera, session.view.subpixels), settings, False, False).picture
     saved = np.asarray(Image.open(viewer.services.folder / "view.png").convert("RGB"))
     np.testing.assert_allclose(saved, whole, atol=1)
-
-
-def test_screenshots_are_finished_views(source, monkeypatch):
-    with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
-        finished(page, viewer)
-        looks = []
-        look = type(source.take()).look
-        monkeypatch.setattr(
-            type(source.take()), "look", lambda self, *rest: looks.append(rest) or look(self, *rest)
-        )
-        page.set("width", 32)
-        page.set("height", 24)
-        page.set("save a screenshot (PNG)", True)
-        page.wait_until(lambda: page.downloads == ["view.png"])
-        assert looks

@@ -142,12 +142,6 @@ def test_a_page_keeps_both_limits_and_each_surface_is_made_once(exported, tmp_pa
     assert f"as fine as {tried[-1]} cells along the longest edge, not 64: browsers turn {most:,}" in note
 
 
-def test_a_page_that_can_not_be_small_enough_is_said_to_be_large(tmp_path, monkeypatch):
-    monkeypatch.setattr(page, "MOST_BYTES", 1000)
-    _, said, path = export(tmp_path, regions={})
-    assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
-
-
 def test_areas_are_as_good_on_small_triangles_as_on_large_ones():
     areas = np.array([1e-6] * 6 + [1.0])
     positions = np.arange(21.0).reshape(7, 3)
@@ -317,14 +311,6 @@ LOOK_AWAY = """() => {
 
 
 @pytest.mark.slow
-def test_what_lies_behind_the_eye_is_in_no_region_and_has_no_label(opened):
-    opened.evaluate(LOOK_AWAY)
-    assert not opened.locator("#labels span:not([hidden])").count()
-    stroke(opened, [(2, 2), (560, 2), (560, 598), (2, 598)])
-    assert "Nothing of the surface is inside" in opened.inner_text("#hint")
-
-
-@pytest.mark.slow
 def test_names_are_text_in_a_table_and_one_is_changed_after_the_other(opened):
     opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
     for place in ((285, 300), (285, 340)):
@@ -338,6 +324,10 @@ def test_names_are_text_in_a_table_and_one_is_changed_after_the_other(opened):
     assert table[0][-2:] == ["_=1+1", "_@second"]
     opened.evaluate("unmixPage.draw()")
     assert "=1+1" in opened.inner_text("#labels")
+    opened.evaluate(LOOK_AWAY)  # what lies behind the eye is in no region and has no label
+    assert not opened.locator("#labels span:not([hidden])").count()
+    stroke(opened, [(2, 2), (560, 2), (560, 598), (2, 598)])
+    assert "Nothing of the surface is inside" in opened.inner_text("#hint")
 
 
 def shape_in_colour(shape, away):
@@ -374,11 +364,7 @@ def sheet():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("shape", "away"),
-    [
-        (plate(), (0.3, 0.2, 1.0)),
-        (sheet(), (0.3, 0.2, 1.0)),
-        (sheet(), (0.3, 0.2, -1.0)),
-    ],
+    [(plate(), (0.3, 0.2, 1.0)), (sheet(), (0.3, 0.2, 1.0)), (sheet(), (0.3, 0.2, -1.0))],
     ids=["plate", "sheet", "sheet from its back"],
 )
 def test_one_side_of_something_thin_is_seen(shape, away, browser, tmp_path):
@@ -390,3 +376,9 @@ def test_one_side_of_something_thin_is_seen(shape, away, browser, tmp_path):
     (seen,) = probes(opened, "area")
     opened.close()
     assert seen["area"] == pytest.approx(1 / FRAME.scale**2, rel=0.08)
+
+
+def test_a_page_that_can_not_be_small_enough_is_said_to_be_large(tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "MOST_BYTES", 1000)
+    _, said, path = export(tmp_path, regions={})
+    assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said

@@ -32,11 +32,6 @@ def test_components_are_the_directions_of_largest_variance_of_all_views_together
     np.testing.assert_allclose(components.explained, variances / variances.sum(), atol=0.01)
 
 
-def test_spectra_all_alike_explain_nothing():
-    assert _find_components([torch.ones(10, 5)], "spectra").explained == (0.0, 0.0, 0.0)
-    assert _find_components([torch.zeros(0, 5)], "abundances").explained == (0.0, 0.0, 0.0)
-
-
 @pytest.mark.parametrize("of", ["spectra", "abundances"])
 def test_a_picture_shows_the_components_of_its_pixels(of):
     components = _find_components([_survey_view(SCENE, CAMERA, of)], of)
@@ -61,12 +56,8 @@ def test_a_component_that_tells_nothing_is_black_rather_than_noise():
     colours = components.colours(shares.double())
     assert float(colours[:, 2].max()) == 0
     assert float(colours[:, 1].max()) == 1
-
-
-def test_a_view_is_surveyed_where_something_is():
-    shares = _survey_view(SCENE, CAMERA, "abundances")
-    torch.testing.assert_close(shares.sum(dim=-1), torch.ones(len(shares)), atol=1e-4, rtol=0)
-    assert _survey_view(SCENE, CAMERA, "spectra").shape == (len(shares), 5)
+    for nothing in (torch.ones(10, 5), torch.zeros(0, 5)):
+        assert _find_components([nothing], "spectra").explained == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("of", "first"), [("spectra", "450"), ("abundances", "endmember_0")])

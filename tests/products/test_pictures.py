@@ -19,7 +19,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.products.abundances import _write_view, colour_panel, draw_abundances
+from unmix_plugin.products.abundances import colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import _write_endmembers
 from unmix_plugin.products.evaluation import (
     _draw_colour,
@@ -92,7 +92,13 @@ def test_where_nothing_is_pictures_are_neutral():
     np.testing.assert_allclose(premultiplied_over_neutral(black, nothing), NEUTRAL, atol=1e-6)
     np.testing.assert_allclose(premultiplied_over_neutral(white, all_there), 1.0, atol=1e-6)
     np.testing.assert_allclose(premultiplied_over_neutral(black, all_there), 0.0, atol=1e-6)
-    np.testing.assert_allclose(paint_ids(np.full((2, 2), 255, np.uint8), {0: (0.0, 0.0, 0.0)}), NEUTRAL)
+    painted = paint_ids(np.array([[0, 1, 255]], dtype=np.uint8), {0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
+    np.testing.assert_array_equal(painted[0], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
+    painted = paint(np.array([[-1.0, 0.0, 1.0, 7.0]]), SCALE)[
+        0
+    ]  # values beyond a scale have the colours of its ends
+    np.testing.assert_array_equal(painted[[0, 3]], painted[[1, 2]])
+    assert np.abs(painted[1] - painted[2]).max() > 0.5
 
 
 def test_a_sky_is_seen_rather_than_what_pictures_lie_on():
@@ -104,20 +110,6 @@ def test_a_sky_is_seen_rather_than_what_pictures_lie_on():
     world = colour_panel(replace(view, has_sky=True), given.bands).image
     np.testing.assert_allclose(world[:, :4], 0.0, atol=1e-6)
     np.testing.assert_allclose(world[:, 4:], flat[:, 4:], atol=1e-6)
-
-
-def test_a_scale_gives_its_ends_to_values_beyond_them():
-    values = np.array([[-1.0, 0.0, 1.0, 7.0]])
-    painted = paint(values, SCALE)
-    np.testing.assert_array_equal(painted[0, 0], painted[0, 1])
-    np.testing.assert_array_equal(painted[0, 2], painted[0, 3])
-    assert np.abs(painted[0, 1] - painted[0, 2]).max() > 0.5
-
-
-def test_ids_are_painted_in_their_own_colours():
-    ids = np.array([[0, 1, 255]], dtype=np.uint8)
-    painted = paint_ids(ids, {0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
-    np.testing.assert_array_equal(painted[0], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
 
 
 def test_the_segmentation_figure_shows_the_colours_of_the_endmembers():
@@ -138,17 +130,6 @@ def test_scores_are_what_the_ids_were_chosen_by():
     probe = _scores_of(view, replace(given, segmentation="probe"))
     torch.testing.assert_close(probe[:, 4:], cosines[:, 4:])
     assert float(probe[:, :4].abs().max()) == 0.0
-
-
-def test_an_exported_array_is_zero_where_nothing_is(tmp_path):
-    given = materials(3)
-    view = rendered(given)
-    folder = tmp_path / "new"
-    _write_view(("npy",), folder, "view", view, given)
-    exported = np.load(tmp_path / "new" / "view.npy")
-    assert (exported.dtype, exported.shape) == (np.float32, (12, 16, 3))
-    assert (exported[:, :4] == 0).all()
-    np.testing.assert_allclose(exported[:, 4:].sum(axis=-1), 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("num_true", [2, 3, 5])

@@ -39,11 +39,7 @@ def test_lone_points_are_told_from_a_surface():
     alone = _is_outlier(np.concatenate([sphere(2000), lone]))
     assert alone[-2:].all()
     assert alone[:-2].mean() < 0.01
-
-
-@pytest.mark.parametrize("count", [0, 1, 8])
-def test_few_points_are_company_enough(count):
-    assert not _is_outlier(sphere(count)).any()
+    assert not any(_is_outlier(sphere(count)).any() for count in (0, 1, 8))  # company enough
 
 
 @given(st.integers(1, 400), st.integers(1, 500))
@@ -67,9 +63,6 @@ def test_thinning_covers_evenly_what_was_seen_unevenly():
     assert gaps.max() < 1.6 * ideal
     upper = (kept[:, 2] > 0.5).mean()
     assert upper == pytest.approx(0.25, abs=0.03)
-
-
-def test_points_that_coincide_are_thinned_to_one():
     assert len(_thinned(np.zeros((50, 3)), 10)) == 1
 
 
@@ -80,10 +73,7 @@ def test_normals_of_a_sphere_are_its_radii_and_face_the_viewer():
     np.testing.assert_allclose(np.linalg.norm(outwards, axis=1), 1, atol=1e-9)
     assert (outwards * positions[:200]).sum(axis=1).min() > 0.99
     np.testing.assert_allclose(inwards, -outwards)
-
-
-def test_where_there_is_no_plane_the_normal_is_the_viewers_direction():
-    towards = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])
+    towards = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])  # where there is no plane, the viewer's direction
     normals = _plane_normals(np.zeros((2, 3)), towards, np.array([0, 1]))
     np.testing.assert_allclose(normals, [[0, 0, 1], [1, 0, 0]])
 
@@ -106,25 +96,8 @@ def properties(*outputs):
 
 def test_named_indices_keep_their_names_and_the_rest_is_numbered(paint):
     outputs = ("index:r650/r450", "index:PRI", "index:iron-oxide", "index:1+r450", f"target:ace:{paint}")
+    outputs += ("index: PRI", "index:r650/r450")  # asked for twice
     assert properties(*outputs) == ["index_1", "index_pri", "index_iron_oxide", "index_2", "target_1"]
-
-
-def test_an_output_asked_for_twice_is_given_once():
-    assert properties("index:pri", "index: PRI", "index:r650/r450", "index:r650/r450") == [
-        "index_pri",
-        "index_1",
-    ]
-
-
-def test_values_are_of_reflectance_and_undefined_where_the_index_is():
-    (score,) = _require_point_scores(["index:r650/r450"], BANDS)
-    reflectances = torch.tensor([[0.1, 0.2, 0.3, 0.4, 0.5], [0.0, 0.2, 0.3, 0.4, 0.5]])
-    light = torch.tensor(LIGHT)
-    values = score.values(reflectances * light, light)
-    assert values.dtype == np.float32
-    assert values[0] == pytest.approx(5.0, rel=1e-5)
-    assert np.isnan(values[1])
-    assert score.values(reflectances * light, None)[0] == pytest.approx(25.0, rel=1e-5)
 
 
 def test_a_target_is_judged_against_the_points_themselves(paint):
@@ -153,17 +126,21 @@ def test_other_outputs_are_refused_with_what_points_take(output):
         _require_point_scores(["index:pri", output], BANDS)
 
 
-@pytest.mark.parametrize(
-    ("output", "error", "message"),
-    [
+def test_what_cannot_be_computed_or_shows_nothing_is_refused(points, tmp_path):
+    for output, error, message in (
         ("index:prri", ConfigError, "there is no index 'prri'; nearest: pri"),
         ("index:ndvi", SpectrumError, "needs 800 nm"),
         ("target:none.csv", ConfigError, "none.csv"),
-    ],
-)
-def test_what_cannot_be_computed_is_refused(output, error, message):
-    with pytest.raises(error, match=message):
-        _require_point_scores([output], BANDS)
+    ):
+        with pytest.raises(error, match=message):
+            _require_point_scores([output], BANDS)
+    for count in (0, -3, 10_000_001):
+        with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
+            export(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))
+    nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
+    with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
+        _write_point_cloud(tmp_path / "points.ply", nothing, 800, SCENE, FRAME)
+    assert list(tmp_path.iterdir()) == []
 
 
 SCENE = ball_scene()
@@ -188,6 +165,11 @@ def columns(cloud, names):
 def test_points_are_in_the_world_of_the_scene(cloud):
     ply, count = cloud
     assert 600 < count == ply["vertex"].count <= 800
+    what, world, size, *materials = ply.comments
+    assert what == "surface points of an unmix-nerf run"
+    assert "coordinates: world of the given poses, or of transforms.json if they were estimated" in world
+    assert size == "lengths are in units of the scene, of unknown size"
+    assert materials == [f"material {index}: endmember_{index}" for index in range(3)]
     center = FRAME.to_world(np.zeros(3))
     radii = np.linalg.norm(columns(ply, "xyz") - center, axis=1)
     np.testing.assert_allclose(radii, RADIUS / FRAME.scale, atol=0.02 / FRAME.scale)
@@ -219,17 +201,6 @@ def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectr
     np.testing.assert_allclose(columns(ply, ("red", "green", "blue"))[top], expected, atol=1)
 
 
-def test_the_file_says_what_it_is(cloud):
-    ply, _ = cloud
-    assert ply.comments[0] == "surface points of an unmix-nerf run"
-    assert (
-        "coordinates: world of the given poses, or of transforms.json if they were estimated"
-        in ply.comments[1]
-    )
-    assert ply.comments[2] == "lengths are in units of the scene, of unknown size"
-    assert ply.comments[3:] == [f"material {index}: endmember_{index}" for index in range(3)]
-
-
 def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
     spectra = SCENE.materials.endmembers.detach().double().numpy()
     write_spectra_csv(tmp_path / "top.csv", SpectraTable(SCENE.bands, ("top",), spectra[:1]))
@@ -251,16 +222,3 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
     np.testing.assert_array_equal(found[pure, 2], material[pure] == 0)
     assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-3]
     assert ply.comments[-3].endswith("of radiance, since the scene's light is unknown")
-
-
-def test_nothing_to_export_is_said(points, tmp_path):
-    nothing = points.select(torch.zeros(len(points), dtype=torch.bool))
-    with pytest.raises(RunError, match="no ray of the run's cameras ends on a surface"):
-        _write_point_cloud(tmp_path / "points.ply", nothing, 800, SCENE, FRAME)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("count", [0, -3, 10_000_001])
-def test_an_impossible_number_of_points_is_refused(count):
-    with pytest.raises(ConfigError, match=f"--num-points is {count}; choose 1 to 10000000"):
-        export(MagicMock(spec=Job, materials=SCENE.materials), PointCloud(num_points=count))

@@ -1,6 +1,7 @@
 """The file of refined cameras: in world space, of frame cameras readable as a camera file, of line cameras by row."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -15,14 +16,8 @@ from unmix_plugin.trained.run_views import RunView
 
 FRAME = Normalisation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.3, 0.2, -1.0]), 0.5)
 POSE = torch.tensor([[[0.0, 0, 1, 2.0], [1, 0, 0, 0.5], [0, 1, 0, 0.1]]])
-CAMERA = Cameras(
-    POSE,
-    torch.tensor([[20.0, 21.0]]),
-    torch.tensor([[6.0, 5.0]]),
-    torch.tensor([[0.1, 0.0, 0.0, 0.0]]),
-    12,
-    10,
-)
+LENS = (torch.tensor([[20.0, 21.0]]), torch.tensor([[6.0, 5.0]]), torch.tensor([[0.1, 0.0, 0.0, 0.0]]))
+CAMERA = Cameras(POSE, *LENS, 12, 10)
 
 
 def test_a_frame_camera_comes_back_as_it_was(tmp_path):
@@ -38,7 +33,7 @@ def test_a_frame_camera_comes_back_as_it_was(tmp_path):
 
 def test_a_line_camera_has_its_key_poses_at_rows():
     keys = KeyPoses(POSE.repeat(2, 1, 1), torch.tensor([0.5, 9.5]), (2,))
-    lines = Cameras(POSE, CAMERA.focal_px, CAMERA.center_px, CAMERA.distortion, 12, 10, key_poses=keys)
+    lines = replace(CAMERA, key_poses=keys)
     entry = _poses_json([RunView("a", lines)], FRAME, False)["frames"][0]
     assert "transform_matrix" not in entry
     assert [key["row"] for key in entry["key_poses"]] == [0.0, 9.0]

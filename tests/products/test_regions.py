@@ -39,6 +39,10 @@ def surface():
 def test_a_box_has_its_part_of_a_ball(surface):
     all_of_it = surface.measure(box([-9.0] * 3, [9.0] * 3), "all")
     assert all_of_it.area == pytest.approx(4 * np.pi * WORLD_RADIUS**2, rel=0.01)
+    upper, lower = (SHADE * SCENE.materials.endmembers.detach().double().numpy())[:2]
+    np.testing.assert_allclose(all_of_it.abundances, [0.5, 0.5, 0], atol=0.03)
+    np.testing.assert_allclose(all_of_it.mean, (upper + lower) / 2, atol=0.03)
+    np.testing.assert_allclose(all_of_it.spread, np.abs(upper - lower) / 2, atol=0.03)
     cap = surface.measure(box([-9.0, -9.0, WORLD_RADIUS / 2], [9.0] * 3), "cap")
     assert cap.area == pytest.approx(np.pi * WORLD_RADIUS**2, rel=0.02)
     np.testing.assert_allclose(cap.abundances, [1, 0, 0], atol=1e-6)
@@ -55,14 +59,6 @@ def test_a_rough_sheet_is_as_large_as_the_flat_one_it_stands_for():
     is_right, is_first_row = x.ravel() > 30, np.arange(x.size) < 61
     assert areas[~is_first_row & ~is_right].sum() == pytest.approx(30.5 * 59.5, rel=0.02)
     assert areas[~is_first_row & is_right].sum() == pytest.approx(29.5 * 59.5, rel=0.02)
-
-
-def test_mean_and_spread_are_those_of_the_area(surface):
-    whole = surface.measure(box([-9.0] * 3, [9.0] * 3), "all")
-    upper, lower = (SHADE * SCENE.materials.endmembers.detach().double().numpy())[:2]
-    np.testing.assert_allclose(whole.abundances, [0.5, 0.5, 0], atol=0.03)
-    np.testing.assert_allclose(whole.mean, (upper + lower) / 2, atol=0.03)
-    np.testing.assert_allclose(whole.spread, np.abs(upper - lower) / 2, atol=0.03)
 
 
 def test_a_material_is_where_it_prevails(surface):
@@ -119,18 +115,27 @@ def test_many_regions_of_large_views_take_little_memory_until_they_are_measured(
     assert kept < 1e7
 
 
-def test_names_of_areas_of_materials_are_refused():
+def test_names_that_no_file_can_have_or_that_tables_take_for_formulas_are_refused():
+    for name in (
+        "",
+        " ",
+        "../x",
+        "a/b",
+        ".x",
+        "leaf.",
+        "a\nb",
+        "con",
+        "x" * 65,
+        "=1+1",
+        "+x",
+        "-x",
+        "@SUM(A1)",
+    ):
+        with pytest.raises(ConfigError, match="can't be the name of a region"):
+            check_name(name)
     with pytest.raises(ConfigError, match="'material leaf' can't be the name of a region: exports"):
         check_name("material leaf")
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["", " ", "../x", "a/b", ".x", "leaf.", "a\nb", "con", "x" * 65, "=1+1", "+x", "-x", "@SUM(A1)"],
-)
-def test_names_that_no_file_can_have_or_that_tables_take_for_formulas_are_refused(name):
-    with pytest.raises(ConfigError, match="can't be the name of a region"):
-        check_name(name)
+    assert check_name(" e\u0301pave (2) ") == "\u00e9pave (2)"  # however it is composed
 
 
 def test_names_that_differ_in_capitals_are_refused_since_some_systems_take_their_files_for_one(tmp_path):
@@ -142,10 +147,6 @@ def test_names_that_differ_in_capitals_are_refused_since_some_systems_take_their
     with pytest.raises(ConfigError, match="no region 'leaf'"):
         keep_region(run, "leaf", None)
     assert read_measures(run).regions == {"Leaf": OfMaterial(1)}
-
-
-def test_letters_with_accents_are_the_same_however_they_are_composed():
-    assert check_name(" e\u0301pave (2) ") == "\u00e9pave (2)"
 
 
 @pytest.mark.parametrize(

@@ -40,35 +40,26 @@ def points_seen(camera: Cameras) -> torch.Tensor:
     return camera.project(points, 0)[0]
 
 
-@pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4)])
-def test_a_view_that_is_off_by_pixels_is_brought_back(camera, share):
-    scene = SCENE
-    given = _moved(camera, share * OFF, scene)
+@pytest.mark.parametrize(("camera", "share"), [(CAMERA, 1.0), (swept(), 0.4), (CAMERA, 0.0)])
+def test_a_view_that_is_off_by_pixels_is_brought_back_and_one_that_is_right_stays(camera, share):
+    given = _moved(camera, share * OFF, SCENE)
     before = (points_seen(given) - points_seen(camera)).norm(dim=1).mean()
-    found = align_pose(scene, given, truth_of(scene, camera))
+    found = align_pose(SCENE, given, truth_of(SCENE, camera))
     after = (points_seen(found) - points_seen(camera)).norm(dim=1).mean()
-    assert before > 1.0
-    assert after < 0.1 * before
+    assert before > 1.0 or share == 0
+    assert after < max(0.1 * before, 0.05)
 
 
 def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
-    scene = SCENE
-    given = _moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), scene)
+    given = _moved(CAMERA, torch.tensor([-0.1, 0.12, 0.1, 0.0, 0.0, 0.0]), SCENE)
     assert float((points_seen(given) - points_seen(CAMERA)).norm(dim=1).mean()) > 7
-    found = align_pose(scene, given, truth_of(scene, CAMERA))
+    found = align_pose(SCENE, given, truth_of(SCENE, CAMERA))
     assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.5
 
 
-def test_a_view_that_is_right_stays():
-    scene = SCENE
-    found = align_pose(scene, CAMERA, truth_of(scene, CAMERA))
-    assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.05
-
-
 def test_a_view_of_something_else_does_not_leave_the_scene():
-    scene = SCENE
     noise = torch.rand(32, 32, 5, generator=torch.Generator().manual_seed(0))
-    found = align_pose(scene, CAMERA, ViewTruth("a", noise, torch.ones(32, 32, dtype=torch.bool)))
+    found = align_pose(SCENE, CAMERA, ViewTruth("a", noise, torch.ones(32, 32, dtype=torch.bool)))
     turn = found.camera_to_world[0, :, :3].diagonal().sum()
     assert float(((turn - 1) / 2).arccos()) <= LARGEST_STEP * 3**0.5 + 1e-4
 
@@ -101,23 +92,14 @@ def off_by(found: Cameras, truth: Cameras) -> float:
     return float((mine - theirs)[both].norm(dim=1).mean())
 
 
-def test_rows_that_wobble_are_aligned():
-    scene, truth, given = SCENE, swept_rows(0.02), swept_rows(0.0)
-    found = align_rows(scene, given, truth_of(scene, truth))
+def test_rows_that_wobble_are_aligned_and_those_that_are_right_or_show_nothing_stay():
+    truth, given = swept_rows(0.02), swept_rows(0.0)
+    measured = truth_of(SCENE, truth)
+    found = align_rows(SCENE, given, measured)
     assert off_by(given, truth) > 0.7
     assert off_by(found, truth) < 0.3 * off_by(given, truth)
-
-
-def test_rows_that_are_right_stay():
-    scene, truth = SCENE, swept_rows(0.02)
-    found = align_rows(scene, truth, truth_of(scene, truth))
-    assert off_by(found, truth) < 0.1
-    assert points_seen(found).isfinite().all()
-
-
-def test_a_view_that_shows_nothing_keeps_its_poses():
-    scene, camera = SCENE, swept_rows(0.02)
-    empty = truth_of(scene, camera)
-    empty = replace(empty, valid=torch.zeros_like(empty.valid))
-    found = align_rows(scene, camera, empty)
-    assert off_by(found, camera) < 1e-3
+    again = align_rows(SCENE, truth, measured)
+    assert off_by(again, truth) < 0.1
+    assert points_seen(again).isfinite().all()
+    empty = replace(measured, valid=torch.zeros_like(measured.valid))
+    assert off_by(align_rows(SCENE, truth, empty), truth) < 1e-3

@@ -44,18 +44,15 @@ def test_two_points_and_their_distance_tell_the_unit(tmp_path):
     assert read_measures(run).scale == scale
 
 
-@pytest.mark.parametrize(
-    ("second", "distance", "message"),
-    [
+def test_no_distance_and_no_two_points_are_refused():
+    for second, distance, message in (
         ((0.0, 0.0, 1.0), 0.0, "the distance is 0 m; it must be greater than 0"),
         ((0.0, 0.0, 1.0), float("nan"), "the distance is nan m"),
         ((0.0, 0.0, 0.0), 0.1, "the two points are the same"),
         ((0.0, 0.0, 1.0), 1e12, "a unit of the scene would be 1e\\+12 m long"),
-    ],
-)
-def test_no_distance_and_no_two_points_are_refused(second, distance, message):
-    with pytest.raises(ConfigError, match=message):
-        scale_between((0.0, 0.0, 0.0), second, distance)
+    ):
+        with pytest.raises(ConfigError, match=message):
+            scale_between((0.0, 0.0, 0.0), second, distance)
 
 
 def test_points_count_on_the_surface_that_views_show():

@@ -27,14 +27,7 @@ def model_with(**settings):
 
 def three_cameras() -> Cameras:
     """With distortion, as a refined lens has it."""
-    return Cameras(
-        CAMERA.camera_to_world.repeat(3, 1, 1),
-        CAMERA.focal_px.repeat(3, 1),
-        CAMERA.center_px.repeat(3, 1),
-        torch.tensor([[0.1, -0.02, 0.001, 0.002]]).repeat(3, 1),
-        CAMERA.width,
-        CAMERA.height,
-    )
+    return replace(CAMERA, distortion=torch.tensor([[0.1, -0.02, 0.001, 0.002]]))[[0, 0, 0]]
 
 
 def test_a_refined_lens_is_that_of_evaluation_views_too_whose_poses_stay():
@@ -80,79 +73,72 @@ def find(summary, data=None):
     return find_scene(summary, Path("/runs/this"), data)
 
 
-def test_a_scene_that_is_where_it_was_is_found(folder):
-    scene = find(run_on(folder))
+def test_a_scene_is_found_where_it_was_or_is_said_to_be(copy, tmp_path):
+    run = run_on(copy)
+    scene = find(run)
     assert scene is not None
-    assert scene.root == folder
+    assert scene.root == copy
     assert scene.cube(0).max() > 0
-
-
-def test_a_scene_that_is_gone_is_not_at_hand(copy):
-    run = run_on(copy)
-    shutil.rmtree(copy)
-    assert find(run) is None
-
-
-def test_a_scene_that_has_moved_is_found_where_it_is_said_to_be(copy, tmp_path):
-    run = run_on(copy)
+    for root in (None, "relative/place"):
+        assert find({**run, "root": root}) is None
     moved = copy.rename(tmp_path / "moved")
+    assert find(run) is None
     scene = find(run, moved)
     assert scene is not None
     assert scene.root == moved
-    assert find(run) is None
 
 
-def changed(root):
+def edit(root, change):
+    """Change the content of transforms.json."""
+    path = root / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def halve_a_cube(root):
     path = root / "cubes" / "view_0.npy"
     np.save(path, np.load(path) * np.float16(0.5))
 
 
-def test_a_scene_that_was_changed_is_not_the_runs(copy):
-    run = run_on(copy)
-    changed(copy)
-    assert find(run) is None
-    with pytest.raises(
-        RunError, match=r"is not the one that /runs/this was trained on: files.cubes/view_0.npy differ$"
-    ):
-        find(run, copy)
-
-
-def test_a_scene_that_is_damaged_is_passed_over_unless_it_was_named(copy):
-    run = run_on(copy)
-    (copy / "transforms.json").write_text("{")
-    assert find(run) is None
-    with pytest.raises(SceneError):
-        find(run, copy)
-
-
-def test_a_run_that_kept_no_root_has_no_find_scene(folder):
-    for root in (None, "relative/place"):
-        assert find({**run_on(folder), "root": root}) is None
-
-
-def edit_poses(root, change):
-    path = root / "transforms.json"
-    content = json.loads(path.read_text())
+def round_poses(content):
+    """As another machine would."""
     for frame in content["frames"]:
-        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
-    path.write_text(json.dumps(content))
+        pose = np.array(frame["transform_matrix"])
+        frame["transform_matrix"] = np.concatenate([np.nextafter(pose[:3], 9.0), pose[3:]]).tolist()
 
 
-def test_poses_that_another_machine_rounded_are_the_same_scene(copy):
+SAME = {
+    "rounded poses": lambda root: edit(root, round_poses),
+    "mended labels": lambda root: shutil.copy(root / "labels" / "view_1.png", root / "labels" / "view_0.png"),
+}
+OTHER = {
+    "another cube": (
+        halve_a_cube,
+        RunError,
+        r"is not the one that /runs/this .*: files.cubes/view_0.npy differ$",
+    ),
+    "another lens": (
+        lambda root: edit(root, lambda content: content.update(fl_x=30.0)),
+        RunError,
+        "focal_px.* differ",
+    ),
+    "damage": (lambda root: (root / "transforms.json").write_text("{"), SceneError, "JSON"),
+}
+
+
+@pytest.mark.parametrize("change", SAME)
+def test_what_a_run_does_not_depend_on_leaves_a_scene_the_same(copy, change):
     run = run_on(copy)
-    edit_poses(copy, lambda pose: np.concatenate([np.nextafter(pose[:3], 9.0), pose[3:]]))
+    SAME[change](copy)
     assert find(run, copy) is not None
 
 
-def test_another_camera_is_another_scene(copy):
+@pytest.mark.parametrize("change", OTHER)
+def test_a_scene_that_was_changed_is_passed_over_and_refused_where_it_was_named(copy, change):
+    make, error, said = OTHER[change]
     run = run_on(copy)
-    path = copy / "transforms.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "fl_x": 30.0}))
-    with pytest.raises(RunError, match=r"cameras\.focal_px.* differ"):
+    make(copy)
+    assert find(run) is None
+    with pytest.raises(error, match=said):
         find(run, copy)
-
-
-def test_labels_that_were_mended_leave_a_scene_the_same(copy):
-    run = run_on(copy)
-    (copy / "labels" / "view_0.png").write_bytes((copy / "labels" / "view_1.png").read_bytes())
-    assert find(run, copy) is not None

@@ -85,14 +85,10 @@ def test_empty_space_has_no_opacity():
     assert nothing.spectra["predicted"].max() == 0
 
 
-def test_a_point_outside_the_box_is_refused_with_the_box_in_world_units():
-    with pytest.raises(
-        ConfigError, match=r"the point 99,0,0 is .* between -2,-3.7,-9 and 6,4.3,-1 of the world"
-    ):
+def test_what_is_outside_the_image_or_the_box_is_refused_with_its_bounds():
+    for pixel in ((-1, 0), (40, 0), (0, 30)):
+        with pytest.raises(ConfigError, match="columns are 0 to 39, rows 0 to 29"):
+            one_pixel(CAMERA, *pixel)
+    said = r"the point 99,0,0 is .* between -2,-3.7,-9 and 6,4.3,-1 of the world"
+    with pytest.raises(ConfigError, match=said):
         BALL.probe_point(99.0, 0.0, 0.0)
-
-
-@pytest.mark.parametrize("pixel", [(-1, 0), (40, 0), (0, 30)])
-def test_a_pixel_outside_the_image_is_refused(pixel):
-    with pytest.raises(ConfigError, match="columns are 0 to 39, rows 0 to 29"):
-        one_pixel(CAMERA, *pixel)

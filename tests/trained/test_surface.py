@@ -2,14 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.products.ball_model import (
-    ALL_ROUND,
-    FROM_ABOVE,
-    RADIUS,
-    SHADE,
-    ball_scene,
-    seen_surface,
-)
+from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
 from unmix_plugin.trained.surface import look_from_above
 
 SCENE = ball_scene()
@@ -42,12 +35,6 @@ def test_points_carry_the_mixture_and_the_light_of_their_surface(ball):
     torch.testing.assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
     expected = SHADE * points.abundances @ SCENE.materials.endmembers
     torch.testing.assert_close(points.diffuse(SCENE.materials), expected, atol=1e-4, rtol=0)
-
-
-def test_points_take_the_same_memory_however_many_bands_there_are(ball):
-    points, num_materials = ball.points(), len(SCENE.materials.names)
-    numbers = sum(values.numel() for values in vars(points).values())
-    assert numbers == len(points) * (3 + 3 + 2 * num_materials)
 
 
 def test_directions_lead_from_a_camera_to_the_point(ball):
@@ -93,19 +80,6 @@ def test_hidden_is_what_lies_behind_a_surface_for_every_camera(ball):
     below = torch.tensor([[0.0, 0.0, -0.6]])
     assert seen(FROM_ABOVE).hides(below).tolist() == [True]
     assert ball.hides(below).tolist() == [False]
-
-
-def test_the_number_of_rays_is_what_was_asked_for_whatever_the_image_size():
-    for num_rays in (4_000, 30_000):
-        surface = seen(FROM_ABOVE, num_rays=num_rays)
-        cast = sum(distances.numel() for _, distances in surface._views)
-        assert cast == pytest.approx(num_rays, rel=0.25)
-
-
-def test_a_single_camera_gives_points_without_a_second_witness():
-    points = seen([(1.0, 0.0, 0.2)], num_rays=1600).points()
-    assert len(points) > 100
-    assert float((points.positions.norm(dim=-1) - RADIUS).abs().max()) < 0.04
 
 
 def test_from_straight_above_a_point_looks_as_its_surface():

@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import make_model
+from tests.products.render.render_factory import read_exr
 from tests.viewer.pages import decoded, has_control, opened, serving, show_layer
 from tests.viewer.view_factory import BOX, make_source, ring, source_of_model
 from unmix_plugin.editing import Light, Recipe, Retint
@@ -22,7 +23,6 @@ from unmix_plugin.engine.training.training_control import DeviceShare, TrainingC
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
-from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, read_measures
@@ -41,20 +41,6 @@ def source_of_bands(folder, *centers_nm):
     return source_of_model(model, folder)
 
 
-@pytest.mark.slow
-def test_pages_get_a_picture_of_their_shape_that_becomes_finer_at_rest(viewer):
-    with opened(viewer, rows=160, width=400, height=200) as page:
-        picture = decoded(page.last_picture)
-        assert picture.shape[1] / picture.shape[0] == pytest.approx(2, rel=0.1)
-        assert picture.std() > 5
-        assert page.last_depth is None
-        count = len(page.pictures)
-        page.look_from(0.9)
-        page.wait_until(lambda: len(decoded(page.last_picture)) < 160)
-        page.wait_until(lambda: len(decoded(page.last_picture)) == 160)
-        assert len(page.pictures) >= count + 2
-
-
 def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compressed(viewer):
     with opened(viewer) as page:
         assert page.last_picture.startswith(b"\x89PNG")
@@ -67,15 +53,6 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
         colours = (viewer.services.maker.aids.for_layers().colours_of(materials) * 255).round().int().tolist()
         background = [round(255 * BACKGROUNDS["grey"])] * 3
         assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
-
-
-def test_a_layer_that_cannot_be_shown_says_why_and_the_next_one_is_shown(viewer):
-    with opened(viewer) as page:
-        page.set("layer", "error against a training view")
-        page.wait_until(lambda: "no error to show" in page.texts)
-        assert "the scene has gone" in page.texts
-        assert show_layer(page, "colour").std() > 5
-        page.wait_until(lambda: "no error to show" not in page.texts)
 
 
 def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_what_is_wrong(viewer):
@@ -103,18 +80,6 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 
-@pytest.mark.slow
-def test_a_formula_is_shown_when_it_is_typed_not_letter_by_letter(viewer):
-    with opened(viewer) as page:
-        show_layer(page, "spectral index")
-        formula = "r650/r450"
-        for length in range(1, len(formula) + 1):
-            page.set("formula", formula[:length])
-        page.wait_until(lambda: "formula r650/r450" in page.texts)
-        assert "formula r650/r4;" not in page.seen_texts  # a prefix that can be read, too
-        assert "expected" not in page.seen_texts
-
-
 def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_were(viewer):
     with opened(viewer) as page:
         show_layer(page, "depth")
@@ -129,18 +94,6 @@ def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_
         page.set("own range", False)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
         assert not low["visible"]
-
-
-@pytest.mark.slow
-def test_bands_that_no_named_index_takes_say_so_and_a_formula_is_shown(tmp_path):
-    source = source_of_bands(tmp_path, 1000.0, 1010.0, 1020.0, 1030.0, 1040.0)
-    with serving(source) as (viewer, _), opened(viewer) as page:
-        assert available_indices(viewer.services.maker.edited(Edit()).bands) == []
-        assert page.controls[page.control("index")]["options"] == ["none for these bands"]
-        page.set("layer", "spectral index")
-        page.wait_until(lambda: "type a formula of the wavelengths from 995 to 1045 nm" in page.texts)
-        page.set("formula", "r1040/r1000")
-        page.wait_until(lambda: "formula r1040/r1000" in page.texts)
 
 
 def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(viewer):
@@ -332,25 +285,65 @@ def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
 
 
 @pytest.mark.slow
-def test_a_name_can_be_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(viewer):
+def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(viewer):
     with opened(viewer) as page:
         name, recipe = (page.controls[page.control(label)] for label in ("name", "recipe"))
-        for length in range(len("blue ") + 1):
-            page.set("name", "blue "[:length])
-        page.wait_until(lambda: "name: blue" in recipe["value"])
-        # What the page was sent has the letters as typed, with the space: nothing was written back.
-        assert name["value"] == "endmember_0"
-        for length in range(len("blue "), len("blue cloth") + 1):
+        for length in range(len("blue cloth") + 1):
             page.set("name", "blue cloth"[:length])
         page.wait_until(lambda: "name: blue cloth" in recipe["value"])
+        assert (
+            name["value"] == "endmember_0"
+        )  # as the page was sent: nothing is written back over what is typed
         page.set("changes", "undo")
-        page.wait_until(lambda: recipe["value"] == "edits: []\n")
-        page.wait_until(lambda: name["value"] == "endmember_0")
+        page.wait_until(lambda: recipe["value"] == "edits: []\n" and name["value"] == "endmember_0")
         assert page.notices == []
         page.set("name", "endmember_1")
         page.wait_until(lambda: any("is called 'endmember_1' already" in text for _, text in page.notices))
         assert recipe["value"] == "edits: []\n"
         page.wait_until(lambda: name["value"] == "endmember_0")
+
+
+def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_changes_nothing(viewer):
+    def load(page, name, said):
+        page.set("saved", name)
+        page.set("load", True)
+        page.wait_until(lambda: any(said in text for _, text in page.notices))
+        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+
+    recipes = viewer.services.recipes_folder
+    (recipes.parent / "secret.yml").write_text("edits:\n  - scale: {endmember: 0, factor: 3}\n")
+    with opened(viewer) as page:
+        load(page, "../secret.yml", "choose one of the recipes")
+    recipes.mkdir()
+    (recipes / "wrong.yml").write_text("edits:\n  - scale: {endmember: granite, factor: 2}\n")
+    (recipes / "broken.yml").write_text("edits: [")
+    with opened(viewer) as page:
+        load(page, "wrong.yml", "there is no endmember 'granite'")
+        load(page, "broken.yml", "broken.yml")
+
+
+@pytest.mark.slow
+def test_every_light_that_is_offered_can_be_chosen(tmp_path):
+    source = source_of_bands(tmp_path, 700.0, 800.0, 900.0, 1000.0, 1100.0)
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        offered = page.controls[page.control("light")]["options"]
+        assert 3 < len(offered) < len(illuminant_names())
+        for name in offered[1:]:
+            edited = viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))
+            assert edited.light_power is not None
+
+
+def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
+    with opened(viewer) as page:
+        for label, value in (("width", 60), ("height", 40), ("file name", "../../../evil/../shot")):
+            page.set(label, value)
+        page.set("save a screenshot (PNG)", True)
+        page.wait_until(lambda: bool(page.downloads))
+        (path,) = viewer.services.folder.iterdir()
+        assert path.name == "evil_.._shot.png"
+        picture = Image.open(path)
+        assert picture.size == (60, 40)
+        assert np.asarray(picture).std() > 5
 
 
 @pytest.mark.slow
@@ -383,87 +376,27 @@ def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
             page.set(label, value)
             page.wait_until(lambda written=written: written in recipe["value"])
         show_layer(page, "depth")
-        assert [text for _, text in page.notices] == [
-            "the scene does not say what light it was recorded in: taken as flat (CIE illuminant E)"
-        ]
+        (notice,) = page.notices
+        assert notice[1].endswith("taken as flat (CIE illuminant E)")
 
 
-def test_files_outside_the_folder_of_recipes_are_not_read(viewer):
-    secret = viewer.services.source.run.path / "secret.yml"
-    secret.write_text("edits:\n  - scale: {endmember: 0, factor: 3}\n")
-    with opened(viewer) as page:
-        page.set("saved", "../secret.yml")
-        page.set("load", True)
-        page.wait_until(lambda: bool(page.notices))
-        assert "choose one of the recipes" in page.notices[0][1]
-
-
-def test_a_recipe_that_does_not_fit_is_refused_and_changes_nothing(viewer):
-    recipes = viewer.services.recipes_folder
-    recipes.mkdir()
-    (recipes / "wrong.yml").write_text("edits:\n  - scale: {endmember: granite, factor: 2}\n")
-    (recipes / "broken.yml").write_text("edits: [")
-    with opened(viewer) as page:
-        for name in ("wrong.yml", "broken.yml"):
-            page.set("saved", name)
-            count = len(page.notices)
-            page.set("load", True)
-            page.wait_until(lambda count=count: len(page.notices) > count)
-        texts = [text for _, text in page.notices]
-        assert "there is no endmember 'granite'" in texts[0]
-        assert "broken.yml" in texts[1]
-        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
-
-
-@pytest.mark.slow
-def test_every_light_that_is_offered_can_be_chosen(tmp_path):
-    source = source_of_bands(tmp_path, 700.0, 800.0, 900.0, 1000.0, 1100.0)
-    with serving(source) as (viewer, _), opened(viewer) as page:
-        offered = page.controls[page.control("light")]["options"]
-        assert 3 < len(offered) < len(illuminant_names())
-        for name in offered[1:]:
-            edited = viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))
-            assert edited.light_power is not None
-
-
-def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
-    with opened(viewer) as page:
-        for label, value in (("width", 60), ("height", 40), ("file name", "../../../evil/../shot")):
-            page.set(label, value)
-        page.set("save a screenshot (PNG)", True)
-        page.wait_until(lambda: bool(page.downloads))
-        (path,) = viewer.services.folder.iterdir()
-        assert path.name == "evil_.._shot.png"
-        picture = Image.open(path)
-        assert picture.size == (60, 40)
-        assert np.asarray(picture).std() > 5
-
-
-@pytest.mark.slow
 def test_spectra_are_saved_as_exr(viewer):
-    import OpenEXR
-
     with opened(viewer) as page:
         page.set("width", 32)
         page.set("height", 24)
         page.set("save the spectra (EXR)", True)
         page.wait_until(lambda: page.downloads == ["view.exr"])
         (path,) = viewer.services.folder.iterdir()
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = file.channels()
-            assert sum(name.startswith("S0.") for name in channels) == 5
-            assert channels["S0.450,000000nm"].pixels.shape == (24, 32)
+        assert read_exr(path)["S0.450,000000nm"].shape == (24, 32)
 
 
 @pytest.mark.slow
 def test_sizes_that_are_too_large_or_out_of_bounds_are_refused(viewer):
     with opened(viewer) as page:
         for label, value in (("width", 100_000), ("height", 1e9), ("width", -3)):
-            page.set("width", 1024)
-            page.set("height", 1024)
-            page.set(label, value)
-            for button in ("save a screenshot (PNG)", "save the spectra (EXR)"):
-                page.set(button, True)
+            for one in ("width", "height"):
+                page.set(one, value if one == label else 1024)
+            page.set("save the spectra (EXR)" if value < 0 else "save a screenshot (PNG)", True)
             said = f"{label} is a number of pixels from 16 to 8192; found {value:g}"
             page.wait_until(lambda said=said: any(said in text for _, text in page.notices))
         page.set("width", 8192)

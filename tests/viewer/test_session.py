@@ -14,21 +14,16 @@ def state(rows):
     return PageState(None, LayerSettings(), RecipeHistory(), rows, 1)
 
 
-def test_the_page_that_was_closed_last_comes_back_first_and_once():
-    pages = _KeptPages()
+def test_the_page_that_was_closed_last_comes_back_first_and_once_unless_that_is_long_ago():
+    now = [0.0]
+    pages = _KeptPages(lambda: now[0])
     for rows in (100, 200):
         pages.leave("mine", state(rows))
     pages.leave("other", state(300))
     kept = [pages.take("mine") for _ in range(3)]
     assert [one and one.largest_height for one in kept] == [200, 100, None]
-
-
-def test_what_was_left_long_ago_is_forgotten():
-    now = [0.0]
-    pages = _KeptPages(lambda: now[0])
-    pages.leave("mine", state(100))
     now[0] = _KEPT_S
-    assert pages.take("mine") is None
+    assert pages.take("other") is None
 
 
 def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(viewer):

@@ -55,33 +55,25 @@ def test_a_browser_looking_along_its_z_is_a_camera_looking_along_minus_z():
     assert_close(middle, torch.tensor([0.0, 0.0, 1.0]))
     above = camera.image_rays(0).directions[1]
     assert above[1] < 0  # OpenCV: y points down, so what is above has smaller y
+    wide = camera_of(_checked_pose((1, 0, 0, 0), (0, 0, 0), math.radians(90), 2.0), 100)
+    assert (wide.width, wide.height) == (200, 100)
+    assert wide.focal_px[0].tolist() == pytest.approx([50, 50])  # the field of view spans the height
 
 
-def test_the_vertical_field_of_view_spans_the_height():
-    camera = camera_of(_checked_pose((1, 0, 0, 0), (0, 0, 0), math.radians(90), 2.0), 100)
-    assert (camera.width, camera.height) == (200, 100)
-    assert camera.focal_px[0].tolist() == pytest.approx([50, 50])
+SOUND = {"wxyz": (1, 0, 0, 0), "position": (0, 0, 0), "fov": 1.0, "aspect": 1.0}
 
 
 @pytest.mark.parametrize(
-    ("wxyz", "position", "fov", "aspect"),
+    ("name", "value"),
     [
-        ((math.nan, 0, 0, 1), (0, 0, 0), 1.0, 1.0),
-        ((1, 0, 0, 0), (math.inf, 0, 0), 1.0, 1.0),
-        ((1, 0, 0, 0), (0, 0, 0), math.nan, 1.0),
-        ((1, 0, 0, 0), (0, 0, 0), 1.0, math.nan),
-        ((1, 0, 0, 0), (0, 0, 0), 1.0, 0.0),
-        ((0, 0, 0, 0), (0, 0, 0), 1.0, 1.0),
-        ((1, 0, 0, 0), (0, 1e9, 0), 1.0, 1.0),
-        ((1, 0, 0), (0, 0, 0), 1.0, 1.0),
-        (("x", 0, 0, 0), (0, 0, 0), 1.0, 1.0),
-        ((1, 0, 0, 0), (0, 0), 1.0, 1.0),
-        ((1, 0, 0, 0), (0, None, 0), 1.0, 1.0),
+        *(("wxyz", wxyz) for wxyz in ((math.nan, 0, 0, 1), (0, 0, 0, 0), (1, 0, 0), ("x", 0, 0, 0))),
+        *(("position", place) for place in ((math.inf, 0, 0), (0, 1e9, 0), (0, 0), (0, None, 0))),
+        *(("fov", math.nan), ("aspect", math.nan), ("aspect", 0.0)),
     ],
 )
-def test_a_camera_that_is_none_is_refused(wxyz, position, fov, aspect):
+def test_a_camera_that_is_none_is_refused(name, value):
     with pytest.raises(ConfigError, match="the browser sent a camera"):
-        _checked_pose(wxyz, position, fov, aspect)
+        _checked_pose(**{**SOUND, name: value})
 
 
 def test_absurd_fields_of_view_and_shapes_are_brought_within_bounds():
@@ -97,18 +89,15 @@ def test_a_picture_never_has_more_pixels_than_allowed_nor_none(height, aspect):
     assert 1 <= camera.width * camera.height <= 5000
 
 
-def test_up_is_the_axis_of_the_world_that_the_cameras_hold_upright():
+def test_up_is_the_axis_that_cameras_hold_upright_and_z_where_they_look_down_whatever_their_pictures_have_on_top():
     assert up_direction(ring(8)) == (0.0, 0.0, 1.0)
-
-
-def test_up_is_z_where_cameras_look_down_whatever_their_pictures_have_on_top():
     poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
     poses[::2, :2, :2] *= -1  # flight lines there and back
     for chosen in (poses, poses[::2]):
         assert up_direction(replace(ring(len(chosen)), camera_to_world=chosen)) == (0.0, 0.0, 1.0)
 
 
-def test_a_path_goes_through_its_key_frames_in_their_order():
+def test_a_path_goes_smoothly_through_its_key_frames_in_their_order_and_needs_two():
     keys = [some_pose(index) for index in (0, 2, 1, 3)]
     poses = path_poses(keys, 31)
     assert len(poses) == 31
@@ -117,18 +106,12 @@ def test_a_path_goes_through_its_key_frames_in_their_order():
         np.testing.assert_allclose(pose.position, key.position, atol=1e-6)
         np.testing.assert_allclose(_rotation_matrix(pose.wxyz), _rotation_matrix(key.wxyz), atol=1e-6)
         assert pose.fov == pytest.approx(key.fov)
-
-
-def test_a_path_is_smooth():
     positions = np.array([pose.position for pose in path_poses([some_pose(i) for i in range(4)], 301)])
     speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert np.abs(np.diff(speeds)).max() < 0.02 * speeds.max()
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_path_needs_two_key_frames(count):
-    with pytest.raises(ConfigError, match="at least two key frames"):
-        path_poses([some_pose()] * count, 10)
+    for few in ([], keys[:1]):
+        with pytest.raises(ConfigError, match="at least two key frames"):
+            path_poses(few, 10)
 
 
 def test_a_page_starts_beside_a_camera_and_further_back_but_stays_in_a_room():

@@ -8,11 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from tests.method_factory import BOX, make_model
 from tests.scenes.scene_factory import ring_poses
+from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
@@ -37,15 +35,7 @@ WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
 
 def ring(count: int = 4) -> Cameras:
     """Cameras around the origin that see the whole box."""
-    poses = np.stack(ring_poses(count, distance=4.0))[:, :3]
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        torch.full((count, 2), FOCAL),
-        torch.tensor([[WIDTH / 2, HEIGHT / 2]]).expand(count, 2).contiguous(),
-        torch.zeros(count, 4),
-        WIDTH,
-        HEIGHT,
-    )
+    return cameras_at(ring_poses(count, distance=4.0), WIDTH, HEIGHT, FOCAL)
 
 
 def make_source(

@@ -1,5 +1,7 @@
 """Where cameras stand and look: paths are of real cameras, and the focus is where axes meet."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -65,13 +67,10 @@ def test_cameras_on_one_side_give_an_arc_over_that_side_to_and_fro():
     assert steps.max() < 0.15, "the last frame leads back to the first"
 
 
-def test_one_camera_alone_still_has_an_orbit():
+def test_one_camera_alone_and_cameras_that_look_straight_down_have_an_orbit_too():
     path = orbit(cameras_at([look_at(np.array([0.0, -3.0, 1.0]), np.zeros(3))]), BOX, 12)
     assert_rigid(path)
     assert 0.3 < np.ptp(path.camera_to_world[:, 0, 3].numpy()) < 2.0
-
-
-def test_cameras_that_look_straight_down_have_an_orbit_too():
     poses = [look_at(np.array([x, 0.01, 4.0]), np.array([x, 0.0, 0.0])) for x in (-0.5, 0.0, 0.5)]
     assert_rigid(orbit(cameras_at(poses), BOX, 12))
 
@@ -98,14 +97,9 @@ def test_a_path_bends_around_what_its_cameras_look_at():
     torch.testing.assert_close(coords, torch.tensor([[20.0, 15.0]]).expand(60, 2), atol=0.1, rtol=0)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_opposite_cameras_have_a_path_of_real_cameras(sign):
-    poses = [
-        look_at(
-            np.array([x, 0.0, 0.0]), sign * np.array([-x, 0.0, 0.0]) * 0.1 + (1 - sign) * np.array([x, 0, 0])
-        )
-        for x in (-3.0, 3.0)
-    ]
+@pytest.mark.parametrize("target", [-0.1, 2.0])
+def test_opposite_cameras_have_a_path_of_real_cameras(target):
+    poses = [look_at(np.array([x, 0.0, 0.0]), np.array([target * x, 0.0, 0.0])) for x in (-3.0, 3.0)]
     path = interpolated(cameras_at(poses), BOX, 31)
     assert_rigid(path)
     assert bool(torch.isfinite(path.camera_to_world).all())
@@ -127,20 +121,14 @@ def test_a_path_needs_two_different_cameras():
             interpolated(cameras_at(poses), BOX, 5)
 
 
-def test_another_size_keeps_the_vertical_view_and_square_pixels():
+def test_another_size_keeps_the_vertical_view_square_pixels_and_a_shifted_centre():
     cameras = around(2)
     larger = cameras.resized(200, 60)
     assert (larger.width, larger.height) == (200, 60)
     point = torch.tensor([[0.1, 0.2, 0.3]])
     before, after = cameras.project(point, 0)[0][0], larger.project(point, 0)[0][0]
     torch.testing.assert_close(after - torch.tensor([100.0, 30.0]), 2 * (before - torch.tensor([20.0, 15.0])))
-
-
-def test_a_shifted_principal_point_stays_shifted_when_resized():
-    camera = around(1)
-    shifted = type(camera)(
-        camera.camera_to_world, camera.focal_px, torch.tensor([[23.0, 12.0]]), camera.distortion, 40, 30
-    )
+    shifted = replace(around(1), center_px=torch.tensor([[23.0, 12.0]]))
     torch.testing.assert_close(shifted.resized(80, 60).center_px, torch.tensor([[46.0, 24.0]]))
 
 
@@ -174,14 +162,6 @@ def test_parallel_and_outward_cameras_have_no_focus(find):
     outward = [look_at(pose[:3, 3], 2.0 * pose[:3, 3]) for pose in ring_poses(6)]
     assert find(stacked(parallel)) is None
     assert find(stacked(outward)) is None
-
-
-def test_cameras_around_a_subject_or_on_one_side_of_it_meet():
-    aside = [look_at(np.array([0.3 * x, -3.0, 0.0]), np.zeros(3)) for x in (-2, -1, 0, 1, 2)]
-    for poses in (ring_poses(12), aside):
-        found = meeting_point(stacked(poses))
-        assert found is not None
-        np.testing.assert_allclose(found, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [3, 5, 20])

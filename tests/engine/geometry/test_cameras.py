@@ -30,17 +30,6 @@ def make_cameras(
     )
 
 
-def identity_camera() -> Cameras:
-    return Cameras(
-        camera_to_world=torch.eye(3, 4)[None],
-        focal_px=torch.tensor([[50.0, 50.0]]),
-        center_px=torch.tensor([[32.0, 24.0]]),
-        distortion=torch.zeros(1, 4),
-        width=WIDTH,
-        height=HEIGHT,
-    )
-
-
 pixels = st.lists(
     st.tuples(st.floats(0.0, WIDTH, width=32), st.floats(0.0, HEIGHT, width=32)), min_size=1, max_size=8
 )
@@ -85,29 +74,32 @@ def test_distortion_agrees_with_the_opencv_formula_at_a_worked_point():
     assert_close(bent, torch.tensor([[expected_x, expected_y]], dtype=torch.float64), atol=1e-7, rtol=0)
 
 
+CAMERA = Cameras(
+    torch.eye(3, 4)[None],
+    torch.full((1, 2), 50.0),
+    torch.tensor([[32.0, 24.0]]),
+    torch.zeros(1, 4),
+    WIDTH,
+    HEIGHT,
+)
+
+
 def test_axes_are_opengl():
-    camera = identity_camera()
-    middle = camera.generate_rays(
-        torch.zeros(3, dtype=torch.int64), torch.tensor([[32.0, 24], [52.0, 24], [32.0, 4]])
-    )
+    coords = torch.tensor([[32.0, 24], [52.0, 24], [32.0, 4]])
+    middle = CAMERA.generate_rays(torch.zeros(3, dtype=torch.int64), coords)
     assert_close(middle.directions[0], torch.tensor([0.0, 0.0, -1.0]))
     assert middle.directions[1, 0] > 0  # a pixel to the right lies at +x
     assert middle.directions[2, 1] > 0  # a pixel further up lies at +y
 
 
-def test_depth_is_measured_along_the_axis_and_negative_behind():
-    _, depths = identity_camera().project(
-        torch.tensor([[1.0, 2.0, -3.0], [0.0, 0.0, 4.0], [1.0, 1.0, 0.0]]), 0
-    )
-    assert_close(depths, torch.tensor([3.0, -4.0, 0.0]))
-
-
-def test_points_on_the_camera_plane_project_to_finite_numbers():
-    projected, _ = identity_camera().project(torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), 0)
+def test_depth_is_measured_along_the_axis_negative_behind_and_finite_on_the_plane():
+    points = torch.tensor([[1.0, 2.0, -3.0], [0.0, 0.0, 4.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    projected, depths = CAMERA.project(points, 0)
+    assert_close(depths, torch.tensor([3.0, -4.0, 0.0, 0.0]))
     assert torch.isfinite(projected).all()
 
 
-def test_image_rays_run_row_after_row_through_pixel_centres():
+def test_image_rays_run_row_after_row_through_pixel_centres_or_another_part_of_a_pixel():
     cameras = make_cameras()
     rays = cameras.image_rays(1)
     assert len(rays) == WIDTH * HEIGHT
@@ -115,10 +107,6 @@ def test_image_rays_run_row_after_row_through_pixel_centres():
     expected = cameras.generate_rays(torch.tensor([1]), torch.tensor([[column + 0.5, row + 0.5]]))
     assert_close(rays.directions[row * WIDTH + column], expected.directions[0])
     assert (rays.camera_indices == 1).all()
-
-
-def test_a_subpixel_offset_moves_the_rays_by_that_part_of_a_pixel():
-    cameras = make_cameras()
     rays = cameras.image_rays(0, subpixel_offset=(0.25, 1.0))
     projected, _ = cameras.project(rays.origins + rays.directions, 0)
     assert_close(projected[WIDTH + 2], torch.tensor([2.25, 2.0]), atol=1e-3, rtol=0)
@@ -129,7 +117,8 @@ def test_json_gives_back_the_same_bits():
     again = Cameras.from_json(json.loads(json.dumps(cameras.to_json())))
     for name in ("camera_to_world", "focal_px", "center_px", "distortion"):
         assert torch.equal(getattr(again, name), getattr(cameras, name)), name
-    assert (again.width, again.height) == (WIDTH, HEIGHT)
+    assert (again.width, again.height, again.is_distorted) == (WIDTH, HEIGHT, True)
+    assert not make_cameras().is_distorted
 
 
 @pytest.mark.parametrize(
@@ -141,11 +130,6 @@ def test_indexing_gives_cameras_in_the_order_asked_for(index, expected):
     assert len(chosen) == len(expected)
     assert torch.equal(chosen.focal_px, cameras.focal_px[expected])
     assert torch.equal(chosen.camera_to_world, cameras.camera_to_world[expected])
-
-
-def test_a_distorted_lens_is_told_from_a_pinhole():
-    assert make_cameras(distortion=(0.0, 0.0, 0.0, 0.01)).is_distorted
-    assert not make_cameras().is_distorted
 
 
 def cameras_of_two_sizes() -> Cameras:

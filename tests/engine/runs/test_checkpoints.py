@@ -74,6 +74,7 @@ def calls_of_a_save(folder: Path, dead: bool = True) -> int:
 
 
 def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
+    base = torch.arange(12.0).reshape(3, 4)
     tensors = {
         "float": torch.randn(5, 7),
         "double": torch.randn(3, dtype=torch.float64),
@@ -81,26 +82,19 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
         "scalar": torch.tensor(3.5),
         "empty": torch.zeros(0, 4),
         "half": torch.randn(4).to(torch.bfloat16),
+        "base": base,
+        "transposed": base.T,
+        "row": base[1],
+        "again": base,  # as what views show
+        "parameter": torch.nn.Parameter(base.clone()),
     }
     path = save_checkpoint(tmp_path / "new", 7, tensors, {"seconds": 1.25, "list": [1, "x", None]})
     assert path.name == "step-000007.json"
     loaded = complete(tmp_path / "new")
-    assert loaded.step == 7
-    assert loaded.record["seconds"] == 1.25
-    assert loaded.record["list"] == [1, "x", None]
+    assert (loaded.step, loaded.record["seconds"], loaded.record["list"]) == (7, 1.25, [1, "x", None])
     assert set(loaded.tensors) == set(tensors)
     for name, tensor in tensors.items():
         assert loaded.tensors[name].dtype == tensor.dtype
-        assert torch.equal(loaded.tensors[name], tensor)
-
-
-def test_views_and_tied_tensors_are_saved_as_what_they_show(tmp_path: Path):
-    base = torch.arange(12.0).reshape(3, 4)
-    parameter = torch.nn.Parameter(base.clone())
-    tensors = {"base": base, "transposed": base.T, "row": base[1], "again": base, "parameter": parameter}
-    save_checkpoint(tmp_path, 1, tensors, {})
-    loaded = complete(tmp_path)
-    for name, tensor in tensors.items():
         assert torch.equal(loaded.tensors[name], tensor.detach())
 
 
@@ -213,24 +207,18 @@ def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):
     assert found.step == 1
 
 
-def test_a_save_after_damage_never_counts_the_damaged_one_among_those_kept(tmp_path: Path):
+def test_the_newest_two_stay_and_a_damaged_one_does_not_count_among_them(tmp_path: Path):
+    assert newest_complete_checkpoint(tmp_path / "missing") is None
+    assert newest_complete_checkpoint(tmp_path) is None
+    for step in (10, 999_999, 1_000_000, 1_000_001):
+        save_checkpoint(tmp_path / "many", step, tensors_of(step), {})
+    assert checkpoint_steps(tmp_path / "many") == [1_000_001, 1_000_000]
+    assert len(list((tmp_path / "many").iterdir())) == 4
     for step in (1, 2, 9):
         save_checkpoint(tmp_path, step, tensors_of(step), {}, keep=3)
     (tmp_path / "step-000009.safetensors").write_bytes(b"damaged")
     save_checkpoint(tmp_path, 3, tensors_of(3), {}, keep=2)
     assert checkpoint_steps(tmp_path) == [3, 2]
-
-
-def test_only_the_newest_two_stay(tmp_path: Path):
-    for step in (10, 999_999, 1_000_000, 1_000_001):
-        save_checkpoint(tmp_path, step, tensors_of(step), {})
-    assert checkpoint_steps(tmp_path) == [1_000_001, 1_000_000]
-    assert len(list(tmp_path.iterdir())) == 4
-
-
-def test_no_checkpoint_is_none(tmp_path: Path):
-    assert newest_complete_checkpoint(tmp_path) is None
-    assert newest_complete_checkpoint(tmp_path / "missing") is None
 
 
 def test_a_checkpoint_of_a_newer_version_is_refused_not_passed_over(tmp_path: Path):

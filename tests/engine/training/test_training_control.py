@@ -107,13 +107,8 @@ def test_without_training_a_guest_never_waits():
     with device.guest_turn():
         pass
     assert time.monotonic() - started < 5
-
-
-def test_what_a_guest_took_before_training_is_forgotten():
-    device = DeviceShare(0.05)
-    device.charge(1000.0)
     device.is_training = True
-    assert device.guest_may_go
+    assert device.guest_may_go  # what it took before training is forgotten
 
 
 def test_a_guest_that_waits_for_credit_goes_on_when_training_ends():
@@ -134,42 +129,22 @@ def test_a_guest_that_waits_for_credit_goes_on_when_training_ends():
     guest.join()
 
 
-def test_an_error_in_a_turn_gives_the_device_back():
-    device = DeviceShare()
-    for turn in (device.training_turn, device.guest_turn):
-        with pytest.raises(ZeroDivisionError), turn():
-            raise ZeroDivisionError
-    with device.training_turn():
-        pass
-
-
 @pytest.mark.parametrize("inner", ["training_turn", "guest_turn"])
 @pytest.mark.parametrize("outer", ["training_turn", "guest_turn"])
-def test_a_turn_within_a_turn_is_refused_rather_than_waited_for_for_ever(outer, inner):
+def test_a_turn_within_a_turn_is_refused_and_an_error_in_one_gives_the_device_back(outer, inner):
     device = DeviceShare()
     refused = pytest.raises(RuntimeError, match="turns do not nest")
     with getattr(device, outer)(), refused, getattr(device, inner)():
         pass
+    with pytest.raises(ZeroDivisionError), getattr(device, outer)():
+        raise ZeroDivisionError
     with getattr(device, inner)():
         pass
 
 
-def test_training_turns_are_counted():
-    device = DeviceShare()
-    for _ in range(3):
-        with device.training_turn():
-            pass
-    with device.guest_turn():
-        pass
-    assert device.training_turns == 3
-
-
-@pytest.mark.parametrize(("asked", "kept"), [(-1.0, SHARE_BOUNDS[0]), (7.0, SHARE_BOUNDS[1]), (0.3, 0.3)])
-def test_shares_stay_within_bounds(asked, kept):
-    device = DeviceShare(asked)
-    assert device.guest_share == kept
-    device.guest_share = math.nan
-    assert device.guest_share == SHARE_BOUNDS[0]
+def test_shares_stay_within_bounds():
+    low, high = SHARE_BOUNDS
+    assert [DeviceShare(share).guest_share for share in (-1.0, 7.0, 0.3, math.nan)] == [low, high, 0.3, low]
 
 
 def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under_way():
@@ -246,11 +221,14 @@ def test_a_guest_on_the_device_changes_nothing_of_a_training(short_config, avera
 
 
 def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
-    trainer = quiet_trainer(short_config)
-    control = trainer.control
+    out = io.StringIO()
+    trainer = Trainer(short_config, console=Console(file=out))
+    control, owners = trainer.control, []
+    trainer.pipeline.model.warm_up = lambda: owners.append(control.device._owner)
     call_after_step(trainer, 5, control.pause)
     thread = in_background(trainer.train)
     wait_for(lambda: control.is_paused and trainer.step == 5)
+    assert owners == [thread.ident]  # kernels are compiled once, in a turn of training
     assert control.is_running
     assert not control.device.is_training
     seconds = trainer.clock.seconds
@@ -261,10 +239,11 @@ def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
     assert trainer.step == 12
     assert not control.is_running
     assert not control.device.is_training
+    assert out.getvalue().count("paused at step 5") == out.getvalue().count("resumed at step 5") == 1
 
 
 def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
-    trainer = quiet_trainer(replace(short_config, steps_per_save=0))
+    trainer = quiet_trainer(replace(short_config, steps_per_save=0, checkpoints_kept=5))
     call_after_step(trainer, 3, trainer.control.pause)
     thread = in_background(trainer.train)
     wait_for(lambda: trainer.control.is_paused and trainer.step == 3)
@@ -275,15 +254,10 @@ def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
     wait_for(lambda: checkpoint_steps(trainer.run.checkpoints) == [3])
     assert trainer.step == 3
     assert trainer.control.device.training_turns <= turns + 1
+    call_after_step(trainer, 7, trainer.control.request_save)
     trainer.control.resume()
     thread.join(120)
-
-
-def test_a_checkpoint_that_is_asked_for_is_saved_after_the_step(short_config):
-    trainer = quiet_trainer(replace(short_config, steps_per_save=0, checkpoints_kept=5))
-    call_after_step(trainer, 7, trainer.control.request_save)
-    trainer.train()
-    assert sorted(checkpoint_steps(trainer.run.checkpoints)) == [7, 12]
+    assert sorted(checkpoint_steps(trainer.run.checkpoints)) == [3, 7, 12]
 
 
 @pytest.mark.parametrize("is_paused", [False, True])
@@ -319,26 +293,6 @@ def test_a_guest_that_leaves_the_model_in_evaluation_mode_does_not_change_the_ne
     trainer.pipeline.eval()  # a page that rendered before the first step
     trainer.train()
     assert modes == [True, True, False] + 9 * [True]
-
-
-def test_kernels_are_compiled_in_a_turn_of_training(short_config, monkeypatch):
-    trainer = quiet_trainer(short_config)
-    device, owners = trainer.control.device, []
-    monkeypatch.setattr(trainer.pipeline.model, "warm_up", lambda: owners.append(device._owner))
-    trainer.train()
-    assert owners == [threading.get_ident()]
-
-
-def test_the_terminal_says_when_training_pauses_and_goes_on(short_config):
-    out = io.StringIO()
-    trainer = Trainer(short_config, console=Console(file=out))
-    call_after_step(trainer, 5, trainer.control.pause)
-    thread = in_background(trainer.train)
-    wait_for(lambda: "paused at step 5" in out.getvalue())
-    trainer.control.resume()
-    thread.join(120)
-    assert out.getvalue().count("paused") == 1
-    assert "resumed at step 5" in out.getvalue()
 
 
 def test_the_status_follows_the_training(short_config, monkeypatch):

@@ -19,7 +19,7 @@ from unmix_plugin.neumatex.demo.objects import (
     write_object,
     write_spectral_object,
 )
-from unmix_plugin.neumatex.demo.surfaces import Noise, SpectralSurface, demo_mesh, demo_surface
+from unmix_plugin.neumatex.demo.surfaces import SpectralSurface, demo_mesh, demo_surface
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
 from unmix_plugin.neumatex.tracing.light_files import read_environment
@@ -48,44 +48,30 @@ def test_a_seed_repeats_and_another_differs():
     assert torch.equal(first.vertices, again.vertices)
     assert first.vertices.shape != other.vertices.shape
     assert torch.equal(first.vertices, demo_mesh(resolution=24).vertices)
-
-
-def test_noise_has_unit_variance():
-    noise = Noise.draw(np.random.default_rng(0), 5.0)
-    values = noise.at(20 * torch.rand(50_000, 3, generator=torch.Generator().manual_seed(0)))
-    assert_close(values.mean(), torch.tensor(0.0), atol=0.05, rtol=0)
-    assert_close(values.std(), torch.tensor(1.0), atol=0.05, rtol=0)
+    first, again, other = (seeded_surface(seed).parameters(_positions()) for seed in (0, 0, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert demo_surface().kinds == seeded_surface(0).kinds
+    assert torch.equal(demo_surface().parameters(_positions()), first)
 
 
 def _positions():
     return 2 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(0)) - 1
 
 
-def test_parameters_are_in_range_and_vary():
-    seen = set()
+def test_parameters_are_in_range_and_vary_and_every_layer_is_used_by_some_object():
+    seen, largest = set(), []
     for seed in range(12):
         surface = seeded_surface(seed)
         parameters = surface.parameters(_positions())
         assert parameters.shape == (5000, surface.family.num_parameters)
         assert bool(((parameters >= 0) & (parameters <= 1)).all())
         assert bool((parameters[:, :3].std(dim=0) > 0.01).all())
+        largest.append(parameters.amax(dim=0))
         seen |= set(surface.kinds)
     assert len(seen) == 7
-
-
-def test_every_layer_is_used_by_some_object():
-    largest = torch.stack([seeded_surface(seed).parameters(_positions()).amax(dim=0) for seed in range(12)])
-    named = dict(zip(LayeredFamily.PARAMETERS, largest.amax(dim=0).tolist(), strict=True))
+    named = dict(zip(LayeredFamily.PARAMETERS, torch.stack(largest).amax(dim=0).tolist(), strict=True))
     assert all(value > 0.3 for value in named.values()), named
-
-
-def test_a_seed_repeats_and_another_differs_layered_surface():
-    first, again, other = (seeded_surface(seed).parameters(_positions()) for seed in (3, 3, 4))
-    assert torch.equal(first, again)
-    assert not torch.equal(first, other)
-    built_in = demo_surface()
-    assert built_in.kinds == seeded_surface(0).kinds
-    assert torch.equal(built_in.parameters(_positions()), seeded_surface(0).parameters(_positions()))
 
 
 SIZE = 20
@@ -107,12 +93,10 @@ def _read(path):
 
 def _cameras(content):
     poses = torch.tensor([frame["transform_matrix"] for frame in content["frames"]])[:, :3]
-    lens = [
-        torch.tensor([[content[f"{what}_{axis}"] for axis in axes]] * len(poses))
-        for what, axes in [("fl", "xy")]
-    ]
-    centres = torch.tensor([[content["cx"], content["cy"]]] * len(poses))
-    return Cameras(poses, lens[0], centres, torch.zeros(len(poses), 4), content["w"], content["h"])
+    lens, centres = (
+        torch.tensor([[content[a], content[b]]] * len(poses)) for a, b in (("fl_x", "fl_y"), ("cx", "cy"))
+    )
+    return Cameras(poses, lens, centres, torch.zeros(len(poses), 4), content["w"], content["h"])
 
 
 def test_pictures_can_be_rendered_again_from_the_files(folder):
@@ -142,12 +126,9 @@ def test_objects_are_well_exposed_and_whole(folder):
     assert 0.15 < covered.mean() < 0.6
     border = torch.cat([pictures[:, 0], pictures[:, -1], pictures[:, :, 0], pictures[:, :, -1]], dim=1)
     assert border.abs().max() == 0
-
-
-def test_base_colours_are_those_of_evaluation_views(folder):
-    truth = sorted(path.name for path in (folder / "truth" / "base_colour").iterdir())
-    assert truth == ["000.exr", "008.exr"]
-    colours = _read(folder / "truth" / "base_colour" / "008.exr")
+    truth = sorted((folder / "truth" / "base_colour").iterdir())
+    assert [path.name for path in truth] == ["000.exr", "008.exr"]  # of evaluation views
+    colours = _read(truth[1])
     assert torch.equal(colours[..., 3], _read(folder / "images" / "008.exr")[..., 3])
     assert colours[..., :3].max() <= 1.0001
     assert colours[colours[..., 3] > 0][:, :3].std() > 0.01
@@ -223,6 +204,11 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder
     assert scene.bands is not None
     shares = truth.abundances(0)
     assert shares is not None
+    like_any_other = load_scene(spectral_folder)
+    assert like_any_other.material_names == truth.names
+    assert (len(like_any_other.frames), len(like_any_other.eval_indices)) == (9, 2)
+    assert like_any_other.has_alpha
+    assert like_any_other.has_abundances
     alpha = scene.pictures.read(0).alpha
     assert alpha is not None
     np.testing.assert_allclose(shares.sum(axis=-1)[alpha > 0.5], 1, atol=2e-3)
@@ -232,15 +218,3 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder
     means = surface.parameters(vertices)[:, :4].mean(dim=0)
     assert_close(means, torch.full((4,), 0.25), atol=0.02, rtol=0)
     assert_close(surface.family.endmembers.double(), torch.from_numpy(truth.endmembers), atol=1e-6, rtol=0)
-
-
-def test_it_is_a_spectral_scene_like_any_other(spectral_folder):
-    scene = load_scene(spectral_folder)
-    truth = load_object(spectral_folder).true_materials
-    assert truth is not None
-    assert scene.material_names == truth.names
-    assert len(scene.eval_indices) == 2
-    assert scene.has_alpha
-    assert scene.has_abundances
-    content = json.loads((spectral_folder / "transforms.json").read_text())
-    assert len(content["frames"]) == 9

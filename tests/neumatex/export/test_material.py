@@ -15,7 +15,7 @@ from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths, write_material
 from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.export.product import MaterialProduct
-from unmix_plugin.neumatex.tracing.families import LayeredFamily
+from unmix_plugin.neumatex.tracing.families import LayeredFamily, PbrFamily
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
@@ -51,12 +51,6 @@ def exr(path):
     return np.stack([channels[name] for name in "RGB"], axis=-1)
 
 
-def test_the_gltf_is_in_metres_where_the_scale_is_known(written, tmp_path):
-    write_material(tmp_path, knot(), PBR, FRAME, 256, metres_per_unit=0.001)
-    units, metres = (loaded_mesh(folder / "material.glb").vertices for folder in (written, tmp_path))
-    np.testing.assert_allclose(metres, 0.001 * units, atol=1e-7)
-
-
 def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
     loaded = loaded_mesh(written / "material.glb")
     model = FRAME.to_model(np.asarray(loaded.vertices, dtype=np.float64))
@@ -71,38 +65,35 @@ def test_the_gltf_shows_the_material_where_the_surface_has_it(written):
     assert (pbr.metallicFactor, pbr.roughnessFactor) == (1, 1)
 
 
-def test_the_gltf_is_the_mesh_in_the_world(written):
+def test_the_gltf_is_the_mesh_in_the_world_in_metres_where_the_scale_is_known(written, tmp_path):
     loaded, mesh = loaded_mesh(written / "material.glb"), knot()
     assert len(loaded.faces) == len(mesh.faces)
+    corners = np.asarray(loaded.vertices)[loaded.faces]
     world = FRAME.to_world(mesh.vertices.double().numpy())
-    np.testing.assert_allclose(
-        np.asarray(loaded.vertices)[loaded.faces], world[mesh.faces.numpy()], atol=1e-5
-    )
-    normals = np.asarray(loaded.vertex_normals)
-    outward = np.cross(*(np.diff(np.asarray(loaded.vertices)[loaded.faces], axis=1).swapaxes(0, 1)))
-    assert ((normals[loaded.faces].mean(axis=1) * outward).sum(axis=1) > 0).all()
+    np.testing.assert_allclose(corners, world[mesh.faces.numpy()], atol=1e-5)
+    outward = np.cross(*np.diff(corners, axis=1).swapaxes(0, 1))
+    normals = np.asarray(loaded.vertex_normals)[loaded.faces].mean(axis=1)
+    assert ((normals * outward).sum(axis=1) > 0).all()
+    write_material(tmp_path, mesh, PBR, FRAME, 256, metres_per_unit=0.001)
+    metres = loaded_mesh(tmp_path / "material.glb").vertices
+    np.testing.assert_allclose(metres, 0.001 * np.asarray(loaded.vertices), atol=1e-7)
 
 
-def test_pictures_are_srgb_numbers_linear_and_both_are_the_same_colours(written):
+def test_pictures_are_srgb_numbers_linear_and_both_are_what_the_report_says(written):
     numbers = exr(written / "base_colour.exr")
     picture = np.asarray(Image.open(written / "base_colour.png"), dtype=np.float32) / 255
     assert numbers.shape == picture.shape == (256, 256, 3)
     decoded = srgb_to_linear(torch.from_numpy(picture)).numpy()
     np.testing.assert_allclose(decoded, numbers, atol=0.006)
+    rough = exr(written / "gltf_metallic_roughness.exr")
     packed = np.asarray(Image.open(written / "gltf_metallic_roughness.png"), dtype=np.float32) / 255
-    np.testing.assert_allclose(packed, exr(written / "gltf_metallic_roughness.exr"), atol=0.5 / 255 + 1e-6)
-
-
-def test_all_parameters_are_kept_in_full_precision(written):
-    channels = channels_of(written / "parameters.exr")
-    names = json.loads((written / "material.json").read_text())["parameters"]
-    assert [name[3:] for name in sorted(channels)] == names
-    roughness = exr(written / "gltf_metallic_roughness.exr")[..., 1]
-    np.testing.assert_array_equal(channels["03 roughness"], roughness)
-
-
-def test_the_report_says_what_is_in_each_texture(written):
-    report = json.loads((written / "material.json").read_text())
+    np.testing.assert_allclose(packed, rough, atol=0.5 / 255 + 1e-6)
+    report, channels = (
+        json.loads((written / "material.json").read_text()),
+        channels_of(written / "parameters.exr"),
+    )
+    assert [name[3:] for name in sorted(channels)] == report["parameters"]
+    np.testing.assert_array_equal(channels["03 roughness"], rough[..., 1])  # in full precision
     assert report["texture_size"] == 256
     assert 0.4 < report["texels_in_charts"] / 256**2 < 0.9
     for name, texture in report["textures"].items():
@@ -112,8 +103,6 @@ def test_the_report_says_what_is_in_each_texture(written):
 
 def fit_error(parameters, pbr, seed=3):
     """Mean relative error of reflected light of materials, from independent directions."""
-    from unmix_plugin.neumatex.tracing.families import PbrFamily
-
     g = torch.Generator().manual_seed(seed)
     wi, wo = (torch.nn.functional.normalize(torch.randn(len(pbr), 3, generator=g), dim=-1) for _ in range(2))
     wi, wo = wi * wi[:, 2:].sign(), wo * wo[:, 2:].sign()
@@ -154,10 +143,15 @@ def test_a_layered_material_that_is_a_gltf_one_is_found_again(monkeypatch):
     assert float((fit[:, :3] - parameters[:, :3]).abs().mean()) < 0.06
 
 
-@pytest.mark.parametrize("size", [0, 15, 8193])
-def test_impossible_sizes_are_refused(size):
-    with pytest.raises(ConfigError, match=f"--texture-size is {size}; choose 16 to 8192"):
-        MaterialProduct(texture_size=size)
+def test_impossible_sizes_and_what_is_missing_are_refused(monkeypatch):
+    for size in (0, 15, 8193):
+        with pytest.raises(ConfigError, match=f"--texture-size is {size}; choose 16 to 8192"):
+            MaterialProduct(texture_size=size)
+    with pytest.raises(ConfigError, match="--texture-size"):
+        unwrapped(ball(5), 16)  # too small for the charts
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match="-m pip install xatlas"):
+        unwrapped(ball(1), 64)
 
 
 def unwrapped(mesh, texture_size):
@@ -173,7 +167,7 @@ def areas_of(atlas):
     return np.abs(np.linalg.det(np.stack([b - a, c - a], axis=1))) / 2
 
 
-def test_charts_keep_every_triangle_and_lie_in_the_unit_square():
+def test_charts_keep_every_triangle_lie_in_the_unit_square_and_share_no_texel(monkeypatch):
     mesh = ball()
     atlas = unwrapped(mesh, 256)
     assert len(atlas.faces) == len(mesh.faces)
@@ -183,13 +177,13 @@ def test_charts_keep_every_triangle_and_lie_in_the_unit_square():
     areas = areas_of(atlas)
     assert 0.3 < areas.sum() < 1
     assert (areas > 0).all()
-
-
-def test_no_texel_lies_in_two_charts():
-    atlas = unwrapped(ball(), 256)
     texels = texels_of(atlas, 256)
     assert len(np.unique(texels.places)) == len(texels.places)
-    assert len(texels.places) == pytest.approx(areas_of(atlas).sum() * 256**2, rel=0.02)
+    assert len(texels.places) == pytest.approx(areas.sum() * 256**2, rel=0.02)
+    monkeypatch.setattr("unmix_plugin.products.atlas._CHUNK", 37)
+    parts = texels_of(atlas, 256)
+    np.testing.assert_array_equal(parts.places, texels.places)
+    np.testing.assert_array_equal(parts.triangles, texels.triangles)
 
 
 def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
@@ -204,17 +198,13 @@ def test_texels_show_the_points_of_the_surface_that_their_centres_map_to():
     assert radii.max() < 1 + 1e-6
 
 
-def test_two_triangles_that_fill_the_square_have_all_texels_once():
+def test_two_triangles_that_fill_the_square_have_all_texels_once_and_one_without_area_has_none():
     atlas = flat_atlas([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
     texels = texels_of(atlas, 32)
     np.testing.assert_array_equal(texels.places, np.arange(32 * 32))
     assert set(texels.triangles.tolist()) == {0, 1}
     np.testing.assert_allclose(texels.weights.sum(axis=1), 1, atol=1e-12)
-
-
-def test_triangles_without_area_in_the_texture_have_no_texels():
-    atlas = flat_atlas([[0.1, 0.1], [0.6, 0.6], [0.35, 0.35]], [[0, 1, 2]])
-    assert len(texels_of(atlas, 64).places) == 0
+    assert len(texels_of(flat_atlas([[0.1, 0.1], [0.6, 0.6], [0.35, 0.35]], [[0, 1, 2]]), 64).places) == 0
 
 
 def test_a_texture_has_the_values_of_its_texels_and_beyond_them_those_of_the_nearest():
@@ -225,28 +215,8 @@ def test_a_texture_has_the_values_of_its_texels_and_beyond_them_those_of_the_nea
     np.testing.assert_array_equal(picture[..., 0], np.repeat(np.arange(8.0)[:, None], 8, axis=1))
 
 
-def test_triangles_are_found_whatever_chunks_they_are_looked_at_in(monkeypatch):
-    atlas = unwrapped(ball(), 64)
-    whole = texels_of(atlas, 64)
-    monkeypatch.setattr("unmix_plugin.products.atlas._CHUNK", 37)
-    parts = texels_of(atlas, 64)
-    np.testing.assert_array_equal(parts.places, whole.places)
-    np.testing.assert_array_equal(parts.triangles, whole.triangles)
-
-
 def test_tiny_triangles_are_placed_too():
     mesh = ball(4)
     atlas = unwrap(1e-5 * mesh.vertices.double().numpy(), mesh.faces.numpy(), 512)
     edges = np.linalg.norm(atlas.uv[atlas.faces] - atlas.uv[np.roll(atlas.faces, 1, axis=1)], axis=2)
     assert edges.max() < 4 * np.median(edges)
-
-
-def test_without_xatlas_one_message_names_it(monkeypatch):
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match="-m pip install xatlas"):
-        unwrapped(ball(1), 64)
-
-
-def test_a_texture_too_small_for_the_charts_is_refused():
-    with pytest.raises(ConfigError, match="--texture-size"):
-        unwrapped(ball(5), 16)

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
-from tests.commands.running import run
+from tests.commands.running import done
 from tests.neumatex.factory import SMALL, write_object, write_spectral_object
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
@@ -80,11 +80,9 @@ def test_the_page_of_an_object_turns_its_light_and_shows_its_material(kind, tmp_
     (write_object if kind == "colours" else write_spectral_object)(tmp_path / "ball")
     words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "outputs", "--max-num-iterations", 2]
     material = "pbr" if kind == "colours" else "spectral"
-    ended = run(train, "neumatex", *words, *SMALL, f"--pipeline.model.material={material}")
-    assert ended.status == 0, ended.err
+    ended = done(train, "neumatex", *words, *SMALL, f"--pipeline.model.material={material}")
     place = ["--run", ended.last_line.removeprefix("run: "), "--output", tmp_path]
-    ended = run(export, "page", *place, "--resolution", 24, "--title", "<i>ball</i>")
-    assert ended.status == 0, ended.err
+    done(export, "page", *place, "--resolution", 24, "--title", "<i>ball</i>")
     with sync_playwright() as session:
         browser = session.chromium.launch(executable_path=CHROMIUM, args=[FLAGS[1], *SOFTWARE_GL])
         opened, said = browser.new_page(viewport={"width": 300, "height": 300}), []

@@ -11,7 +11,6 @@ from unmix_plugin.neumatex.fit.tone import (
     LampRatio,
     SpectralDisplay,
     _CameraResponse,
-    psnr_db,
     tone_curve,
 )
 from unmix_plugin.spectral.bands import Bands
@@ -28,15 +27,11 @@ def test_curves_increase_for_greys_and_stay_in_0_to_1(name):
     assert numbers[-1].min() > 0.98
 
 
-@pytest.mark.parametrize("name", ["linear", "srgb", "agx"])
+@pytest.mark.parametrize("name", ["linear", "srgb", "agx", "learnt"])
 def test_slopes_are_those_of_differences(name):
     light = torch.tensor([[0.05, 0.18, 0.6], [0.3, 0.9, 0.02]], dtype=torch.float64)
-    curve = tone_curve(name)
+    curve = _CameraResponse().double() if name == "learnt" else tone_curve(name)
     assert torch.autograd.gradcheck(curve, light.requires_grad_())
-
-
-def test_psnr_of_a_known_error():
-    assert float(psnr_db(torch.full((4, 4), 1e-3))) == pytest.approx(30)
 
 
 @settings(deadline=None, max_examples=30)
@@ -76,25 +71,11 @@ def test_an_unknown_curve_and_exposure_are_found_from_light_and_numbers(name, cu
     assert error.max() < 0.03, name
 
 
-def test_its_slope_by_light_is_that_of_differences():
-    response = _CameraResponse().double()
-    light = torch.tensor([[0.013, 0.2, 0.71]], dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(response(light).sum(), light)
-    step = 1e-7
-    expected = (response(light + step) - response(light - step)) / (2 * step)
-    torch.testing.assert_close(slope, expected, rtol=1e-4, atol=1e-6)
-
-
 LAMP = (0.2, 0.6, 1.0)
 
 
-def test_light_counts_by_the_lamps_power_and_by_its_logarithm_above_it():
-    curve = LampRatio(LAMP)
-    assert_close(curve(torch.tensor([0.1, 0.3, 0.5])), torch.full((3,), 0.5))
-    assert_close(curve(torch.e * torch.tensor(LAMP)), torch.full((3,), 2.0))
-
-
 def test_the_curve_and_its_slope_have_no_step():
+    assert_close(LampRatio(LAMP)(torch.tensor([0.1, 0.3, 0.5])), torch.full((3,), 0.5))
     curve = LampRatio((1.0,))
     ratio = torch.tensor([0.0, 0.5, 1 - 1e-3, 1 + 1e-3, 4.0]).requires_grad_()
     values = curve(ratio[:, None])[:, 0]

@@ -26,10 +26,14 @@ def test_it_offers_what_commands_and_viewer_ask_of_scenes(scene):
     assert isinstance(scene, RelightableScene)
     assert isinstance(scene, EstimatedScene)
     view = scene.look(CAMERA)
+    empty, solid = view.opacity == 0, view.opacity == 1
+    assert empty.any()
     for output in scene.outputs:
         channels = () if output.kind == "map" else (3,)
         assert view[output.name].shape == (18, 24, *channels), output.name
         assert view[output.name].isfinite().all()
+        assert (view[output.name][empty] == 0).all(), output.name
+    torch.testing.assert_close(view["rgb"][solid], scene.curve(view["linear_rgb"][solid]))
     with pytest.raises(ConfigError, match=r"no output named 'rouhness' \(did you mean roughness\?\)"):
         scene.render(CAMERA, ["rouhness"])
 
@@ -49,20 +53,6 @@ def test_what_is_shown_of_the_material_is_that_of_the_surface_that_is_seen(scene
     np.testing.assert_allclose(FRAME.to_model(middle.world_position[None])[0], middle.position, atol=1e-9)
     normal = middle.values["normals"] @ TURN.T  # back in model space
     np.testing.assert_allclose(normal, middle.position / 0.6, atol=0.05)
-
-
-def test_where_nothing_is_all_is_black(scene):
-    view = scene.look(CAMERA)
-    empty = view.opacity == 0
-    assert empty.any()
-    for output in scene.outputs:
-        assert (view[output.name][empty] == 0).all(), output.name
-
-
-def test_colour_is_the_tone_curve_of_linear_light_at_full_opacity(scene):
-    view = scene.look(CAMERA)
-    solid = view.opacity == 1
-    torch.testing.assert_close(view["rgb"][solid], scene.curve(view["linear_rgb"][solid]))
 
 
 def test_light_adds_up_and_materials_do_not_change_with_it(scene):

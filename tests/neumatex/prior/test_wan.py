@@ -11,11 +11,8 @@ from torch.testing import assert_close
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.wan import WanPrior, _diffusers_models, read_wan_prior
 
-WAN_1_3B = {
-    "num_layers": 30,
-    "num_attention_heads": 12,
-    "attention_head_dim": 128,
-    "ffn_dim": 8960,
+WAN_1_3B = {"num_layers": 30, "num_attention_heads": 12, "attention_head_dim": 128, "ffn_dim": 8960}
+WAN_1_3B |= {
     "patch_size": (1, 2, 2),
     "in_channels": 16,
     "out_channels": 16,
@@ -24,14 +21,8 @@ WAN_1_3B = {
 }
 """Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
 
-TINY = {
-    **WAN_1_3B,
-    "num_layers": 2,
-    "num_attention_heads": 2,
-    "attention_head_dim": 12,
-    "ffn_dim": 32,
-    "text_dim": 8,
-}
+TINY = {"num_layers": 2, "num_attention_heads": 2, "attention_head_dim": 12, "ffn_dim": 32, "text_dim": 8}
+TINY = {**WAN_1_3B, **TINY}
 TINY_AUTOENCODER = {"base_dim": 4, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1}
 
 
@@ -65,24 +56,6 @@ def test_the_real_size_has_the_published_parameters(real_size):
     with torch.device("meta"):
         assert count(autoencoder()) == 126_892_531
     assert len(real_size.transformer.blocks) == 30
-
-
-def test_every_tensor_of_a_block_has_the_published_shape(real_size):
-    shapes = {name: tuple(p.shape) for name, p in real_size.transformer.blocks[0].named_parameters()}
-    for attention in ("attn1", "attn2"):
-        for layer in ("to_q", "to_k", "to_v", "to_out.0"):
-            assert shapes.pop(f"{attention}.{layer}.weight") == (1536, 1536)
-            assert shapes.pop(f"{attention}.{layer}.bias") == (1536,)
-        assert shapes.pop(f"{attention}.norm_q.weight") == shapes.pop(f"{attention}.norm_k.weight") == (1536,)
-    assert shapes == {
-        "scale_shift_table": (1, 6, 1536),
-        "norm2.weight": (1536,),
-        "norm2.bias": (1536,),
-        "ffn.net.0.proj.weight": (8960, 1536),
-        "ffn.net.0.proj.bias": (8960,),
-        "ffn.net.2.weight": (1536, 8960),
-        "ffn.net.2.bias": (1536,),
-    }
 
 
 def test_the_real_size_turns_views_into_planes_of_their_resolution(real_size):
@@ -156,29 +129,20 @@ def test_weights_of_a_folder_are_those_that_were_written(folder):
     assert torch.isfinite(prior(*views(32))).all()
 
 
-def test_a_folder_without_models_is_refused(tmp_path):
+def test_a_folder_that_holds_other_weights_is_refused_and_they_are_named(folder, tmp_path):
     with pytest.raises(
-        ConfigError, match=r"transformer.config\.json is missing; name a folder in diffusers' layout"
+        ConfigError, match=r"transformer.config\.json is missing; name a folder in diffusers'"
     ):
-        read_wan_prior(tmp_path, num_parameters=9)
-
-
-def test_a_tensor_of_another_shape_is_named(folder):
+        read_wan_prior(tmp_path / "elsewhere", num_parameters=9)
+    save_file({"embedding": torch.zeros(3, 8)}, folder / "null_text.safetensors")
+    with pytest.raises(ConfigError, match=r"has shape \(3, 8\), expected \(512, 8\)"):
+        read_wan_prior(folder, num_parameters=9)
     path = folder / "vae" / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "z_dim": 12}))
     with pytest.raises(ConfigError, match=r"vae: tensor \S+ has shape \(.*\), but config.json says \("):
         read_wan_prior(folder, num_parameters=9)
-
-
-def test_another_model_in_the_folder_is_named(folder):
     (folder / "transformer" / "config.json").write_text('{"_class_name": "FluxTransformer2DModel"}')
     with pytest.raises(ConfigError, match="describes FluxTransformer2DModel; expected WanTransformer3DModel"):
-        read_wan_prior(folder, num_parameters=9)
-
-
-def test_a_null_text_of_another_shape_is_refused(folder):
-    save_file({"embedding": torch.zeros(3, 8)}, folder / "null_text.safetensors")
-    with pytest.raises(ConfigError, match=r"has shape \(3, 8\), expected \(512, 8\)"):
         read_wan_prior(folder, num_parameters=9)
 
 

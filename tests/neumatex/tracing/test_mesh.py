@@ -138,30 +138,27 @@ def test_an_open_mesh_is_noted(tmp_path):
 
 def _ply(path, vertices, faces):
     trimesh.Trimesh(vertices, faces, process=False).export(path)
-    return path
 
 
 def test_bad_meshes_are_refused(tmp_path, monkeypatch):
-    line = [[0, 0, 0], [1, 1, 1], [2, 2, 2]]
-    with pytest.raises(SceneError, match="none of its 1 triangles has an area"):
-        read_mesh(_ply(tmp_path / "line.ply", line, [[0, 1, 2]]))
-    with pytest.raises(SceneError, match="position of vertex 1 is not finite"):
-        read_mesh(_ply(tmp_path / "nan.ply", [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]]))
-    (tmp_path / "text.ply").write_text("no mesh")
-    with pytest.raises(SceneError, match=r"can't be read as a mesh|no triangles"):
-        read_mesh(tmp_path / "text.ply")
-    with pytest.raises(SceneError, match="there is no such mesh file"):
-        read_mesh(tmp_path / "missing.glb")
-    (tmp_path / "mesh.stl").write_text("solid")
-    with pytest.raises(SceneError, match="convert it to one of"):
-        read_mesh(tmp_path / "mesh.stl")
-    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
-    with pytest.raises(SceneError, match="no triangles"):
-        read_mesh(tmp_path / "points.ply")
     monkeypatch.setattr(reading, "MAX_TRIANGLES", 11)
+    _ply(tmp_path / "line.ply", [[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]])
+    _ply(tmp_path / "nan.ply", [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    (tmp_path / "text.ply").write_text("no mesh")
+    (tmp_path / "mesh.stl").write_text("solid")
+    trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
     trimesh.creation.box().export(tmp_path / "box.ply")
-    with pytest.raises(SceneError, match="has 12 triangles, at most 11"):
-        read_mesh(tmp_path / "box.ply")
+    for name, said in {
+        "line.ply": "none of its 1 triangles has an area",
+        "nan.ply": "position of vertex 1 is not finite",
+        "text.ply": r"can't be read as a mesh|no triangles",
+        "missing.glb": "there is no such mesh file",
+        "mesh.stl": "convert it to one of",
+        "points.ply": "no triangles",
+        "box.ply": "has 12 triangles, at most 11",
+    }.items():
+        with pytest.raises(SceneError, match=said):
+            read_mesh(tmp_path / name)
 
 
 def test_model_space_is_centred_with_half_edge_one():
@@ -216,8 +213,7 @@ def test_a_ray_is_blocked_where_it_has_a_hit(device):
 
 
 def test_points_lie_on_the_surface_and_face_the_viewer():
-    mesh, rays = _sphere(), None
-    rays = RayMesh(mesh)
+    rays = RayMesh(_sphere())
     origins, directions = _rays(500, seed=2)
     hits = rays.closest(origins, directions)
     origins, directions = origins[hits.found], directions[hits.found]

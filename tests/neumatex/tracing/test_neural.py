@@ -23,18 +23,13 @@ def test_encoded_materials_look_like_the_layered_ones():
     generator = torch.Generator().manual_seed(77)
     layered = draw_materials(2000, generator)
     neural = FAMILY.from_layered(layered)
+    assert torch.equal(neural[:, :3], layered[:, :3])
+    assert neural.min() >= 0
+    assert neural.max() <= 1
     truth, found = LayeredFamily().stack(layered), FAMILY.stack(neural)
     error = response_error(truth, found, layered[:, :3].T, 16, generator)
     assert -10 * math.log10(float(error.mean())) > 36
     assert -10 * float(torch.log10(error).mean()) > 39
-
-
-def test_encoding_keeps_base_colours_and_gives_latents_in_range():
-    layered = draw_materials(200, torch.Generator().manual_seed(78))
-    neural = FAMILY.from_layered(layered)
-    assert torch.equal(neural[:, :3], layered[:, :3])
-    assert neural.min() >= 0
-    assert neural.max() <= 1
 
 
 def test_decoded_parameters_reflect_and_are_drawn_alike():
@@ -95,9 +90,6 @@ def test_the_record_belongs_to_the_shipped_file():
     assert record["sha256"] == hashlib.sha256(data).hexdigest()
     assert record["bytes"] == len(data) < 1_000_000
     DecoderTraining(**record["training"])  # every setting is still one
-
-
-def test_shipped_weights_are_frozen():
     decoder, encoder = _read_weights()
     assert not any(parameter.requires_grad for parameter in [*decoder.parameters(), *encoder.parameters()])
 
@@ -110,21 +102,19 @@ def test_what_is_written_is_read_back(tmp_path: Path):
     assert_close(found(latents).metal_colour, decoder(latents).metal_colour)
 
 
-def test_weights_of_another_shape_are_refused(tmp_path: Path):
-    write_weights(tmp_path / "w.safetensors", Decoder(width=7), Encoder(), {})
-    with pytest.raises(
-        ConfigError, match=r"weights of another shape .*decoder\.hidden\.0\.bias is \(7,\), expected"
+def test_other_weights_are_refused_with_the_reason(tmp_path: Path):
+    path = tmp_path / "w.safetensors"
+    for write, said in (
+        (
+            lambda: write_weights(path, Decoder(width=7), Encoder(), {}),
+            r"weights of another shape .*decoder\.hidden\.0\.bias is \(7,\), expected",
+        ),
+        (
+            lambda: path.write_bytes(safetensors.torch.save({"other": torch.zeros(2)})),
+            r"decoder\.hidden\.0\.bias is missing",
+        ),
+        (lambda: path.write_text("no weights"), "can't read the material decoder's weights"),
     ):
-        _read_weights(tmp_path / "w.safetensors")
-
-
-def test_missing_tensors_are_named(tmp_path: Path):
-    (tmp_path / "w.safetensors").write_bytes(safetensors.torch.save({"other": torch.zeros(2)}))
-    with pytest.raises(ConfigError, match=r"decoder\.hidden\.0\.bias is missing"):
-        _read_weights(tmp_path / "w.safetensors")
-
-
-def test_a_file_of_another_kind_is_refused(tmp_path: Path):
-    (tmp_path / "w.safetensors").write_text("no weights")
-    with pytest.raises(ConfigError, match="can't read the material decoder's weights"):
-        _read_weights(tmp_path / "w.safetensors")
+        write()
+        with pytest.raises(ConfigError, match=said):
+            _read_weights(path)

@@ -14,7 +14,7 @@ from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames
-from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, _SamplePoints
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 
 GLOSSY = [0.4, 0.3, 0.2, 0.3, 0.5]
@@ -72,20 +72,15 @@ def test_white_furnace_of_a_convex_lambertian():
 def test_bounces_within_a_closed_sphere_are_a_geometric_series(bounces):
     """A hole of a known size lets light in; all of it comes from the hole's solid angle."""
     sphere = trimesh.creation.icosphere(subdivisions=4)
-    middles = sphere.triangles_center
-    open_sphere = trimesh.Trimesh(sphere.vertices, sphere.faces[middles[:, 2] < 0.8], process=False)
+    open_faces = sphere.faces[sphere.triangles_center[:, 2] < 0.8]
+    open_sphere = trimesh.Trimesh(sphere.vertices, open_faces, process=False)
     hole = 1 - open_sphere.area / sphere.area
     points, to_eye = _seen(_rays(open_sphere), count=3000, origin=(0.0, 0.0, 0.0))
     below = points.positions[:, 2] < 0.75
+    points, to_eye = points.select(below), to_eye[below]
     albedo = torch.tensor([0.9, 0.6, 0.3])
     radiance = _radiance(
-        Uniform(Lambert(), albedo),
-        _rays(open_sphere),
-        _white(),
-        points.select(below),
-        to_eye[below],
-        samples=16,
-        bounces=bounces,
+        Uniform(Lambert(), albedo), _rays(open_sphere), _white(), points, to_eye, 16, bounces
     )
     # Inside a sphere every point sees every part under cos cos / (pi r^2) = 1 / area, so the irradiance is the same
     # everywhere and each reflection keeps the albedo and the closed part.
@@ -236,27 +231,6 @@ def test_two_calls_are_independent_and_a_seed_repeats():
     assert torch.corrcoef(errors)[0, 1].abs() < 0.2
 
 
-def test_nothing_seen_gives_nothing():
-    rays = _sphere(1)
-    points, to_eye = _seen(rays, origin=(0.0, 0.0, 9.0))
-    nothing = torch.zeros(0, dtype=torch.int64)
-    radiance = _radiance(
-        Uniform(Lambert(), [1.0] * 3), rays, _white(), points.select(nothing), to_eye[nothing]
-    )
-    assert radiance.shape == (0, 3)
-
-
-def test_numbers_are_uniform_and_even():
-    numbers = _SamplePoints.draw(3, 64, 2, _generator(), torch.device("cpu"))
-    drawn = numbers.of(torch.arange(3 * 64), 1)
-    assert drawn.shape == (192, 5)
-    for point in range(3):
-        for dimension in range(5):
-            counts = torch.histc(drawn[64 * point : 64 * (point + 1), dimension], 16, 0, 1)
-            assert counts.min() >= 2
-            assert counts.max() <= 6
-
-
 SIZE = 48
 
 
@@ -267,13 +241,8 @@ def _camera(distance=4.0, size=SIZE):
     return Cameras(pose, focal, torch.full((1, 2), size / 2), torch.zeros(1, 4), size, size)
 
 
-def _sphere_render_view():
-    sphere = trimesh.creation.icosphere(subdivisions=4)
-    return RayMesh(mesh_of(torch.tensor(sphere.vertices), torch.tensor(sphere.faces)))
-
-
 def test_alpha_is_the_covered_part_of_pixels():
-    alpha = pixel_hits(_sphere_render_view(), _camera(), 0, subpixels=4).alpha()
+    alpha = pixel_hits(_sphere(4), _camera(), 0, subpixels=4).alpha()
     # A unit sphere at distance 4 has an outline of this radius in pixels.
     radius = 1.5 * SIZE / math.sqrt(4**2 - 1)
     assert_close(alpha.sum(), torch.tensor(math.pi * radius**2), rtol=0.005, atol=0)
@@ -283,7 +252,7 @@ def test_alpha_is_the_covered_part_of_pixels():
 
 
 def test_rays_of_a_pixel_are_averaged():
-    hits = pixel_hits(_sphere_render_view(), _camera(), 0, subpixels=2)
+    hits = pixel_hits(_sphere(4), _camera(), 0, subpixels=2)
     image = hits.image(torch.ones(len(hits), 3))
     assert_close(image, hits.alpha()[..., None].expand(-1, -1, 3))
     inner = hits.select(hits.pixels == SIZE // 2 * SIZE + SIZE // 2)
@@ -297,25 +266,23 @@ def test_left_and_up_are_where_they_belong():
     image = torch.zeros(16, 32, 3)
     image[:8, :, 0] = 1  # +z
     image[:, 0:16, 1] = 1  # azimuths from 0 to pi, +y
-    traced = TracedObject(_sphere_render_view(), Environment(image), Uniform(Lambert(), [1.0] * 3))
+    traced = TracedObject(_sphere(4), Environment(image), Uniform(Lambert(), [1.0] * 3))
     picture, _ = traced.picture(_camera(), 0, 64, bounces=0)
     half = SIZE // 2
     assert picture[:half, :, 0].mean() > 2 * picture[half:, :, 0].mean()
     assert picture[:, half:, 1].mean() > 2 * picture[:, :half, 1].mean()
 
 
-WHITE_SPHERE = (Environment(torch.ones(8, 16, 3)), Uniform(Lambert(), [1.0] * 3))
-
-
-def test_white_sphere_in_a_white_world():
-    picture, alpha = TracedObject(_sphere_render_view(), *WHITE_SPHERE).picture(_camera(), 0, 256)
+def test_a_white_sphere_in_a_white_world_is_its_alpha():
+    traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
+    picture, alpha = traced.picture(_camera(), 0, 256)
     expected = alpha[..., None].expand_as(picture)
     assert_close(picture.mean(), expected.mean(), atol=0.004, rtol=0)
     assert_close(picture, expected, atol=0.06, rtol=0)
 
 
-def test_a_camera_that_sees_nothing_gives_black():
+def test_a_camera_that_sees_nothing_gives_black_and_alpha_zero():
+    traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
     away = torch.tensor([[[0.0, 0, -1, 4], [-1, 0, 0, 0], [0, 1, 0, 0]]])
-    camera = dataclasses.replace(_camera(size=8), camera_to_world=away)
-    picture, alpha = TracedObject(_sphere_render_view(), *WHITE_SPHERE).picture(camera, 0, 64)
+    picture, alpha = traced.picture(dataclasses.replace(_camera(size=8), camera_to_world=away), 0, 64)
     assert picture.abs().sum() + alpha.sum() == 0

@@ -4,13 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.neumatex.tracing.surface import (
-    LOG_VARIANCE_RANGE,
-    PLANE_AXES,
-    Triplane,
-    encode,
-    look_up,
-)
+from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE, PLANE_AXES, Triplane, encode, look_up
 
 
 def look_up_twin(planes: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
@@ -84,17 +78,3 @@ def test_the_encoding_has_its_three_periods():
     assert_close(there[0, 0], -here[0, 0])  # sin of pi x
     assert_close(there[1:3], here[1:3])  # 2 pi x and 4 pi x have come round
     assert encode(position).shape == (1, 18)
-
-
-def test_the_two_groups_hold_every_parameter_once():
-    triplane = Triplane(9, resolution=4)
-    groups = triplane.parameter_groups()
-    assert [id(p) for p in groups["planes"]] == [id(triplane.planes)]
-    grouped = sorted(id(p) for group in groups.values() for p in group)
-    assert grouped == sorted(id(p) for p in triplane.parameters())
-
-
-def test_one_generator_draws_one_triplane():
-    first, second = (Triplane(9, 8, generator=torch.Generator().manual_seed(3)) for _ in range(2))
-    positions = points(20).float()
-    assert_close(first.parameters_at(positions), second.parameters_at(positions), rtol=0, atol=0)

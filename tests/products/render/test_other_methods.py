@@ -14,7 +14,7 @@ from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render.files import choose_formats, needs_legend, still_paths
 from unmix_plugin.products.render.job import RenderJob, output_paths, take_survey
-from unmix_plugin.products.render.pictures import Palette, draw_legend
+from unmix_plugin.products.render.pictures import draw_legend
 from unmix_plugin.trained.protocol import RenderableScene
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
@@ -113,10 +113,3 @@ def test_without_a_wish_it_gets_what_is_usual_of_what_it_has():
     assert {one.output.name for one in choose_formats([], [], SCENE, False)} == {"rgb"}
     odd = GlowScene(OUTPUTS[1:3])
     assert {one.output.name for one in choose_formats([], [], odd, True)} == {"heat", "classes"}
-
-
-def test_pictures_are_described_by_what_is_behind_them():
-    colours = Palette.of(None, {})
-    assert colours.describe(OUTPUTS[0]) == "sRGB, transparent where nothing is"
-    assert colours.describe(OUTPUTS[0], is_opaque=True) == "sRGB on light grey"
-    assert colours.describe(OUTPUTS[2], is_opaque=True) == OUTPUTS[2].what

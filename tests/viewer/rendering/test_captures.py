@@ -123,27 +123,20 @@ def test_pictures_that_would_not_fit_are_refused(size, message):
 @pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
-    output = output_of(replace(chosen, layer=layer))
     with source.borrowed() as scene:
-        products = choose_formats((output,), ("mp4",), scene, True)
+        products = choose_formats((output_of(replace(chosen, layer=layer)),), ("mp4",), scene, True)
     assert [product.format for product in products] == ["mp4"]
-
-
-def test_the_first_settings_are_outputs_of_renders_for_bands_anywhere():
-    bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
-    materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
-    for layer in ("band", "false-colour"):
+    if layer in ("band", "false-colour"):  # the first settings are outputs for bands anywhere
+        bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
+        materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
         find_output(output_of(replace(first_settings(bands), layer=layer)), materials)
 
 
-def test_an_absorption_is_an_output_of_renders_by_its_own_name():
+def test_an_absorption_goes_by_its_own_name_and_what_is_no_output_is_refused():
     assert output_of(LayerSettings(layer="index", index="absorption:650-700")) == "absorption:650-700"
-
-
-@pytest.mark.parametrize("layer", ["error", "index"])
-def test_the_error_and_an_index_that_is_not_chosen_are_no_outputs(layer):
-    with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
-        output_of(LayerSettings(layer=layer))
+    for layer in ("error", "index"):
+        with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
+            output_of(LayerSettings(layer=layer))
 
 
 def test_the_words_are_those_of_the_command(tmp_path):
@@ -183,33 +176,29 @@ def rendered(folder):
     return *one.wait(), one.parts
 
 
-WRITE = "import sys, pathlib; pathlib.Path({folder!r}, 'a.mp4').write_bytes(b'video')"
+FOLLOWED = "list(follow(Console(), 'rendering', [1, 2])); print('other'); print('rendering: 1 of 4 done')"
 
 
-def test_the_video_is_handed_over(tmp_path, run_instead):
-    run_instead(WRITE.format(folder=str(tmp_path)) + "; assert sys.argv[1:] == ['--some', 'words']")
-    assert rendered(tmp_path)[0] == tmp_path / "a.mp4"
-
-
-def test_progress_is_told_as_the_command_prints_it(tmp_path, run_instead):
-    run_instead("print('rendering: 1 of 4 done'); print('other'); print('rendering: 3 of 4 done')")
-    assert rendered(tmp_path)[2] == [0.25, 0.75]
-
-
-def test_the_command_prints_progress_as_it_is_read(capsys):
-    from rich.console import Console
-
-    from unmix_plugin.commands.reporting import follow
-
-    list(follow(Console(), "rendering", [1, 2]))
-    found = captures._PROGRESS.match(capsys.readouterr().out)
-    assert found is not None
-    assert found.groups() == ("0", "2")
-
-
-def test_a_failure_is_said_with_its_reason(tmp_path, run_instead):
-    run_instead("import sys; sys.exit('no checkpoint')")
-    assert rendered(tmp_path)[:2] == (None, "rendering the video failed: no checkpoint")
+@pytest.mark.parametrize(
+    ("code", "name", "reason", "parts"),
+    [
+        ("assert sys.argv[1:] == ['--some', 'words']; open({!r}, 'w').close()", "a.mp4", None, []),
+        (FOLLOWED, None, None, [0.0, 0.25]),
+        ("sys.exit('no checkpoint')", None, "rendering the video failed: no checkpoint", []),
+    ],
+    ids=["a video", "progress as the command prints it", "a failure"],
+)
+def test_a_video_or_the_reason_why_there_is_none_is_told_and_progress(
+    tmp_path, run_instead, code, name, reason, parts
+):
+    imports = (
+        "import sys; from rich.console import Console; from unmix_plugin.commands.reporting import follow\n"
+    )
+    run_instead(imports + code.format(str(tmp_path / "a.mp4")))
+    found, said, told = rendered(tmp_path)
+    assert found == (name and tmp_path / name)
+    assert reason is None or said == reason
+    assert told == parts
 
 
 WAIT = "import sys, time, pathlib; print('rendering: 0 of 1 done', flush=True); time.sleep(60)"

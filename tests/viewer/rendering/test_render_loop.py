@@ -90,7 +90,8 @@ def test_switching_layers_renders_nothing(loop, screen, rendered):
 
 def test_a_movement_interrupts_what_is_refined(loop, screen):
     screen.view.largest_height = 256
-    loop.change(screen.view, pose=some_pose(0))
+    for index in range(40):  # of which only the last is answered
+        loop.change(screen.view, pose=some_pose(index % 4))
     assert loop.step()
     assert loop.step()
     assert screen.view.render is not None
@@ -100,16 +101,6 @@ def test_a_movement_interrupts_what_is_refined(loop, screen):
     assert len(screen.shown) == count + 1
     assert screen.shown[-1].picture.shape[0] < 20
     assert screen.view.frame.camera.camera_to_world[0, :, 3].tolist() == pytest.approx(some_pose(1).position)
-
-
-def test_only_the_last_of_many_movements_is_answered_and_refined(loop, screen):
-    for index in range(40):
-        loop.change(screen.view, pose=some_pose(index % 4))
-    loop.change(screen.view, pose=some_pose(2))
-    finish(loop)
-    heights = [shown.picture.shape[0] for shown in screen.shown]
-    assert heights == sorted(set(heights))
-    assert screen.view.frame.camera.camera_to_world[0, :, 3].tolist() == pytest.approx(some_pose(2).position)
 
 
 def test_every_view_has_its_own_camera_size_and_layer(loop):
@@ -134,20 +125,6 @@ def test_nobody_starves_while_eight_move(loop):
         assert loop.step()
     assert [len(screen.shown) for screen in screens] == [3] * len(screens)
     assert all(not screen.reports for screen in screens)
-
-
-def test_those_at_rest_are_refined_in_turn(loop):
-    screens = [Screen() for _ in range(4)]
-    for screen in screens:
-        loop.add(screen.view)
-        loop.change(screen.view, pose=some_pose())
-        assert loop.step()
-    blocks = []
-    for _ in range(8):
-        before = [screen.view.served_at for screen in screens]
-        assert loop.step()
-        blocks += [index for index, screen in enumerate(screens) if screen.view.served_at != before[index]]
-    assert blocks == [0, 1, 2, 3] * 2
 
 
 def test_other_light_is_shown_without_rendering_and_other_shapes_with(loop, screen, rendered):
@@ -194,29 +171,6 @@ def test_removed_materials_leave_no_faint_specks(loop, screen):
     assert is_trace.any()
     assert (shown[is_trace] == round(0.92 * 255)).all()
     assert (shown[opacity > 0.3] != round(0.92 * 255)).any()
-
-
-def test_depth_is_sent_only_where_it_is_wanted(loop, screen):
-    loop.change(screen.view, pose=some_pose())
-    assert finest(loop, screen).depth is None
-    loop.change(screen.view, wants_depth=True)
-    shown = finest(loop, screen)
-    assert shown.depth is not None
-    assert shown.depth.shape == shown.picture.shape[:2]
-
-
-def test_a_capture_is_rendered_beside_the_views(loop, screen):
-    reasons, rows, parts = [], [], []
-
-    def take(_, frame):
-        rows.append(frame.camera.height)
-
-    loop.capture(Capture(camera_of(some_pose(3), 40), Edit(), 1, take, reasons.append, parts.append))
-    loop.change(screen.view, pose=some_pose())
-    finest(loop, screen)
-    assert (rows, reasons) == ([40], [""])
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0
 
 
 def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, monkeypatch):
@@ -315,8 +269,7 @@ def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
 
 
 def test_a_capture_that_ends_while_the_loop_is_stopped_is_told_once(loop):
-    reasons = []
-    camera = camera_of(some_pose(), 16)
+    reasons, camera = [], camera_of(some_pose(), 16)
     loop.capture(Capture(camera, Edit(), 1, unwanted, reasons.append, lambda _: loop.stop()))
     finish(loop)
     assert reasons == ["the viewer was stopped"]
