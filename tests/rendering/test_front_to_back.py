@@ -117,5 +117,7 @@ def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path)
         errors = (model.materials.spectra(found) - model.materials.spectra(exact)).abs()
     assert float(exact.accumulation.max()) > 0.8
     assert 0 < float(errors.square().mean().sqrt()) < 1e-3
-    assert float(errors.max()) < 6e-3
-    assert float((found.accumulation - exact.accumulation).abs().max()) < 8e-3
+    # Rays end where so much of their light is left, which takes the colour of what lies before.
+    ending_light = 3 * WITH_ALPHA.smallest_weight
+    assert float(errors.max()) < ending_light
+    assert float((found.accumulation - exact.accumulation).abs().max()) < ending_light

@@ -9,8 +9,8 @@ is as opaque anywhere in an untrained field.
 
 Notation: as in marching.py; points are in units of the inner cube's half edge, centred on it.
 
-Of the kernels a work item is a ray. Counting and writing walk the same points with the same arithmetic, so that the
-second pass fills what the first one counted.
+Of the kernel a work item is a ray. From an empty point of the inner cube it goes on to the first one that may lie in an
+occupied cell, by the skips of the cell: contraction lengthens no way by more than a third, in the maximum norm.
 """
 
 from typing import no_type_check
@@ -41,13 +41,13 @@ def march_contracted(
     Args:
         origins, directions: Rays in units of the inner cube's half edge.
         jitter: Where in its interval a ray's samples lie, [0, 1).
-        skips: 0 in occupied cells of the cube from -2 to 2, whatever else it is in others.
+        skips: 0 in occupied cells of the cube from -2 to 2, as `skip_distances` says.
         step: Distance of samples in the inner cube, in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.
     """
     rays = _rays(origins, directions, torch.zeros_like(jitter), jitter, skips, step)
-    return take_all(_count_kernel, _write_kernel, rays, origins)
+    return take_all(_write_kernel, rays, origins)
 
 
 def march_contracted_first(
@@ -75,7 +75,7 @@ def _rays(
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> list[KernelArray | float]:
-    """The arguments that both kernels share."""
+    """The first arguments of the kernel."""
     check_step(step)
     point = vector_type(3, torch.float32)
     lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
@@ -132,42 +132,27 @@ def _stride_at(radius: float, step: float):
 
 @wp.func
 @no_type_check
-def _is_occupied(point: wp.vec3f, skips: wp.array3d(dtype=wp.uint8)):
-    """1 in an occupied cell, else 0."""
+def _skip_at(point: wp.vec3f, skips: wp.array3d(dtype=wp.uint8)):
     radius = wp.max(_radius_at(point), 1.0)
     unit = point * ((2.0 - 1.0 / radius) / radius) / 4.0 + wp.vec3f(0.5, 0.5, 0.5)
     x = wp.clamp(int(unit[0] * float(skips.shape[0])), 0, skips.shape[0] - 1)
     y = wp.clamp(int(unit[1] * float(skips.shape[1])), 0, skips.shape[1] - 1)
     z = wp.clamp(int(unit[2] * float(skips.shape[2])), 0, skips.shape[2] - 1)
-    return 1 - wp.min(int(skips[x, y, z]), 1)
+    return int(skips[x, y, z])
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
 @no_type_check
-def _count_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    t_start: wp.array(dtype=float),
-    jitter: wp.array(dtype=float),
-    step: float,
-    skips: wp.array3d(dtype=wp.uint8),
-    counts: wp.array(dtype=wp.int64),
-):
-    index = first + wp.tid()
-    while index < end:
-        count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
-        t = t_start[index]
-        radius = _radius_at(origins[index] + t * directions[index])
-        while radius <= 512.0:
-            length = _stride_at(radius, step)
-            count += _is_occupied(origins[index] + (t + jitter[index] * length) * directions[index], skips)
-            t += length
-            radius = _radius_at(origins[index] + t * directions[index])
-        counts[index] = wp.int64(count)
-        index += stride
+def _cube_exit(origin: wp.vec3f, direction: wp.vec3f):
+    """Where a ray from within the inner cube leaves it."""
+    to_face = wp.vec3f(1.0, 1.0, 1.0) - wp.cw_mul(
+        origin, wp.vec3f(wp.sign(direction[0]), wp.sign(direction[1]), wp.sign(direction[2]))
+    )
+    slowest = 1.0e-9
+    x = to_face[0] / wp.max(wp.abs(direction[0]), slowest)
+    y = to_face[1] / wp.max(wp.abs(direction[1]), slowest)
+    z = to_face[2] / wp.max(wp.abs(direction[2]), slowest)
+    return wp.min(wp.min(x, y), z)
 
 
 @wp.kernel(enable_backward=False)
@@ -193,15 +178,27 @@ def _write_kernel(
         own = t_samples[start : start + int(room[index, 1])]
         slot = int(0)  # noqa: RUF046, UP018
         t = t_start[index]
-        radius = _radius_at(origins[index] + t * directions[index])
+        origin, direction = origins[index], directions[index]
+        leaves = _cube_exit(origin, direction)
+        # A ray may go so far for each cell of clearance; a little less, since coordinates are rounded.
+        clear_way = (
+            2.99
+            / float(wp.max(wp.max(skips.shape[0], skips.shape[1]), skips.shape[2]))
+            / _radius_at(direction)
+        )
+        radius = _radius_at(origin + t * direction)
         while slot < own.shape[0] and radius <= 512.0:
             length = _stride_at(radius, step)
             middle = t + jitter[index] * length
+            clear = _skip_at(origin + middle * direction, skips)
             # An empty point's entry is overwritten by the next point's.
             own[slot] = middle
-            slot += _is_occupied(origins[index] + middle * directions[index], skips)
+            slot += 1 - wp.min(clear, 1)
+            if clear > 1 and radius <= 1.0:
+                way = wp.min(float(clear - 1) * clear_way, leaves - t)
+                length *= float(1 + int(wp.max(way, 0.0) / step))
             t += length
-            radius = _radius_at(origins[index] + t * directions[index])
+            radius = _radius_at(origin + t * direction)
         counts[index] = wp.int64(slot)
         ends[index] = t
         index += stride

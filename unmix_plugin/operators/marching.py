@@ -6,8 +6,7 @@ Notation: `R` rays, `S` samples in all, stored packed: the samples of a ray are 
 Of the kernels a work item is a ray. Samples lie at t = t_near + (i + jitter) * step for integer i. From an empty
 lattice point a ray goes on to the first one that may lie in an occupied cell, by the skips of the cell: working out
 where a cell ends costs more. Near occupied cells several points are looked up at once, empty or not: look-ups that
-don't wait for one another cost a tenth of those that do. Counting and writing walk the same lattice with the same
-arithmetic, so that the second pass fills what the first one counted.
+don't wait for one another cost a tenth of those that do.
 """
 
 from collections.abc import Sequence
@@ -84,7 +83,7 @@ def march(
         ValueError: step isn't positive.
     """
     rays = _rays(origins, directions, t_near, t_far, jitter, skips, step)
-    return take_all(_count_kernel, _write_kernel, rays, origins)
+    return take_all(_write_kernel, rays, origins)
 
 
 def march_first(
@@ -111,7 +110,9 @@ def count_samples(
 ) -> Int[Tensor, "R"]:
     """How many samples of each ray `march` takes at t_near + (i + 1/2) step."""
     rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), skips, step)
-    return _counted(_count_kernel, rays, origins)
+    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
+    launch(_count_kernel, len(origins), [*rays, as_warp(counts)], origins.device)
+    return counts
 
 
 def _rays(
@@ -131,21 +132,33 @@ def _rays(
     return [*lines, *numbers, step, as_warp(skips.contiguous())]
 
 
+_ROOM = 256
+"""Samples of a ray that there is room for at first."""
+
+
 def take_all(
-    count_kernel: Any, write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
+    write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
 ) -> PackedSamples:
-    """Samples of rays by two launches: one counts them, the other writes them where there is then room.
+    """Samples of rays by one launch, and another with twice the room for each where a ray may have more.
 
     Args:
-        rays: Arguments of both kernels.
+        rays: The first arguments of the kernel.
         origins: Of the rays.
     """
-    counts = _counted(count_kernel, rays, origins)
+    most = _ROOM
+    found = take_first(write_kernel, rays, origins, most)
+    while len(origins) and int(found.counts.max()) == most:
+        most *= 2
+        found = take_first(write_kernel, rays, origins, most)
+    counts = found.counts
     ends = counts.cumsum(0)
-    packed_info = torch.stack([ends - counts, counts], dim=-1)
+    starts = ends - counts
     total = int(ends[-1]) if len(ends) else 0
-    t, _, _ = _written(write_kernel, rays, packed_info, total)
-    return PackedSamples(t, torch.repeat_interleave(counts, output_size=total), packed_info)
+    indices = torch.arange(max(total, len(counts)), device=counts.device)
+    ray_indices = torch.repeat_interleave(counts, output_size=total)
+    shifts = most * indices[: len(counts)] - starts
+    t = found.t.view(-1).index_select(0, shifts.index_select(0, ray_indices).add_(indices[:total]))
+    return PackedSamples(t, ray_indices, torch.stack([starts, counts], dim=-1))
 
 
 def take_first(
@@ -154,27 +167,10 @@ def take_first(
     """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
     starts = most * torch.arange(len(origins), device=origins.device)
     room = torch.stack([starts, torch.full_like(starts, most)], dim=-1)
-    t, counts, ends = _written(write_kernel, rays, room, most * len(origins))
+    t, ends = (origins.new_empty(size, dtype=torch.float32) for size in (most * len(origins), len(origins)))
+    counts = torch.empty_like(starts)
+    launch(write_kernel, len(origins), [*rays, *map(as_warp, (room, t, counts, ends))], origins.device)
     return FirstSamples(t.view(len(origins), most), counts, ends)
-
-
-def _counted(
-    kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
-) -> Int[Tensor, "R"]:
-    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
-    launch(kernel, len(origins), [*rays, as_warp(counts)], origins.device)
-    return counts
-
-
-def _written(
-    kernel: Any, rays: Sequence[KernelArray | float], room: Int[Tensor, "R 2"], size: int
-) -> tuple[Float[Tensor, "S"], Int[Tensor, "R"], Float[Tensor, "R"]]:
-    """Samples, how many each ray has, and where it goes on; `room` are the first place of each ray and the number."""
-    t, ends = (torch.empty(count, dtype=torch.float32, device=room.device) for count in (size, len(room)))
-    counts = torch.empty_like(room[:, 0])
-    if size:
-        launch(kernel, len(room), [*rays, *map(as_warp, (room, t, counts, ends))], room.device)
-    return t, counts, ends
 
 
 def march_twin(
