@@ -125,6 +125,18 @@ def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_diffe
     np.testing.assert_allclose(scene.cube(1), np.delete(counts, 3, axis=2) / 4095, atol=1e-4)
 
 
+def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    white = np.fromfile(capture.root / "white.raw", "<u2").reshape(-1, len(WAVELENGTHS_NM), WIDTH)
+    white[:, 2] = 4095  # which no view reaches
+    white.tofile(capture.root / "white.raw")
+    scene, findings = made(tmp_path, capture, **references_of(capture))
+    assert findings[0].startswith("white.hdr: the white is saturated in 550 nm: these bands are left out")
+    np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 2))
+    expected = np.delete(capture.reflectance["view_00"], 2, axis=2)
+    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
+
+
 def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     stated = references_of(capture) | {"white_reflectance": "0.02"}
