@@ -64,13 +64,10 @@ def test_pixels_are_drawn_by_the_shares_that_are_asked_for(rig):
     assert len(groups[1].numbers.unique()) == 140
 
 
-def test_opaque_pixels_are_sampled_of_one_sensor(rig):
+def test_opaque_pixels_are_sampled_of_one_sensor_and_of_large_blocks_from_some(rig, monkeypatch):
     pixels = PixelTable(rig, CPU, (1, 3, 4, 5)).sample_opaque(1, 12, seed=0)
     assert pixels.shape == (12, 2)
     np.testing.assert_allclose(pixels[:, 1], 0.25 * pixels[:, 0], atol=1e-3)
-
-
-def test_of_large_blocks_some_opaque_pixels_are_sampled_from(rig, monkeypatch):
     everything = PixelTable(rig, CPU, (3, 4)).sample_opaque(1, 1000, seed=0)
     monkeypatch.setattr(pixel_table, "_MOST_LISTED", 100)
     table = PixelTable(rig, CPU, (3, 4))

@@ -304,6 +304,8 @@ def test_files_are_inspected_with_the_options_of_reading_and_those_that_do_nothi
     assert "--dataset does nothing: the format envi leaves no choice" in out
     assert "--axes does nothing" in out
     assert "--size" not in out
+    with pytest.raises(ConfigError, match="no file is named"):
+        inspect_command([])
 
 
 def test_the_table_for_people_has_every_number_that_values_depend_on(header, poses, tmp_path, capsys):
@@ -324,8 +326,3 @@ def test_the_table_for_people_has_every_number_that_values_depend_on(header, pos
         "map info UTM, 1, 1, 500000, 4500000, 2, 2, 33, North, WGS-84",
     ):
         assert said in out, said
-
-
-def test_no_file_is_an_error():
-    with pytest.raises(ConfigError, match="no file is named"):
-        inspect_command([])
