@@ -163,9 +163,8 @@ def _pixels(views: Sequence[SeenView]) -> list[str]:
     """Views with many saturated or missing pixels, or without matter."""
     findings = []
     for what, limit in (("saturated", _SATURATED_SHARE), ("missing", _MISSING_SHARE)):
-        shares = {
-            view.name: getattr(view.record, f"{what}_pixels") / view.record.num_pixels for view in views
-        }
+        records = [view.record for view in views]
+        shares = {one.name: getattr(one, f"{what}_pixels") / one.num_pixels for one in records}
         many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
         if many:
             findings.append(

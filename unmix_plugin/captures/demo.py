@@ -167,9 +167,8 @@ def _print_of_markers() -> Blend:
     cells = dictionary.markerSize + 2  # with the black border
     steps = [(i, j) for i in range(-3, 4) for j in range(-3, 4) if max(abs(i), abs(j)) == 3]
     middles = _BOARD_STEP * np.array(steps)
-    black = np.stack(
-        [cv2.aruco.generateImageMarker(dictionary, index, cells) < 128 for index in range(len(steps))]
-    )
+    printed_as = [cv2.aruco.generateImageMarker(dictionary, index, cells) for index in range(len(steps))]
+    black = np.stack(printed_as) < 128
 
     def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
         points = local_points[:, :2] * _BOARD_REACH
@@ -262,6 +261,5 @@ def _demo_line_camera(
         generator.standard_normal((width, 1)) + 0.3 * generator.standard_normal((width, bands))
     )
     dark[1::2] += _DARK_SPREAD
-    return _LineCamera(
-        (WHITE_SHARE * FULL_WELL * light / light.max()).astype(np.float32), dark.clip(0).astype(np.float32)
-    )
+    white = WHITE_SHARE * FULL_WELL * light / light.max()
+    return _LineCamera(white.astype(np.float32), dark.clip(0).astype(np.float32))

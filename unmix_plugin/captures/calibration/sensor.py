@@ -403,9 +403,8 @@ def _drop_found(
     noise[~is_dead] = _noise_shares(values[usable][:, ~is_dead])
     is_noisy = noise > max_noise  # false for NaN
     if is_noisy.mean() > _MOST_NOISY:  # bands have little in common then, or the whole capture is noisy
-        notes = (
-            f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal; all are kept",
-        )
+        noisy = f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal"
+        notes = (f"{noisy}; all are kept",)
         is_noisy[:] = False
     # The first reason that is found counts.
     reasons = {int(kept[i]): f"noise is {noise[i]:.0%} of the signal" for i in np.flatnonzero(is_noisy)}

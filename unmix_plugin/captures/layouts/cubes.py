@@ -108,10 +108,7 @@ def _capture_of_groups(
     take_results = all(group.result for group in complete.values()) and not all(
         group.cube and group.white for group in complete.values()
     )
-    paths = {
-        key: group.result if take_results or group.cube is None else group.cube
-        for key, group in complete.items()
-    }
+    paths = {key: (not take_results and group.cube) or group.result for key, group in complete.items()}
     if not any(paths.values()):
         raise CaptureError(
             f"{root} holds references only ({name_some([path.name for path in left_out])}); expected one file a view"

@@ -257,9 +257,8 @@ class _Chain:
 def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4 4"]:
     """Both poses of a square of side 1, the better first."""
     cv2 = require_opencv()
-    _, turns, shifts, _ = cv2.solvePnPGeneric(
-        SQUARE, ideal[:, None], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-    )
+    flat = cv2.SOLVEPNP_IPPE_SQUARE
+    _, turns, shifts, _ = cv2.solvePnPGeneric(SQUARE, ideal[:, None], np.eye(3), None, flags=flat)
     poses = [_transform(turn, shift) for turn, shift in zip(turns, shifts, strict=True)]
     return np.stack([*poses, np.eye(4), np.eye(4)][:2])
 

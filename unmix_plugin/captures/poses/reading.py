@@ -202,9 +202,8 @@ def _has_frames(content: Any) -> bool:
     """Whether JSON looks like a transforms.json: an object with frames, or a bare list of them."""
     if isinstance(content, dict):
         return "frames" in content
-    return isinstance(content, list) and any(
-        isinstance(frame, dict) and "transform_matrix" in frame for frame in content
-    )
+    frames = content if isinstance(content, list) else []
+    return any(isinstance(frame, dict) and "transform_matrix" in frame for frame in frames)
 
 
 def frames_of(path: Path, content: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:

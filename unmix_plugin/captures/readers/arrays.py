@@ -64,7 +64,7 @@ class FoundArray:
     shape: tuple[int, ...]
     dtype: np.dtype
     whole: Callable[[], np.ndarray]
-    """All its numbers, mapped or loaded."""
+    """All its numbers, mapped or loaded, perhaps of a smaller type."""
     take: _TakePart | None = None
     """A faster way to some rows and bands than through `whole`."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -242,7 +242,7 @@ def _find_vector(
 
 def _counts(array: FoundArray) -> bool:
     """Whether a list counts instead of measuring: whole numbers one apart."""
-    numbers = array.whole().reshape(-1)
+    numbers = array.whole().reshape(-1).astype(np.float64)
     return bool((np.diff(numbers) == 1).all() and numbers[0] < 100)
 
 
@@ -314,15 +314,12 @@ def _prisma(image: FoundArray) -> tuple[float, float, str] | None:
     for part in ("Vnir", "Swir"):
         if part.lower() not in image._own_name:
             continue
-        low, high = (
-            _first_number(image._all_attributes, (f"l2scale{part.lower()}{end}",)) for end in ("min", "max")
-        )
+        ends = [f"l2scale{part.lower()}{end}" for end in ("min", "max")]
+        low, high = (_first_number(image._all_attributes, (end,)) for end in ends)
         if low is not None and high is not None and high > low:
             return (high - low) / 65535.0, low, f"'L2Scale{part}Min' and 'L2Scale{part}Max'"
-        factor, offset = (
-            _first_number(image._all_attributes, (f"{name}_{part.lower()}",))
-            for name in ("scalefactor", "offset")
-        )
+        names = [f"{name}_{part.lower()}" for name in ("scalefactor", "offset")]
+        factor, offset = (_first_number(image._all_attributes, (name,)) for name in names)
         if factor:
             return 1.0 / factor, -(offset or 0.0), f"'ScaleFactor_{part}' and 'Offset_{part}'"
     return None

@@ -341,10 +341,7 @@ def _found_in_matlab(
             return loaded(_unpack, path, name, shape, stored, offset, packed)
         return np.memmap(path, stored, "r", offset, shape, order="F")
 
-    def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
-        return take_part(numbers(), axes, rows, bands).astype(dtype)
-
-    return [FoundArray(name, shape, dtype, lambda: numbers().astype(dtype), take)]
+    return [FoundArray(name, shape, dtype, numbers)]
 
 
 def _tag(head: bytes, order: str, position: int) -> tuple[int, int, int, int]:
