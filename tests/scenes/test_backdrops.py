@@ -28,6 +28,12 @@ def shaded_with_a_seam(view: int, _: np.random.Generator) -> np.ndarray:
     return (side * (0.7 + 0.3 * COLUMNS / WIDTH))[..., None] * COLOUR
 
 
+def with_a_faint_seam(view: int, _: np.random.Generator) -> np.ndarray:
+    """A wall hardly darker than the floor, but in one view, where it stands in the shade."""
+    wall = 0.23 if view == 0 else 0.415
+    return np.where(40 + 2 * view > ROWS, wall, 0.45)[..., None] * COLOUR
+
+
 BACKDROPS: dict[str, Light] = {
     "black": grey(0.02),
     "grey": grey(0.2),
@@ -38,6 +44,7 @@ BACKDROPS: dict[str, Light] = {
         0.9 * (1 - 0.3 * (2 * COLUMNS / WIDTH - 1.2) ** 2)[..., None] * COLOUR
     ),
     "a shaded wall and floor": shaded_with_a_seam,
+    "a wall that is hardly darker than the floor": with_a_faint_seam,
 }
 
 

@@ -74,6 +74,8 @@ _MOST_DISTANCE = 0.012
 """Median distance of a backdrop's pixels from its surfaces; more is a texture."""
 _MOST_UNLIKE = 0.12
 """Distance of a view's backdrop from that of the others, as a share of the brightest pixels."""
+_MOST_SHADED = 2.0
+"""How many times brighter or darker the same backdrop may be in a view."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,11 @@ class Backdrop:
         return features @ self.basis.T
 
     def is_like(self, level: Float32[np.ndarray, " k"]) -> bool:
-        """Whether features are near those of a surface that was looked at."""
-        return bool((_norm(self.levels - level) < _MOST_UNLIKE * self.brightest).any())
+        """Whether features are near those of a surface that was looked at, or of it in more or in less light."""
+        share = (self.levels @ level) / np.maximum(np.square(self.levels).sum(-1), 1e-12)
+        lit = np.clip(share, 1 / _MOST_SHADED, _MOST_SHADED)[:, None] * self.levels
+        near = _norm(self.levels - level) < _MOST_UNLIKE * self.brightest
+        return bool((near | (_norm(lit - level) < _FIRST_TOLERANCE * self.brightest)).any())
 
     @property
     def in_words(self) -> str:
@@ -420,11 +425,21 @@ def _fit(
     values = features[thin].reshape(-1, features.shape[-1])
     at_border, farthest = _border(shape), _FIRST_TOLERANCE * brightest
     border = np.flatnonzero(at_border & known[thin])
-    surfaces = _border_surfaces(terms[border], values[border], farthest)
-    tolerances = [farthest] * len(surfaces)
-    levels = [np.zeros(values.shape[1], np.float32)] * len(surfaces)
-    members = border
-    for turn in range(_TURNS if surfaces else 0):
+    surfaces: list[Float32[np.ndarray, "t k"]] = []
+    tolerances: list[float] = []
+    levels: list[Float32[np.ndarray, " k"]] = []
+    members = unexplained = border
+    for turn in range(_TURNS):
+        # Once surfaces are fitted closely, what they miss of the border can be another behind a faint seam.
+        most = _SMALLEST_SURFACE * len(border)
+        more = _border_surfaces(terms[unexplained], values[unexplained], farthest, most)
+        more = more[: _MOST_SURFACES - len(surfaces)]
+        surfaces += more
+        tolerances += [farthest] * len(more)
+        levels += [np.zeros(values.shape[1], np.float32)] * len(more)
+        if not surfaces:
+            break
+        members = np.union1d(members, unexplained)
         distances = np.stack([_norm(values[members] - terms[members] @ surface) for surface in surfaces])
         owners = distances.argmin(axis=0)
         for index, own in enumerate(distances):
@@ -442,6 +457,7 @@ def _fit(
         ]
         alike = np.any(near, axis=0).reshape(shape) & known[thin]
         members = np.flatnonzero(_reaching(alike, at_border))
+        unexplained = border[~alike.ravel()[border]]
     return ViewBackdrop(features, tuple(surfaces), tuple(levels), tuple(tolerances), farthest, known)
 
 
@@ -449,12 +465,14 @@ def _border_surfaces(
     terms: Float32[np.ndarray, "P t"],
     values: Float32[np.ndarray, "P k"],
     farthest: float,
+    fewest: float,
 ) -> list[Float32[np.ndarray, "t k"]]:
-    """Quadratic surfaces near to most pixels of the border, each sought from all parts of it."""
+    """Quadratic surfaces near to most pixels of the border, each sought from all parts of it and near to more than
+    `fewest`."""
     parts = np.floor((np.arctan2(terms[:, 2], terms[:, 1]) / (2 * np.pi) + 0.5) * _SEGMENTS)
     free, surfaces = np.ones(len(terms), bool), []
     while len(surfaces) < _MOST_SURFACES:
-        best, most = free, _SMALLEST_SURFACE * len(terms)
+        best, most = free, fewest
         found = None
         for part in range(_SEGMENTS):
             near = free & (parts == part)
@@ -462,14 +480,16 @@ def _border_surfaces(
                 continue
             surface = np.zeros((_NUM_TERMS, values.shape[1]), np.float32)
             surface[0] = np.median(values[near], axis=0)
+            near = free & (_norm(values - terms @ surface) < farthest)
             for num_terms in (1, 3, 3, 6, 6):
-                near = free & (_norm(values - terms @ surface) < farthest)
                 if near.sum() < 2 * num_terms:
                     break
                 surface = _least_squares(terms[near], values[near], num_terms)
-            near = free & (_norm(values - terms @ surface) < farthest)
-            if near.sum() > most:
-                found, best, most = surface, near, int(near.sum())
+                away = _norm(values - terms @ surface) / farthest
+                near = free & (away < 1)
+                # By how near they are, not by their number: a surface can pass near to parts of two others.
+                if (score := float((1 - away[near] ** 2).sum())) > most:
+                    found, best, most = surface, near, score
         if found is None:
             break
         surfaces.append(found)
