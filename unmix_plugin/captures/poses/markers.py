@@ -350,8 +350,7 @@ def _pose_set(
     free: Bool[np.ndarray, " L"],
 ) -> PoseSet:
     """Cameras in the world that stands on the markers, those without enough markers named."""
-    views = np.unique(seen.view[kept])
-    markers = np.unique(seen.marker[kept])
+    views, markers = np.unique(seen.view[kept]), np.unique(seen.marker[kept])
     corners = transformed(found.world_from_marker[markers], np.broadcast_to(SQUARE, (len(markers), 4, 3)))
     to_board, up, how_up = _stand_on_markers(corners, marker_size or 1.0)
     cameras = {}
