@@ -70,7 +70,7 @@ def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=4
         materials_scene=scene,
         scale=scene.scale,
         measures=Measures(None, regions),
-        record=SimpleNamespace(summary={"root": "ball"}),
+        scene_name="ball",
         folder=SimpleNamespace(path=Path("ball/unmix-nerf/run")),
         config=SimpleNamespace(method_name="unmix-nerf"),
     )

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
         TrainerConfig,
         short,
     )
-    from unmix_plugin.engine.geometry.camera_paths import upright_cameras
+    from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes, upright_cameras
     from unmix_plugin.engine.geometry.cameras import Cameras
     from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
     from unmix_plugin.engine.machine import step_generator
@@ -57,7 +57,7 @@ _MODULES = {
         "TrainerConfig",
         "short",
     ),
-    "geometry.camera_paths": ("upright_cameras",),
+    "geometry.camera_paths": ("nearest_to_axes", "upright_cameras"),
     "geometry.cameras": ("Cameras",),
     "geometry.space": ("RayBundle", "SceneBox"),
     "machine": ("step_generator",),
@@ -100,6 +100,7 @@ __all__ = [
     "load_model",
     "load_pipeline",
     "named_output",
+    "nearest_to_axes",
     "short",
     "step_generator",
     "upright_cameras",

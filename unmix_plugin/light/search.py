@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light.lamp import Lamp, LampFrame, MovingLamp, Triple
@@ -171,14 +172,12 @@ def _best_lamp(evidence: _LampEvidence, cameras: Cameras) -> Candidate:
 def _turning_axis(cameras: Cameras) -> tuple[Triple, Triple]:
     """The point nearest to all lines of sight, and the unit vector upwards to which the cameras' right sides are
     perpendicular."""
-    rotations, origins = cameras.camera_to_world[:, :, :3], cameras.camera_to_world[:, :, 3]
+    rotations = cameras.camera_to_world[:, :, :3]
     axis = torch.linalg.svd(rotations[:, :, 0]).Vh[-1]
     if float(rotations[:, :, 1].mean(dim=0) @ axis) < 0:
         axis = -axis
-    sight = rotations[:, :, 2]
-    across = torch.eye(3) - sight[:, :, None] * sight[:, None, :]
-    middle = torch.linalg.pinv(across.sum(dim=0)) @ (across @ origins[:, :, None]).sum(dim=0)[:, 0]
-    return _triple(middle), _triple(axis)
+    middle = nearest_to_axes(cameras.camera_to_world.double().numpy())
+    return _triple(torch.from_numpy(middle)), _triple(axis)
 
 
 def _moved(lamp: Lamp, move: float, box: SceneBox) -> list[Lamp]:

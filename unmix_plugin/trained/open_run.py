@@ -142,6 +142,12 @@ class LoadedRun:
         return self.measures.scale or recorded_scale(self.record.summary)
 
     @property
+    def scene_name(self) -> str:
+        """What the run calls its scene: the name of its folder."""
+        root = self.record.summary.get("root")
+        return Path(str(root)).name if root else self.folder.path.parents[1].name
+
+    @property
     def materials_scene(self) -> TrainedScene:
         """The scene, which must be one of mixed materials.
 

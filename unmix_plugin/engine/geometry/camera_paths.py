@@ -222,12 +222,17 @@ _MOST_MISSED = 0.25
 """By how much half of the axes may miss the point, over their depth there."""
 
 
+def nearest_to_axes(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"]:
+    """The point nearest to all optical axes, least squares; of parallel axes the one nearest to the origin, too."""
+    across = _across(poses)
+    return np.linalg.pinv(across.mean(axis=0)) @ (across @ poses[:, :, 3:]).mean(axis=0)[:, 0]
+
+
 def focus_point(poses: Float64[np.ndarray, "N 3 4"]) -> Float64[np.ndarray, "3"] | None:
     """The point nearest to all optical axes, least squares; None if they are parallel or most point away from it."""
     if _convergence(poses) < _LEAST_CONVERGENCE:
         return None
-    across = _across(poses)
-    point = np.linalg.solve(across.mean(axis=0), (across @ poses[:, :, 3:]).mean(axis=0)[:, 0])
+    point = nearest_to_axes(poses)
     depths = ((point - poses[:, :, 3]) * -poses[:, :, 2]).sum(axis=-1)
     return point if (depths > 0.0).mean() > 0.5 else None
 

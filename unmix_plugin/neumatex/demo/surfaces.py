@@ -76,16 +76,9 @@ def meshed(field: Field, resolution: int) -> Mesh:
     spacing = axis[1] - axis[0]
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(spacing,) * 3, allow_degenerate=False)
     vertices = vertices.astype(np.float64) - _HALF_EDGE
-    faces = _largest_volume_outwards(vertices, faces.astype(np.int64))
     normals = torch.tensor(_gradient(field, vertices, spacing))
-    mesh = mesh_of(torch.tensor(vertices), torch.tensor(faces), normals)
+    mesh = mesh_of(torch.tensor(vertices), torch.tensor(np.ascontiguousarray(faces, np.int64)), normals)
     return mesh.transformed(*mesh.to_model_space())
-
-
-def _largest_volume_outwards(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    volume = np.einsum("ij,ij->", a, np.cross(b, c))
-    return faces if volume > 0 else faces[:, ::-1].copy()
 
 
 def _gradient(field: Field, points: np.ndarray, spacing: float) -> np.ndarray:

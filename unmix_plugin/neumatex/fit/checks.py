@@ -15,9 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
-from unmix_plugin.engine import Cameras
+from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -86,8 +85,9 @@ def compare_outlines(
 
 def _places(cameras: Cameras, frame: Normalisation) -> str:
     """Where the mesh and the cameras are in the world, without digits that rounding made."""
-    positions = frame.to_world(cameras.camera_to_world[:, :, 3].double().numpy())
-    middle, target = frame.to_world(np.zeros(3)), frame.to_world(_looked_at(cameras).numpy())
+    poses = cameras.camera_to_world.double().numpy()
+    positions = frame.to_world(poses[:, :, 3])
+    middle, target = frame.to_world(np.zeros(3)), frame.to_world(nearest_to_axes(poses))
     away = float(np.median(np.linalg.norm(positions - target, axis=1)))
     unit = 10.0 ** math.floor(math.log10(1e-4 * max(away, 2 / frame.scale)))
     middle, target = (np.round(point / unit) * unit + 0.0 for point in (middle, target))
@@ -96,15 +96,6 @@ def _places(cameras: Cameras, frame: Normalisation) -> str:
         f"its middle is {shown[0]}, the cameras look at {shown[1]}, {np.linalg.norm(target - middle):.4g} away from "
         f"there, and stand {away:.4g} from what they look at"
     )
-
-
-def _looked_at(cameras: Cameras) -> Float[Tensor, "3"]:
-    """The point nearest to the optical axes of all cameras, least squares."""
-    poses = cameras.camera_to_world.double()
-    axes = -poses[:, :, 2]
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None]
-    sought = (across @ poses[:, :, 3:]).sum(dim=0)
-    return torch.linalg.lstsq(across.sum(dim=0), sought, driver="gelsd").solution[:, 0]
 
 
 def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"] | None) -> float:

@@ -11,7 +11,7 @@ Notation: `H x W` pixels, `B` bands, `M` true materials.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -162,23 +162,21 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     faults, notes = Faults(root), list[str]()
     entry = read_transforms(root, faults, needs_cubes=False)
     split = split_frames(entry, "auto", EVAL_INTERVAL, faults)
-    light = _read_light(root, faults)
+    folder = _read_folder(root, entry, faults)
     mesh_path = _find_file(root, "mesh_path", "mesh", MESH_SUFFIXES, faults)
     faults.raise_if_any()
-    assert light is not None
     assert mesh_path is not None
-    given = read_mesh(mesh_path, notes)
-    frame, mesh, pictures = _placed(given, mesh_path.name, root, entry, light, notes, faults)
-    spectral = _spectral_light(root, entry, pictures, lamp)
-    environment = light.environment(spectral)
+    frame, mesh, pictures = _placed(read_mesh(mesh_path, notes), mesh_path.name, folder, notes)
+    bands, own_lamp = _spectral_light(folder, pictures, lamp)
+    environment = folder.environment(bands, own_lamp)
     doubt = light_doubt(pictures, environment)
     notes += [] if doubt is None else [doubt]
-    own_lamp = None if spectral is None else spectral.lamp
-    if spectral is not None and own_lamp is None:
+    held_out = [_read_held_out(path, frame, bands, own_lamp) for path in _held_out_folders(root)]
+    if bands is not None and own_lamp is None:
         light_of_all = environment.mean_radiance().double().numpy()
         own_lamp = light_of_all / light_of_all.max()
     truth = root / "truth" / "base_colour"
-    files = {path.name: sha256_of(path) for path in (mesh_path, light.environment_path)}
+    files = {path.name: sha256_of(path) for path in (mesh_path, folder.environment_path)}
     return ObjectScene(
         root=root,
         mesh=mesh,
@@ -186,34 +184,57 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         frame=frame,
         pictures=pictures,
         split=split,
-        lights=tuple(_read_held_out(path, frame, spectral) for path in _held_out_folders(root)),
-        bands=None if spectral is None else spectral.bands,
+        lights=tuple(held_out),
+        bands=bands,
         lamp=own_lamp,
         truth=truth if truth.is_dir() else None,
-        true_materials=None if spectral is None else _read_true_materials(root, entry, spectral.bands),
+        true_materials=None if bands is None else _read_true_materials(root, entry, bands),
         input_hashes={**files, **pictures.hashes},
         notes=tuple(notes),
     )
 
 
 @dataclass(frozen=True)
-class _SpectralLight:
-    """Bands and lamp of spectral pictures."""
+class _Folder:
+    """What a folder's transforms.json says."""
 
-    bands: Bands
-    lamp: Float64[np.ndarray, " B"] | None
-    """Relative power, greatest 1; None where it is not given."""
+    root: Path
+    entry: SceneEntry
+    environment_path: Path
+    placement: tuple[float, float]
+    """Of the environment: rotation in degrees and exposure in stops."""
+    tone: ToneMapping | None
+
+    def pictures(self, frame: Normalisation) -> PosedPictures:
+        """Its pictures in model space, given that from the world."""
+        return read_posed_pictures(self.root, self.entry, _from_poses(frame, self.entry.placement), self.tone)
+
+    def environment(self, bands: Bands | None, lamp: Float64[np.ndarray, " B"] | None) -> Environment:
+        """In the bands of spectral pictures, otherwise in colours."""
+        if bands is None:
+            return read_environment(self.environment_path, *self.placement)
+        return read_environment_of_bands(self.environment_path, bands, lamp, *self.placement)
+
+    def lamp(self, bands: Bands) -> Float64[np.ndarray, " B"] | None:
+        """What 'illuminant_path' names; None where there is none."""
+        if self.entry.illuminant_path is None:
+            return None
+        faults = Faults(self.root)
+        path = resolve_path(self.root, self.entry.illuminant_path, None, "'illuminant_path'", faults)
+        faults.raise_if_any()
+        return None if path is None else read_lamp(str(path), bands)
 
 
 def _spectral_light(
-    root: Path, entry: SceneEntry, pictures: PosedPictures, lamp: str | None
-) -> _SpectralLight | None:
-    """Bands and lamp of an object's pictures; None for pictures in colours."""
-    found, count = entry.wavelengths_nm, pictures.num_colours
+    folder: _Folder, pictures: PosedPictures, lamp: str | None
+) -> tuple[Bands | None, Float64[np.ndarray, " B"] | None]:
+    """Bands of an object's pictures, None for pictures in colours, and their lamp's power, None where it is not
+    given."""
+    root, found, count = folder.root, folder.entry.wavelengths_nm, pictures.num_colours
     if count == _NUM_COLOURS and (found is None or len(found) != count):
         if lamp is not None:
             raise SceneError(f"{root}: a lamp is given, but its pictures have {count} colours; leave it out")
-        return None
+        return None, None
     if found is None or len(found) != count:
         given = "no 'wavelengths'" if found is None else f"{len(found)} 'wavelengths'"
         raise SceneError(
@@ -224,17 +245,7 @@ def _spectral_light(
             f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
         )
     bands = Bands(found)
-    return _SpectralLight(bands, _own_lamp(root, entry, bands) if lamp is None else read_lamp(lamp, bands))
-
-
-def _own_lamp(root: Path, entry: SceneEntry, bands: Bands) -> Float64[np.ndarray, " B"] | None:
-    """What 'illuminant_path' names; None where there is none."""
-    if entry.illuminant_path is None:
-        return None
-    faults = Faults(root)
-    path = resolve_path(root, entry.illuminant_path, None, "'illuminant_path'", faults)
-    faults.raise_if_any()
-    return None if path is None else read_lamp(str(path), bands)
+    return bands, folder.lamp(bands) if lamp is None else read_lamp(lamp, bands)
 
 
 def _read_true_materials(root: Path, entry: SceneEntry, bands: Bands) -> _TrueMaterials | None:
@@ -254,28 +265,11 @@ def _read_true_materials(root: Path, entry: SceneEntry, bands: Bands) -> _TrueMa
     return _TrueMaterials(table.names, table.spectra, files)
 
 
-@dataclass(frozen=True)
-class _Light:
-    """What a transforms.json says of light and tone."""
-
-    environment_path: Path
-    rotation_deg: float
-    exposure_stops: float
-    tone: ToneMapping | None
-
-    def environment(self, spectral: _SpectralLight | None) -> Environment:
-        """In the bands of spectral pictures, otherwise in colours."""
-        placement = (self.rotation_deg, self.exposure_stops)
-        if spectral is None:
-            return read_environment(self.environment_path, *placement)
-        return read_environment_of_bands(self.environment_path, spectral.bands, spectral.lamp, *placement)
-
-
-def _read_light(root: Path, faults: Faults) -> _Light | None:
-    """The keys of light and tone; None with noted faults where they are wrong."""
-    noted, content = faults.noted, _content(root)
+def _read_folder(root: Path, entry: SceneEntry, faults: Faults) -> _Folder:
+    """The keys of light and tone; only sound where no faults are noted."""
+    content = _content(root)
     path = _find_file(root, "environment_path", "environment", ENVIRONMENT_SUFFIXES, faults)
-    numbers = dict[str, float]()
+    numbers = list[float]()
     for key, most in (("environment_rotation_deg", 1e6), ("environment_exposure_stops", MOST_STOPS)):
         number = read_number(content.get(key, 0.0))
         if number is None or abs(number) > most:
@@ -283,15 +277,13 @@ def _read_light(root: Path, faults: Faults) -> _Light | None:
                 FILE_NAME,
                 f"'{key}' is {describe(content[key])}; expected a number from {-most:g} to {most:g}",
             )
-        numbers[key] = number or 0.0
+        numbers.append(number or 0.0)
     tone = content.get("tone_mapping")
     if tone is not None and tone not in TONE_MAPPINGS:
         known = ", ".join(TONE_MAPPINGS)
         faults.add(FILE_NAME, f"'tone_mapping' is {describe(tone)}; expected one of {known}")
-    if path is None or faults.noted > noted:
-        return None
-    rotation_deg, exposure_stops = numbers.values()
-    return _Light(path, rotation_deg, exposure_stops, cast("ToneMapping | None", tone))
+        tone = None
+    return _Folder(root, entry, path or root, (numbers[0], numbers[1]), cast("ToneMapping | None", tone))
 
 
 def _find_file(root: Path, key: str, what: str, suffixes: tuple[str, ...], faults: Faults) -> Path | None:
@@ -320,7 +312,7 @@ def _content(root: Path) -> dict[str, Any]:
 
 
 def _placed(
-    given: Mesh, name: str, root: Path, entry: SceneEntry, light: _Light, notes: list[str], faults: Faults
+    given: Mesh, name: str, folder: _Folder, notes: list[str]
 ) -> tuple[Normalisation, Mesh, PosedPictures]:
     """The mesh and the pictures in model space; a mesh that fits only with its y axis upwards is turned.
 
@@ -331,8 +323,7 @@ def _placed(
     for placed in (given, given.with_y_upwards()):
         scale, offset = placed.to_model_space()
         frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
-        mesh = placed.transformed(scale, offset)
-        pictures = read_posed_pictures(root, entry, _from_poses(frame, entry.placement), light.tone, faults)
+        mesh, pictures = placed.transformed(scale, offset), folder.pictures(frame)
         read = (pictures.read(index) for index in range(len(pictures)))
         alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
         misplaced, doubt = compare_outlines(RayMesh(mesh), pictures.cameras, alphas, frame, name)
@@ -356,21 +347,21 @@ def _held_out_folders(root: Path) -> list[Path]:
     return sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
 
 
-def _read_held_out(folder: Path, frame: Normalisation, spectral: _SpectralLight | None) -> _HeldOutLight:
-    faults = Faults(folder)
-    entry: SceneEntry = read_transforms(folder, faults, needs_cubes=False)
-    light = _read_light(folder, faults)
+def _read_held_out(
+    root: Path, frame: Normalisation, bands: Bands | None, lamp: Float64[np.ndarray, " B"] | None
+) -> _HeldOutLight:
+    faults = Faults(root)
+    entry = read_transforms(root, faults, needs_cubes=False)
+    folder = _read_folder(root, entry, faults)
     faults.raise_if_any()
-    if light is None:
-        raise SceneError(f"{folder} has no environment map")
-    pictures = read_posed_pictures(folder, entry, _from_poses(frame, entry.placement), light.tone, faults)
-    if spectral is not None:
-        own, bands = entry.wavelengths_nm, spectral.bands
+    pictures = folder.pictures(frame)
+    if bands is not None:
+        own = entry.wavelengths_nm
         if pictures.num_colours != len(bands) or (own is not None and Bands(own) != bands):
             named = "" if own is None else f", wavelengths of {Bands(own)}"
             raise SceneError(
-                f"{folder}: pictures of {pictures.num_colours} bands{named}; the object has {bands}: give the same"
+                f"{root}: pictures of {pictures.num_colours} bands{named}; the object has {bands}: give the same"
             )
-        lamp = _own_lamp(folder, entry, bands)
-        spectral = spectral if lamp is None else replace(spectral, lamp=lamp)
-    return _HeldOutLight(folder.name, light.environment(spectral), pictures)
+        own_lamp = folder.lamp(bands)
+        lamp = lamp if own_lamp is None else own_lamp
+    return _HeldOutLight(root.name, folder.environment(bands, lamp), pictures)

@@ -15,11 +15,10 @@ from jaxtyping import Bool, Float32
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError, counted
-from unmix_plugin.limits import allow_decoded
 from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
-from unmix_plugin.scenes.reading.images import FORMATS, UnreadableImageError, read_colour, read_mask
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import distinct_names, make_cameras
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
 from unmix_plugin.scenes.scene import Normalisation
@@ -69,19 +68,7 @@ def read_picture(path: Path, value_scale: float | None = None) -> Picture:
 
 
 def _read_display(path: Path) -> Picture:
-    from PIL import Image
-
-    try:
-        with Image.open(path, formats=FORMATS) as image:
-            size = (image.height, image.width)
-            allow_decoded(path, image.height * image.width * 16, SceneError)  # becomes float32
-    except SceneError:
-        raise
-    except Exception as error:
-        raise UnreadableImageError(
-            f"cannot be read as a PNG, JPEG or TIFF picture ({type(error).__name__})"
-        ) from error
-    pixels = read_colour(path, size).astype(np.float32) / np.float32(255)
+    pixels = read_colour(path, None).astype(np.float32) / np.float32(255)
     return Picture(pixels[..., :3], pixels[..., 3] if pixels.shape[2] == 4 else None)
 
 
@@ -203,7 +190,7 @@ def _read_files(files: _PictureFiles) -> Picture:
 
 
 def read_posed_pictures(
-    root: Path, entry: SceneEntry, frame: Normalisation, tone: ToneMapping | None, faults: Faults
+    root: Path, entry: SceneEntry, frame: Normalisation, tone: ToneMapping | None
 ) -> PosedPictures:
     """Find and check the pictures of a transforms.json.
 
@@ -212,10 +199,10 @@ def read_posed_pictures(
         entry: Its content, without faults.
         frame: From the space of its poses to model space.
         tone: What it says of the pictures; None for light in files that hold light, an unknown response in others.
-        faults: Where faults are noted.
     Raises:
         SceneError: pictures are missing or malformed; all their faults in one message.
     """
+    faults = Faults(root)
     located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
     faults.raise_if_any()
     names = distinct_names(

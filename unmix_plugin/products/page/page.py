@@ -174,8 +174,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
     """The whole page."""
     arrays, layout = _packed({**content.arrays, "known": known[1]})
     scale = job.loaded.scale
-    root = job.loaded.record.summary.get("root")
-    name = title or (Path(str(root)).name if root else job.loaded.folder.path.parents[1].name)
+    name = title or job.loaded.scene_name
     facts = {
         "title": name,
         "subtitle": f"{job.loaded.config.method_name}, run {job.loaded.folder.path.name}",

@@ -150,7 +150,7 @@ def _write_report(
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
     page = _render_page(
         {
-            "title": about.get("title") or f"{_scene_name(loaded)}: materials and spectra",
+            "title": about.get("title") or f"{loaded.scene_name}: materials and spectra",
             "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
             "page": _page_link(folder, loaded),
             "summary": _summary(loaded, views, cards, figures, library.names),
@@ -267,7 +267,7 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
     named = [(word.capitalize(), about[word]) for word in ("object", "number", "author") if about.get(word)]
     return [
         *named,
-        ("Scene", _scene_name(loaded)),
+        ("Scene", loaded.scene_name),
         ("Views", f"{len(cameras)} to learn from, {len(scene.eval_cameras)} to check with"),
         ("Pixels of a view", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("Bands", str(materials.bands)),
@@ -334,12 +334,6 @@ def _about(run: RunFolder, asked: Report) -> dict[str, str]:
     if about != kept and any(text is not None for text in given.values()):
         write_run_json(path, dict(about))
     return about
-
-
-def _scene_name(loaded: LoadedRun) -> str:
-    """What the run calls its scene: the folder's name."""
-    root = loaded.record.summary.get("root")
-    return Path(str(root)).name if root else loaded.folder.path.parents[1].name
 
 
 def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from unmix_plugin.errors import SceneError
+from unmix_plugin.limits import allow_decoded
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, Size
 
@@ -32,9 +34,9 @@ class UnreadableImageError(ValueError):
     """A file is not a picture of the kind needed; the text says why and what to do."""
 
 
-def read_colour(path: Path, size: Size) -> UInt8[np.ndarray, "H W C"]:
-    """Read sRGB (C = 3) or sRGB with alpha (C = 4), 8 bits. Raises UnreadableImageError: not a readable picture of this
-    size with 8 bits a channel."""
+def read_colour(path: Path, size: Size | None) -> UInt8[np.ndarray, "H W C"]:
+    """Read sRGB (C = 3) or sRGB with alpha (C = 4), 8 bits; None: of any size. Raises UnreadableImageError: not a
+    readable picture of this size with 8 bits a channel; SceneError: too large a one."""
 
     def convert(image: Image.Image) -> np.ndarray:
         if image.mode == "P":
@@ -97,7 +99,10 @@ def _grey_of(image: Image.Image) -> tuple[np.ndarray, int]:
 
 
 def read_picture(
-    path: Path, size: Size, convert: Callable[[Image.Image], np.ndarray], formats: tuple[str, ...] = FORMATS
+    path: Path,
+    size: Size | None,
+    convert: Callable[[Image.Image], np.ndarray],
+    formats: tuple[str, ...] = FORMATS,
 ) -> np.ndarray:
     """What `convert` makes of a picture of this size. Raises UnreadableImageError: not a readable picture of this size
     and of these formats."""
@@ -105,11 +110,13 @@ def read_picture(
 
     try:
         with Image.open(path, formats=formats) as image:
-            if (image.height, image.width) != size:
+            if size is None:
+                allow_decoded(path, image.height * image.width * 16, SceneError)  # as float32
+            elif (image.height, image.width) != size:
                 found = f"the picture has {image.width} x {image.height} pixels (width x height)"
                 raise UnreadableImageError(f"{found}; expected {size[1]} x {size[0]} as the cubes have")
             return convert(image)
-    except UnreadableImageError:
+    except (UnreadableImageError, SceneError):
         raise
     # pillow reports damage as OSError, SyntaxError, ValueError, EOFError or a bomb error, by format
     except Exception as error:
