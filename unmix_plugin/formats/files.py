@@ -74,6 +74,11 @@ def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode()
 
 
+def eight_bits(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] as 8-bit numbers; others are cut."""
+    return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)
+
+
 def array_bytes(array: np.ndarray) -> bytes:
     """An array as the bytes of an .npy file."""
     buffer = io.BytesIO()

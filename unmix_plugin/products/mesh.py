@@ -19,7 +19,13 @@ import torch
 from jaxtyping import Float32, Float64
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.formats.files import grey_png_bytes, indexed_png_bytes, rgba_png_bytes, write_file
+from unmix_plugin.formats.files import (
+    eight_bits,
+    grey_png_bytes,
+    indexed_png_bytes,
+    rgba_png_bytes,
+    write_file,
+)
 from unmix_plugin.formats.meshes import obj_paths, write_glb, write_obj, write_ply
 from unmix_plugin.products.atlas import Atlas, texels_of, unwrap
 from unmix_plugin.products.product import Job
@@ -135,9 +141,9 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
     colours, ids, shares = [], [], []
     for part in torch.arange(len(positions)).split(_TEXELS):
         looks = SurfaceAppearance(scene.materials, *look_from_above(scene, positions[part], normals[part]))
-        colours.append(np.round(255 * looks.srgb).astype(np.uint8))
+        colours.append(eight_bits(looks.srgb))
         ids.append(looks.material_ids)
-        shares.append(np.round(255 * looks.abundances.numpy()).astype(np.uint8))
+        shares.append(eight_bits(looks.abundances.numpy()))
     share_pictures = texels.texture(np.concatenate(shares))
     names, palette = scene.materials.names, endmember_colours(scene.materials)
     id_picture = texels.texture(np.concatenate(ids)[:, None])[..., 0]

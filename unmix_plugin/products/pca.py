@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.figures.pictures import over_neutral
-from unmix_plugin.formats.files import csv_bytes, rgba_png_bytes, write_file
+from unmix_plugin.formats.files import csv_bytes, eight_bits, rgba_png_bytes, write_file
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Pca
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
@@ -89,8 +88,7 @@ def _painted(name: str, view: PredictedView, components: _Components) -> bytes:
     what = (
         f"{name}: three principal components of the {components.of}, each from its 1st to its 99th percentile"
     )
-    pixels = np.round(255 * np.clip(painted, 0, 1)).astype(np.uint8)
-    return rgba_png_bytes(pixels, what)
+    return rgba_png_bytes(eight_bits(painted), what)
 
 
 def _table(components: _Components, materials: Materials) -> bytes:

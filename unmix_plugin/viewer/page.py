@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
@@ -150,14 +150,14 @@ def paragraph(text: str, is_warning: bool = False) -> str:
     return f'<div style="{BLOCK_STYLE}{colour}">{escape(text)}</div>'
 
 
-def bars(entries: Sequence[tuple[str, float, Sequence[float]]]) -> str:
-    """Names, values in [0, 1] and sRGB colours as horizontal bars."""
+def bars(entries: Iterable[tuple[str, float, Sequence[float]]]) -> str:
+    """Names, values in [0, 1] and sRGB colours as horizontal bars, the 16 largest."""
     rows = (
         f'{_ROW}<span style="flex:0 0 8.5em;overflow-wrap:anywhere">{escape(name)}</span>'
         '<span style="flex:1;background:#8883;height:0.8em"><span style="display:block;height:100%;'
         f'width:{100 * min(max(value, 0.0), 1.0):.1f}%;background:{css_colour(colour)}"></span></span>'
         f'<span style="flex:0 0 2.6em;text-align:right">{value:.2f}</span></div>'
-        for name, value, colour in entries
+        for name, value, colour in sorted(entries, key=lambda entry: -entry[1])[:16]
     )
     return f'<div style="{BLOCK_STYLE}">{"".join(rows)}</div>'
 

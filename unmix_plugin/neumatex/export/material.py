@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.formats.files import make_folder, rgba_png_bytes, write_file
+from unmix_plugin.formats.files import eight_bits, make_folder, rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import write_textured_glb
 from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
@@ -127,10 +127,9 @@ def write_material(
         RunError: the disk is full or refuses.
     """
     family, baked = surface.family, _bake(mesh, surface, texture_size)
-    seen = family
-    if isinstance(family, SpectralFamily) and bands is not None:
+    if isinstance(family, SpectralFamily):
         family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
-        seen = InColours(family, bands)
+    seen = InColours(family, bands) if isinstance(family, SpectralFamily) and bands is not None else family
     fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(seed))
     textures = _textures_of(seen, baked.parameters, fit.parameters)
     written, pictures = [], {}
@@ -187,7 +186,7 @@ def _write_texture(folder: Path, baked: _BakedMaterial, texture: _Texture) -> tu
     shown = encode_srgb(numbers) if texture.is_colour else numbers
     channels = ", ".join(texture.channels)
     description = f"{texture.name}: {channels}; {'sRGB' if texture.is_colour else 'linear'}"
-    picture = rgba_png_bytes(np.round(255 * shown.clip(0, 1)).astype(np.uint8), description)
+    picture = rgba_png_bytes(eight_bits(shown), description)
     write_file(picture_path, picture)
     planes = {name: numbers[..., index] for index, name in enumerate("RGB")}
     write_exr(numbers_path, planes, {"comments": f"{channels}; linear"})

@@ -231,7 +231,7 @@ class LayerStack:
         surface = coat * self._mixed(sharp, hazy)
         of_sheen = dust * _sheen_reflection(self.sheen_roughness, half, wi[2], wo[2])
         # f0 + (1 - f0) edge, of three colours, with what has none apart.
-        specular = self.f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
+        specular = self._f0 * (surface * (1.0 - edge)) + (surface * edge + sheen * of_coat)
         specular = specular + of_sheen * self.sheen_colour + self._dust(light.dust, eye.dust)
         above = (wi[2] > 0) & (wo[2] > 0)
         passed = coat * (1.0 - self.metallicity) * light.surface * eye.surface / self._surface_mean()
@@ -241,7 +241,7 @@ class LayerStack:
         """A density about like the reflectance times the cosine; without gradient."""
         with torch.no_grad():
             eye = self._passing(wo[2])
-            f0 = self.f0.mean(0)
+            f0 = self._f0.mean(0)
             edge = schlick(wo[2]) * (1.0 - self.roughness[1])
             surface = eye.dust * eye.sheen * eye.coat * (f0 + (1.0 - f0) * edge)
             coat = eye.dust * eye.sheen * (1.0 - eye.coat)
@@ -251,7 +251,7 @@ class LayerStack:
             return LobeMixture.of_albedos(alpha_of(self.roughness), diffuse, specular)
 
     @property
-    def f0(self) -> Float[Tensor, "3 N"]:
+    def _f0(self) -> Float[Tensor, "3 N"]:
         """What the surface reflects at normal incidence."""
         return self.dielectric_f0 + self.metallicity * (self.metal_colour - self.dielectric_f0)
 

@@ -31,7 +31,7 @@ from unmix_plugin import __version__
 from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
-from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import draw_abundances
 from unmix_plugin.products.mesh import find_surface
@@ -87,7 +87,7 @@ class PageContent:
 
 
 @runtime_checkable
-class ShownAsPage(Protocol):
+class _ShownAsPage(Protocol):
     """A trained scene without mixed materials that says itself what a page shows of it."""
 
     def page_content(self, resolution: int) -> PageContent:
@@ -104,10 +104,10 @@ def export(job: Job, asked: Page) -> list[Path]:
     """
     path, scene = job.folder / "page.html", job.loaded.scene
     job.claim([path])
-    known = None if isinstance(scene, ShownAsPage) else _known_spectra(job.materials, asked.library)
+    known = None if isinstance(scene, _ShownAsPage) else _known_spectra(job.materials, asked.library)
     resolution, before = asked.resolution, math.inf
     while True:
-        if isinstance(scene, ShownAsPage):
+        if isinstance(scene, _ShownAsPage):
             with job.working("looking at the surface"):
                 content = scene.page_content(resolution)
         else:
@@ -380,7 +380,10 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
             parts[name] = (steps, {"scales": (largest / 32767).tolist()})
         else:
             largest = max(float(values.max()), 1e-9)
-            parts[name] = (_roots(values / largest), {"scale": largest / 255**2, "is_root": True})
+            parts[name] = (
+                eight_bits(np.sqrt(values / largest)),
+                {"scale": largest / 255**2, "is_root": True},
+            )
     layout, content = {}, io.BytesIO()
     for name, (values, how) in parts.items():
         width = values.shape[1] if values.ndim > 1 and name != "faces" else 1
@@ -393,10 +396,6 @@ def _packed(arrays: dict[str, np.ndarray]) -> tuple[str, dict[str, Any]]:
         } | how
         content.write(np.ascontiguousarray(values).tobytes())
     return base64.b64encode(gzip.compress(content.getvalue(), 6, mtime=0)).decode(), layout
-
-
-def _roots(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    return np.round(255 * np.sqrt(np.clip(values, 0, 1))).astype(np.uint8)
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> list[Any]:

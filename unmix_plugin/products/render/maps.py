@@ -43,7 +43,7 @@ _OUTSIDE = 1.01
 """Where rays start, in half diagonals of the scene box from its middle."""
 
 
-class OrthographicCameras(Cameras):
+class _OrthographicCameras(Cameras):
     """Cameras whose rays are parallel to their axis; `focal_px` is pixels in a unit of length."""
 
     def generate_rays(
@@ -69,7 +69,7 @@ class OrthographicCameras(Cameras):
         """The same part of the map with another number of pixels."""
         factors = torch.tensor([[width / self.width, height / self.height]])
         parts = (self.focal_px * factors.to(self.focal_px), self.center_px * factors.to(self.center_px))
-        return OrthographicCameras(self.camera_to_world, *parts, self.distortion, width, height)
+        return _OrthographicCameras(self.camera_to_world, *parts, self.distortion, width, height)
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def map_camera(
     middle[2] += _OUTSIDE * float(np.linalg.norm(high - low)) / 2
     place = frame.to_model(middle / metres @ axes)
     pose = np.column_stack([frame.rotation @ axes.T, place])
-    camera = OrthographicCameras(
+    camera = _OrthographicCameras(
         torch.from_numpy(pose).float()[None],
         torch.full((1, 2), metres / (pixel_size * frame.scale)),
         torch.tensor([[width / 2, height / 2]]),

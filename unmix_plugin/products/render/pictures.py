@@ -23,7 +23,7 @@ from unmix_plugin.figures.pictures import (
     premultiplied_over_neutral,
 )
 from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes
-from unmix_plugin.formats.files import csv_bytes
+from unmix_plugin.formats.files import csv_bytes, eight_bits
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import endmember_colours
@@ -52,7 +52,7 @@ class Palette:
             return Palette((), colormaps["tab20"](np.arange(255) % 20)[:, :3].astype(np.float64), surveyed)
         return Palette(materials.names, endmember_colours(materials), surveyed)
 
-    def entries(self, output: Output) -> list[tuple[str, Colour]]:
+    def _entries(self, output: Output) -> list[tuple[str, Colour]]:
         """Names and colours of the output's ids or shares; none where they have no names."""
         return list(output.classes) or list(zip(self.names, self.colours, strict=False))
 
@@ -92,9 +92,9 @@ def opaque_tiles(
         return _over_grey(_linear(output, values), opacity)
     tiles = _symbols(output, values, opacity, palette)
     if output.name == "accumulation":
-        return _eight_bits(tiles)
+        return eight_bits(tiles)
     flat = [over_neutral(tiles[:, :, index], opacity) for index in range(tiles.shape[2])]
-    return _eight_bits(np.stack(flat, axis=2))
+    return eight_bits(np.stack(flat, axis=2))
 
 
 def opaque_band(
@@ -114,8 +114,8 @@ def transparent_tiles(
     else:
         tiles = _symbols(output, values, opacity, palette)
     alpha = np.ones_like(opacity) if output.name == "accumulation" else opacity
-    alpha = np.broadcast_to(_eight_bits(alpha)[:, :, None, None], (*tiles.shape[:3], 1))
-    return np.concatenate([np.where(alpha > 0, _eight_bits(tiles), np.uint8(0)), alpha], axis=-1)
+    alpha = np.broadcast_to(eight_bits(alpha)[:, :, None, None], (*tiles.shape[:3], 1))
+    return np.concatenate([np.where(alpha > 0, eight_bits(tiles), np.uint8(0)), alpha], axis=-1)
 
 
 def _symbols(
@@ -152,11 +152,7 @@ def _grey(light: Float64[np.ndarray, "h W"]) -> Float64[np.ndarray, "h W 3"]:
 def _over_grey(
     linear: Float64[np.ndarray, "h W 3"], opacity: Float[np.ndarray, "h W"]
 ) -> UInt8[np.ndarray, "h W 1 3"]:
-    return _eight_bits(premultiplied_over_neutral(linear, opacity))[:, :, None]
-
-
-def _eight_bits(values: np.ndarray) -> np.ndarray:
-    return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+    return eight_bits(premultiplied_over_neutral(linear, opacity))[:, :, None]
 
 
 _WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
@@ -181,7 +177,7 @@ def draw_legend(output: Output, palette: Palette) -> bytes:
 
     scale = palette.scale(output)
     has_names = output.kind in ("labels", "shares")
-    names = palette.entries(output) if has_names else []
+    names = palette._entries(output) if has_names else []
     bar = 0.0 if scale is None else _BAR_ROW
     is_long = max((len(name) for name, _ in names), default=0) > _SHORT_NAME
     columns = _LONG_NAMES_A_ROW if is_long else _NAMES_A_ROW

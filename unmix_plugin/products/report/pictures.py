@@ -16,6 +16,7 @@ from jaxtyping import Float, Float64, UInt8
 
 from unmix_plugin.figures.pictures import NEUTRAL, ColourScale, over_neutral, paint
 from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, LineChart, css_colour
+from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.evaluation import MaterialLook, material_look
 from unmix_plugin.products.segmentation import paint_ids
@@ -332,15 +333,15 @@ class ReportViews:
             self._sure += float((as_numpy(view.confidence) * opacity).sum())
             self._seen += float(opacity.sum())
         maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
-        shares = tuple(_eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
-        predicted = _eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
+        shares = tuple(eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
+        predicted = eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
         ids = view.segmentation.numpy()
         if truth is None or self.evaluation is None:
             self.shown.append(_ShownView(name, predicted, ids, shares=shares))
             return
         figures = self.evaluation.add(truth, view)
         labels = None if truth.labels is None else truth.labels.numpy()
-        measured = _eight_bits(picture(truth.spectra, truth.opacity, self.materials.bands))
+        measured = eight_bits(picture(truth.spectra, truth.opacity, self.materials.bands))
         error = self._count_error(view, truth)
         shown = _ShownView(name, predicted, ids, measured, error, labels, figures["psnr"], shares)
         self.shown.append(shown)
@@ -379,8 +380,4 @@ class ReportViews:
         self._pixels += int(matter.sum())
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
         seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
-        return _eight_bits(over_neutral(painted, seen.astype(np.float64)))
-
-
-def _eight_bits(colours: np.ndarray) -> _EightBits:
-    return np.round(255 * np.clip(colours, 0, 1)).astype(np.uint8)
+        return eight_bits(over_neutral(painted, seen.astype(np.float64)))

@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.figures.plotting import LineChart, css_colour, draw_chart
-from unmix_plugin.formats.files import write_file
+from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.product import Job
@@ -237,7 +237,7 @@ def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> 
     from PIL import Image
 
     is_float = np.issubdtype(image.dtype, np.floating)
-    pixels = Image.fromarray(np.round(255 * np.clip(image, 0, 1)).astype(np.uint8) if is_float else image)
+    pixels = Image.fromarray(eight_bits(image) if is_float else image)
     longest = max(pixels.size)
     if longest > _LARGEST_SIDE_PX:
         size = [max(1, round(side * _LARGEST_SIDE_PX / longest)) for side in pixels.size]

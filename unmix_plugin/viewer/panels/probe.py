@@ -197,7 +197,7 @@ class ProbePanel:
         names, wavelengths = shown.materials.names, shown.materials.bands.centers_nm
         colours = self._session.colours_of(shown.materials)
         entries = zip(names, shown.abundances.tolist(), colours, strict=True)
-        self._bars.content = bars(sorted(entries, key=lambda entry: -entry[1])[:16])
+        self._bars.content = bars(entries)
         lines = [Line("predicted", shown.predicted, _colour(shown))]
         if shown.measured is not None:
             grey = (0.35, 0.35, 0.35)

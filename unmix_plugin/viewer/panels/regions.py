@@ -172,7 +172,7 @@ class RegionsPanel:
             rows.append(("of", "the run as it was trained, without edits"))
         self._found.content = table(rows)
         entries = zip(materials.names, region.abundances.tolist(), session.colours_of(materials), strict=True)
-        self._bars.content = bars(sorted(entries, key=lambda entry: -entry[1])[:16])
+        self._bars.content = bars(entries)
         colour = [value / 255 for value in _COLOUR]
         lines = [
             Line("mean", region.mean, colour),
