@@ -11,7 +11,7 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -75,12 +75,10 @@ _BY_KIND: dict[OutputKind, _KindFormats] = {
 }
 _COMPOSITE = _KindFormats(("png", "exr", "npy", "envi", "mp4"), ("png",))
 
+_SHOWS_COLOURS = "a PNG shows colours: ask for"
 _REASONS = {
-    ("channels", "png"): "a PNG shows colours: ask for rgb, band:NMnm, false-colour:NM,NM,NM or pca",
-    (
-        "spectra",
-        "png",
-    ): "a PNG shows colours: ask for band:NMnm, false-colour:NM,NM,NM or absorption:LOW-HIGH",
+    ("channels", "png"): f"{_SHOWS_COLOURS} rgb, band:NMnm, false-colour:NM,NM,NM or pca",
+    ("spectra", "png"): f"{_SHOWS_COLOURS} band:NMnm, false-colour:NM,NM,NM or absorption:LOW-HIGH",
     ("spectra", "exr"): "the layout of spectral EXR has no place for it",
     ("srgb", "exr"): "it is encoded for displays and EXR holds linear light: ask for linear_rgb",
     ("picture", "exr"): "it is made for displays and EXR holds linear light",
@@ -105,11 +103,8 @@ def file_name(output: Output) -> str:
     >>> file_name(Output("false-colour:860,650,550", "linear", "", ""))
     'false-colour-860-650-550'
     """
-    short = (
-        re.sub(r"[^:]*[/\\]", "", output.name)
-        if output.name.startswith(("target:", "library:"))
-        else output.name
-    )
+    has_file = output.name.startswith(("target:", "library:"))
+    short = re.sub(r"[^:]*[/\\]", "", output.name) if has_file else output.name
     plain = re.sub(r"[^\w.+-]+", "-", short).strip("-.")
     is_formula = output.name.startswith("index:") and output.name.removeprefix("index:") not in NAMED_INDICES
     ending = f"-{hashlib.sha256(output.name.encode()).hexdigest()[:8]}" if is_formula else ""
@@ -257,32 +252,26 @@ def video_path(folder: Path, formatted: FormattedOutput) -> Path:
     return folder / f"{file_name(formatted.output)}.{formatted.format}"
 
 
-@contextmanager
-def still(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> Iterator[RowsSink]:
+def still(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> AbstractContextManager[RowsSink]:
     """Context that gives a sink for the rows of one view; at its end the file is there; of ENVI's two, the header.
 
     Raises:
         RunError: the disk is full or refuses.
     """
-    open_file = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep, "tif": _tif}[
-        formatted.format
-    ]
-    with open_file(formatted.output, path, setting) as sink:
-        yield sink
+    files = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep, "tif": _tif}
+    return files[formatted.format](formatted.output, path, setting)
 
 
-@contextmanager
 def video(
     formatted: FormattedOutput, setting: RenderSetting, frames_per_second: float
-) -> Iterator[FrameSink]:
+) -> AbstractContextManager[FrameSink]:
     """Context that gives a sink for the frames of an output of all views; at its end the video is there.
 
     Raises:
         RunError: the disk is full or refuses.
     """
-    path = video_path(setting.folder, formatted)
-    with video_frames(path, *_layout(formatted.output, setting).size, frames_per_second) as add:
-        yield add
+    size = _layout(formatted.output, setting).size
+    return video_frames(video_path(setting.folder, formatted), *size, frames_per_second)
 
 
 @contextmanager
