@@ -7,7 +7,7 @@ of `LayeredFamily`, `W` waves of all noises.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from tools.procedural_objects import seeded_mesh, seeded_surface
 from unmix_plugin.formats.files import write_file
-from unmix_plugin.neumatex.prior.observations import KnownLight, Observations, known_light, sample_surface
+from unmix_plugin.neumatex.prior.observations import Observations, known_light, sample_surface
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import LayeredFamily
@@ -210,7 +210,7 @@ class TrainingObjects:
     def select(self, rows: slice | list[int]) -> TrainingObjects:
         """Some of the objects, in float32."""
         return TrainingObjects(
-            Observations(**{name: _widened(part[rows]) for name, part in _parts(self.observations).items()}),
+            Observations(**{name: _widened(part[rows]) for name, part in vars(self.observations).items()}),
             self.materials[rows].float(),
         )
 
@@ -239,8 +239,7 @@ def training_object(
     eyes = random_eyes(num_views, generator)
     known = known_light(points, eyes, ray_mesh, environment, generator)
     colours = traced_colours(surface, ray_mesh, environment, points, eyes, known, samples, generator)
-    parts = {name: part[None] for name, part in _parts(known).items()}
-    observations = Observations(positions=points.positions[None], colours=colours[None], **parts)
+    observations = replace(known, colours=colours).alone()
     return TrainingObjects(observations, surface.parameters(points.positions)[None])
 
 
@@ -262,7 +261,7 @@ def traced_colours(
     environment: Environment,
     points: SurfacePoints,
     eyes: Float[Tensor, "V 3"],
-    known: KnownLight,
+    known: Observations,
     samples: int,
     generator: torch.Generator,
 ) -> Float[Tensor, "N V 3"]:
@@ -279,7 +278,7 @@ def traced_colours(
 
 def write_objects(path: Path, objects: list[TrainingObjects]) -> None:
     """Put objects of the same size into one file."""
-    parts = [{**_parts(one.observations), "materials": one.materials} for one in objects]
+    parts = [{**vars(one.observations), "materials": one.materials} for one in objects]
     joined = {name: torch.cat([_narrowed(part[name]) for part in parts]).contiguous() for name in parts[0]}
     write_file(path, save(joined))
 
@@ -290,10 +289,6 @@ def read_objects(paths: list[Path]) -> TrainingObjects:
     joined = {name: torch.cat([table[name] for table in tables]) for name in tables[0]}
     materials = joined.pop("materials")
     return TrainingObjects(Observations(**joined), materials)
-
-
-def _parts(values: Observations | KnownLight) -> dict[str, Tensor]:
-    return {part.name: getattr(values, part.name) for part in fields(values)}
 
 
 def _narrowed(values: Tensor) -> Tensor:

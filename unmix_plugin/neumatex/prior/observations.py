@@ -119,21 +119,33 @@ def _shrunk(environment: Environment, rows: int) -> Float[Tensor, "H W C"]:
 
 
 @dataclass(frozen=True)
-class KnownLight:
-    """Who sees points of a surface, and what light reaches them, before any picture is read."""
+class Observations:
+    """What is known of points of objects and what views show of them; light is divided by the environment's mean."""
 
-    visible: Bool[Tensor, "N V"]
+    positions: Float[Tensor, "*B N 3"]
+    colours: Float[Tensor, "*B N V 3"]
+    """What the views show; 0 before any picture is read."""
+    visible: Bool[Tensor, "*B N V"]
     """Whether a view's camera sees a point."""
-    cosines: Float[Tensor, "N V"]
+    cosines: Float[Tensor, "*B N V"]
     """Between the normal and the direction to the camera."""
-    mirrored: Float[Tensor, "N V K 3"]
+    mirrored: Float[Tensor, "*B N V K 3"]
     """Light in lobes about the mirrored direction of each view, as if nothing were in the way."""
-    mirror_open: Float[Tensor, "N V"]
+    mirror_open: Float[Tensor, "*B N V"]
     """1 where the mirrored direction leaves the object, 0 where it meets it again."""
-    irradiance: Float[Tensor, "N 3"]
+    irradiance: Float[Tensor, "*B N 3"]
     """Over pi, as if nothing were in the way."""
-    unshadowed: Float[Tensor, "N 3"]
+    unshadowed: Float[Tensor, "*B N 3"]
     """Share of the irradiance that the object itself does not block."""
+
+    @property
+    def reaching(self) -> Float[Tensor, "*B N 3"]:
+        """Irradiance over pi after shadows."""
+        return self.irradiance * self.unshadowed
+
+    def alone(self) -> Observations:
+        """Those of one object, as a batch of one."""
+        return Observations(**{name: part[None] for name, part in vars(self).items()})
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfacePoints:
@@ -160,8 +172,8 @@ def known_light(
     ray_mesh: RayMesh,
     environment: Environment,
     generator: torch.Generator,
-) -> KnownLight:
-    """What is known of points.
+) -> Observations:
+    """What is known of points of one object before any picture is read.
 
     Args:
         eyes: Positions of the cameras, model space, outside the mesh.
@@ -175,7 +187,9 @@ def known_light(
     facing = (cosines > _LEAST_COSINE) & (above > _LEAST_COSINE)
     mirrored = functional.normalize(2 * cosines[..., None] * points.normals[:, None] - to_eye, dim=-1)
     shape = facing.shape
-    return KnownLight(
+    return Observations(
+        positions=points.positions,
+        colours=torch.zeros(*shape, 3),
         visible=facing & _open(points, to_eye, facing, ray_mesh),
         cosines=cosines.clamp(0, 1),
         mirrored=lobes.about(mirrored.reshape(-1, 3)).unflatten(0, shape) / mean,
@@ -206,28 +220,6 @@ def _unshadowed(
         values.unflatten(0, (-1, _SHADOW_RAYS)).sum(dim=1) for values in (light, light * is_open)
     )
     return torch.where(total > 0, reaching / total.clamp(min=1e-12), 1.0)
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What is known of points of B objects and what views show of them; light is divided by the environment's mean.
-
-    But for positions and colours these are the fields of `KnownLight`.
-    """
-
-    positions: Float[Tensor, "B N 3"]
-    colours: Float[Tensor, "B N V 3"]
-    visible: Bool[Tensor, "B N V"]
-    cosines: Float[Tensor, "B N V"]
-    mirrored: Float[Tensor, "B N V K 3"]
-    mirror_open: Float[Tensor, "B N V"]
-    irradiance: Float[Tensor, "B N 3"]
-    unshadowed: Float[Tensor, "B N 3"]
-
-    @property
-    def reaching(self) -> Float[Tensor, "B N 3"]:
-        """Irradiance over pi after shadows."""
-        return self.irradiance * self.unshadowed
 
 
 NUM_VIEW_FEATURES = 3 + 3 * NUM_LOBES + 3 + 3 + 3

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -226,8 +226,7 @@ def _observe(
         )
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
     colours = torch.where(visible[..., None], colours / mean, 0.0)
-    parts = {**vars(known), "positions": points.positions, "colours": colours, "visible": visible}
-    return Observations(**{name: part[None] for name, part in parts.items()})
+    return replace(known, colours=colours, visible=visible).alone()
 
 
 def _read_colours(
