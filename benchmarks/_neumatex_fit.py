@@ -20,31 +20,28 @@ from tools.procedural_objects import seeded_surface
 from unmix_plugin.engine.pipeline import average_metrics
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface
 from unmix_plugin.neumatex.fit.model import NeumatexModel
-from unmix_plugin.neumatex.fit.start import PriorAnchor
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
-from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE
+from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE, Triplane
 
 
-class OracleAnchor(nn.Module):
-    """A prior that knows how wrong it is: its squared error at each point in place of its log-variance.
+class OraclePrior(nn.Module):
+    """A prior that knows how wrong it is: the logarithm of its squared error at each point as its log-variance.
 
     N points, P parameters.
     """
 
-    def __init__(self, anchor: PriorAnchor, truth: LayeredSurface) -> None:
+    def __init__(self, prior: Triplane, truth: LayeredSurface) -> None:
         super().__init__()
-        self.anchor, self.truth, self.family = anchor, truth, NeuralFamily()
+        self.prior, self.truth, self.family = prior, truth, NeuralFamily()
 
-    def distance(
-        self, parameters: Float[Tensor, "N P"], positions: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, ""]:
-        """As of `PriorAnchor`."""
-        with torch.no_grad():
-            expected = self.anchor.triplane.parameters_at(positions)
-            true = self.family.from_layered(self.truth.parameters(positions))
-            low, high = (torch.tensor(bound).exp() for bound in LOG_VARIANCE_RANGE)
-            variance = (expected - true).square().clamp(low, high)
-        return ((parameters - expected).square() / variance).sum(dim=-1).mean()
+    def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """As of `Triplane`."""
+        return self.prior.parameters_at(positions)
+
+    def log_variance(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
+        """As of `Triplane`."""
+        true = self.family.from_layered(self.truth.parameters(positions))
+        return (self.parameters_at(positions) - true).square().log().clamp(*LOG_VARIANCE_RANGE)
 
 
 def measured_fit(words: Sequence[str], oracle_seed: int | None, processes: int = 1) -> dict[str, Any]:
@@ -75,8 +72,8 @@ def _fit(words: list[str], oracle_seed: int | None, processes: int, found: Path)
     pipeline, model = trainer.pipeline, trainer.pipeline.model
     if oracle_seed is not None:
         assert isinstance(model, NeumatexModel)
-        assert isinstance(model.anchor, PriorAnchor)
-        model.anchor = OracleAnchor(model.anchor, seeded_surface(oracle_seed))  # type: ignore[assignment]
+        assert model.prior is not None
+        model.prior = OraclePrior(model.prior, seeded_surface(oracle_seed))  # type: ignore[assignment]
     started = time.process_time()
     record = trainer.train()
     cpu_seconds = time.process_time() - started

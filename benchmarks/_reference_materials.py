@@ -10,6 +10,7 @@ import math
 import torch
 from torch import Tensor
 
+from unmix_plugin.neumatex.tracing.families import MaterialFamily
 from unmix_plugin.neumatex.tracing.microfacet import (
     distribution,
     half_vectors,
@@ -18,7 +19,7 @@ from unmix_plugin.neumatex.tracing.microfacet import (
 )
 
 
-class ConductorBlend:
+class ConductorBlend(MaterialFamily):
     """Parameters: colour (0 to 2), GGX width alpha (3), share of the conductor (4)."""
 
     num_parameters = 5

@@ -39,9 +39,6 @@ class Lambert(MaterialFamily):
     num_parameters = 3
     num_colours = 3
 
-    def _mixture(self, parameters, wo):
-        raise NotImplementedError  # it draws in a way of its own
-
     def evaluate(self, parameters, wi, wo):
         above = (wi[:, 2:] > 0) & (wo[:, 2:] > 0)
         return torch.where(above, parameters / math.pi, 0.0)
@@ -61,9 +58,6 @@ class Glossy(MaterialFamily):
 
     num_parameters = 5
     num_colours = 3
-
-    def _mixture(self, parameters, wo):
-        raise NotImplementedError  # it draws in a way of its own
 
     def _lobe(self, parameters, wi, wo):
         exponent = 1 + 60 * parameters[:, 4]

@@ -61,9 +61,9 @@ class MaterialFamily(ABC):
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
 
-    @abstractmethod
     def _mixture(self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "3 N"]) -> LobeMixture:
-        """The lobes of each point, seen along a direction."""
+        """The lobes of each point, seen along a direction; a family that draws in a way of its own has none."""
+        raise NotImplementedError
 
     @torch.no_grad()
     def sample(
