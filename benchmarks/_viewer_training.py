@@ -16,6 +16,7 @@ from unmix_plugin.engine.runs.load_run import read_scene_record
 from unmix_plugin.viewer.access import TrainingViewerOptions
 from unmix_plugin.viewer.rendering.scene import source_of_training
 from unmix_plugin.viewer.server import Viewer
+from unmix_plugin.viewer.session import Services
 
 WAYS = ("no viewer", "no page", "one page at rest", "one page always moving")
 UNTIMED_STEPS = 10
@@ -85,7 +86,7 @@ def _seconds(words: list[str], way: str, options: TrainingViewerOptions) -> tupl
     else:
         source = source_of_training(trainer, read_scene_record(trainer.run))
         source.device.guest_share = options.share
-        viewer = Viewer(source, options, _no_scene)
+        viewer = Viewer(Services(source, _no_scene), options)
         viewer.start()
         page = None if way == "no page" else _page(viewer.port, moves=way.endswith("moving"))
         try:

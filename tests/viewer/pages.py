@@ -10,13 +10,16 @@ from tests.viewer.view_factory import no_scene
 from tests.viewer_page import Page
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.server import Viewer
+from unmix_plugin.viewer.session import Services
 
 
 @contextmanager
 def serving(source, read_scene=no_scene, **options):
     """A viewer that listens at any free port, and what it said."""
     lines = []
-    viewer = Viewer(source, ViewerOptions(**{"port": 0, **options}), read_scene, lines.append)
+    viewing = ViewerOptions(**{"port": 0, **options})
+    services = Services(source, read_scene, environments=viewing.environments)
+    viewer = Viewer(services, viewing, lines.append)
     viewer.start()
     try:
         yield viewer, lines

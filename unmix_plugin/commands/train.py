@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -177,6 +178,7 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
     from unmix_plugin.engine.runs.load_run import read_scene_record
     from unmix_plugin.viewer.rendering.scene import source_of_training
     from unmix_plugin.viewer.server import Viewer
+    from unmix_plugin.viewer.session import Services
 
     try:
         source = source_of_training(trainer, read_scene_record(trainer.run))
@@ -192,7 +194,8 @@ def _shown(trainer: Trainer, viewing: TrainingViewerOptions, console: Console) -
             raise ConfigError(f"{trainer.config.method_name} has no spectral scene")
         return found
 
-    viewer = Viewer(source, viewing, scene, lambda line: say(console, line))
+    services = Services(source, scene, environments=viewing.environments)
+    viewer = Viewer(services, viewing, partial(say, console))
     viewer.start()
     try:
         yield

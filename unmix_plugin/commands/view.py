@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -76,6 +77,7 @@ def prepared(options: ViewOptions) -> Viewer:
     from unmix_plugin.trained.open_run import load_run
     from unmix_plugin.viewer.rendering.scene import source_of_run
     from unmix_plugin.viewer.server import Viewer
+    from unmix_plugin.viewer.session import Services
 
     console = CommandConsole()
     recipe = requested_recipe(options.edits, options.illuminant)
@@ -88,14 +90,9 @@ def prepared(options: ViewOptions) -> Viewer:
         print(note, flush=True)
     known = library_of(options.library, loaded.materials_scene.bands) if options.library else None
     with working(console, "looking at the scene"):
-        return Viewer(
-            source,
-            options.viewer,
-            lambda: _scene_of(source, options.data),
-            lambda line: print(line, flush=True),
-            recipe,
-            known,
-        )
+        scene = partial(_scene_of, source, options.data)
+        services = Services(source, scene, recipe, options.viewer.environments, known)
+        return Viewer(services, options.viewer, partial(print, flush=True))
 
 
 def _scene_of(source: SceneSource, data: Path | None) -> Scene:

@@ -14,16 +14,13 @@ from pathlib import Path
 
 import viser
 
-from unmix_plugin.editing import Recipe
-from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.trained.run_views import up_direction
 from unmix_plugin.viewer.access import ViewerOptions, free_port, start_notices
 from unmix_plugin.viewer.connections import LABEL, open_server, quiet, send_what_is_queued
 from unmix_plugin.viewer.gate import Gate
 from unmix_plugin.viewer.page import failures_said, paragraph
 from unmix_plugin.viewer.panels import panels_of
-from unmix_plugin.viewer.rendering.scene import SceneSource
-from unmix_plugin.viewer.session import PageState, SceneReader, Services, Session
+from unmix_plugin.viewer.session import PageState, Services, Session
 from unmix_plugin.viewer.view_cameras import beside, point_ahead, pose_of
 
 _TICK_S = 0.5
@@ -76,32 +73,21 @@ class Viewer:
     """A run in the browser, from `start` to `stop`."""
 
     def __init__(
-        self,
-        source: SceneSource,
-        options: ViewerOptions,
-        read_scene: SceneReader,
-        say: Callable[[str], None] = lambda _: None,
-        recipe: Recipe | None = None,
-        library: MaterialLibrary | None = None,
+        self, services: Services, options: ViewerOptions, say: Callable[[str], None] = lambda _: None
     ) -> None:
         """
         Args:
-            source: The model.
+            services: What all pages share.
             options: Where to listen, and the token to ask for.
-            read_scene: Reads the scene that the run was trained on.
             say: Prints a line on the user's terminal.
-            recipe: Edits that every page starts with.
-            library: Known materials to compare with; None: the built-in ones.
         Raises:
-            ConfigError: the recipe does not fit the run, environments were given and its method has none, or the token
-                can't be read.
-            SceneError: an environment map is missing, damaged or unusable.
+            ConfigError: the token can't be read.
         """
         self._options = options
         self._say = say
         self._gate = Gate(options.host, options.secret(os.environ), say)
         self._kept_pages = _KeptPages()
-        self.services = Services(source, read_scene, recipe, options.environments, library)
+        self.services = services
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         self._stopped = threading.Event()

@@ -92,10 +92,10 @@ class _Texture:
 def material_paths(folder: Path, family: MaterialFamily) -> list[Path]:
     """Files that `write_material` makes."""
     own = _NEURAL_TEXTURES if isinstance(family, NeuralFamily) else ()
-    single = [folder / name for name in ("parameters.exr", "material.glb", "material.json")]
-    paths = [path for name in (*_TEXTURES, *own) for path in _texture_paths(folder, name)] + single
-    if isinstance(family, SpectralFamily):
-        return [*paths, *_spectral_paths(folder)]
+    names = [f"{name}.{kind}" for name in (*_TEXTURES, *own) for kind in ("png", "exr")]
+    names += ["parameters.exr", "material.glb", "material.json"]
+    names += ["abundances.exr", "endmembers.csv"] if isinstance(family, SpectralFamily) else []
+    paths = [folder / name for name in names]
     return [*paths, *shader_paths(folder)] if isinstance(family, NeuralFamily) else paths
 
 
@@ -175,22 +175,20 @@ def _textures_of(
     return textures
 
 
-def _texture_paths(folder: Path, name: str) -> list[Path]:
-    return [folder / f"{name}.png", folder / f"{name}.exr"]
-
-
 def _write_texture(folder: Path, baked: _BakedMaterial, texture: _Texture) -> tuple[list[Path], bytes]:
     """Write a texture as PNG and as OpenEXR (float32); gives the bytes of the PNG, too."""
-    picture_path, numbers_path = _texture_paths(make_folder(folder), texture.name)
+    base = make_folder(folder) / texture.name
     numbers = baked.texture(texture.values)
     shown = encode_srgb(numbers) if texture.is_colour else numbers
     channels = ", ".join(texture.channels)
     description = f"{texture.name}: {channels}; {'sRGB' if texture.is_colour else 'linear'}"
     picture = rgba_png_bytes(eight_bits(shown), description)
-    write_file(picture_path, picture)
+    written = write_file(base.with_suffix(".png"), picture)
     planes = {name: numbers[..., index] for index, name in enumerate("RGB")}
-    write_exr(numbers_path, planes, {"comments": f"{channels}; linear"})
-    return [picture_path, numbers_path], picture
+    return [
+        written,
+        write_exr(base.with_suffix(".exr"), planes, {"comments": f"{channels}; linear"}),
+    ], picture
 
 
 def _write_channels(
@@ -273,15 +271,11 @@ class InColours(MaterialFamily):
         return (self._family.base_colour(parameters) @ self._matrix).clamp(0, 1)
 
 
-def _spectral_paths(folder: Path) -> list[Path]:
-    return [folder / "abundances.exr", folder / "endmembers.csv"]
-
-
 def _write_spectral_files(
     folder: Path, baked: _BakedMaterial, family: SpectralFamily, bands: Bands
 ) -> list[Path]:
     """Write abundances as one texture, a channel an endmember, and the endmembers' reflectances."""
-    textures, table = _spectral_paths(folder)
+    textures, table = folder / "abundances.exr", folder / "endmembers.csv"
     names = default_names(family.num_endmembers)
     about = "shares of the endmembers of endmembers.csv; linear"
     _write_channels(textures, baked, family.abundances(baked.parameters), names, about)
