@@ -76,9 +76,8 @@ def export(job: Job, asked: Report) -> list[Path]:
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
     regions = _region_cards(job, notes)
     with job.working("laying out the report"):
-        return [
-            _write_report(job.folder, job.loaded, views, known, _stored_figures(job), notes, said, regions)
-        ]
+        page = _page(job, views, known, notes, said, regions)
+        return [write_file(job.folder / "report.html", page.encode("utf-8", "backslashreplace"))]
 
 
 def _region_cards(job: Job, notes: list[str]) -> list[Any]:
@@ -129,30 +128,28 @@ _FIGURE = (int, float, type(None))
 _WORST_VIEWS = 3
 
 
-def _write_report(
-    folder: Path,
-    loaded: LoadedRun,
+def _page(
+    job: Job,
     views: ReportViews,
     library: MaterialLibrary,
-    stored_figures: dict[str, Any] | None,
     notes: Sequence[str],
     about: Mapping[str, str],
-    regions: Sequence[Any] = (),
-) -> Path:
-    """Write `report.html`; without `stored_figures`, with those of `views` if they were compared."""
-    materials, light = views.materials, loaded.materials_scene.light_power
-    figures, source = stored_figures, "From the run's eval/metrics.json."
+    regions: Sequence[Any],
+) -> str:
+    """The report; with the figures that `unmix-eval` stored, or else those of `views` if they were compared."""
+    loaded, materials, light = job.loaded, views.materials, job.scene.light_power
+    figures, source = _stored_figures(job), "From the run's eval/metrics.json."
     if figures is None and views.evaluation is not None:
         figures = finite_or_none(views.evaluation.figures())
         source = f"Of the {len(views.shown)} views rendered for this report."
     truth = _true_materials(loaded, light)
     cards = material_cards(materials, views.proportions, light, library, truth)
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
-    page = _render_page(
+    return _render_page(
         {
             "title": about.get("title") or f"{loaded.scene_name}: materials and spectra",
             "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
-            "page": _page_link(folder, loaded),
+            "page": _page_link(job.folder, loaded),
             "summary": _summary(loaded, views, cards, figures, library.names),
             "about": about.get("notes", ""),
             "notes": notes,
@@ -171,7 +168,6 @@ def _write_report(
             **_view_values(views),
         }
     )
-    return write_file(folder / "report.html", page.encode("utf-8", "backslashreplace"))
 
 
 def _view_values(views: ReportViews) -> dict[str, Any]:
