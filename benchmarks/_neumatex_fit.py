@@ -73,7 +73,7 @@ def _fit(words: list[str], oracle_seed: int | None, processes: int, found: Path)
     if oracle_seed is not None:
         assert isinstance(model, NeumatexModel)
         assert model.prior is not None
-        model.prior = OraclePrior(model.prior, seeded_surface(oracle_seed))  # type: ignore[assignment]
+        model.anchor["triplane"] = OraclePrior(model.prior, seeded_surface(oracle_seed))
     started = time.process_time()
     record = trainer.train()
     cpu_seconds = time.process_time() - started

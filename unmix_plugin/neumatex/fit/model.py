@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -63,10 +64,10 @@ class NeumatexModel(Model):
         shares = 0 if self.endmembers is None else len(self.endmembers)
         self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
         self.light_curve = self._light_curve()
-        self.prior: Triplane | None = None
-        """Neither its material nor its log-variance changes while the object is fitted."""
+        self.anchor = nn.ModuleDict()  # under which name runs keep the prior
         if self.config.prior != "none" and not record.is_spectral:
-            self.prior = Triplane(parameters, resolution, generator=generator).requires_grad_(False)
+            prior = Triplane(parameters, resolution, generator=generator).requires_grad_(False)
+            self.anchor["triplane"] = prior
         if not self.config.fit_networks:
             for network in self.triplane.parameter_groups()["networks"]:
                 network.requires_grad_(False)
@@ -116,6 +117,11 @@ class NeumatexModel(Model):
         if self.endmembers is None:
             return []
         return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_endmembers)]
+
+    @property
+    def prior(self) -> Triplane | None:
+        """Neither its material nor its log-variance changes while the object is fitted; None without a prior."""
+        return cast("Triplane", self.anchor["triplane"]) if len(self.anchor) else None
 
     @property
     def mesh(self) -> Mesh:
