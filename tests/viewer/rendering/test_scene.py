@@ -19,7 +19,9 @@ from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.panels.probe import _take_probe
+from unmix_plugin.viewer.rendering import aids as aids_module
 from unmix_plugin.viewer.rendering import scene as scene_module
+from unmix_plugin.viewer.rendering.aids import SceneAids
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
 
@@ -208,3 +210,17 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_
     expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]
     assert taken.measured is not None
     np.testing.assert_allclose(taken.measured, expected)
+
+
+def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_rendered(
+    views, scene, ball_of, source, monkeypatch
+):
+    camera, render = scene.cameras[scene.train_indices[1]], aids_module.render_reference
+    aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene), has_materials=True)
+
+    def slowly(*arguments):
+        aids.set_measured(views)
+        return render(*arguments)
+
+    monkeypatch.setattr(aids_module, "render_reference", slowly)
+    assert aids.for_layers().error_of == views.error

@@ -6,7 +6,7 @@ Notation: `N` reference rays that end on something, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import torch
@@ -117,7 +117,6 @@ class SceneAids:
     def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
         """Note what was measured, or why that is unknown."""
         self.measured, self._why_not_measured = measured, why_not
-        self._for_layers = None
 
     def for_layers(self) -> LayerAids | None:
         """What layers need; None without materials. Must not be called while the scene is lent."""
@@ -126,13 +125,13 @@ class SceneAids:
         kept, version = self._for_layers, self._source.version
         age = 0 if kept is None else version - kept[0]
         if kept is None or age >= STEPS_KEPT or (age > 0 and not self._source.device.is_training):
-            error_of = None if self.measured is None else self.measured.error
-            why_not, record = self._why_not_measured, self._source.record
+            record = self._source.record
             with self._source.borrowed_materials() as scene:
                 reference = render_reference(scene, record.train_cameras)
-            kept = (version, LayerAids(*reference, record.scene_box, error_of, why_not))
-            self._for_layers = kept
-        return kept[1]
+            kept = self._for_layers = (version, LayerAids(*reference, record.scene_box))
+        # Noted by another thread at any moment, also while the reference was rendered.
+        error_of = None if self.measured is None else self.measured.error
+        return replace(kept[1], error_of=error_of, why_no_error=self._why_not_measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
         """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
