@@ -14,7 +14,7 @@ import trimesh
 from tests.fuzz.mutation import Mutator, Reader, mutate_bytes, mutate_json
 from tests.neumatex import factory
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.object_scene import _read_light
+from unmix_plugin.neumatex.fit.object_scene import _read_folder
 from unmix_plugin.neumatex.fit.pictures import read_picture
 from unmix_plugin.neumatex.tracing.light_files import read_environment
 from unmix_plugin.neumatex.tracing.mesh import read_mesh
@@ -79,7 +79,7 @@ def transforms_reader() -> Reader:
         faults = Faults(path.parent)
         entry = read_transforms(path.parent, faults, needs_cubes=False)
         split_frames(entry, "auto", 2, faults)
-        _read_light(path.parent, faults)
+        _read_folder(path.parent, entry, faults)
         faults.raise_if_any()
 
     samples = [
