@@ -204,11 +204,6 @@ class SpectralFile:
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
     @property
-    def scale(self) -> float | None:
-        """Stored number that stands for 1, if the file says one for all bands."""
-        return None if self.linear is None else self.linear.scale
-
-    @property
     def files(self) -> tuple[Path, ...]:
         """Every file that `read` depends on, `path` first."""
         return (self.path, *(source for source in self.sources if source != self.path))
