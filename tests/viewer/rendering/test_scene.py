@@ -223,4 +223,6 @@ def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_ren
         return render(*arguments)
 
     monkeypatch.setattr(aids_module, "render_reference", slowly)
-    assert aids.for_layers().error_of == views.error
+    found = aids.for_layers()
+    assert found is not None
+    assert found.error_of == views.error
