@@ -158,3 +158,11 @@ def test_samples_are_counted_as_they_are_taken(num_rays, device):
     # A sample within rounding of a cell's face may fall to either side.
     assert_close(counts, taken.packed_info[:, 1], rtol=0, atol=2)
     assert int(counts.sum()) == pytest.approx(int(taken.packed_info[:, 1].sum()), rel=1e-3)
+
+
+def test_rays_have_all_their_samples_however_many(device):
+    full = torch.zeros(2, 2, 2, dtype=torch.uint8, device=device)
+    rays = [values.to(device) for values in make_rays(3)]
+    found, expected = (function(*rays, full, 3e-4) for function in (march, march_twin))
+    assert int(found.packed_info[:, 1].max()) > 1024
+    assert (found.packed_info[:, 1] - expected.packed_info[:, 1]).abs().max() <= 1

@@ -132,8 +132,8 @@ def _rays(
     return [*lines, *numbers, step, as_warp(skips.contiguous())]
 
 
-_ROOM = 256
-"""Samples of a ray that there is room for at first."""
+_ROOM, _MOST_SAMPLES = 1 << 22, 1024
+"""Samples of all rays, and of one, that there is room for at first."""
 
 
 def take_all(
@@ -145,7 +145,7 @@ def take_all(
         rays: The first arguments of the kernel.
         origins: Of the rays.
     """
-    most = _ROOM
+    most = max(1, min(_ROOM // max(len(origins), 1), _MOST_SAMPLES))
     found = take_first(write_kernel, rays, origins, most)
     while len(origins) and int(found.counts.max()) == most:
         most *= 2
