@@ -16,18 +16,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, contracted_unit
+from unmix_plugin.engine.geometry.space import SceneBox, contracted_unit
 from unmix_plugin.engine.model import Field
 from unmix_plugin.light.lamp import Lamp, MovingLamp
 from unmix_plugin.light.shading import (
     LOBES,
-    NUM_BACKDROP_FEATURES,
     NUM_DIRECTION_FEATURES,
     NUM_SKY_FEATURES,
     Lamplight,
     LampShading,
     LitSurface,
-    backdrop_features,
     bias_free_network,
     direction_features,
     in_parts,
@@ -92,8 +90,8 @@ class CoefficientField(Field):
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
         """Abundances a of points with these geometry features, summing to 1."""
 
-    def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
-        """What is behind all matter: K abundances, and the brightness they are multiplied with; None if nothing."""
+    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+        """What is infinitely far away: K abundances, and the brightness they are multiplied with; None if nothing."""
         return None
 
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
@@ -160,8 +158,7 @@ class UnmixField(CoefficientField):
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         self._make_networks()
         if is_unbounded or has_sky:
-            num_features = NUM_SKY_FEATURES if is_unbounded else NUM_BACKDROP_FEATURES
-            self.sky_network = bias_free_network(num_features, config.hidden_width, num_endmembers + 1)
+            self.sky_network = bias_free_network(NUM_SKY_FEATURES, config.hidden_width, num_endmembers + 1)
         weights = torch.ones(config.num_levels) if coarse_to_fine else None
         self.register_buffer("level_weights", weights)
 
@@ -200,12 +197,11 @@ class UnmixField(CoefficientField):
             return (positions - low) / (high - low)
         return contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
 
-    def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
-        """Abundances and brightness of what is infinitely far away, or of a backdrop; None if nothing."""
+    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+        """Abundances and brightness of what is infinitely far away; None if nothing."""
         if not self.has_sky:
             return None
-        features = sky_features(rays.directions) if self.is_unbounded else backdrop_features(rays)
-        found = self.sky_network(features)
+        found = self.sky_network(sky_features(directions))
         shares = torch.softmax(found[:, :-1] / self.config.temperature, dim=-1)
         return torch.cat([shares, torch.sigmoid(found[:, -1:])], dim=-1)
 
