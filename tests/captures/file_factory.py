@@ -135,7 +135,8 @@ def check_file(file: SpectralFile, **expected: Any) -> None:
             case "names":
                 assert bands.names == tuple(value)
             case _:
-                found = getattr(file, name) if hasattr(file, name) else file.metadata.get(name)
+                facts = {"scale": file.linear and file.linear.scale, **file.metadata}
+                found = getattr(file, name) if hasattr(file, name) else facts.get(name)
                 assert found == (pytest.approx(value) if isinstance(value, float) else value), name
 
 

@@ -292,6 +292,7 @@ def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
         ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": NM}, None, {"nm": NM}),
         ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": np.arange(1.0, 6)}, "rad", {"nm": None}),
         ({"cube": CUBE, "wavelengths": NM, "exposure_ms": [5.0]}, None, {"notes": (), "exposure_s": 0.005}),
+        ({"cube": CUBE, "wavelengths": NM, "exposure_ms": 5.0}, None, {"notes": (), "exposure_s": 0.005}),
         (
             {"cube": CUBE, "wavelengths": NM, "scale": 1e4, "mask": CUBE[..., 0] > 0},
             None,

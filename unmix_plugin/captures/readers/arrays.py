@@ -85,9 +85,8 @@ class FoundArray:
 
     @property
     def is_vector(self) -> bool:
-        """Whether it is a list of numbers, also as MATLAB's matrix of one row or column."""
-        is_list = bool(self.shape) and sum(length != 1 for length in self.shape) <= 1
-        return is_list and self.dtype.kind in "iuf"
+        """Whether it is a number or a list of them, also as MATLAB's matrix of one row or column."""
+        return sum(length != 1 for length in self.shape) <= 1 and self.dtype.kind in "iuf"
 
 
 def image_of_arrays(
