@@ -1,14 +1,18 @@
 """What small or long files of strangers may cost: asked before anything is decoded."""
 
 import json
+import os
 import time
 
 import numpy as np
 import pytest
 import trimesh
 
+from tests.captures.poses.pose_factory import ring, transforms
+from tests.systems import needs_posix
+from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import SceneError, SpectrumError
-from unmix_plugin.formats.libraries import read_library
+from unmix_plugin.formats.libraries import library_of, read_library
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import parse_json, parse_xml
 from unmix_plugin.neumatex.tracing.mesh import read_mesh
@@ -91,3 +95,17 @@ def test_a_message_names_a_few_of_many_columns(tmp_path):
     with pytest.raises(SpectrumError, match="a, a and 9992 more") as refused:
         read_library(tmp_path / "a.csv")
     assert len(str(refused.value)) < 500
+
+
+@needs_posix
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "oak.hdr")
+    with pytest.raises(SpectrumError, match="is no regular file"):
+        library_of([tmp_path])
+    content = transforms(ring())
+    content = {key: value for key, value in content.items() if key not in ("w", "h")}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    for frame in content["frames"]:
+        (tmp_path / frame["file_path"]).parent.mkdir(exist_ok=True)
+        os.mkfifo(tmp_path / frame["file_path"])
+    assert all(camera.lens is None for camera in read_poses(tmp_path).cameras.values())

@@ -99,6 +99,11 @@ def test_too_little_memory_is_the_users_error_with_what_to_do(capsys, error):
     assert "bug" not in shown
 
 
+def test_a_message_moves_no_cursor(capsys):
+    assert end_of(raising(SceneError("band \x1b[31mred\r\x9b1A\tof\na.hdr: grün"))) == 2
+    assert capsys.readouterr().err == "error: band ?[31mred??1A\tof\na.hdr: grün\n"
+
+
 def test_a_users_error_exits_2_with_its_message_alone_or_with_debug_its_traceback(capsys):
     for error in (ConfigError("no such method"), SceneError("no such method")):
         assert end_of(raising(error)) == 2

@@ -202,8 +202,12 @@ def _verdict(error: Exception) -> tuple[str, int]:
     return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR
 
 
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""What moves a terminal's cursor or changes its state; messages quote files of others."""
+
+
 def _say(message: str, is_debug: bool) -> None:
     with suppress(OSError):  # the terminal may be gone
         if is_debug:
             traceback.print_exc()
-        print(message, file=sys.stderr)
+        print(_CONTROL.sub("?", message), file=sys.stderr)

@@ -120,6 +120,8 @@ def _is_library(header_path: Path) -> bool:
         return "library" in read_header(header_path).get("file type", "").lower()
     except ValueError:
         return False
+    except OSError:  # which is said where it is read
+        return True
 
 
 _BESIDE_SPECTRA = re.compile(r"ancillary|wavelengths|bandpass|readme", re.IGNORECASE)

@@ -8,6 +8,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from tests.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.tracing import mesh as reading
@@ -110,6 +111,7 @@ def test_a_vertex_of_no_triangle_changes_nothing_however_far_it_is(tmp_path):
     assert_close(read.vertices.amax(dim=0).double(), torch.full((3,), 0.5, dtype=torch.float64))
 
 
+@needs_posix
 def test_no_file_outside_the_folder_is_read_for_a_mesh_and_no_pipe(tmp_path):
     exported = trimesh.creation.box().export(file_type="gltf")
     folder = tmp_path / "mesh"

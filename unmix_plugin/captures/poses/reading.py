@@ -310,7 +310,7 @@ def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | Non
     if len(set(given.values())) == 1:
         return next(iter(given.values()))
     try:
-        with Image.open(folder / name, formats=FORMATS) as picture:
+        with open_regular(folder / name) as file, Image.open(file, formats=FORMATS) as picture:
             return picture.size
     except (OSError, ValueError, Image.DecompressionBombError):
         return None

@@ -102,7 +102,7 @@ def read_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-_MOST_FOLDERS = 64
+_MOST_FOLDERS = 32
 """In a path; each is where it may go on in another folder."""
 _DRIVE = re.compile(r"[A-Za-z]:/")
 
