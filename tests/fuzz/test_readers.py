@@ -27,6 +27,7 @@ FOUND = (
     ("poses COLMAP points3D.txt", 0, b"2 1 2 3", b"2 -1e308 2 3"),
     ("points (.ply)", 0, b"vertex 2", b"vertex"),
     ("points (.ply)", 0, b"255 0 3", b"255 0 nan"),
+    ("points (.ply)", 0, b"0 1 2 255 0 3\n4 5 6 1 2 3", b""),
     ("object mesh.obj", 0, b"v 0.0", b"v 1e300 0.0"),
     ("object mesh.obj", 0, b"\nf", b"\nvn 1\nf"),
     ("object mesh.gltf", 0, b'"mesh":0', b'"mesh":0,"scale":[NaN,1,1]'),

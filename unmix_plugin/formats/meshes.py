@@ -88,8 +88,8 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
     data = read_bounded(path, MOST_TABLE_BYTES)
     end = data.find(b"end_header")
     start = data.find(b"\n", end) + 1
-    if not data.startswith(b"ply") or end < 0 or start == 0:
-        raise ValueError("no PLY header")
+    if not data.startswith(b"ply") or end < 0 or start == 0 or not re.compile(rb"\S").search(data, start):
+        raise ValueError("no PLY header, or nothing after it")
     lines = [line.split() for line in data[:end].decode("ascii", "replace").splitlines()]
     order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
     kinds = [line[1] for line in lines if line[:1] == ["format"] and len(line) > 1]
