@@ -16,16 +16,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from unmix_plugin.engine.geometry.space import SceneBox, contracted_unit
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, contracted_unit
 from unmix_plugin.engine.model import Field
 from unmix_plugin.light.lamp import Lamp, MovingLamp
 from unmix_plugin.light.shading import (
     LOBES,
+    NUM_BACKDROP_FEATURES,
     NUM_DIRECTION_FEATURES,
     NUM_SKY_FEATURES,
     Lamplight,
     LampShading,
     LitSurface,
+    backdrop_features,
     bias_free_network,
     direction_features,
     in_parts,
@@ -41,10 +43,10 @@ _ROWS_PER_CELL_OF_A_FACE = 1 / 3
 _FEWEST_LOG2_ROWS, _MOST_LOG2_ROWS = 16, 19
 NUM_FEATURES = 15
 """Geometry features that the heads see."""
-_BRIGHTEST_GLOSS = 8.0
-"""Of lamps and their mirror images, in the brightness at which a sensor saturates: those that fill a small part of a
-pixel saturate all of it."""
-_SPECULAR_BIAS = -3.0 - math.log(_BRIGHTEST_GLOSS)
+_BRIGHTEST = 8.0
+"""Of gloss, in the brightness at which a sensor saturates: a lamp that fills a small part of a pixel saturates all of
+it. And of a sky, in that of its endmembers, which are near its mean: what is brighter must not wait at the limit."""
+_SPECULAR_BIAS = -3.0 - math.log(_BRIGHTEST)
 """Logit of the view-dependent part at the start; low, so that colour is first explained by materials."""
 
 
@@ -90,8 +92,8 @@ class CoefficientField(Field):
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
         """Abundances a of points with these geometry features, summing to 1."""
 
-    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
-        """What is infinitely far away: K abundances, and the brightness they are multiplied with; None if nothing."""
+    def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
+        """What is behind all matter: K abundances, and the brightness they are multiplied with; None if nothing."""
         return None
 
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
@@ -158,7 +160,8 @@ class UnmixField(CoefficientField):
         self.table = nn.Parameter(nn.init.uniform_(table, -1e-4, 1e-4))
         self._make_networks()
         if is_unbounded or has_sky:
-            self.sky_network = bias_free_network(NUM_SKY_FEATURES, config.hidden_width, num_endmembers + 1)
+            num_features = NUM_SKY_FEATURES if is_unbounded else NUM_BACKDROP_FEATURES
+            self.sky_network = bias_free_network(num_features, config.hidden_width, num_endmembers + 1)
         weights = torch.ones(config.num_levels) if coarse_to_fine else None
         self.register_buffer("level_weights", weights)
 
@@ -197,13 +200,15 @@ class UnmixField(CoefficientField):
             return (positions - low) / (high - low)
         return contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
 
-    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
-        """Abundances and brightness of what is infinitely far away; None if nothing."""
+    def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
+        """Abundances and brightness of what is infinitely far away, or of a backdrop; None if nothing."""
         if not self.has_sky:
             return None
-        found = self.sky_network(sky_features(directions))
+        features = sky_features(rays.directions) if self.is_unbounded else backdrop_features(rays)
+        found = self.sky_network(features)
         shares = torch.softmax(found[:, :-1] / self.config.temperature, dim=-1)
-        return torch.cat([shares, torch.sigmoid(found[:, -1:])], dim=-1)
+        brightness = _BRIGHTEST * torch.sigmoid(found[:, -1:] - math.log(_BRIGHTEST))
+        return torch.cat([shares, brightness], dim=-1)
 
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
         """Density per scene unit and geometry features where the encoding is `encoded`."""
@@ -263,7 +268,7 @@ class UnmixField(CoefficientField):
         factors = torch.sigmoid(
             rows_of_outputs(self.specular_network, features, seen) + self.specular_bias / 2
         )
-        return (_BRIGHTEST_GLOSS * factors[:1] * factors[1:]).t()
+        return (_BRIGHTEST * factors[:1] * factors[1:]).t()
 
 
 def _bounded_exp(raw: Float[Tensor, "S"]) -> Float[Tensor, "S"]:

@@ -46,7 +46,7 @@ def test_the_sky_fills_what_matter_leaves_and_is_no_matter():
         renderer, field = make(density)
         with torch.no_grad():
             found = renderer.render(field, bundle)
-            sky = field.sky(bundle.directions)
+            sky = field.sky(bundle)
             bare = renderer.render(_WithoutSky(field), bundle)
         assert sky is not None
         left = 1 - found.coefficients.accumulation[:, None]
@@ -64,7 +64,7 @@ class _WithoutSky(EditedField):
     def __init__(self, field: UnmixField) -> None:
         super().__init__(field, torch.ones(3, dtype=torch.bool), torch.ones(1, 3))
 
-    def sky(self, directions):
+    def sky(self, rays):
         return None
 
 
@@ -96,7 +96,7 @@ def test_rays_end_on_what_stands_outside_the_box():
 def test_removing_a_material_takes_its_light_out_of_the_sky():
     _, field = make()
     edited = EditedField(field, torch.tensor([True, False, True]), torch.ones(1, 3))
-    before, after = field.sky(rays(5).directions), edited.sky(rays(5).directions)
+    before, after = field.sky(rays(5)), edited.sky(rays(5))
     assert before is not None
     assert after is not None
     assert (after[:, 1] == 0).all()
@@ -151,10 +151,42 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
     assert blocks == [2, 2, 1, 1, 1, 1]
 
 
+def test_a_backdrop_may_stand_still_in_the_picture_and_a_sky_does_not():
+    config, bundle = UnmixFieldConfig(log2_rows_per_level=8), rays(20)
+    aside = replace(bundle, offsets=torch.full((20, 2), 0.3))
+    elsewhere = replace(bundle, origins=bundle.origins + 0.5)
+    for is_unbounded in (False, True):
+        field = UnmixField(config, BOX, 3, 1, 1.0, 0.1, is_unbounded=is_unbounded, has_sky=True)
+        with torch.no_grad():
+            here, others = field.sky(bundle), [field.sky(aside), field.sky(elsewhere)]
+        assert here is not None
+        for other in others:
+            assert other is not None
+            assert bool((here - other).abs().max() < 1e-6) == is_unbounded
+
+
+def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
+    """As the light of a lens falls from the middle to the sides."""
+    config = UnmixFieldConfig(log2_rows_per_level=8)
+    field = UnmixField(config, BOX, 3, 1, 1.0, 0.1, has_sky=True)
+    bundle = replace(rays(64), offsets=torch.linspace(-0.7, 0.7, 64)[:, None].expand(64, 2).contiguous())
+    wanted = 1.3 - 1.2 * bundle.offsets[:, 0].square()
+    optimizer = torch.optim.Adam(field.sky_network.parameters(), lr=0.01)
+    loss = wanted.new_ones(())
+    for _ in range(300):
+        found = field.sky(bundle)
+        assert found is not None
+        loss = (found[:, -1] - wanted).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert loss < 1e-3
+
+
 def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backdrop():
     config = UnmixFieldConfig(log2_rows_per_level=8)
     bare = UnmixField(config, BOX, 3, 1, 1.0, 0.1)
-    assert bare.sky(rays(2).directions) is None
+    assert bare.sky(rays(2)) is None
     assert not [name for name in bare.state_dict() if "sky" in name]
     field = UnmixField(config, BOX, 3, 1, 1e-9, 0.1, has_sky=True)
     reachable = torch.ones((8, 8, 8), dtype=torch.bool)
@@ -163,7 +195,7 @@ def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backd
     with torch.no_grad():
         found = renderer.render(field, bundle)
         quick = renderer.composite(field, bundle)
-        sky = field.sky(bundle.directions)
+        sky = field.sky(bundle)
     assert field.has_sky
     assert sky is not None
     assert_close(found.mixtures, sky[:, :-1], atol=1e-4, rtol=1e-3)

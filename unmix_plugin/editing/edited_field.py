@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.editing.recipe import Colour, Endmember
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.lamp import MovingLamp
@@ -255,9 +256,9 @@ class EditedField(CoefficientField):
         """Whether something is behind all that is rendered."""
         return self.field.has_sky
 
-    def sky(self, directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R C"] | None:
+    def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
         """The sky, without the light that removed materials stand for."""
-        found = self.field.sky(directions)
+        found = self.field.sky(rays)
         if found is None:
             return None
         return torch.cat([found[:, :-1] * self.is_kept.to(found), found[:, -1:]], dim=-1)

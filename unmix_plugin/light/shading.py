@@ -26,7 +26,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.light.lamp import MovingLamp
 from unmix_plugin.operators.marching import count_samples
 
@@ -64,8 +64,24 @@ NUM_SKY_FEATURES = NUM_DIRECTION_FEATURES + 6 * _SKY_OCTAVES
 
 def sky_features(directions: Float[Tensor, "R 3"]) -> Float[Tensor, "R 39"]:
     """Harmonics of unit directions, and sines and cosines of 1, 2, 4 and 8 times their components."""
-    angles = torch.cat([2.0**octave * directions for octave in range(_SKY_OCTAVES)], dim=-1)
-    return torch.cat([direction_features(directions), angles.sin(), angles.cos()], dim=-1)
+    return torch.cat([direction_features(directions), _waves(directions)], dim=-1)
+
+
+NUM_BACKDROP_FEATURES = NUM_SKY_FEATURES + 3 + 4 * _SKY_OCTAVES
+
+
+def backdrop_features(rays: RayBundle) -> Float[Tensor, "R 58"]:
+    """Those of a sky, and what a backdrop at hand depends on too: where it is seen from, as it is not infinitely far
+    away, and where in the picture, as it can stand still there and lenses show less light towards the sides. Neither
+    tells how a camera or a lens is to be corrected."""
+    offsets = rays.directions.new_zeros(len(rays), 2) if rays.offsets is None else rays.offsets
+    return torch.cat([sky_features(rays.directions), rays.origins.detach(), _waves(offsets.detach())], dim=-1)
+
+
+def _waves(values: Float[Tensor, "R n"]) -> Float[Tensor, "R _"]:
+    """Sines and cosines of 1, 2, 4 and 8 times each value."""
+    angles = torch.cat([2.0**octave * values for octave in range(_SKY_OCTAVES)], dim=-1)
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 _CACHED_ROWS = 4096

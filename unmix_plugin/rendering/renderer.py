@@ -232,7 +232,7 @@ class VolumeRenderer:
         if self.residual_on_last_sample:
             totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
         matter = Coefficients(totals, values.num_endmembers)
-        coefficients, mixtures = _before_sky(matter, field.sky(ray_bundle.directions))
+        coefficients, mixtures = _before_sky(matter, field.sky(ray_bundle))
         return RenderedRays(
             coefficients,
             mixtures,
@@ -260,7 +260,8 @@ class VolumeRenderer:
             self.rays_per_chunk,
         )
         found = composite_front_to_back(field, ray_bundle, how)
-        parts = [field.sky(along) for along in ray_bundle.directions.split(self.rays_per_chunk)]
+        chunk = self.rays_per_chunk
+        parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
         skies = [sky for sky in parts if sky is not None]
         return _before_sky(found, torch.cat(skies) if skies else None)[0]
 

@@ -57,6 +57,16 @@ def test_directions_are_unit_and_origins_are_the_camera_positions(coords, lens):
     assert torch.equal(rays.camera_indices, indices)
 
 
+def test_offsets_from_the_optical_axis_know_no_pixels():
+    cameras = make_cameras()
+    rays = cameras.generate_rays(torch.zeros(1, dtype=torch.int64), torch.tensor([[3.0, 2.0]]))
+    finer = cameras.resized(4 * WIDTH, 4 * HEIGHT)
+    same = finer.generate_rays(torch.zeros(1, dtype=torch.int64), torch.tensor([[12.0, 8.0]]))
+    assert rays.offsets is not None
+    assert_close(rays.offsets, (torch.tensor([[3.0, 2.0]]) - cameras.center_px[:1]) / cameras.focal_px[:1])
+    assert_close(rays.offsets, same.offsets)
+
+
 @given(lenses, st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_undistortion_inverts_distortion_to_rounding_in_double(lens, x, y):
     coefficients = torch.tensor(lens, dtype=torch.float64)

@@ -170,7 +170,7 @@ class Cameras:
         directions = (poses[:, :, :3] * local[:, None, :]).sum(dim=-1)
         directions = directions / directions.norm(dim=-1, keepdim=True)
         return RayBundle(
-            poses[:, :, 3].contiguous(), directions, camera_indices, -poses[:, :, 2], pixel_coords
+            poses[:, :, 3].contiguous(), directions, camera_indices, -poses[:, :, 2], pixel_coords, coords
         )
 
     def image_rays(self, index: int, subpixel_offset: tuple[float, float] = (0.5, 0.5)) -> RayBundle:

@@ -35,6 +35,8 @@ class RayBundle:
     """Where the camera of each ray looked when it was taken, unit vectors; None where no camera is known."""
     pixel_coords: Float[Tensor, "R 2"] | None = None
     """x and y in the image that each ray passes, pixels; None where no image is known."""
+    offsets: Float[Tensor, "R 2"] | None = None
+    """The same from the optical axis, to the right and downwards at distance 1, without the lens's distortion."""
 
     def __len__(self) -> int:
         return self.origins.shape[0]
