@@ -87,6 +87,7 @@ def test_a_lamp_can_be_so_bright_that_a_small_part_of_a_pixel_saturates_it():
     _, features = field.get_density(positions)
     direction = torch.tensor([[0.0, 0.0, 1.0]])
     optimizer = torch.optim.Adam(field.specular_network.parameters(), lr=0.05)
+    brightness = torch.zeros(1, 2)
     for _ in range(200):
         brightness = field.get_outputs(positions, direction, features.detach())["specular_coefficients"]
         optimizer.zero_grad()

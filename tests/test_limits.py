@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_a_path_through_thousands_of_folders_is_none(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["gltf", "glb"])
 def test_gltf_of_zeros_that_are_not_in_the_file_is_refused(tmp_path, suffix):
-    exported = trimesh.creation.box().export(file_type="gltf")
+    exported: Any = trimesh.creation.box().export(file_type="gltf")
     for name, data in exported.items():
         (tmp_path / name).write_bytes(data)
     content = json.loads(exported["model.gltf"])
@@ -65,7 +66,7 @@ def test_a_mesh_that_is_placed_a_thousand_times_is_refused(tmp_path, monkeypatch
     box, scene = trimesh.creation.box(), trimesh.Scene()
     scene.add_geometry(box, geom_name="box")
     scene.export(tmp_path / "model.glb")
-    exported = scene.export(file_type="gltf")
+    exported: Any = scene.export(file_type="gltf")
     for name, data in exported.items():
         (tmp_path / name).write_bytes(data)
     content = json.loads(exported["model.gltf"])

@@ -29,9 +29,11 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
         "exposure_s": [0.1, 0.2],
         "parts": [{"exposure_s": 0.1, "scale": 2.0}, {"exposure_s": 0.2}],
     }
+    assert stack.linear is not None
     assert (stack.bands.evidence, stack.linear.scale) == ("test", None)
     np.testing.assert_array_equal(stack.read(slice(1, 2), np.array([1, 0]))[0, 0], [2, 1])
     alike = stack_bands([part(tmp_path, 1, scale=3.0), part(tmp_path, 2, scale=3.0)], tmp_path)
+    assert alike.linear is not None
     assert (alike.linear.scale, alike.metadata, alike.warnings) == (3.0, {"scale": 3.0}, ())
     assert "only some of the files of one view state gains" in stack.warnings[0]
     mixed = stack_bands([*parts, replace(part(tmp_path, 3), bands=BandTable())], tmp_path).bands

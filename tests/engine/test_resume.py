@@ -141,8 +141,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(short_config: TrainerConfig):
         TAKING + "print('held', flush=True); sys.stdin.read()",
         str(run / "run.lock"),
     ]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with subprocess.Popen(words, text=True, **pipes) as other:
+    with subprocess.Popen(words, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(RunError, match=rf"another training writes to {run}; stop it"):

@@ -111,7 +111,7 @@ def _envi() -> bytes:
     return (header_text(CUBE, "bil", {}) + more).encode()
 
 
-def _matlab(path: Path, **options: bool) -> None:
+def _matlab(path: Path, **options: Any) -> None:
     scipy.io.savemat(path, {"cube": CUBE, "wavelengths": NM, "name": "x"}, **options)
 
 

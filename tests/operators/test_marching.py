@@ -162,7 +162,7 @@ def test_samples_are_counted_as_they_are_taken(num_rays, device):
 
 def test_rays_have_all_their_samples_however_many(device):
     full = torch.zeros(2, 2, 2, dtype=torch.uint8, device=device)
-    rays = [values.to(device) for values in make_rays(3)]
-    found, expected = (function(*rays, full, 3e-4) for function in (march, march_twin))
+    o, d, t_near, t_far, start = (values.to(device) for values in make_rays(3))
+    found, expected = (function(o, d, t_near, t_far, start, full, 3e-4) for function in (march, march_twin))
     assert int(found.packed_info[:, 1].max()) > 1024
     assert (found.packed_info[:, 1] - expected.packed_info[:, 1]).abs().max() <= 1

@@ -169,14 +169,15 @@ def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
     """As the light of a lens falls from the middle to the sides."""
     config = UnmixFieldConfig(log2_rows_per_level=8)
     field = UnmixField(config, BOX, 3, 1, 1.0, 0.1, has_sky=True)
-    bundle = replace(rays(64), offsets=torch.linspace(-0.7, 0.7, 64)[:, None].expand(64, 2).contiguous())
-    wanted = 1.3 - 1.2 * bundle.offsets[:, 0].square()
+    across = torch.linspace(-0.7, 0.7, 64)
+    bundle = replace(rays(64), offsets=torch.stack([across, across], dim=1))
+    wanted = 1.3 - 1.2 * across.square()
     optimizer = torch.optim.Adam(field.sky_network.parameters(), lr=0.01)
     loss = wanted.new_ones(())
     for _ in range(300):
-        found = field.sky(bundle)
-        assert found is not None
-        loss = (found[:, -1] - wanted).square().mean()
+        sky = field.sky(bundle)
+        assert sky is not None
+        loss = (sky[:, -1] - wanted).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -97,7 +97,6 @@ def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
     unknown = {"psnr_white", "miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
     assert {name for name, value in figures.items() if value is None} == unknown
     assert figures["psnr"] == pytest.approx(psnr(view.spectra * 0.5, view.spectra))
-    assert figures["psnr"] < 20
     assert figures["sam"] == pytest.approx(0.0, abs=1e-7)
     flat, blank = torch.zeros(6, 9, 3), torch.zeros(6, 9)
     small = PredictedView(torch.rand(6, 9, 5), blank, flat, blank.byte(), flat)

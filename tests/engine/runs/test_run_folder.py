@@ -57,7 +57,9 @@ def test_a_scene_name_that_is_no_file_name_stays_inside_the_output_folder(tmp_pa
 
 def test_the_newest_run_is_the_one_started_or_resumed_last_whatever_its_name(tmp_path: Path):
     started = ((2099, "a", True), (2026, "b", True), (2024, "c", True), (2027, "d", False))
-    runs = [complete_run(tmp_path, NOON.replace(year=year), *rest) for year, *rest in started]
+    runs = [
+        complete_run(tmp_path, NOON.replace(year=year), name, is_whole) for year, name, is_whole in started
+    ]
     for second, run in enumerate(runs):
         os.utime(run.config_path, (second, second))
     (tmp_path / "a" / "m" / "notes").mkdir()

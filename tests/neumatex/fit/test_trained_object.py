@@ -22,9 +22,7 @@ CAMERA = CAMERAS[0].resized(24, 18)
 
 
 def test_it_offers_what_commands_and_viewer_ask_of_scenes(scene):
-    assert isinstance(scene, RenderableScene)
-    assert isinstance(scene, RelightableScene)
-    assert isinstance(scene, EstimatedScene)
+    assert all(isinstance(scene, kind) for kind in (RenderableScene, RelightableScene, EstimatedScene))
     view = scene.look(CAMERA)
     empty, solid = view.opacity == 0, view.opacity == 1
     assert empty.any()

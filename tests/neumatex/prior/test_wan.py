@@ -2,6 +2,7 @@
 
 import builtins
 import json
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,12 @@ from torch.testing import assert_close
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.wan import WanPrior, _diffusers_models, read_wan_prior
 
-WAN_1_3B = {"num_layers": 30, "num_attention_heads": 12, "attention_head_dim": 128, "ffn_dim": 8960}
+WAN_1_3B: dict[str, Any] = {
+    "num_layers": 30,
+    "num_attention_heads": 12,
+    "attention_head_dim": 128,
+    "ffn_dim": 8960,
+}
 WAN_1_3B |= {
     "patch_size": (1, 2, 2),
     "in_channels": 16,
@@ -21,9 +27,15 @@ WAN_1_3B |= {
 }
 """Configuration of the transformer of Wan2.1-T2V-1.3B; the autoencoder's is diffusers' default."""
 
-TINY = {"num_layers": 2, "num_attention_heads": 2, "attention_head_dim": 12, "ffn_dim": 32, "text_dim": 8}
+TINY: dict[str, Any] = {
+    "num_layers": 2,
+    "num_attention_heads": 2,
+    "attention_head_dim": 12,
+    "ffn_dim": 32,
+    "text_dim": 8,
+}
 TINY = {**WAN_1_3B, **TINY}
-TINY_AUTOENCODER = {"base_dim": 4, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1}
+TINY_AUTOENCODER: dict[str, Any] = {"base_dim": 4, "dim_mult": [1, 1, 1, 1], "num_res_blocks": 1}
 
 
 def tiny_models():

@@ -1,6 +1,7 @@
 """Meshes from files, and rays against them."""
 
 import os
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,14 +107,15 @@ def test_inward_triangles_are_turned_and_said(tmp_path):
 def test_a_vertex_of_no_triangle_changes_nothing_however_far_it_is(tmp_path):
     box, notes = trimesh.creation.box(), []
     vertices = np.vstack([box.vertices, [[np.nan, 1e30, 0]]])
-    read = read_mesh(_ply(tmp_path / "box.ply", vertices, box.faces[:, ::-1]), notes)
+    _ply(tmp_path / "box.ply", vertices, box.faces[:, ::-1])
+    read = read_mesh(tmp_path / "box.ply", notes)
     assert "turned outwards" in notes[0]
     assert_close(read.vertices.amax(dim=0).double(), torch.full((3,), 0.5, dtype=torch.float64))
 
 
 @needs_posix
 def test_no_file_outside_the_folder_is_read_for_a_mesh_and_no_pipe(tmp_path):
-    exported = trimesh.creation.box().export(file_type="gltf")
+    exported: Any = trimesh.creation.box().export(file_type="gltf")
     folder = tmp_path / "mesh"
     folder.mkdir()
     for name, data in exported.items():
