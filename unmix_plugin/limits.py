@@ -27,6 +27,9 @@ MOST_TEXT_BYTES = 1 << 24
 MOST_TABLE_BYTES = 1 << 28
 """Bytes of a text or table that has an entry for each view, row or point."""
 
+GREATEST_PX = 1e9
+"""Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
+
 _PARSED_BYTES = 10**9
 """That the values of a text may take. Small texts aren't counted."""
 

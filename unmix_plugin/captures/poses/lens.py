@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.scenes.reading.transforms_json import GREATEST_PX
+from unmix_plugin.limits import GREATEST_PX
 
 Points = Float64[np.ndarray, "P 2"]
 Project: TypeAlias = Callable[[Points], Points]

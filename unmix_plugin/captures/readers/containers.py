@@ -225,7 +225,7 @@ def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[Fo
 
     def whole() -> np.ndarray:
         with import_extra("h5py").File(path, "r") as file:
-            stored = file[name][()]
+            stored = np.asarray(file[name][()])
         return stored.T if is_matlab else stored
 
     def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:

@@ -17,6 +17,7 @@ from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import SpectrumError
+from unmix_plugin.limits import GREATEST_PX
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.faults import (
     Faults,
@@ -36,8 +37,6 @@ _FILE_KEYS += ("abundance_file_path", "responses_path")
 _SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-GREATEST_PX = 1e9
-"""Of focal lengths and principal points; beyond, and below its inverse, float32 loses what is projected."""
 _SMALLEST_ANGLE = 1e-6
 """Field of view in radians that is still one, and how much less than pi it must be."""
 _BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
