@@ -1,5 +1,7 @@
 """What pages share, and what a page that is loaded again goes on with."""
 
+import time
+
 import numpy as np
 
 from tests.viewer.pages import decoded, opened, page_of, show_layer
@@ -34,11 +36,12 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         page.wait_until(lambda: "scale" in page.controls[page.control("recipe")]["value"])
         before = show_layer(page, "all abundances")
         page.wait_until(lambda: len(decoded(page.last_picture)) == 24)
+        time.sleep(0.5)  # the edit can reach the picture after the layer
         before = decoded(page.last_picture)
     with page_of(viewer, storage=storage) as page:
         page.look_from(0.3)
         page.wait_until(lambda: bool(page.pictures) and len(decoded(page.last_picture)) == 24)
-        np.testing.assert_allclose(decoded(page.last_picture), before, atol=2)
+        page.wait_until(lambda: np.allclose(decoded(page.last_picture), before, rtol=0, atol=2))
         assert page.controls[page.control("layer")]["value"] == "all abundances"
         assert "scale" in page.controls[page.control("recipe")]["value"]
         page.set("changes", "undo")
