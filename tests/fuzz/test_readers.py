@@ -33,6 +33,7 @@ FOUND = (
     ("object mesh.gltf", 0, b'"mesh":0', b'"mesh":0,"scale":[NaN,1,1]'),
     ("object environment.hdr", 0, b"-Y 8", b"\xd0Y 8"),
     ("object picture.exr", 0, b"scanlineimage", b"scanlineimagf"),
+    ("library text", 2, b" 0.25\n", b" 0.25\n ,\n"),
 )
 """What fuzzing found once: reader, sample, and what was exchanged for what; the end of the sample where the former is
 empty."""

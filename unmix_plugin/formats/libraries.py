@@ -263,7 +263,7 @@ def _read_text(path: Path) -> _Table:
     said = {key.strip().lower(): value.strip() for key, _, value in (line.partition(":") for line in words)}
     record = re.match(r"\s*(\S+) Record=\d+:\s*(.*\S)", words[0]) if words else None
     is_usgs = record is not None or any("USGS" in line for line in words[:3])
-    if record is not None and len(numbers[0]) == 1:
+    if record is not None and all(len(row) == 1 for row in numbers):
         values = np.array([row[0] for row in numbers])
         return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None], 1.0
     rows = np.array([row[:2] for row in numbers if 2 <= len(row) <= 3])
@@ -293,7 +293,7 @@ def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
     numbers: list[list[float]] = []
     for line in filter(str.strip, text.splitlines()):
         parts = line.replace(",", " ").split()
-        if all(map(is_number, parts)):
+        if parts and all(map(is_number, parts)):
             numbers.append([float(part) for part in parts])
         elif numbers:
             raise SpectrumError(f"{line.strip()[:40]!r} stands among the numbers")
