@@ -176,9 +176,8 @@ def parse_xml(data: bytes | str) -> ElementTree.Element:
     Raises:
         ValueError: it is damaged, or declares entities, which can grow without end.
     """
-    found = (
-        data.encode() if isinstance(data, str) else data.replace(b"\0", b"")
-    )  # as UTF-16 has between letters
+    # UTF-16 has zeros between letters.
+    found = data.encode() if isinstance(data, str) else data.replace(b"\0", b"")
     if b"<!DOCTYPE" in found or b"<!ENTITY" in found:
         raise ValueError("it declares a DOCTYPE or entities")
     if (tags := found.count(b"<")) > _MOST_TAGS:

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -140,16 +140,20 @@ def export(job: Job, asked: Page) -> list[Path]:
     return [write_file(path, page)]
 
 
-_KnownSpectra = tuple[list[dict[str, str]], UInt16[np.ndarray, "M B"]]
-"""Name and source of each spectrum that can be compared at the bands of a page, and its reflectance there: steps of
-65534 for its greatest value, which angles don't ask for; `_UNKNOWN` where nothing was measured."""
+class _KnownSpectra(NamedTuple):
+    """Reflectances of a library at the bands of a page, without those that can't be compared there."""
+
+    sources: list[dict[str, str]]
+    """Name and source of each."""
+    steps: UInt16[np.ndarray, "M B"]
+    """Of 65534 for its greatest value, which angles don't ask for; `_UNKNOWN` where nothing was measured."""
 
 
 def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _KnownSpectra:
     if materials is None:
         if library:
             raise ConfigError("the object is known in colours, not in bands: leave out --library")
-        return [], np.zeros((0, 0), np.uint16)
+        return _KnownSpectra([], np.zeros((0, 0), np.uint16))
     known, light = library_of(library, materials.bands), _light_of(materials)
     chosen = known.comparable(materials.bands, light)
     if chosen.sum() > _MOST_KNOWN:
@@ -163,7 +167,7 @@ def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _Kno
         for one, is_in in zip(known.materials, chosen, strict=True)
         if is_in
     ]
-    return named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2")
+    return _KnownSpectra(named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2"))
 
 
 def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
@@ -172,7 +176,7 @@ def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
 
 def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> bytes:
     """The whole page."""
-    arrays, layout = _packed({**content.arrays, "known": known[1]})
+    arrays, layout = _packed({**content.arrays, "known": known.steps})
     scale = job.loaded.scale
     name = title or job.loaded.scene_name
     facts = {
@@ -183,7 +187,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "metres_per_unit": None if scale is None else scale.metres_per_unit,
         "scale": None if scale is None else scale.said,
         **_spectral_facts(content.materials),
-        "known": known[0],
+        "known": known.sources,
         "regions": [],
         **content.facts,
         "up": rounded(world_up(job.loaded.scene.views, job.frame)),
