@@ -13,7 +13,10 @@ import json
 import subprocess
 import sys
 import time
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -24,6 +27,7 @@ import _machine
 import tyro
 
 TESTS = ("tests/gpu", "tests/operators", "tests/test_model.py", "tests/engine/test_second_method.py")
+IN_PARALLEL = ("-n", "8", "-p", "no:benchmark")  # a plugin that refuses to be beside others
 SIDE = 512
 FRAME_RATE = _common.Limit(30, unit=" frames/s")
 SAMPLES_PER_SECOND = _common.Limit(10e6, unit=" samples/s")
@@ -41,6 +45,9 @@ class Options:
     """Folder for gpu.json and the table; None: beside the benchmarks."""
     rehearse: bool = False
     """Do it all on the CPU, small, to see that it would work; figures mean nothing and nothing is written."""
+
+    leave_out: tuple[str, ...] = ()
+    """Parts to leave out where time is short: operators, still-life, "large scene", viewer."""
 
     @property
     def device(self) -> Literal["cpu", "cuda"]:
@@ -60,11 +67,16 @@ def main(options: Options) -> None:
         return
     figures, measured = [run_tests()], {}
     with TemporaryDirectory(prefix="unmix-gpu-") as folder:
-        work = Path(folder)
-        for figure, name, values in (time_operators(work, options), *train_scenes(work, options)):
-            figures.append(figure)
-            measured[name] = values
-        figures.append(frame_rate(Path(measured["large scene"]["run"]), options.device))
+        for name, part in parts(Path(folder), options).items():
+            if name in options.leave_out:
+                continue
+            try:
+                found, measured[name] = part()
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - a result like another, and the rest is wanted
+                traceback.print_exc()
+                found = _common.required(name, "an end", False, f"{type(error).__name__}: {error}"[:200])
+            figures.append(found)
+            print(found, flush=True)
     report = _common.Report(
         "gpu",
         "Tests, operators, trainings and viewer frames on a CUDA GPU",
@@ -79,15 +91,37 @@ def main(options: Options) -> None:
 
 def run_tests() -> _common.Figure:
     """Every test that computes on CUDA."""
-    words = [sys.executable, "-m", "pytest", "-q", "-k", "cuda or gpu or CUDA", *TESTS]
+    words = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "--tb=short",
+        *IN_PARALLEL,
+        "-k",
+        "cuda or gpu or CUDA",
+        *TESTS,
+    ]
     ended = subprocess.run(words, cwd=_common.REPOSITORY, capture_output=True, text=True, check=False)
-    print(ended.stdout[-4000:])
+    print(ended.stdout, ended.stderr, flush=True)
     return _common.required(
         "tests that use the GPU", "pass", ended.returncode == 0, ended.stdout.splitlines()[-1]
     )
 
 
-def time_operators(work: Path, options: Options) -> tuple[_common.Figure, str, Any]:
+def parts(work: Path, options: Options) -> dict[str, Callable[[], tuple[_common.Figure, Any]]]:
+    """What is measured after the tests, by name; the last one looks at what the one before trained."""
+    still_life, large = options.scenes / "still-life", work / "large"
+    found = {"operators": partial(time_operators, work, options)}
+    if still_life.is_dir():
+        found["still-life"] = partial(train, still_life, work, 20, 7, STILL_LIFE, options)
+    return found | {
+        "large scene": partial(train, large, work, 30, 6, LARGE_SCENE, options),
+        "viewer": partial(frame_rate, work, options.device),
+    }
+
+
+def time_operators(work: Path, options: Options) -> tuple[_common.Figure, Any]:
     """Rendering operators beside their twins, by the benchmark made for it."""
     script = Path(__file__).with_name("operators.py")
     words = [sys.executable, script, "--device", options.device, "--results", work]
@@ -95,46 +129,48 @@ def time_operators(work: Path, options: Options) -> tuple[_common.Figure, str, A
     (written,) = work.glob("operators*.json")
     found = json.loads(written.read_text())["measured"]
     slowest = min(values["samples_per_second"]["kernel"] for values in found["operators"].values())
-    return SAMPLES_PER_SECOND.judge("slowest operator", slowest), "operators", found
+    return SAMPLES_PER_SECOND.judge("slowest operator", slowest), found
 
 
-def train_scenes(work: Path, options: Options) -> list[tuple[_common.Figure, str, Any]]:
-    """PSNR of evaluation views after some seconds of training with the defaults."""
+def train(
+    data: Path, work: Path, seconds: int, materials: int, limit: _common.Limit, options: Options
+) -> tuple[_common.Figure, Any]:
+    """PSNR of evaluation views after some seconds of training with the defaults, and the other metrics."""
     from unmix_plugin.scenes.demo.scene import make_demo_scene
 
-    scenes, side = options.scenes, 32 if options.rehearse else SIDE
-    make_demo_scene(work / "large", side)
-    asked = [("large scene", work / "large", 30, 6, LARGE_SCENE)]
-    if (scenes / "still-life").is_dir():
-        asked.insert(0, ("still-life", scenes / "still-life", 20, 7, STILL_LIFE))
-    found = []
-    for name, data, seconds, materials, limit in asked:
-        values = train(data, work, 3 if options.rehearse else seconds, materials, options)
-        found.append((limit.judge(f"{name}: PSNR after {seconds} s", values["psnr"]), name, values))
-    return found
-
-
-def train(data: Path, work: Path, seconds: int, materials: int, options: Options) -> dict[str, Any]:
-    """Train and evaluate by the commands; the metrics, and where the run is."""
+    if not data.exists():
+        make_demo_scene(data, 32 if options.rehearse else SIDE)
+    seconds = 3 if options.rehearse else seconds
     device = ("--device", options.device)
-    words = ["unmix-nerf", "--data", data, "--output-dir", work / "runs", "--max-seconds", seconds, *device]
+    words = [
+        "unmix-nerf",
+        "--data",
+        data,
+        "--output-dir",
+        work / data.name,
+        "--max-seconds",
+        seconds,
+        *device,
+    ]
     words += ["--endmembers", materials, "--viewer.no-enabled"]
     run = _common.run_command([_common.console_script("unmix-train"), *map(str, words)]).run
     _common.run_command([_common.console_script("unmix-eval"), "--run", str(run), *device])
-    return {**json.loads((run / "eval" / "metrics.json").read_text()), "run": str(run)}
+    values = json.loads((run / "eval" / "metrics.json").read_text())
+    return limit.judge(f"{data.name}: PSNR after {seconds} s", values["psnr"]), values
 
 
-def frame_rate(run: Path, device: str) -> _common.Figure:
-    """Pictures a second of one view of a run, with their copy to the host."""
+def frame_rate(work: Path, device: str) -> tuple[_common.Figure, Any]:
+    """Pictures a second of one view of the run of the large scene, with their copy to the host."""
     from unmix_plugin import open_run
 
-    scene = open_run(run, device=device)
+    (config,) = (work / "large").rglob("config.json")
+    scene = open_run(config.parent, device=device)
     camera, seconds = scene.views[0].camera.resized(SIDE, SIDE), []
     for _ in range(30):
         started = time.perf_counter()
         scene.look(camera, subpixels=1)["rgb"].cpu()
         seconds.append(time.perf_counter() - started)
-    return FRAME_RATE.judge(f"viewer at {SIDE} x {SIDE}", 1 / median(seconds[5:]))
+    return FRAME_RATE.judge(f"viewer at {SIDE} x {SIDE}", 1 / median(seconds[5:])), seconds
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import _machine
 import tyro
 
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint
-from unmix_plugin.settings import UnmixModelConfig
+from unmix_plugin.model import SAMPLES_ON_CPU
 
 PSNR_DIFFERENCE = _common.Limit(0.2, is_upper=True, unit=" dB")
 MIOU_DIFFERENCE = _common.Limit(0.02, is_upper=True)
@@ -35,7 +35,7 @@ DEVICES = (1, 2, 4, 8)
 NETWORKS = {"10 Gbit/s Ethernet": 1.25e9, "100 Gbit/s": 12.5e9}
 """Bytes a second."""
 SAMPLES = "--pipeline.model.samples-per-step"
-FULL_SAMPLES = UnmixModelConfig().samples_per_step
+FULL_SAMPLES = SAMPLES_ON_CPU
 
 
 @dataclass(frozen=True)

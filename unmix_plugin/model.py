@@ -53,7 +53,9 @@ from unmix_plugin.spectral.library.spectra_csv import write_spectra_csv
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.spectral.metrics import psnr
 
-_FEWEST_RAYS, _MOST_RAYS = 64, 8192
+SAMPLES_ON_CPU, SAMPLES_ON_GPU = 25_000, 400_000
+"""That a training step looks at; a GPU takes no longer for so many than the processor does to tell it what to do."""
+_FEWEST_RAYS, _FEWEST_SAMPLES_A_RAY = 64, 3
 _FIRST_PART = 0.05
 """Part of the training in which lighter samples may have gradients than later."""
 _COARSEST_REFINED = 4
@@ -194,7 +196,7 @@ class UnmixModel(Model):
                 choose(config.renderer.smallest_weight, self.preset.smallest_weight),
                 self.is_unbounded,
                 config.losses.background == "last",
-                config.eval_num_rays_per_chunk,
+                self.rays_per_chunk,
                 self.grid.opaque_skips,
             )
         return self._renderer
@@ -338,9 +340,10 @@ class UnmixModel(Model):
 
     def next_num_rays(self, outputs: dict[str, Tensor], current: int) -> int | None:
         """Half of the way to the rays with which a step would have `samples_per_step`."""
-        samples_a_ray = max(self.num_samples(outputs) / current, 1.0)
-        wanted = self.config.samples_per_step / self.processes.count / samples_a_ray
-        return int(min(max((current + wanted) / 2, _FEWEST_RAYS), _MOST_RAYS))
+        usual = SAMPLES_ON_CPU if self.device.type == "cpu" else SAMPLES_ON_GPU
+        samples = choose(self.config.samples_per_step, usual) / self.processes.count
+        samples_a_ray = max(self.num_samples(outputs) / current, _FEWEST_SAMPLES_A_RAY)
+        return max(int(current + samples / samples_a_ray) // 2, _FEWEST_RAYS)
 
     def warm_up(self) -> None:
         """Compile the kernels by one render along the box's diagonal and its backward pass."""

@@ -22,8 +22,9 @@ from torch.utils.backend_registration import _setup_privateuseone_for_python_bac
 from unmix_plugin.operators import launching
 
 NAME = "standin"
-_setup_privateuseone_for_python_backend(NAME)
-DEVICE = torch.device(NAME, 0)
+if not torch.cuda.is_available():  # a device registered beside CUDA would take the gradients from its tensors
+    _setup_privateuseone_for_python_backend(NAME)
+DEVICE = torch.device("privateuseone", 0)
 
 _INDEXING = {"index", "index_put", "index_put_", "_unsafe_index_put"}
 """Operations that take indices on the CPU on CUDA too."""

@@ -114,12 +114,13 @@ class ModelConfig(InstantiateConfig):
     """Settings that every model has."""
 
     _target: Target = "unmix_plugin.engine.model:Model"
-    eval_num_rays_per_chunk: int = 32_768
-    """Rays rendered at once for a whole image; fewer take less memory."""
+    eval_num_rays_per_chunk: int | Literal["auto"] = "auto"
+    """Rays rendered at once for a whole image; fewer take less memory. Auto is 32,768 on a CPU, 131,072 on a GPU."""
 
     def __post_init__(self) -> None:
         """Refuse a number out of its range by `ConfigError`; a subclass with rules of its own calls this too."""
-        require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 256, 2**22)
+        if self.eval_num_rays_per_chunk != "auto":
+            require_in_range("eval_num_rays_per_chunk", self.eval_num_rays_per_chunk, 256, 2**22)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator

@@ -162,6 +162,12 @@ class Model(nn.Module, ABC):
         """Where the parameters are."""
         return next(self.parameters()).device
 
+    @property
+    def rays_per_chunk(self) -> int:
+        """Rays of a whole image under way at once."""
+        chosen = self.config.eval_num_rays_per_chunk
+        return chosen if chosen != "auto" else 32_768 if self.device.type == "cpu" else 131_072
+
     @abstractmethod
     def populate_modules(self) -> None:
         """Make the modules, parameters and buffers, their shapes from `config`, `scene_box` and `metadata` only."""
@@ -277,7 +283,7 @@ class Model(nn.Module, ABC):
             ConfigError: a name that `get_outputs` does not give.
         """
         ray_bundle = camera.to(self.device).image_rays(0)
-        chunk = self.config.eval_num_rays_per_chunk
+        chunk = self.rays_per_chunk
         parts = [
             self._ray_outputs(ray_bundle[i : i + chunk], outputs) for i in range(0, len(ray_bundle), chunk)
         ]

@@ -108,7 +108,7 @@ class NeumatexModelConfig(ModelConfig):
     """What is fitted, and how it is rendered meanwhile."""
 
     _target: Target = "unmix_plugin.neumatex.fit.model:NeumatexModel"
-    eval_num_rays_per_chunk: tyro.conf.Suppress[int] = 32_768
+    eval_num_rays_per_chunk: tyro.conf.Suppress[int | Auto] = "auto"
     """No flag: pictures are traced in parts of a size of their own."""
     material: Annotated[MaterialName, Common] = "neural"
     """Family of materials: neural (base colour and latents of a shared decoder), pbr (base colour, roughness,
