@@ -7,8 +7,7 @@ from tests.spectral.mixtures import seeded, smooth_endmembers
 from unmix_plugin.losses import abundance_guide
 from unmix_plugin.losses.abundance_guide import AbundanceGuide, mixing_penalty
 from unmix_plugin.sensors.batches import MeasuredPixels
-from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
-from unmix_plugin.spectral.unmixing.endmembers import drop_uninformative_pixels
+from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_distance
 
 ENDMEMBERS = smooth_endmembers(4).float() * 0.8
@@ -51,17 +50,39 @@ def test_black_and_saturated_pixels_do_not_count():
     assert error(torch.rand(2, 4, generator=seeded(2)), dark) == 0
 
 
-def test_what_pairs_leave_unexplained_sets_the_penalty_of_further_materials():
+def tinted_pixels(strength):
+    """Of one material each, lit in part by two others."""
+    shares = torch.rand(300, 2, generator=seeded(3)) * strength
+    own = torch.arange(300) % 4
+    light = shares[:, :1] * ENDMEMBERS[(own + 1) % 4] + shares[:, 1:] * ENDMEMBERS[(own + 2) % 4]
+    return ENDMEMBERS[own] + light
+
+
+def beyond_pairs(pixels):
+    """Mean angle by which mixtures of all come nearer than mixtures of two."""
+    pixels, corners = (spectra / spectra.norm(dim=1, keepdim=True) for spectra in (pixels, ENDMEMBERS))
+    to_all = (pixels - nnls(pixels, corners) @ corners).norm(dim=1)
+    return mean_pair_distance(pixels, corners) - float(to_all.mean())
+
+
+def test_what_all_materials_explain_beyond_pairs_sets_the_penalty_of_further_materials():
     """It grows with the square of that, and then in proportion."""
     seen = []
-    for noise in (0.01, 0.02, 0.4):
-        pixels = noisy_pixels(noise)
-        angle = mean_pair_distance(drop_uninformative_pixels(pixels), ENDMEMBERS)
-        seen.append(angle)
-        expected = 100 * angle**2 if angle < 0.03 else 3 * angle
-        assert_close(mixing_penalty(pixels, ENDMEMBERS), expected, rtol=1e-4, atol=0)
-    assert seen[0] < seen[1] < 0.03 < seen[2]
-    assert mixing_penalty(noisy_pixels(0.0), ENDMEMBERS) < 1e-3
+    for strength in (0.03, 0.06, 0.2):
+        pixels = tinted_pixels(strength)
+        gain = beyond_pairs(pixels)
+        seen.append(gain)
+        expected = 500 * gain**2 if gain < 0.01 else 5 * gain
+        assert_close(mixing_penalty(pixels, ENDMEMBERS), expected, rtol=1e-2, atol=0)
+    assert seen[0] < seen[1] < 0.01 < seen[2]
+    assert mixing_penalty(noisy_pixels(0.0), ENDMEMBERS) < 1e-6
+
+
+def test_noise_and_spectra_that_vary_set_no_penalty():
+    """What they leave unexplained no further material explains."""
+    pixels = noisy_pixels(0.05)
+    assert mean_pair_distance(pixels, ENDMEMBERS) > 0.02
+    assert mixing_penalty(pixels, ENDMEMBERS) < 0.1 * mixing_penalty(tinted_pixels(0.5), ENDMEMBERS)
 
 
 def observed(deviation, steps=60):

@@ -17,13 +17,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from unmix_plugin.sensors.batches import MeasuredPixels
 from unmix_plugin.sensors.views import BandBalance, SensorViews
 from unmix_plugin.settings import UnmixModelConfig
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
-from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
+from unmix_plugin.spectral.unmixing.abundances import nnls, sparse_abundances
 from unmix_plugin.spectral.unmixing.endmembers import (
     distinct_spectra,
     drop_uninformative_pixels,
@@ -36,13 +37,11 @@ from unmix_plugin.spectral.unmixing.two_material_mixtures import mean_pair_dista
 
 _OBSERVED_PIXELS = 256
 """Pixels of a batch by which the error of margins is followed."""
-_PLAIN_UNEXPLAINED = 0.02
-"""Mean angle, in radians, that mixtures of two materials usually leave unexplained. Of three scenes, two of little
-coloured light leave 0.014 and 0.015, one whose walls colour each other 0.029."""
-_RELATIVE_PENALTY = 2.0
-"""By how much a further material must improve the fit of a spectrum there, in multiples of that angle."""
-_MOST_STRICT = 1.5
-"""Largest factor on that multiple: noise leaves angles too, and is not coloured light."""
+_RELATIVE_PENALTY = 5.0
+"""By how much a further material must improve the fit of a spectrum, in multiples of what all materials improve that of
+the pixels beyond mixtures of two. Of landscapes, this is the most that costs 3 % of their abundance error."""
+_CLEAR_GAIN = 0.01
+"""Smallest mean improvement, in radians, at which that multiple counts in full; below it falls in proportion."""
 _CLEAR_MARGIN = 0.9
 """Nearly pure pixels, whose margin is larger, hardly err, and would hide what the others do."""
 _DECAY = 0.99
@@ -122,11 +121,17 @@ def _is_informative(measured: MeasuredPixels) -> Bool[Tensor, "R"]:
 def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> float:
     """By how many radians a further material must improve the fit of a spectrum to count, from all training pixels.
 
-    It grows with the square of the mean angle that mixtures of two leave unexplained, up to 0.03, and then in
-    proportion: light that is coloured by what it met before leaves more, and makes more mixtures that are none.
+    It follows what all endmembers explain of the pixels beyond mixtures of two, by the square up to 0.01 and in
+    proportion from there: much where surfaces tint each other's light, and the tints would count as materials; little
+    where noise, or spectra that vary from place to place, leave the same angle.
     """
-    unexplained = mean_pair_distance(drop_uninformative_pixels(pixels), endmembers.to(pixels))
-    return _RELATIVE_PENALTY * min(unexplained / _PLAIN_UNEXPLAINED, _MOST_STRICT) * unexplained
+    informative = normalize(drop_uninformative_pixels(pixels), dim=1)
+    corners = normalize(endmembers.to(pixels), dim=1)
+    left = (informative - nnls(informative, corners) @ corners).norm(dim=1).double().sum() / max(
+        1, len(informative)
+    )
+    gain = max(0.0, mean_pair_distance(informative, corners) - float(left))
+    return _RELATIVE_PENALTY * min(gain / _CLEAR_GAIN, 1.0) * gain
 
 
 class _MixtureCache:
