@@ -91,3 +91,18 @@ def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
     for view in made.reflectance:
         stored = np.load(tmp_path / "scene" / "cubes" / f"{view}.npy") / 65535
         np.testing.assert_allclose(stored, made.reflectance[view], atol=1e-3)
+
+
+@pytest.mark.parametrize("stated", ["{10.5, 5.25}", "10,5"])
+def test_exposures_that_are_neither_one_nor_one_a_band_are_not_dropped_in_silence(stated):
+    facts = exposure_facts({"tint": stated}, "header field")[0]
+    odd = file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
+    other = exposed([0.02, 0.01])
+    for views, whites in (([odd, other], []), ([odd], [exposed(0.01)]), ([exposed(0.01)], [odd])):
+        found = compare_exposures(views, whites, [], False)
+        assert any(
+            "2 exposure times or gains for 3 bands: exposures may differ and were not compared" in text
+            for text in found.warnings
+        )
+        assert not found.notes
+    assert compare_exposures([odd, odd], [odd], [], False).warnings == ()  # nothing that could differ

@@ -383,18 +383,20 @@ def compare_exposures(
         [exposure for file in files if (exposure := exposure_of(file)) is not None]
         for files in (views, whites, darks)
     )
-    warnings = _missing_units([*views, *whites])
+    warnings, misfits = _missing_units([*views, *whites]), _misfits(views, whites)
+    warnings += misfits
     differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
     if len(known) < len(views):
         missing = (
             f"{counted(len(views) - len(known), 'view')} without exposure time: exposures are not compared"
         )
-        return Exposures(warnings=(*warnings, missing) if known or of_whites else tuple(warnings))
+        is_partial = bool(known or of_whites) and not misfits
+        return Exposures(warnings=(*warnings, missing) if is_partial else tuple(warnings))
     taken = f"were exposed {_in_words(known)} s times gain"
     if is_bent:
         bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
         return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
-    if len(of_whites) < len(whites) and differs:
+    if len(of_whites) < len(whites) and differs and not misfits:
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
         )
@@ -423,6 +425,26 @@ def _in_words(exposures: Iterable[Float64[np.ndarray, " b"]]) -> str:
     every = np.concatenate(list(exposures))
     low, high = every.min(), every.max()
     return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> list[str]:
+    """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
+    stated = {
+        repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in (*views, *whites)
+    }
+    if whites and len(stated) == 1:
+        return []
+    num_bands, found = views[0].shape[2], []
+    for file in (*views, *whites):
+        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")} - {1, num_bands}
+        if sizes and "exposure_s" in file.metadata:
+            found.append((file.path.name, max(sizes)))
+    if not found:
+        return []
+    names, numbers = name_some([name for name, _ in found]), sorted({size for _, size in found})
+    what = f"{' or '.join(map(str, numbers))} exposure times or gains for {counted(num_bands, 'band')}"
+    said = f"{names}: {what}: exposures may differ and were not compared"
+    return [f"{said}. Give one number, or one a band, with points as decimal marks"]
 
 
 def _missing_units(files: Iterable[SpectralFile]) -> list[str]:
