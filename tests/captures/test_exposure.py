@@ -1,12 +1,24 @@
 """Exposure under its many names, and what becomes of it."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from tests.captures.capture_factory import make_capture, process, write_cube
+from tests.captures.capture_factory import (
+    BANDS,
+    HEIGHT,
+    WIDTH,
+    make_capture,
+    process,
+    write_cube,
+    write_poses,
+)
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.references import compare_exposures, exposure_of
 from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.spectral_file import Linear
 
 
 @pytest.mark.parametrize(
@@ -106,3 +118,51 @@ def test_exposures_that_are_neither_one_nor_one_a_band_are_not_dropped_in_silenc
         )
         assert not found.notes
     assert compare_exposures([odd, odd], [odd], [], False).warnings == ()  # nothing that could differ
+
+
+@pytest.mark.parametrize(
+    ("factor", "header"),
+    [(10000, {"reflectance scale factor": "10000"}), (1, {"reflectance scale factor": "1"}), (1, {})],
+)
+def test_reflectances_are_not_divided_by_the_exposure_of_their_raw_files(tmp_path, factor, header):
+    """SPy writes the header of the raw file, with its tint, beside what was made of it."""
+    values = np.random.default_rng(0).uniform(0.1, 0.9, (HEIGHT, WIDTH, BANDS)) * factor
+    (tmp_path / "capture").mkdir()
+    names = [f"view_{index:02d}" for index in range(4)]
+    for index, name in enumerate(names):
+        stored = values.astype(np.float32 if factor == 1 else np.uint16)
+        write_cube(tmp_path / "capture", name, stored, header={"tint": f"{10 + 10 * (index % 2)}", **header})
+    write_poses(tmp_path / "capture" / "transforms.json", names)
+    told: list[str] = []
+    wrong = process(tmp_path / "capture", tmp_path / "scene", "cubes", told.append)
+    means = [np.load(tmp_path / "scene" / "cubes" / f"{name}.npy").mean() / 65535 for name in names]
+    np.testing.assert_allclose(means, values.mean() / factor, rtol=1e-3)
+    said = next(text for text in (told if header else wrong[:1]) if "values are not divided by that" in text)
+    assert "were exposed 0.01 to 0.02 s times gain" in said
+    assert ("taken for reflectances" in said) == (
+        not header
+    )  # which nobody can know: the report begins with it
+
+
+def test_values_that_may_be_reflectances_are_raw_beside_a_reference():
+    views = [exposed(0.01), exposed(0.02)]
+    (warning,) = compare_exposures(views, [], [], False, may_be_finished=True).warnings
+    assert "give a white reference, or divide them by it yourself" in warning
+    assert compare_exposures(views, [exposed(0.01)], [], False, may_be_finished=True).common == 0.01
+    assert compare_exposures(views, [], [exposed(0.01)], False, may_be_finished=True).common == 0.01
+
+
+def test_values_are_finished_by_gains_or_names_that_say_so():
+    """REFLECTANCE_212 is what a Specim IQ writes."""
+
+    def notes(whites=(), **facts):
+        files = [replace(exposed(time), **facts) for time in (0.01, 0.02)]
+        return compare_exposures(files, whites, [], False).notes
+
+    for path in ("results/REFLECTANCE_212.dat", "leaf-reflectance.npy"):
+        assert "not divided by that" in notes(path=Path(path))[0]
+        assert "each is brought to" in notes([exposed(0.01)], path=Path(path))[0]
+    linear = Linear(np.full(3, 0.5), np.zeros(3), "header field 'data gain values'")
+    assert "not divided by that" in notes(linear=linear)[0]
+    assert "each is brought to" in notes(linear=replace(linear, evidence="attribute 'scale_factor'"))[0]
+    assert "each is brought to" in notes(path=Path("reflectances_of_lamps.npy"))[0]

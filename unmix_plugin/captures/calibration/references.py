@@ -6,6 +6,7 @@ Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` band
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,9 +30,33 @@ _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
+_FINISHED = ("reflectance", "data gain", "data offset")
+"""In the evidence of gains that make reflectance or radiance of numbers."""
+_REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
+"""The word in names: REFLECTANCE_212, site/reflectance."""
+
+
 def is_srgb(file: SpectralFile) -> bool:
     """Whether the file is a picture for people."""
     return file.metadata.get("encoding") == "sRGB"
+
+
+def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
+    """Where a file says that its values are reflectance or radiance, in which the exposure is accounted for; None where
+    it does not. Software keeps the exposure time of the raw file in the header of such values.
+
+    Args:
+        by_name: Whether its name may say so.
+    Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr), `reflectance scale factor`).
+    """
+    if file.linear is not None and any(word in file.linear.evidence for word in _FINISHED):
+        return file.linear.evidence
+    header = file.metadata.get("header")
+    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
+        return "header field 'reflectance scale factor'"
+    names = (file.path.stem, str(file.metadata.get("dataset", "")))
+    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
+    return None if named is None else f"the name {named}"
 
 
 def stated_values(
@@ -371,6 +396,7 @@ def compare_exposures(
     whites: Sequence[SpectralFile],
     darks: Sequence[SpectralFile],
     is_bent: bool,
+    may_be_finished: bool = False,
 ) -> Exposures:
     """The exposure of the white reference, to which views are brought; without one, that of the first view.
 
@@ -378,14 +404,21 @@ def compare_exposures(
         views: At least one.
         whites, darks: References of all views, or one a view.
         is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
+        may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
     """
     known, of_whites, of_darks = (
         [exposure for file in files if (exposure := exposure_of(file)) is not None]
         for files in (views, whites, darks)
     )
+    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
+    finished = [finished_by(file, by_name=not whites) for file in views]
+    if None not in finished and not is_bent:
+        if not differs:
+            return Exposures()
+        kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
+        return Exposures(notes=(f"views were exposed {_in_words(known)} s times gain: {kept}",))
     warnings, misfits = _missing_units([*views, *whites]), _misfits(views, whites)
     warnings += misfits
-    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
     if len(known) < len(views):
         missing = (
             f"{counted(len(views) - len(known), 'view')} without exposure time: exposures are not compared"
@@ -396,6 +429,12 @@ def compare_exposures(
     if is_bent:
         bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
         return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
+    if may_be_finished and differs and not (whites or darks):
+        kept = (
+            f"views {taken}: values are not divided by that, as they are at most about 1 and taken for reflectances. "
+            "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
+        )
+        return Exposures(warnings=(*warnings, kept))
     if len(of_whites) < len(whites) and differs and not misfits:
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"

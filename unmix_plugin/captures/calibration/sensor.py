@@ -25,6 +25,7 @@ from unmix_plugin.captures.calibration.references import (
     find_missing,
     find_references,
     is_srgb,
+    stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.header_values import in_ranges
@@ -58,6 +59,8 @@ _MOST_ABOVE_ONE = 0.01
 """Share of reflectances above 1 that is still taken for highlights."""
 _LEAST_BRIGHT = 0.05
 """Bright values below this would lose digits if they were kept."""
+_MOST_REFLECTANCE = 1.5
+"""Of bright pixels with highlights."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +181,9 @@ def prepare_sensor(
     exposures = Exposures()
     if model is None:
         darks = [one.file for one, _ in pairs if one is not None]
-        exposures = compare_exposures(files, [one.file for one in whites], darks, is_srgb(first))
+        exposures = compare_exposures(
+            files, [one.file for one in whites], darks, is_srgb(first), _may_be_reflectance(first)
+        )
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
@@ -206,6 +211,15 @@ def prepare_sensor(
         (*warnings, *exposures.warnings),
         bool(whites) or states_one,
     )
+
+
+def _may_be_reflectance(file: SpectralFile) -> bool:
+    """Whether the values of sampled rows were brought to what stands for 1, perhaps."""
+    if file.dtype.kind != "f" and file.linear is None:
+        return False
+    parts = [(_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])]
+    values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
+    return len(values) > 0 and 0.0 < np.percentile(values, _BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE
 
 
 def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
