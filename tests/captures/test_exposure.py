@@ -67,7 +67,7 @@ def test_views_are_brought_to_the_white_and_that_is_said():
         "views were exposed 0.01 to 0.04 s times gain: each is brought to that of the white reference, 0.005",
     )
     assert found.warnings == ()
-    same = compare_exposures([exposed(0.01)] * 2, [exposed(0.01)], [exposed(0.01)], False)
+    same = compare_exposures([exposed(0.01)] * 2, [exposed(0.01)], [(exposed(0.01), exposed(0.01))], False)
     assert (same.notes, same.warnings) == ((), ())
     bands = exposed([0.01, 0.02, 0.04])  # which may differ within a view
     np.testing.assert_array_equal(exposure_of(bands), [0.01, 0.02, 0.04])
@@ -80,7 +80,8 @@ def test_what_may_be_wrong_with_exposures_is_said():
 
     plain = file_of(np.ones((2, 2, 3), np.uint16))
     views = [exposed(0.01), exposed(0.02)]
-    assert "dark frame was exposed 0.02" in warnings(views, [exposed(0.005)], [exposed(0.02)])
+    assert "dark frame was exposed 0.02" in warnings(views, [], [(exposed(0.02), view) for view in views])
+    assert warnings(views, [], [(view, view) for view in views]) == ""  # each view has one of its own
     assert "1 view without exposure time" in warnings([*views, plain], [], [])
     assert "does not say how long" in warnings(views, [plain], [])
     assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
@@ -149,7 +150,9 @@ def test_values_that_may_be_reflectances_are_raw_beside_a_reference():
     (warning,) = compare_exposures(views, [], [], False, may_be_finished=True).warnings
     assert "give a white reference, or divide them by it yourself" in warning
     assert compare_exposures(views, [exposed(0.01)], [], False, may_be_finished=True).common == 0.01
-    assert compare_exposures(views, [], [exposed(0.01)], False, may_be_finished=True).common == 0.01
+    assert (
+        compare_exposures(views, [], [(exposed(0.01), views[0])], False, may_be_finished=True).common == 0.01
+    )
 
 
 def test_values_are_finished_by_gains_or_names_that_say_so():

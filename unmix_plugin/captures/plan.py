@@ -143,7 +143,7 @@ def make_plan(
             f"values ({units}) were divided by {scale:g}, as more than 1 % are above 1 or nearly all are small: "
             f"multiply exported spectra by {scale:g}, or keep values with --scale 1, which cuts off those above 1"
         )
-    each = [(view.name, file) for view in views for file in (view.cube, view.dark, view.white)]
+    each = [(view.name, file) for view in views for file in (view.cube, *view.references)]
     each += [(file.path.name, file) for file in opened]
     return Plan(
         capture,
@@ -251,8 +251,7 @@ def _find_backdrop(
 def input_files(view: CaptureView) -> list[Path]:
     """Every file that a view is made of."""
     more = [path for path in (view.picture, view.mask, view.labels) if path is not None]
-    references = [file for file in (view.dark, view.white) if file is not None]
-    return [*view.cube.files, *more, *(path for file in references for path in file.files)]
+    return [*view.cube.files, *more, *(path for file in view.references for path in file.files)]
 
 
 def hashes(paths: Iterable[Path]) -> list[dict[str, Any]]:

@@ -415,6 +415,8 @@ class CaptureView:
     dark: SpectralFile | None = None
     white: SpectralFile | None = None
     """References that were taken for this view alone."""
+    white_dark: SpectralFile | None = None
+    """Dark frame that was taken for its white reference alone, with the exposure of that."""
     alpha: SpectralFile | None = None
     """Opacity in [0, 1], (H, W, 1), where it is not a channel of the picture; the cube is multiplied by it."""
     lens: Lens | None = None
@@ -423,6 +425,11 @@ class CaptureView:
     """Name of the shutter release; views of one release were taken at one moment by the lenses of a rig."""
     split: Literal["train", "eval"] | None = None
     """What the layout says the view is for."""
+
+    @property
+    def references(self) -> list[SpectralFile]:
+        """The files of all references of its own."""
+        return [file for file in (self.dark, self.white, self.white_dark) if file is not None]
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,31 @@ def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
         np.testing.assert_allclose(stored, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
 
 
+@pytest.mark.parametrize("names", ["WHITEDARKREF_{}", "whitedark_{}", "{}_White-Dark_Reference"])
+def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, names):
+    """Specim IQ writes WHITEDARKREF where the white was taken before, with another exposure."""
+    write_tree(tmp_path / "tree")
+    write_poses(tmp_path / "poses.json", NAMES)
+    for name in NAMES:
+        folder = tmp_path / "tree" / name / "capture"
+        write_cube(folder, names.format(name), counts(300, 3), header={"tint": 10})
+        for stem, tint in ((name, 40), (f"DARKREF_{name}", 40), (f"WHITEREF_{name}", 10)):
+            with (folder / f"{stem}.hdr").open("a") as header:
+                header.write(f"tint = {tint}\n")
+    assert list(stems(tmp_path / "tree")) == NAMES
+    assert "4 of 4 views have a dark frame for their white reference alone" in str(
+        find_cubes(tmp_path / "tree", PLAIN)
+    )
+    options = {"poses": str(tmp_path / "poses.json"), "saturation": 60000.0, "max_noise": 9.0}
+    wrong = process(tmp_path / "tree", tmp_path / "scene", **options)
+    assert not any(
+        "dark current" in text for text in wrong
+    )  # each dark was exposed like what it is taken off
+    for index, name in enumerate(NAMES):
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
+        np.testing.assert_allclose(stored, (1000 + 100 * index) / (1800 + 400 * index) / 4, atol=1e-4)
+
+
 def test_reflectances_of_the_camera_are_taken_where_a_white_is_missing(tmp_path):
     write_tree(tmp_path)
     for path in tmp_path.glob("213/capture/WHITEREF*"):

@@ -2,7 +2,7 @@
 
     value = (stored - dark) / (white - dark) * reflectance of the panel * exposure of white / exposure of view
 
-with what is not given left out.
+with what is not given left out. A white may have a dark frame of its own.
 
 Notation: `H x W` pixels and `B` bands of the file, of which `h` rows and `b` bands are read; `n x w` pixels and `c`
 bands of the result.
@@ -166,7 +166,9 @@ class Calibration:
         if white is not None:
             assert white.reflectance is not None
             light = white.rows(rows, columns, bands)
-            if dark is not None:
+            if white.dark is not None:
+                light = light - white.dark.rows(rows, columns, bands)
+            elif dark is not None:
                 light = light - dark
             # NaN where the white is not above the dark.
             light = np.where(light > 0, light, np.float32(np.nan))

@@ -121,6 +121,8 @@ class Reference:
     """How it is used, for people."""
     reflectance: Float64[np.ndarray, " B"] | None = None
     """Of a white panel at every band of the file, above 0."""
+    dark: Reference | None = None
+    """Of a white panel: the dark frame that was taken for it alone, in place of that of the views."""
     is_view: bool = False
     """Whether the file is a view that shows it."""
 
@@ -140,8 +142,8 @@ class Reference:
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
     def signal(self, dark: Reference | None) -> Float64[np.ndarray, " B"]:
-        """Mean counts above dark at each band of the file."""
-        own = self.mean.astype(np.float64).mean(axis=(0, 1))
+        """Mean counts above its own dark, or that of the views, at each band of the file."""
+        own, dark = self.mean.astype(np.float64).mean(axis=(0, 1)), self.dark or dark
         return own if dark is None else own - dark.signal(None)
 
 
@@ -179,6 +181,15 @@ def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Refere
         return Reference(file, what, _stretched(mean, cube.shape[1]), False, how)
     how = f"{lines} and of all columns: {wider}, so its columns can't be those of the cubes"
     return Reference(file, what, mean.mean(axis=1, keepdims=True), False, how)
+
+
+def _open_white(file: SpectralFile, own_dark: SpectralFile | None, cube: SpectralFile) -> Reference:
+    """A white reference with the dark frame that was taken for it alone, if there is one."""
+    white = _open_reference(file, "white reference", cube)
+    if own_dark is None:
+        return white
+    dark = _open_reference(own_dark, "dark frame", cube)
+    return replace(white, dark=dark, how=f"{white.how}; less a dark frame of its own ({dark.how})")
 
 
 def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], view: str) -> Reference:
@@ -261,7 +272,7 @@ def _as_white(
     reference: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Reference:
     """A white panel that is brighter than the dark, with its reflectance: a number, or that of a CSV file."""
-    light = reference.signal(dark)
+    light, dark = reference.signal(dark), reference.dark or dark
     if not (light > 0).mean() > 0.5:
         dark_name = "0" if dark is None else f"the dark frame {dark.file.path}"
         raise CaptureError(
@@ -319,6 +330,9 @@ def find_references(
         panel = _open_reference(white_file, "white reference", cube)
     white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
     own: dict[Path, References] = {}
+    of_whites = {view.white.path: view.white_dark for view in views if view.white and view.white_dark}
+    if dark is not None:  # the user's goes before all
+        of_whites = {}
     darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
     whites = _each_view([view.white for view in views], views, "white reference", white is not None)
     seen: dict[tuple[Path | None, Path | None], References] = {}  # files that several views share
@@ -330,7 +344,7 @@ def find_references(
             its_dark = dark if own_dark is None else _open_reference(own_dark, "dark frame", view.cube)
             its_white = white
             if own_white is not None:
-                panel = _open_reference(own_white, "white reference", view.cube)
+                panel = _open_white(own_white, of_whites.get(own_white.path), view.cube)
                 its_white = _as_white(panel, its_dark, options.white_reflectance, wavelengths_nm)
             seen[key] = its_dark, its_white
         own[view.cube.path] = seen[key]
@@ -394,7 +408,7 @@ class Exposures:
 def compare_exposures(
     views: Sequence[SpectralFile],
     whites: Sequence[SpectralFile],
-    darks: Sequence[SpectralFile],
+    darks: Sequence[tuple[SpectralFile, SpectralFile]],
     is_bent: bool,
     may_be_finished: bool = False,
 ) -> Exposures:
@@ -402,13 +416,14 @@ def compare_exposures(
 
     Args:
         views: At least one.
-        whites, darks: References of all views, or one a view.
+        whites: References of all views, or one a view.
+        darks: Each dark frame with a view or a white that it is subtracted from.
         is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
         may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
     """
-    known, of_whites, of_darks = (
+    known, of_whites = (
         [exposure for file in files if (exposure := exposure_of(file)) is not None]
-        for files in (views, whites, darks)
+        for files in (views, whites)
     )
     differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
     finished = [finished_by(file, by_name=not whites) for file in views]
@@ -439,10 +454,13 @@ def compare_exposures(
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
         )
-    if any(len({tuple(exposure), *map(tuple, [*known, *of_whites])}) > 1 for exposure in of_darks):
+    pairs = [(exposure_of(dark), exposure_of(other)) for dark, other in darks]
+    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
+    if unlike:
+        of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
         warnings.append(
-            f"the dark frame was exposed {_in_words(of_darks)} s times gain, views and white reference "
-            f"{_in_words([*known, *of_whites])}: dark current grows with exposure, so take a dark frame at each"
+            f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}: dark current "
+            "grows with exposure, so take a dark frame at each"
         )
     common, of_whom = np.median(known[0], keepdims=True), "that of the first view"
     if of_whites:

@@ -180,7 +180,12 @@ def prepare_sensor(
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
     if model is None:
-        darks = [one.file for one, _ in pairs if one is not None]
+        darks: list[tuple[SpectralFile, SpectralFile]] = []
+        for file in files:
+            its_dark, used = own.get(file.path, (dark, white))
+            darks += [(its_dark.file, file)] if its_dark else []
+            of_white = used and (used.dark or its_dark)
+            darks += [(of_white.file, used.file)] if used and of_white else []
         exposures = compare_exposures(
             files, [one.file for one in whites], darks, is_srgb(first), _may_be_reflectance(first)
         )

@@ -7,6 +7,7 @@ the views: three bands, gamma-encoded.
 Cameras of Specim write each view with its own references, and what they make of it themselves:
 
     NAME/capture/{NAME, DARKREF_NAME, WHITEREF_NAME}.{hdr,raw}     stored numbers
+    NAME/capture/WHITEDARKREF_NAME.{hdr,raw}                       dark frame of a white that was taken before
     NAME/results/REFLECTANCE_NAME.{hdr,dat}                        taken where a view has no white reference
 
 The same names count in any folder and in any case; files such as darkReference are references of the views beside them.
@@ -37,13 +38,20 @@ _NUMBERS = frozenset(
 """Of files that may be views whose header is lost, or of a kind that is not read."""
 _PICTURE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg"})
 _BAND_SUFFIXES = _PICTURE_SUFFIXES | {".tif", ".tiff", ".exr"}
+_KIND = r"white[ _-]*dark|white|dark|flat"
 _WORD = r"(?:ref(?:erence)?|frame|field|current|calibration)"
 _REFERENCE = re.compile(
-    rf"(?P<kind>white|dark|flat)[ _-]*(?P<word>{_WORD})?(?:[ _-]+(?P<of>.+))?"
-    rf"|(?P<of2>.+?)[ _-]+(?P<kind2>white|dark|flat)[ _-]*(?P<word2>{_WORD})?",
+    rf"(?P<kind>{_KIND})[ _-]*(?P<word>{_WORD})?(?:[ _-]+(?P<of>.+))?"
+    rf"|(?P<of2>.+?)[ _-]+(?P<kind2>{_KIND})[ _-]*(?P<word2>{_WORD})?",
     re.IGNORECASE,
 )
 """Names of files that hold no view: WHITEREF_212, dark frame 3, 212_darkReference, white."""
+_OWN = {
+    "dark": ("dark frame of their own", "--dark"),
+    "white": ("white reference of their own", "--white"),
+    "white_dark": ("dark frame for their white reference alone", "--dark or --white"),
+}
+"""References of a view, for messages, and what names others."""
 _RESULT = re.compile(r"reflectance[ _-]+(?P<of>.+)", re.IGNORECASE)
 _RESULTS = "results"
 """Folder of what a camera makes of its numbers."""
@@ -94,6 +102,7 @@ class _Group:
     result: Path | None = None
     dark: Path | None = None
     white: Path | None = None
+    white_dark: Path | None = None
 
 
 def _capture_of_groups(
@@ -119,7 +128,7 @@ def _capture_of_groups(
     else:
         names = view_names([str(place.relative_to(root) / f"{name}.x") for place, name in paths], str(root))
     views: list[CaptureView] = []
-    references: dict[str, int] = {"dark": 0, "white": 0}
+    references = dict.fromkeys(_OWN, 0)
     for name, (key, path) in sorted(
         zip(names, paths.items(), strict=True), key=lambda pair: natural_order(pair[0])
     ):
@@ -142,8 +151,8 @@ def _notes(
     references: dict[str, int], num_views: int, left_out: list[Path], take_results: bool
 ) -> tuple[str, ...]:
     notes = [
-        f"{count} of {num_views} views have a {what} of their own, which is used unless --{kind} names another"
-        for (kind, count), what in zip(references.items(), ("dark frame", "white reference"), strict=True)
+        f"{count} of {num_views} views have a {what}, which is used unless {flag} names another"
+        for count, (what, flag) in zip(references.values(), _OWN.values(), strict=True)
         if count
     ]
     if take_results:
@@ -175,7 +184,8 @@ def _sort_into(
     for path in references:
         match = _REFERENCE.fullmatch(path.stem)
         assert match is not None
-        kind = "dark" if (match["kind"] or match["kind2"]).lower() == "dark" else "white"
+        word = (match["kind"] or match["kind2"]).lower()
+        kind = "white" if word in ("white", "flat") else "dark" if word == "dark" else "white_dark"
         of = match["of"] or match["of2"]
         owners = [stem for stem in own if of is not None and stem.casefold() == of.casefold()]
         if not owners and is_tree and (len(own) == 1 or of is None):
