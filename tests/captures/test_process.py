@@ -137,6 +137,36 @@ def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: P
     np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
 
 
+@pytest.mark.parametrize("has_file", [False, True])
+def test_dark_lines_of_a_file_are_its_dark_frame_where_it_has_no_other(tmp_path: Path, has_file: bool):
+    """Specim's line cameras close the shutter for the last lines; poses and masks may be made for all of them."""
+    capture = make_capture(tmp_path / "capture")
+
+    def write(name, light, level, shut):
+        counts = np.concatenate([light + level, np.broadcast_to(shut, (6, *light.shape[1:]))])
+        write_cube(
+            capture.root, name, counts.round().astype(np.uint16), header={"autodarkstartline": len(light)}
+        )
+
+    for index, (name, reflectance) in enumerate(capture.reflectance.items()):
+        level = capture.dark if has_file else capture.dark + 40 * index  # which drifts from view to view
+        write(name, reflectance * capture.white, level, 500 if has_file else level)
+        Image.new("RGBA", (WIDTH, HEIGHT + 6 * has_file), (9, 9, 9, 255)).save(capture.root / f"{name}.png")
+    level = capture.dark if has_file else 200
+    write("white", np.tile(capture.white, (12, 1, 1)), level, 500 if has_file else level)
+    write_poses(capture.root / "transforms.json", list(capture.reflectance), height=HEIGHT + 6)
+    references = references_of(capture)
+    if not has_file:
+        references.pop("dark")
+    process(capture.root, tmp_path / "scene", mask="files", **references)
+    for name, reflectance in capture.reflectance.items():
+        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
+        np.testing.assert_allclose(stored, reflectance, atol=1e-3)
+    frame = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+    lens = {**frame, **frame["frames"][0]}
+    assert (lens["w"], lens["h"], lens["cy"]) == (WIDTH, HEIGHT, (HEIGHT + 6) / 2)
+
+
 def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
     stated = references_of(capture) | {"white_reflectance": "0.02"}

@@ -174,6 +174,8 @@ def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:
         raise CaptureError(f"view {view.name} has a pose but no lens; expected a focal length ('fl_x')")
     if (lens.width, lens.height) == (width, height):
         return lens
+    if (lens.width, lens.height) == (width, height + view.cube.dark_lines):  # given for all lines of the file
+        return lens.seen_as(width, height, (0.0, 0.0), (1.0, 1.0))
     across, down = width / lens.width, height / lens.height
     if abs(across / down - 1.0) > _MOST_STRETCH:
         turned = ", or store them turned as EXIF's orientation says"

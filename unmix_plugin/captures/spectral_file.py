@@ -171,6 +171,8 @@ class SpectralFile:
     """Other facts by name, as JSON-able values: exposure_s, gain, black_level, xmp, ..."""
     sources: tuple[Path, ...] = ()
     """Files that hold the numbers, where they are not `path` alone."""
+    dark_lines: int = 0
+    """Lines after the image that were taken with the shutter closed."""
 
     def read(self, rows: slice = slice(None), bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "h W b"]:
         """Stored numbers of some rows and bands, in the machine's byte order.
@@ -202,6 +204,21 @@ class SpectralFile:
         if values.shape != wanted:
             raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
+
+    @property
+    def dark(self) -> SpectralFile | None:
+        """The lines that were taken with the shutter closed, as a dark frame; None where there are none."""
+        if not self.dark_lines:
+            return None
+        begin = self.shape[0]
+        return replace(
+            self,
+            shape=(self.dark_lines, *self.shape[1:]),
+            read_part=lambda rows, bands: self.read_part(
+                slice(begin + rows.start, begin + rows.stop, rows.step), bands
+            ),
+            dark_lines=0,
+        )
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -317,6 +334,7 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
             *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
         ),
         sources=tuple(source for part in parts for source in part.files),
+        dark_lines=0,
     )
 
 

@@ -9,7 +9,14 @@ import pytest
 import spectral.io.envi as spy
 import tifffile
 
-from tests.captures.file_factory import AXES, check_file, header_text, rows_and_bands_of, write_envi
+from tests.captures.file_factory import (
+    AXES,
+    check_file,
+    header_text,
+    present,
+    rows_and_bands_of,
+    write_envi,
+)
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -123,6 +130,23 @@ data ignore value = 65535
 )
 def test_what_a_header_says_of_bands_is_used_or_left_out_with_a_reason(tmp_path, entries, expected):
     check_file(open_spectral_file(write_envi(tmp_path / "cube.hdr", CUBE, "bsq", entries)), **expected)
+
+
+def test_dark_lines_at_the_end_are_no_image_but_its_dark_frame(tmp_path):
+    """Specim's autodarkstartline is the first line with the shutter closed, from 0."""
+    file = open_spectral_file(write_envi(tmp_path / "a.hdr", CUBE, "bil", "autodarkstartline = 3"))
+    check_file(file, values=CUBE[:3], note="taken with the shutter closed", dark_lines=2)
+    rows_and_bands_of(present(file.dark), CUBE[3:])
+    tifffile.imwrite(tmp_path / "b.tif", CUBE, metadata=None, photometric="minisblack", planarconfig="contig")
+    (tmp_path / "b.hdr").write_text(header_text(CUBE, "bip", {"autodarkstartline": "4", "file type": "TIFF"}))
+    file = open_spectral_file(tmp_path / "b.tif")
+    check_file(file, reader="tiff", values=CUBE[:4])
+    check_file(present(file.dark), values=CUBE[4:])
+    for text in ("0", "0.5", "5", "3000", "-1"):  # none are there
+        file = open_spectral_file(write_envi(tmp_path / "c.hdr", CUBE, "bsq", f"autodarkstartline = {text}"))
+        check_file(file, values=CUBE, dark=None)
+    file = open_spectral_file(write_envi(tmp_path / "c.hdr", CUBE, "bsq", "autodarkstartline = none"))
+    check_file(file, values=CUBE, warning="'autodarkstartline' is none, no number")
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])

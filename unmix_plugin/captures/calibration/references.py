@@ -325,15 +325,17 @@ def find_references(
     dark = None if dark_file is None else _open_reference(dark_file, "dark frame", cube)
     panel = None
     if options.white_rectangle is not None:
-        panel = _panel_in_view(all_views, *options.white_rectangle)
+        panel = _panel_in_view(all_views, *options.white_rectangle, is_dark_given=dark is not None)
     elif white_file is not None:
-        panel = _open_reference(white_file, "white reference", cube)
+        panel = _open_white(white_file, _own_dark(white_file) if dark is None else None, cube)
     white = panel and _as_white(panel, dark, options.white_reflectance, wavelengths_nm)
     own: dict[Path, References] = {}
-    of_whites = {view.white.path: view.white_dark for view in views if view.white and view.white_dark}
-    if dark is not None:  # the user's goes before all
-        of_whites = {}
-    darks = _each_view([view.dark for view in views], views, "dark frame", dark is not None)
+    # That of the user goes before all.
+    own_whites = [(view.white, view.white_dark) for view in views if view.white is not None and dark is None]
+    of_whites = {one.path: found for one, beside in own_whites if (found := _own_dark(one, beside))}
+    darks = _each_view(
+        [_own_dark(view.cube, view.dark) for view in views], views, "dark frame", dark is not None
+    )
     whites = _each_view([view.white for view in views], views, "white reference", white is not None)
     seen: dict[tuple[Path | None, Path | None], References] = {}  # files that several views share
     for view, own_dark, own_white in zip(views, darks, whites, strict=True):
@@ -352,14 +354,28 @@ def find_references(
 
 
 def _panel_in_view(
-    views: Sequence[CaptureView], wanted: str, top: int, left: int, height: int, width: int
+    views: Sequence[CaptureView],
+    wanted: str,
+    top: int,
+    left: int,
+    height: int,
+    width: int,
+    *,
+    is_dark_given: bool,
 ) -> Reference:
-    """The panel in the view, or the release of a rig, of this name."""
+    """The panel in the view, or the release of a rig, of this name, with the dark frame of that view."""
     view = next((view for view in views if wanted in (view.name, view.release)), None)
     if view is None:
         names = name_some([view.name for view in views], 5)
         raise ConfigError(f"--white-rectangle {wanted}: no view of this name; there are {names}")
-    return _panel_reference(view.cube, (top, left, height, width), view.name)
+    panel = _panel_reference(view.cube, (top, left, height, width), view.name)
+    dark = None if is_dark_given else _own_dark(view.cube, view.dark)
+    return panel if dark is None else replace(panel, dark=_open_reference(dark, "dark frame", view.cube))
+
+
+def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> SpectralFile | None:
+    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw."""
+    return beside or (None if finished_by(file) else file.dark)
 
 
 def _each_view(

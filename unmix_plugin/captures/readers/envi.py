@@ -37,6 +37,15 @@ _DESCRIBED = (".tif", ".tiff", ".exr", ".npy", ".h5", ".hdf5", ".he5", ".nc", ".
 _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"PK\x03\x04": "zip", b"\xfd7zXZ": "xz"}
 
 
+_DARK_START = "autodarkstartline"
+"""Where cameras of Specim close the shutter at the end of a capture: the first dark line, from 0. Source: NEODAAS,
+run_subtract_darkframes, and ARSF, apl."""
+_DARK_LINES = (
+    f"the lines from '{_DARK_START}' on were taken with the shutter closed: they are no part of the image, but the "
+    "dark frame of raw numbers that have no other"
+)
+
+
 def is_envi_header(path: Path) -> bool:
     """Whether a file of any name begins as a header does."""
     with path.open("rb") as file:
@@ -134,15 +143,24 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     bands, band_warnings = check_bands(stated, num_bands)
     linear, linear_warnings = _linear(header_path, header, num_bands)
     exposure, exposure_warnings = exposure_facts(header, "header field")
+    start, lines = _number(header, _DARK_START), file.shape[0]
+    dark_lines = lines - int(start) if start is not None and 1 <= start < lines else 0
     own, no_data = file.bands, _number(header, "data ignore value")
     if no_data is None and header.get("data ignore value"):
         linear_warnings += (f"'data ignore value' is {header['data ignore value']}, no number: not used",)
+    if start is None and header.get(_DARK_START):
+        linear_warnings += (
+            f"'{_DARK_START}' is {header[_DARK_START]}, no number: dark lines may be left in the image",
+        )
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
     on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
     return replace(
         file,
+        shape=(lines - dark_lines, *file.shape[1:]),
+        dark_lines=dark_lines,
+        notes=(*file.notes, _DARK_LINES) if dark_lines else file.notes,
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
         no_data=file.no_data if no_data is None else no_data,

@@ -8,6 +8,7 @@ Notation: `H x W` pixels and `B` bands of the scene; `h` some rows; values in [0
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -400,10 +401,13 @@ def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
 
 
 def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: CaptureView) -> np.ndarray:
-    """What `pixels_of` makes of a picture with the pixels of the cube."""
+    """What `pixels_of` makes of a picture with the pixels of the cube, or of its dark lines too."""
+    height, width = view.cube.shape[:2]
     try:
-        return read_picture(path, view.cube.shape[:2], pixels_of, _FORMATS)
+        return read_picture(path, (height, width), pixels_of, _FORMATS)
     except UnreadableImageError as error:
+        with suppress(UnreadableImageError):
+            return read_picture(path, (height + view.cube.dark_lines, width), pixels_of, _FORMATS)[:height]
         raise CaptureError(f"{path} of view {view.name} {error}") from error
 
 
