@@ -10,6 +10,7 @@ from PIL import Image
 
 from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import (
+    FLIP,
     LENS,
     assert_same_poses,
     lens_of,
@@ -101,12 +102,21 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "hints", [{}, {"scale": 0.5, "from_na": True}, {"applied_transform": np.eye(4).tolist(), "scale": 1}]
+    "hints", [{}, {"scale": 0.5, "from_na": False}, {"applied_transform": np.eye(4).tolist(), "scale": 1}]
 )
 def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
     found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
     assert_same_poses(found, ring())
     assert not found.offset.any()
+
+
+def test_cameras_of_neus2_have_the_axes_of_opencv(tmp_path):
+    flipped = {name: np.column_stack([pose[:, :3] @ FLIP, pose[:, 3]]) for name, pose in ring().items()}
+    content = transforms(flipped, from_na=True, scale=0.5, offset=[0.5, 0.5, 0.5])
+    found = read(tmp_path, content)
+    assert_same_poses(found, ring())
+    assert any("'from_na' is set: cameras have OpenCV's axes" in note for note in found.notes)
+    assert_same_poses(read(tmp_path, content | {"from_na": False}), flipped)
 
 
 def test_a_fisheye_of_instant_ngp_is_one(tmp_path):

@@ -129,6 +129,7 @@ CUBE = "hyperspectral_file_path"
             {"camera_model": "OPENCV_FISHEYE"},
             "is not supported; expected one of PINHOLE, SIMPLE_PINHOLE, OPENCV",
         ),
+        ({"from_na": True}, "'from_na' is set, which stands for camera axes of OpenCV (NeuS2)"),
         ({"camera_model": ["OPENCV"]}, "camera_model a list of 1 is not supported"),
         ({2: "images/view_2.png"}, 'frames[2]: is "images/view_2.png"; expected an'),
         ({2: None}, "frames[2]: is null; expected an object"),

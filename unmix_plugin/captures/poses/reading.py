@@ -19,6 +19,7 @@ from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colma
 from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_possible
 from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
 from unmix_plugin.captures.poses.pose_set import (
+    FLIP,
     PosedCamera,
     PoseSet,
     SparsePoints,
@@ -271,6 +272,9 @@ def _read_frames(
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
         names = [path_text(text) for text in texts] or [f"#{index:04d}"]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
+        if frame.get("from_na", top.get("from_na")):
+            notes.append(f"{path.name}: 'from_na' is set: cameras have OpenCV's axes, as NeuS2 writes them")
+            matrix[:, :3] = matrix[:, :3] @ FLIP
         model, terms, read_from = _other_model(top, frame, where)
         given = read_lens(*read_from, f"frames[{index}]", faults)
         lens = None

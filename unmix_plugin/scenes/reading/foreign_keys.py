@@ -11,11 +11,15 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 _UNDISTORT = "undistort the pictures and write the poses with a pinhole or OPENCV lens"
-_RESAMPLED = dict.fromkeys(
-    (f"ftheta_p{power}" for power in range(6)),
-    f"an ftheta lens (instant-ngp); {_UNDISTORT}: unmix-process does both",
-)
-"""Lenses that captures may have, since their pictures are resampled; scenes may not."""
+_ONLY_IN_CAPTURES = {
+    **dict.fromkeys(
+        (f"ftheta_p{power}" for power in range(6)),
+        f"an ftheta lens (instant-ngp); {_UNDISTORT}: unmix-process does both",
+    ),
+    "from_na": "camera axes of OpenCV (NeuS2), +y down and +z forwards; change the signs of the second and third "
+    "column of every transform_matrix and take the key out: unmix-process does both",
+}
+"""What unmix-process follows: it resamples pictures and turns cameras; scenes may not have it."""
 _REFUSED = {
     "latlong": f"pictures of all directions (instant-ngp); {_UNDISTORT}",
     "equirectangular": f"pictures of all directions (instant-ngp); {_UNDISTORT}",
@@ -48,7 +52,7 @@ _KNOWN = frozenset(
     value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path
     file_path name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
     seg_file_path mask_path abundance_file_path dino_file_path
-    aabb aabb_scale scale from_na render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
+    aabb aabb_scale scale render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
     enable_depth_loading enable_ray_loading sharpen sharpness_discard_threshold sharpness depth_path depth_file_path
     depth_unit_scale_factor driver_parameters envmap orientation_override colmap_im_id rotation time
     transform_matrix_start
@@ -61,14 +65,14 @@ def refused_keys(content: Mapping[str, Any], frame: Mapping[str, Any], is_scene:
     """Faults of a frame: keys that are set and stand for what can't be represented.
 
     Args:
-        is_scene: Whether rays are cast through the lens as it is; pictures of captures are resampled first.
+        is_scene: Whether rays are cast through the lens and from the pose as they are; captures bring both into ours.
 
     >>> refused_keys({"latlong": False, "k6": 0.01}, {})[0][:53]
     "'k6' is set, which stands for radial terms of higher "
     """
     return [
         f"'{key}' is set, which stands for {meaning}"
-        for key, meaning in (_REFUSED | (_RESAMPLED if is_scene else {})).items()
+        for key, meaning in (_REFUSED | (_ONLY_IN_CAPTURES if is_scene else {})).items()
         if _is_set(frame.get(key, content.get(key)))
     ]
 
@@ -86,7 +90,7 @@ def keys_to_say(
     if len({repr(own["time"]) for own in every[1:] if "time" in own}) > 1:
         warnings.append("frames have a 'time': what moves between views is taken to stand still")
     unknown = sorted(
-        {key for own in every for key in own} - _KNOWN - set(_REFUSED) - set(_RESAMPLED) - set(_SAID)
+        {key for own in every for key in own} - _KNOWN - set(_REFUSED) - set(_ONLY_IN_CAPTURES) - set(_SAID)
     )
     notes = [f"keys that are not known and not used: {', '.join(unknown[:8])}"] if unknown else []
     return warnings, notes
