@@ -11,6 +11,7 @@ from tests.captures.poses.pose_factory import (
     BROWN,
     CALIBRATION,
     FLIP,
+    METASHAPE_CALIBRATION,
     ORIENTATION,
     PERSPECTIVE,
     RADIAL,
@@ -83,6 +84,13 @@ def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
     np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
 
 
+def test_photoscans_old_form_counts_the_principal_point_from_the_corner(tmp_path):
+    old = METASHAPE_CALIBRATION.replace("<f>500</f><cx>3</cx><cy>-4</cy>", "<fx>500</fx><fy>510</fy>{terms}")
+    for terms, center in (("<cx>323</cx><cy>236</cy>", (323, 236)), ("", (320, 240))):
+        lens = lens_of(read_metashape(tmp_path, ring(), calibration=old.format(terms=terms, kind="frame")))
+        assert (lens.focal_px, lens.center_px) == ((500, 510), center)
+
+
 def test_pixels_are_interpolated_where_skew_is_large(tmp_path):
     sheared = read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
     assert any("pixels are interpolated" in note for note in sheared.notes)
@@ -114,6 +122,7 @@ def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_pat
         (lambda text: text.replace('"frame"', '"conic"'), "conic; expected frame, fisheye or spherical"),
         (lambda text: text.replace('width="640"', 'width="-1"'), "has no resolution"),
         (lambda text: text.replace("<f>500", "<f>0"), "focal length 0"),
+        (lambda text: text.replace("<cx>3<", "<cx>323<"), "principal point 643, 236, outside its 640 x 480"),
         (lambda text: text.replace("document", "kml").replace("chunk", "c"), "<kml>"),
     ],
 )

@@ -6,7 +6,7 @@ A camera's matrix leads from the camera (OpenCV axes) to its component; the comp
 to the world, often geocentric (metres from the middle of the Earth).
 
 A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
-which are OpenCV's p2, p1.
+which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote u = cx + x' fx + y' skew, v = cy + y' fy.
 
 MicMac: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it.
 
@@ -165,7 +165,17 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
     skew = _number_of(calibration, "skew", where, values["b2"])
     if min(f_x, f_y) <= 0:
         raise CaptureError(f"{where} has the focal length {min(f_x, f_y):g}; expected pixels above 0")
-    center, tangential = (width / 2 + values["cx"], height / 2 + values["cy"]), (values["p2"], values["p1"])
+    is_old = calibration.find("f") is None
+    center_x, center_y = (
+        _number_of(calibration, tag, where, side / 2) if is_old else side / 2 + values[tag]
+        for tag, side in (("cx", width), ("cy", height))
+    )
+    if not (0 <= center_x <= width and 0 <= center_y <= height):
+        raise CaptureError(
+            f"{where} has the principal point {center_x:g}, {center_y:g}, outside its {width} x {height} pixels; check "
+            "<cx>, <cy> and <resolution> in the file"
+        )
+    center, tangential = (center_x, center_y), (values["p2"], values["p1"])
     start, (k1, k2, k3, k4) = Lens(width, height, (f_x, f_y), center), [values[key] for key in _RADIAL]
     frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
     if kind == "frame" and not skew:
