@@ -63,12 +63,31 @@ def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_th
     assert lens.focal_px == pytest.approx((256.0, 256.0))
 
 
-def test_the_size_is_taken_from_the_picture_where_nothing_else_tells_it(tmp_path):
+def test_the_size_is_that_of_the_picture_that_a_frame_names_and_not_of_the_view(tmp_path):
     poses = {"view.png": next(iter(ring().values()))}
     Image.new("RGB", (30, 20)).save(tmp_path / "view.png")
-    found = read(tmp_path, {"fl_x": 40.0, "frames": transforms(poses)["frames"]})
-    lens = present(found.cameras["view.png"].lens)
-    assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (30, 20, (40.0, 40.0), (15.0, 10.0))
+    for sizes in ({}, {"view": (15, 10)}, {"other": (15, 10)}):
+        found = read(tmp_path, {"fl_x": 40.0, "frames": transforms(poses)["frames"]}, picture_sizes=sizes)
+        lens = present(found.cameras["view.png"].lens)
+        assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (
+            30,
+            20,
+            (40.0, 40.0),
+            (15.0, 10.0),
+        )
+        assert found.warnings == ()
+
+
+def test_a_lens_of_pictures_that_are_gone_is_taken_as_that_of_the_views_or_refused(tmp_path):
+    content = {"fl_x": 40.0, "frames": transforms(ring())["frames"]}
+    sizes = {f"view_{index}": (15, 10) for index in range(6)}
+    found = read(tmp_path, content, picture_sizes=sizes)
+    assert (lens_of(found).width, lens_of(found).focal_px) == (15, (40.0, 40.0))
+    assert len(found.warnings) == 1
+    assert "focal lengths are taken in pixels of the views" in found.warnings[0]
+    for center in ({"cx": 15.0, "cy": 5.0}, {"cy": 10.0}):
+        with pytest.raises(CaptureError, match="outside the view's 15 x 10 pixels, so the lens is that of"):
+            read(tmp_path, content | center, picture_sizes=sizes)
 
 
 def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):

@@ -55,7 +55,8 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
 
     Args:
         path: A file, or a folder that holds the files.
-        picture_sizes: Width and height of pictures by name, file name or stem, for sources without sizes.
+        picture_sizes: Width and height of views by name, file name or stem, for sources that have no sizes and no
+            pictures.
     Raises:
         CaptureError: nothing known is there, or what is there is damaged or can't be represented.
     """
@@ -237,7 +238,7 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
         faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
         metres.add(read_metres_per_unit(top, faults, path.name))
-        found = _read_frames(path, top, frames, sizes, faults, notes)
+        found = _read_frames(path, top, frames, sizes, faults, notes, warnings)
         try:
             faults.raise_if_any()
         except SceneError as error:
@@ -263,6 +264,7 @@ def _read_frames(
     sizes: Mapping[str, _Size],
     faults: Faults,
     notes: list[str],
+    warnings: list[str],
 ) -> list[tuple[list[str], Float64[np.ndarray, "3 4"], Lens | None]]:
     """Names, matrix and lens of each frame, in the file's own world."""
     lenses: dict[str, tuple[Lens | None, str | None]] = {}
@@ -271,6 +273,9 @@ def _read_frames(
         where = f"{path}: frames[{index}]"
         texts = [frame[key] for key in _NAME_KEYS if isinstance(frame.get(key), str) and frame[key].strip()]
         names = [path_text(text) for text in texts] or [f"#{index:04d}"]
+        # Blender's files leave out the suffix.
+        picture = find_named(path.parent, names[0]) or find_named(path.parent, f"{names[0]}.png")
+        missing += [] if picture else [names[0]]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
         if frame.get("from_na", top.get("from_na")):
             notes.append(f"{path.name}: 'from_na' is set: cameras have OpenCV's axes, as NeuS2 writes them")
@@ -282,7 +287,12 @@ def _read_frames(
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)
             else:
-                size = _size_of(path.parent, names[0], sizes)
+                size = _size_in(picture) or _size_of_view(given, names[0], sizes, where)
+                if size is not None and picture is None and given.focal_px != (None, None):
+                    warnings.append(
+                        f"{path.name}: 'w' and 'h' are absent, and so are pictures that it names: focal lengths are "
+                        "taken in pixels of the views; add 'w' and 'h' if they are those of other pictures"
+                    )
             key = repr((given, size, terms))  # many frames share a lens, which takes long to fit
             if key not in lenses:
                 model = model or given.model
@@ -290,9 +300,6 @@ def _read_frames(
                 notes += [note for note in lenses[key][1:] if note is not None]
             lens = lenses[key][0]
         read.append((names, matrix, lens))
-        # Blender's files leave out the suffix.
-        is_there = find_named(path.parent, names[0]) or find_named(path.parent, f"{names[0]}.png")
-        missing += [] if is_there else [names[0]]
     if missing:
         notes.append(
             f"{path.name}: {len(missing)} of {len(read)} frames name files that are not there ({name_some(missing)}); "
@@ -303,21 +310,36 @@ def _read_frames(
     return read
 
 
-def _size_of(folder: Path, name: str, given: Mapping[str, _Size]) -> _Size | None:
-    """Size of a picture: among those given, otherwise in the file itself."""
+def _size_in(picture: Path | None) -> _Size | None:
+    """Size of a picture by its file; None where it is not there or no picture."""
     from PIL import Image
 
-    path = PurePosixPath(name.replace("\\", "/"))
-    for key in (name, path.name, path.stem):
-        if key in given:
-            return given[key]
-    if len(set(given.values())) == 1:
-        return next(iter(given.values()))
+    if picture is None:
+        return None
     try:
-        with open_regular(folder / name) as file, Image.open(file, formats=FORMATS) as picture:
-            return picture.size
+        with open_regular(picture) as file, Image.open(file, formats=FORMATS) as opened:
+            return opened.size
     except (OSError, ValueError, Image.DecompressionBombError):
         return None
+
+
+def _size_of_view(lens: Intrinsics, name: str, given: Mapping[str, _Size], where: str) -> _Size | None:
+    """Size of the view of a frame among those given, where nothing tells that of its picture. Raises CaptureError: the
+    lens is that of a larger picture."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    size = next((given[key] for key in (name, path.name, path.stem) if key in given), None)
+    if size is None and len(set(given.values())) == 1:
+        size = next(iter(given.values()))
+    x, y = lens.center_px
+    if size is not None and ((x or 0.0) >= size[0] or (y or 0.0) >= size[1]):
+        found = ", ".join(
+            f"'{key}' is {value:g}" for key, value in (("cx", x), ("cy", y)) if value is not None
+        )
+        raise CaptureError(
+            f"{where}: {found}, outside the view's {size[0]} x {size[1]} pixels, so the lens is that of another "
+            f"picture; add its size as 'w' and 'h', or put {name} where the file names it"
+        )
+    return size
 
 
 def _other_model(
