@@ -182,6 +182,14 @@ def test_what_tags_say_of_the_image_is_used(tmp_path, options, expected):
     check_file(written(tmp_path, **({"image": CUBE} | options)), **expected)
 
 
+@pytest.mark.parametrize(("first", "nm"), [(1, np.arange(400, 520, 10)), (0, None), (2, None)])
+def test_numbered_bands_of_gdal_go_by_their_numbers_from_1(tmp_path, first, nm):
+    numbered = sorted(f'<Item name="Band_{first + i}">{400 + 10 * i} Nanometers</Item>' for i in range(12))
+    assert ["Band_10" in item for item in numbered].index(True) < 3  # GDAL lists it before Band_2
+    file = written(tmp_path, np.tile(CUBE, (1, 1, 2)), extratags=gdal(*numbered))
+    check_file(file, nm=nm)
+
+
 def test_wavelengths_of_ome_and_of_pages_by_their_descriptions_labels_and_names(tmp_path):
     labels = [f"{nm} nm" for nm in NM]
     channels = {"EmissionWavelength": NM, "EmissionWavelengthUnit": ["nm"] * 6}

@@ -103,7 +103,9 @@ def bands_of_items(items: Sequence[GdalItem]) -> StatedBands | None:
         return _words(whole[0]) if whole else []
 
     names = of_samples(role="description") or of_samples("band_name", "bandname")
-    names = names or [item.value for item in items if re.fullmatch(r"band_\d+", item.name)]
+    numbered = {int(item.name[5:]): item.value for item in items if re.fullmatch(r"band_\d{1,6}", item.name)}
+    if not names and sorted(numbered) == [*range(1, len(numbered) + 1)]:  # files list Band_10 before Band_2
+        names = [numbered[number] for number in sorted(numbered)]
     units = [item.value for item in items if item.name in _UNITS]
     centres, fwhm = of_samples(*_CENTRES), of_samples("fwhm")
     if not centres:
