@@ -208,6 +208,7 @@ IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelengt
         ("x.csv", "wavelength,a\n0.4,1\n", "look like micrometres"),
         ("x.csv", "wavelength,a\n400,-999\n", "'a' has no value that was measured"),
         ("x.csv", "wavelength,a\n400,1\n500,-0.1\n", "must not be negative; found -0.1 in 'a' at 500 nm"),
+        ("x.txt", "a\n1 0.2\n2 0.3\n3 0.3\n", "wavelengths of 1 to 3 count the bands"),
         ("x.txt", "hello\n", "there are no numbers in it"),
         ("x.txt", "400 1\nend\n", "'end' stands among the numbers"),
         ("x.txt", "400\n500\n", "no lines with a wavelength and a value"),

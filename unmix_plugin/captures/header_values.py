@@ -24,7 +24,7 @@ from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.spectral_file import BandTable
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.limits import read_bounded
-from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
+from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit, require_nanometres
 
 _NUMBER = re.compile(r"(?<![\d.,])(\d+(?:[.,]\d+)?)")
 _WITH_UNIT = re.compile(
@@ -75,7 +75,7 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
         if values is not None:
             unused = values == 0 if (values > 0).any() else unused
             used = values[~unused]
-            factor, found = _nm_per_stated(float(used.min()), float(used.max()), stated)
+            factor, found = _nm_per_stated(values, used, stated)
             if factor is None:
                 notes.append(found)
             else:
@@ -136,8 +136,14 @@ def _numbers(what: str, values: Sequence[object] | None, count: int, notes: list
     return numbers
 
 
-def _nm_per_stated(low: float, high: float, stated: StatedBands) -> tuple[float | None, str]:
-    """How many nm one of the file's unit is, and the evidence; None and why where wavelengths can't be true."""
+def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) -> tuple[float | None, str]:
+    """How many nm one of the file's unit is, and the evidence; None and why where wavelengths can't be true.
+
+    Args:
+        values: One number a band.
+        used: Those of bands that are used.
+    """
+    low, high = float(used.min()), float(used.max())
 
     def is_plausible(factor: float) -> bool:
         return _PLAUSIBLE_NM[0] <= low * factor and high * factor <= _PLAUSIBLE_NM[1]
@@ -145,6 +151,9 @@ def _nm_per_stated(low: float, high: float, stated: StatedBands) -> tuple[float 
     unit = (stated.unit or "").strip()
     factor, evidence = nm_per_unit(unit), f"{stated.where}, {unit}"
     if factor is None and unit.lower() in ("", "unknown"):
+        if are_band_numbers(values):
+            found = f"{values[0]:g} to {high:g} with no unit count the bands"
+            return None, f"{stated.where}: {found} and are no wavelengths; {_ASK}"
         factor = next((f for f in (1.0, 1e3) if is_plausible(f)), None)
         taken = "nm" if factor == 1.0 else "micrometres"
         evidence = f"{stated.where}, no unit: {low:g} to {high:g} taken as {taken}"

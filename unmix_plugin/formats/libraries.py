@@ -24,7 +24,7 @@ from jaxtyping import Float64
 from unmix_plugin.errors import SpectrumError, name_some
 from unmix_plugin.formats.envi import data_beside, header_items, read_header, read_layout
 from unmix_plugin.limits import read_bounded
-from unmix_plugin.spectral.bands import Bands, nm_per_unit, require_nanometres
+from unmix_plugin.spectral.bands import Bands, are_band_numbers, nm_per_unit, require_nanometres
 from unmix_plugin.spectral.library.material_library import (
     LibraryMaterial,
     MaterialLibrary,
@@ -276,7 +276,8 @@ def _read_text(path: Path) -> _Table:
     if factor is None:
         if unit:
             raise SpectrumError(f"'X Units' is {said['x units']!r}; expected micrometers or nanometers")
-        factor = 1000.0 if wavelengths.max(initial=0) < _LARGEST_UM else 1.0
+        is_um = wavelengths.max(initial=0) < _LARGEST_UM and not are_band_numbers(rows[:, 0])
+        factor = 1000.0 if is_um else 1.0
     quantity = said.get("y units", "reflectance").lower()
     if "reflectance" not in quantity:
         raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")

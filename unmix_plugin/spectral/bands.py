@@ -22,6 +22,9 @@ VISIBLE_RANGE_NM = (380.0, 780.0)
 _MEASURABLE_RANGE_NM = (20.0, 1e6)
 """Where optical sensors measure; numbers below are wavelengths in micrometres, numbers above are in no unit."""
 
+_LEAST_NM = 100.0
+"""Smaller numbers are wavelengths of no camera in nm: whole ones in a list of bands are numbers of bands."""
+
 _LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
 
@@ -127,10 +130,14 @@ def require_nanometres(centers_nm: Float64[np.ndarray, " B"]) -> None:
     """Refuse wavelengths that a file gives in another unit.
 
     Raises:
-        SpectrumError: the wavelengths look like micrometres, or lie where no optical sensor measures.
+        SpectrumError: the wavelengths count bands, look like micrometres, or lie where no optical sensor measures.
     """
     low, high = _MEASURABLE_RANGE_NM
     first, last = float(centers_nm.min()), float(centers_nm.max())
+    if are_band_numbers(centers_nm):
+        raise SpectrumError(
+            f"wavelengths of {first:g} to {last:g} count the bands; expected those of the bands in nm"
+        )
     if last < low:
         raise SpectrumError(
             f"wavelengths of {first:g} to {last:g} look like micrometres; expected nm: multiply them by 1000"
@@ -146,6 +153,21 @@ def nm_per_unit(unit: str) -> float | None:
     1000.0
     """
     return _NM_PER_UNIT.get(unit.strip().lower())
+
+
+def are_band_numbers(values: np.ndarray, may_have_gaps: bool = False) -> bool:
+    """Whether numbers without a unit count bands instead of measuring: whole ones, one apart from 0 or 1.
+
+    Args:
+        values: One number a band.
+        may_have_gaps: Whether any whole numbers too small for nm count, as in a list called `bands`.
+
+    >>> are_band_numbers(np.array([1, 2, 3])), are_band_numbers(np.array([8, 9, 10]))
+    (True, False)
+    """
+    if may_have_gaps:
+        return bool((values == np.round(values)).all() and values.min() < _LEAST_NM)
+    return float(values[0]) in (0.0, 1.0) and np.array_equal(values, values[0] + np.arange(len(values)))
 
 
 def _require_one_axis(centers: np.ndarray) -> None:

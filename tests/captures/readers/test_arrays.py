@@ -259,6 +259,15 @@ def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_band
         open_spectral_file(path)
 
 
+@pytest.mark.parametrize(("unit", "nm"), [("um", [3000, 5000, 8000, 11_000, 12_000]), ("1", None)])
+def test_a_list_called_bands_holds_wavelengths_where_it_has_their_unit(tmp_path, unit, nm):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"], file["bands"] = CUBE, [3, 5, 8, 11, 12]
+        file["bands"].attrs["units"] = unit
+        file["cube"].attrs["Bands"] = [3, 5, 8, 11, 12]
+    check_file(open_spectral_file(tmp_path / "a.h5"), nm=nm)
+
+
 LARGE = CUBE + np.uint16(50_000)
 
 
@@ -291,6 +300,13 @@ def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
     [
         ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": NM}, None, {"nm": NM}),
         ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": np.arange(1.0, 6)}, "rad", {"nm": None}),
+        ({"cube": CUBE, "bands": [[3, 5, 8, 11, 12]]}, None, {"nm": None, "warnings": ()}),
+        ({"cube": CUBE, "bands": NM / 1000}, None, {"nm": NM}),
+        (
+            {"cube": CUBE, "wavelengths": np.arange(1, 6)},
+            None,
+            {"nm": None, "warning": "1 to 5 with no unit"},
+        ),
         ({"cube": CUBE, "wavelengths": NM, "exposure_ms": [5.0]}, None, {"notes": (), "exposure_s": 0.005}),
         ({"cube": CUBE, "wavelengths": NM, "exposure_ms": 5.0}, None, {"notes": (), "exposure_s": 0.005}),
         (

@@ -109,6 +109,12 @@ data ignore value = 65535
         ),
         ("wavelength units = nm\nwavelength = {.4, .5, .6, .7}", {"nm": None, "warning": "can't be in nm"}),
         ("wavelength = {1, 2, 3, 40}", {"nm": None, "warning": "with no unit can't be brought to nm"}),
+        *(
+            (f"wavelength = {{{numbers}}}", {"nm": None, "warning": f"{said} with no unit count the bands"})
+            for numbers, said in (("1, 2, 3, 4", "1 to 4"), ("0, 1, 2, 3", "0 to 3"))
+        ),
+        ("wavelength = {8, 9, 10, 11}", {"nm": [8000, 9000, 10_000, 11_000]}),
+        ("wavelength units = um\nwavelength = {1, 2, 3, 4}", {"nm": [1000, 2000, 3000, 4000]}),
         ("band names = {Band 201, Band 202, Band 203, Band 204}", {"nm": None}),
         ("band names = {a, b, c, d}", {"nm": None, "names": "abcd"}),
         ("band names = {450 nm, 460 nm, red, 480 nm}", {"nm": None}),

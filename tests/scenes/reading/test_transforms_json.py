@@ -96,6 +96,10 @@ CUBE = "hyperspectral_file_path"
             {"wavelengths": [0.45, 0.52, 0.6, 0.68]},
             "look like micrometres; expected nm: multiply them by 1000",
         ),
+        (
+            {"wavelengths": [1, 2, 3, 4]},
+            "wavelengths of 1 to 4 count the bands; expected those of the bands in nm",
+        ),
         ({"wavelengths": [450, 520, 600, 1e300]}, "expected 20 to 1e+06 nm"),
         ({"materials": "wood"}, "'materials' is \"wood\"; expected a list of different names"),
         ({"materials": ["wood", "wood"]}, "'materials' is a list of 2; expected a list of different"),

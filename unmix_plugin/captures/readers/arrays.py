@@ -27,6 +27,7 @@ from unmix_plugin.captures.spectral_file import (
     take_part,
 )
 from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
 
 _TakePart: TypeAlias = Callable[[Axes, slice, BandIndex], np.ndarray]
 """(h, W, b) numbers of a stored array whose axes are these."""
@@ -234,15 +235,15 @@ def _find_vector(
         if array.is_vector
         and prod(array.shape) in image.shape
         and names.fullmatch(array._own_name)
-        and not (array._own_name == "bands" and _counts(array))
+        and not _counts(array._own_name, array.whole(), _unit_of(array.attributes))
     ]
     return max(found, key=lambda array: common_groups(array.name), default=None)
 
 
-def _counts(array: FoundArray) -> bool:
-    """Whether a list counts instead of measuring: whole numbers one apart."""
-    numbers = array.whole().reshape(-1).astype(np.float64)
-    return bool((np.diff(numbers) == 1).all() and numbers[0] < 100)
+def _counts(name: str, numbers: np.ndarray, unit: str | None = None) -> bool:
+    """Whether a list called `bands` has the numbers of bands, perhaps of some of them, and not their wavelengths."""
+    has_unit = unit is not None and nm_per_unit(unit) is not None
+    return name.lower() == "bands" and not has_unit and are_band_numbers(numbers, may_have_gaps=True)
 
 
 def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands:
@@ -277,6 +278,7 @@ def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, lis
         and (values := np.atleast_1d(value)).ndim == 1
         and values.dtype.kind in "iufb"
         and len(values) in image.shape
+        and not _counts(key, values)
     }
     best = max(found, key=lambda key: len(words & set(re.split(r"[\W_]+", key.lower()))), default="")
     return best, found.get(best)
