@@ -159,8 +159,8 @@ class SpectralFile:
     """bsq, bil or bip where the format has a choice."""
     linear: Linear | None = None
     """What stored numbers stand for, if the file says so."""
-    no_data: float | None = None
-    """Stored number that stands for no measurement."""
+    no_data: tuple[float, ...] = ()
+    """Stored numbers that stand for no measurement."""
     valid_range: tuple[float, float] | None = None
     """Least and greatest stored number that was measured, if the file says so."""
     notes: tuple[str, ...] = ()
@@ -261,7 +261,7 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     """Files of one view that hold one band each, as one file with all of them, in the order given.
 
-    A no-data value and metadata are those that all parts share.
+    No-data values and metadata are those that all parts share.
 
     Args:
         parts: At least one, all of one size.
@@ -324,7 +324,7 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         read_part=read_part,
         bands=bands,
         linear=linear,
-        no_data=None if len(no_data) > 1 else first.no_data,
+        no_data=() if len(no_data) > 1 else first.no_data,
         valid_range=None if len(ranges) > 1 else first.valid_range,
         metadata=same | ({"parts": own} if any(own) else {}),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),

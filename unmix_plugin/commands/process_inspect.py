@@ -121,7 +121,9 @@ def _image_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows += [(key, _range_text(report[key])) for key in ("gains", "offsets")]
     for key, what in (("scale", "stored for 1"), ("no_data", "no data")):
         if report[key] is not None:
-            rows.append((what, f"{report[key]:g}" if isinstance(report[key], float) else str(report[key])))
+            each = report[key] if isinstance(report[key], list) else [report[key]]
+            texts = [f"{number:g}" if isinstance(number, float) else str(number) for number in each]
+            rows.append((what, " or ".join(texts)))
     found = report["metadata"]
     if "exposure_s" in found:
         rows.append(("exposure", f"{_range_text(found['exposure_s'])} s ({found['exposure_evidence']})"))

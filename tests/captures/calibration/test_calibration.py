@@ -126,7 +126,7 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
         light[LINES // 2 :] = 1000
     truth = light.astype(np.float64)
     light[:4, 5] = 65535
-    white = open_reference(file_of(light, no_data=65535.0), "white reference", file_of(light))
+    white = open_reference(file_of(light, no_data=(65535.0,)), "white reference", file_of(light))
     assert white.is_per_pixel == is_image
     assert is_image or (white.mean == 3000).all()
     counts = np.random.default_rng(0).integers(100, 4000, light.shape).astype(np.uint16)
@@ -139,35 +139,35 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
     np.testing.assert_allclose(found.values[measured], (counts / truth)[measured], rtol=1e-5)
     light[:, 5] = 65535
     with pytest.raises(CaptureError, match="has columns without a measurement"):
-        open_reference(file_of(light, no_data=65535.0), "white reference", file_of(light))
+        open_reference(file_of(light, no_data=(65535.0,)), "white reference", file_of(light))
 
 
 def test_a_dark_frame_of_zeros_is_measured_where_zero_means_no_data_too():
     counts = np.random.default_rng(0).integers(0, 2, (LINES, SAMPLES, NUM)).astype(np.uint16)
     counts[:, :3] = 0
-    dark = open_reference(file_of(counts, no_data=0.0), "dark frame", file_of(counts))
+    dark = open_reference(file_of(counts, no_data=(0.0,)), "dark frame", file_of(counts))
     np.testing.assert_allclose(dark.mean[0], counts.mean(axis=0), rtol=1e-6)
     with pytest.raises(CaptureError, match="has columns without a measurement"):
-        open_reference(file_of(counts, no_data=0.0), "white reference", file_of(counts))
+        open_reference(file_of(counts, no_data=(0.0,)), "white reference", file_of(counts))
 
 
 def test_what_a_reference_lacks_is_told_by_all_of_its_bands():
     lines, columns = np.indices((LINES, SAMPLES))
     light = np.full((LINES, SAMPLES, 5), 1000, np.uint16)
     light[: LINES // 2, :, :4] = (2000 * ((lines + columns) % 2))[: LINES // 2, :, None]
-    white = open_reference(file_of(light, no_data=0.0), "white reference", file_of(light))
+    white = open_reference(file_of(light, no_data=(0.0,)), "white reference", file_of(light))
     assert not white.is_per_pixel
 
 
-@pytest.mark.parametrize("no_data", [None, 65535.0])
-def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: float | None):
+@pytest.mark.parametrize("no_data", [(), (65535.0,)])
+def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: tuple[float, ...]):
     counts, _ = _cube()
     counts[2:4, 3] = 65535
     panel = panel_reference(file_of(counts, no_data=no_data), (2, 3, 2, 3), "a view")
-    expected = counts[2:4, 3 if no_data is None else 4 : 6].mean(axis=(0, 1))
+    expected = counts[2:4, 4 if no_data else 3 : 6].mean(axis=(0, 1))
     np.testing.assert_allclose(panel.rows(ALL, ALL, EVERY)[0, 0], expected, rtol=1e-6)
     with pytest.raises(CaptureError, match="no pixel of --white-rectangle holds a measurement"):
-        panel_reference(file_of(counts, no_data=65535.0), (2, 3, 2, 1), "a view")
+        panel_reference(file_of(counts, no_data=(65535.0,)), (2, 3, 2, 1), "a view")
     with pytest.raises(ConfigError, match="leaves the image of 12 rows and 8 columns"):
         panel_reference(file_of(counts), (10, 0, 4, 4), "a view")
 
@@ -175,9 +175,10 @@ def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: floa
 @pytest.mark.parametrize(
     ("stored", "facts", "expected"),
     [
-        ([[7, 5], [7, 7], [1, 2]], {"no_data": 7.0}, [True, True, False]),
-        ([[0, 5], [0, 0], [1, 2]], {"no_data": 0.0}, [False, True, False]),  # which is dark, too
-        ([[0, 5], [0, 0], [1, 2]], {"no_data": -1.0}, [False, False, False]),
+        ([[7, 5], [7, 7], [1, 2]], {"no_data": (7.0,)}, [True, True, False]),
+        ([[0, 5], [0, 0], [1, 2]], {"no_data": (0.0,)}, [False, True, False]),  # which is dark, too
+        ([[0, 5], [0, 0], [1, 2]], {"no_data": (-1.0,)}, [False, False, False]),
+        ([[7, 5], [0, 0], [1, 8]], {"no_data": (7.0, 0.0, 8.0)}, [True, True, True]),
         ([[5, 6], [4, 6], [5, 9]], {"valid_range": (5.0, 8.0)}, [False, True, True]),
         ([[1.0, np.nan], [1.0, 2.0], [np.inf, 1.0]], {}, [True, False, True]),
     ],

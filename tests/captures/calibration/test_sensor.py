@@ -97,8 +97,8 @@ def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts = GENERATOR.integers(2900, 3100, (16, 8, 3)).astype(np.uint16)
     counts[1:4, :, 2] = 4095
     counts[::8] = 65535
-    white = open_reference(file_of(counts, no_data=65535.0), "white reference", file_of(counts))
+    white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
     np.testing.assert_array_equal(_clipped_bands(white, 65535.0), [False, False, True])
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
-    white = open_reference(file_of(counts, no_data=65535.0), "white reference", file_of(counts))
+    white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
     assert not _clipped_bands(white, 65535.0).any()

@@ -150,7 +150,9 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
         file["site/observations"] = np.zeros((8, 9, 10))
         file["exposure"] = 3.0
     file = open_spectral_file(tmp_path / "a.h5")
-    check_file(file, nm=NM, scale=10000, no_data=-9999, bad=[1], dataset="site/reflectance", exposure_s=2e-5)
+    check_file(
+        file, nm=NM, scale=10000, no_data=(-9999,), bad=[1], dataset="site/reflectance", exposure_s=2e-5
+    )
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["run/cube"] = CUBE
         file["run/cube"].attrs["wavelengths"] = NM
@@ -274,15 +276,18 @@ LARGE = CUBE + np.uint16(50_000)
 @pytest.mark.parametrize(
     ("stored", "attributes", "valid_range", "no_data"),
     [
-        (CUBE, {"valid_min": 0, "valid_max": 5000, "_FillValue": -1}, (0, 5000), -1),
-        (LARGE, {"_Unsigned": "true", "_FillValue": -1}, None, 65535),
-        (LARGE, {"_Unsigned": "true", "valid_min": 0, "valid_max": -5536}, (0, 60_000), None),
-        (LARGE, {"_Unsigned": "true", "valid_range": np.array([1, -5536], "i2")}, (1, 60_000), None),
+        (CUBE, {"valid_min": 0, "valid_max": 5000, "_FillValue": -1}, (0, 5000), (-1, -32767)),
+        (CUBE, {"missing_value": np.array([-9, -8], "i2"), "_FillValue": -7}, None, (-7, -9, -8, -32767)),
+        (CUBE, {"scale_factor": 0.5, "valid_range": np.array([1.5, 9.5])}, (2.5, 19.5), (-32767,)),
+        (LARGE, {"_Unsigned": "true", "_FillValue": -1}, None, (65535,)),
+        (LARGE, {"_Unsigned": "true", "valid_min": 0, "valid_max": -5536}, (0, 60_000), ()),
+        (LARGE, {"_Unsigned": "true", "valid_range": np.array([1, -5536], "i2")}, (1, 60_000), ()),
     ],
 )
-def test_signed_numbers_of_netcdf_may_stand_for_unsigned_ones(
+def test_what_was_not_measured_is_known_by_all_attributes_of_netcdf_and_by_its_fill(
     tmp_path, stored, attributes, valid_range, no_data
 ):
+    """In stored numbers; signed ones may stand for unsigned ones."""
     with scipy.io.netcdf_file(tmp_path / "a.nc", "w") as file:
         for axis, length in zip("yxb", CUBE.shape, strict=True):
             file.createDimension(axis, length)

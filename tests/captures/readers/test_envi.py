@@ -81,7 +81,7 @@ data ignore value = 65535
     (tmp_path / "cube.hdr").write_text(text)
     (tmp_path / "cube").write_bytes(CUBE.astype("<u2").transpose(AXES["bil"]).tobytes())
     file = open_spectral_file(tmp_path / "cube")
-    check_file(file, values=CUBE, nm=[400.5, 410, 420, 430], bad=[1], scale=10000, no_data=65535)
+    check_file(file, values=CUBE, nm=[400.5, 410, 420, 430], bad=[1], scale=10000, no_data=(65535,))
     assert file.path == tmp_path / "cube.hdr"
     assert file.warnings == ("the header has no byte order; taken as little-endian",)
 
@@ -126,7 +126,7 @@ data ignore value = 65535
             "wavelength = {.5, .51, .52, .53}\nwavelength units = Micrometers\nfwhm = {5.5, 5.5, 5.5, 5.5}",
             {"fwhm": None, "warning": "FWHM are left out: they would be"},
         ),
-        ("data ignore value = -9999 ; none measured", {"no_data": -9999}),
+        ("data ignore value = -9999 ; none measured", {"no_data": (-9999,)}),
         ("data ignore value = unset", {"warning": "'data ignore value' is unset, no number: not used"}),
         (
             "wavelength = {400, 500, 600, 700}\nsensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}",

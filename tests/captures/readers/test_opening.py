@@ -182,6 +182,9 @@ def test_a_linear_calibration_is_known_by_whatever_name_a_format_has_for_it(tmp_
         ({"Scale_Factor": 10000.0}, 10000, CUBE / 10000),
         ({"scale_factor": 1.0, "add_offset": 0.0}, None, None),
         ({"scale_factor": 2.0, "add_offset": 0.0}, 0.5, 2 * CUBE),
+        ({"scale_factor": 5.0}, 0.2, 5 * CUBE),
+        ({"slope": 5.0}, 0.2, 5 * CUBE),
+        ({"reflectance_scale_factor": 5.0}, 5, CUBE / 5),
         ({"scale_factor": 0.25, "add_offset": 2.0}, None, CUBE * 0.25 + 2),
     ],
 )
@@ -227,7 +230,7 @@ def test_every_xml_beside_an_image_is_read(tmp_path, more, expected):
         xml=enmap_bands((450, 550, 1650), more),
         aux=pam("<NoDataValue>7</NoDataValue>"),
     )
-    check_file(open_spectral_file(image), nm=[450, 550, 1650], no_data=7, **expected)
+    check_file(open_spectral_file(image), nm=[450, 550, 1650], no_data=(7,), **expected)
 
 
 @pytest.fixture

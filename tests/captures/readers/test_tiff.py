@@ -140,7 +140,7 @@ SAID = [
                 (42113, "s", 0, "65535", True),
             ]
         },
-        {"scale": 10000.0, "no_data": 65535},
+        {"scale": 10000.0, "no_data": (65535,)},
     ),
     *(
         ({"description": description, "metadata": None}, {"nm": NM, "evidence": "image description"})

@@ -87,7 +87,7 @@ def _measured(
 
 
 def find_missing(stored: np.ndarray, file: SpectralFile) -> Bool[np.ndarray, "h W"]:
-    """Pixels without a measurement: no number in some band, the file's no-data value, or out of its valid range.
+    """Pixels without a measurement: no number in some band, a no-data value of the file, or out of its valid range.
 
     A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
     """
@@ -97,9 +97,8 @@ def find_missing(stored: np.ndarray, file: SpectralFile) -> Bool[np.ndarray, "h 
     if file.valid_range is not None:
         low, high = file.valid_range
         missing |= ((stored < low) | (stored > high)).any(axis=-1)
-    no_data = file.no_data
-    if no_data is not None and np.isfinite(no_data):
-        limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
+    limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
+    for no_data in filter(np.isfinite, file.no_data):
         if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
             same = stored == stored.dtype.type(no_data)
             missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
@@ -155,8 +154,8 @@ def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Refere
     measurement are left out of it, where 0 in a dark frame is one whatever its header says. Raises CaptureError: other
     bands than the cubes, other units, or a column without a measurement.
     """
-    if what == "dark frame" and file.no_data == 0:  # software writes one value into all headers of a capture
-        file = replace(file, no_data=None)
+    if what == "dark frame":  # software writes one no-data value into all headers of a capture
+        file = replace(file, no_data=tuple(number for number in file.no_data if number != 0))
     height, width, bands = file.shape
     if bands != cube.shape[2]:
         raise CaptureError(

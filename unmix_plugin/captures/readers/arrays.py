@@ -44,6 +44,9 @@ _OWN_GAINS = ("scalefactor", "scale", "gain", "gains", "slope")
 _OWN_OFFSETS = ("offset", "offsets", "bias", "intercept")
 """Names that mean this only beside the numbers themselves; those above hold for all images of a file."""
 _DIVISORS = ("reflectance_scale_factor",)
+_MAY_DIVIDE = ("scale_factor", "scalefactor", "scale")
+"""Names in any case of factors that divide where they are above 1, as NEON's `Scale_Factor` does; CF's `scale_factor`
+never does."""
 _QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertainty|std|stddev)(_|$)")
 """What an array of three axes is called that measures nothing itself."""
 _AXIS_NAMES = {
@@ -73,6 +76,8 @@ class FoundArray:
     """Attributes of the groups that it is in and of the file, the nearest first."""
     dimensions: tuple[str, ...] | None = None
     """Names of its axes."""
+    fill: float | None = None
+    """Stored number where nothing was ever written, if the format has one."""
 
     @property
     def _own_name(self) -> str:
@@ -123,13 +128,7 @@ def image_of_arrays(
     linear = _linear(path, image, of_image[2])
     exposure, exposure_warnings = _exposure(arrays, image)
 
-    dtype, no_data = image.dtype, _first_number(image._all_attributes, _NO_DATA)
-    valid = _valid_range(image._all_attributes)
-    if dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true":
-        dtype, more = np.dtype(dtype.str.replace("i", "u")), 256.0**dtype.itemsize  # attributes are signed
-        no_data = no_data + more if no_data is not None and no_data < 0 else no_data
-        low, high = valid or (0.0, 0.0)
-        valid = valid and (low + more * (low < 0), high + more * (high < 0))
+    dtype, no_data, valid = _measured_numbers(image, linear)
 
     def read_part(rows: slice, wanted: BandIndex) -> np.ndarray:
         if take is not None:
@@ -287,7 +286,8 @@ def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, lis
 def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     """Gains and offsets among the attributes: value = factor * stored + offset, as climate files have it.
 
-    A single factor above 1 without an offset divides, as NEON's 10000 does. PRISMA's are those of its level.
+    Source: CF conventions, 8.1. A single factor above 1 without an offset divides under a name that is not CF's, as
+    NEON's 10000 does. PRISMA's are those of its level.
     """
     columns, evidence = [], []
     for names, own_names in ((_GAINS, _OWN_GAINS), (_OFFSETS, _OWN_OFFSETS)):
@@ -298,9 +298,10 @@ def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
     gains, offsets = columns
     if len(gains) == 1 and not offsets and evidence[0].lower() == "'gain'":  # that of a camera
         gains, evidence = [], []
+    name = evidence[0].strip("'") if gains else ""
     # An offset, 0 too, is CF's, whose factors multiply whatever they are.
-    is_divisor = len(gains) == 1 and gains[0] > 1 and not offsets
-    if is_divisor or (gains and evidence[0].strip("'").lower() in _DIVISORS):
+    is_divisor = len(gains) == 1 and gains[0] > 1 and not offsets and name != "scale_factor"
+    if (is_divisor and name.lower() in _MAY_DIVIDE) or name.lower() in _DIVISORS:
         gains = [1.0 / gain if gain else np.nan for gain in gains]
     if not evidence and (prisma := _prisma(image)) is not None:
         gains, offsets, evidence = [prisma[0]], [prisma[1]], [prisma[2]]
@@ -334,15 +335,44 @@ def _numbers(value: Any) -> list[float]:
         return []
 
 
-def _valid_range(attributes: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Least and greatest stored number that was measured, by NetCDF's attributes."""
-    named = {key.lower(): _numbers(value) for key, value in attributes.items()}
-    both = named.get("valid_range", [])
-    if len(both) == 2:
-        return both[0], both[1]
-    low, high = named.get("valid_min", [-np.inf]), named.get("valid_max", [np.inf])
-    is_given = len(low) == len(high) == 1 and ("valid_min" in named or "valid_max" in named)
-    return (low[0], high[0]) if is_given else None
+def _measured_numbers(
+    image: FoundArray, linear: Linear | None
+) -> tuple[np.dtype, tuple[float, ...], tuple[float, float] | None]:
+    """Type of the stored numbers, every one that stands for no measurement, and the range of those that do.
+
+    Source: CF conventions, 2.5.1: `_FillValue` and `missing_value` both mark missing numbers.
+    """
+    attributes, dtype, valid = image._all_attributes, image.dtype, _valid_range(image, linear)
+    keys = (_first_key(attributes, (name,)) for name in _NO_DATA)
+    no_data = [number for key in keys if key is not None for number in _numbers(attributes[key])]
+    if dtype.kind == "i" and _text(image.attributes.get("_Unsigned", "")).lower() == "true":
+        dtype, more = np.dtype(dtype.str.replace("i", "u")), 256.0**dtype.itemsize  # attributes are signed
+        no_data = [number + more * (number < 0) for number in no_data]
+        low, high = valid or (0.0, 0.0)
+        valid = valid and (low + more * (low < 0), high + more * (high < 0))
+    elif image.fill is not None and image.fill != 0 and (dtype.kind == "f" or image.fill < 0):
+        no_data.append(image.fill)  # other numbers may be light
+    return dtype, tuple(dict.fromkeys(no_data)), valid
+
+
+def _valid_range(image: FoundArray, linear: Linear | None) -> tuple[float, float] | None:
+    """Least and greatest stored number that was measured, by NetCDF's attributes.
+
+    A range of floating-point numbers beside packed whole ones is one of values. Source: netCDF-Java,
+    EnhanceScaleMissingUnsigned.
+    """
+    keys = {key.lower(): key for key in image._all_attributes}
+    named = [keys[name] for name in ("valid_range", "valid_min", "valid_max") if name in keys]
+    numbers = {key.lower(): _numbers(image._all_attributes[key]) for key in named}
+    low, high = numbers.get("valid_min", [-np.inf]), numbers.get("valid_max", [np.inf])
+    both = numbers["valid_range"] if len(numbers.get("valid_range", [])) == 2 else [*low, *high]
+    if not named or len(both) != 2:
+        return None
+    is_float = any(np.asarray(image._all_attributes[key]).dtype.kind == "f" for key in named)
+    if is_float and image.dtype.kind != "f" and linear is not None:
+        ends = np.subtract.outer(both, linear.offsets) / linear.gains
+        both = [ends[0].min() - 0.5, ends[1].max() + 0.5]  # between whole numbers, as dividing rounds
+    return float(both[0]), float(both[1])
 
 
 def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str, Any], tuple[str, ...]]:

@@ -153,6 +153,9 @@ def _check_pickle(path: Path) -> None:
 
 # NetCDF of the classic kind, mapped by SciPy; nothing holds on to the map of a file.
 
+_NETCDF_FILLS = {"i2": -32767.0, "i4": -2147483647.0, "f4": 9.969209968386869e36, "f8": 9.969209968386869e36}
+"""Numbers of variables that were never written, by type. Source: NetCDF's netcdf.h, NC_FILL_SHORT and the like."""
+
 
 def _list_netcdf3(path: Path) -> list[FoundArray]:
     from scipy.io import netcdf_file
@@ -167,7 +170,8 @@ def _list_netcdf3(path: Path) -> list[FoundArray]:
 
         shape, axes, attributes = variable.shape, variable.dimensions, dict(variable._attributes)
         whole, kind = partial(numbers, name), variable.data.dtype
-        return FoundArray(name, shape, kind, whole, take, attributes, root, axes)
+        fill = _NETCDF_FILLS.get(kind.str[1:])
+        return FoundArray(name, shape, kind, whole, take, attributes, root, axes, fill)
 
     with netcdf_file(str(path), "r", mmap=True) as file:
         allow_parts(path, len(file.variables), "variables", CaptureError)
@@ -243,8 +247,8 @@ def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[Fo
         scales = [scale.name for scale in dimension.values()] if len(dimension) else []
         names.append((scales[0] or "") if scales else dimension.label)
     dimensions, faster = tuple(names) if any(names) else None, take if is_cube else None
-    attributes = _attributes(path, item)
-    return [FoundArray(name, shape, item.dtype, whole, faster, attributes, dimensions=dimensions)]
+    attributes, fill = _attributes(path, item), float(item.fillvalue) if item.dtype.kind in "iuf" else None
+    return [FoundArray(name, shape, item.dtype, whole, faster, attributes, {}, dimensions, fill)]
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         notes=(*file.notes, _DARK_LINES) if dark_lines else file.notes,
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
-        no_data=file.no_data if no_data is None else no_data,
+        no_data=file.no_data if no_data is None else tuple(dict.fromkeys((no_data, *file.no_data))),
         warnings=file.warnings + band_warnings + linear_warnings + exposure_warnings,
         metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
     )

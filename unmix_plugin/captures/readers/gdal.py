@@ -168,8 +168,7 @@ def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
         bands = replace(bands, fwhm_nm=widths) if known else bands
     stated = (gains.tolist(), offsets.tolist(), found.name)
     linear = file.linear or linear_values(file.path, file.shape[2], *stated)
-    no_data = file.no_data
-    if no_data is None and not np.isnan(columns["NoDataValue"][0]):
-        no_data = float(columns["NoDataValue"][0])
+    beside = columns["NoDataValue"]
+    no_data = tuple(dict.fromkeys((*file.no_data, *beside[~np.isnan(beside)].tolist())))
     more = (*file.sources, found)
     return replace(file, bands=bands, linear=linear, no_data=no_data, sources=more)

@@ -197,7 +197,8 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
         "scale": opened and _plain(opened.linear and opened.linear.scale),
         "gains": opened and opened.linear and _plain(opened.linear.gains),
         "offsets": opened and opened.linear and _plain(opened.linear.offsets),
-        "no_data": opened and _plain(opened.no_data),
+        "no_data": opened
+        and _plain(opened.no_data[0] if len(opened.no_data) == 1 else opened.no_data or None),
         "poses": None,
         "notes": opened and [*opened.warnings, *opened.notes],
         "metadata": opened and _plain(opened.metadata),

@@ -127,7 +127,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
         linear=linear_of_items(path, items, shape[2]),
-        no_data=no_data,
+        no_data=() if no_data is None else (no_data,),
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
         warnings=stack.warnings
         + axis_warnings
