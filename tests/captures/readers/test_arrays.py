@@ -12,6 +12,7 @@ import scipy.sparse
 import torch
 
 from tests.captures.file_factory import check_file, present, rows_and_bands_of
+from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.readers import containers
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -172,6 +173,35 @@ def test_axes_by_the_names_of_netcdf4(tmp_path):
             file["radiance"].dims[axis].attach_scale(file[name])
         file["radiance"].attrs["scale_factor"] = 0.0001
     check_file(open_spectral_file(tmp_path / "a.nc"), values=square, scale=10000, notes=())
+
+
+@pytest.mark.parametrize(
+    ("dtype", "fill", "attributes", "no_data", "warnings"),
+    [
+        ("f4", None, {}, (0,), 1),
+        ("u2", 65535, {}, (65535,), 1),
+        ("u2", 65535, {"_FillValue": np.uint16(65535)}, (65535,), 0),
+        ("i2", -1, {"_Unsigned": "true"}, (65535,), 1),
+        ("f4", -9999, {"missing_value": -1.0}, (-1, -9999), 0),
+        ("f4", np.nan, {}, (), 0),
+    ],
+)
+@pytest.mark.parametrize("chunks", [(4, 9, 2), None])
+def test_parts_of_hdf5_that_were_never_written_are_missing(
+    tmp_path, dtype, fill, attributes, no_data, warnings, chunks
+):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        image = file.create_dataset("cube", CUBE.shape, dtype, chunks=chunks, fillvalue=fill)
+        image.attrs.update(attributes)
+        if chunks:
+            image[:4] = 7
+    opened = open_spectral_file(tmp_path / "a.h5")
+    assert tuple(number for number in opened.no_data if np.isfinite(number)) == no_data
+    told = [text for text in opened.warnings if "never written" in text]
+    assert len(told) == warnings, opened.warnings
+    missing = find_missing(opened.read(), opened)
+    assert missing[4:].all()
+    assert missing[:4].any() == (chunks is None)
 
 
 def test_numbers_of_hdf5_outside_the_file_are_not_followed(tmp_path):

@@ -10,6 +10,7 @@ import tifffile
 from PIL import Image
 
 from tests.captures.file_factory import check_file, rows_and_bands_of, xmp_packet
+from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
@@ -241,6 +242,55 @@ def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path)
     np.testing.assert_array_equal(file.read(slice(0, 18)), CUBE[:18])
     with pytest.raises(CaptureError, match="can't be read"):
         file.read(slice(18, 19))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "stated", "no_data", "is_told"),
+    [
+        ("f4", "-9999", (-9999,), False),
+        ("f4", None, (), True),
+        ("u2", "65535", (65535,), False),
+        ("u2", "-9999", (-9999, 0), True),
+        ("u2", None, (0,), True),
+    ],
+)
+@pytest.mark.parametrize("compression", ["zlib", None])
+def test_tiles_that_are_left_out_in_the_file_are_missing(
+    tmp_path, dtype, stated, no_data, is_told, compression
+):
+    """As GDAL leaves them out (GTiff driver, sparse files)."""
+    image = (CUBE[:64, :48] + 1).astype(dtype)
+    corners = [(y, x) for y in (0, 32) for x in (0, 16, 32)]
+    tiles = (
+        None if corner == (32, 16) else image[corner[0] :, corner[1] :][:32, :16, band]
+        for band in range(6)
+        for corner in corners
+    )
+    tags = [] if stated is None else [(42113, "s", 0, stated, True)]
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        options: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "separate", "tile": (32, 16)}
+        file.write(tiles, shape=(6, 64, 48), dtype=dtype, compression=compression, extratags=tags, **options)
+    opened = open_spectral_file(tmp_path / "a.tif")
+    missing = find_missing(opened.read(), opened)
+    assert (opened.no_data, missing[32:, 16:32].all(), missing.sum()) == (no_data, True, 32 * 16)
+    np.testing.assert_array_equal(opened.read()[~missing], image[~missing])
+    assert any("6 blocks of the image left out" in text for text in opened.warnings) == is_told
+
+
+def test_a_plain_page_that_is_left_out_in_the_file_is_missing(tmp_path):
+    planes = PLANES.astype("f4")
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for plane in planes:
+            file.write(plane, photometric="minisblack", metadata=None)
+    data = bytearray((tmp_path / "a.tif").read_bytes())
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        for code in (273, 279):  # where its strip begins, and its length
+            start = file.pages[2].tags[code].valueoffset
+            data[start : start + 4] = bytes(4)
+    (tmp_path / "a.tif").write_bytes(data)
+    opened = open_spectral_file(tmp_path / "a.tif")
+    planes[2] = np.nan
+    check_file(opened, values=planes.transpose(1, 2, 0), warning="1 block of the image left out")
 
 
 BYTES = CUBE[..., 0].astype(np.uint8)

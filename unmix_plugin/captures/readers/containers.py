@@ -31,7 +31,7 @@ from unmix_plugin.captures.spectral_file import (
     loaded,
     take_part,
 )
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import allow_decoded, allow_depth, allow_parts, open_zip, refuse
 from unmix_plugin.scenes.reading.cubes import (
     READ_HEADER,
@@ -216,7 +216,25 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
             raise CaptureError(f"{path}: the numbers of {name} lie in other files; write them into this one")
         of_chunk = prod(image.chunks) if image.chunks else 0
         allow_decoded(path, max(image.size, of_chunk) * image.dtype.itemsize, CaptureError)
-    return opened
+        return _with_fill(opened, image)
+
+
+def _with_fill(opened: SpectralFile, image: Any) -> SpectralFile:
+    """The image with the number that its data set has where nothing was written, if chunks of it are lacking."""
+    if image.chunks:
+        grid = [-(-length // step) for length, step in zip(image.shape, image.chunks, strict=True)]
+        absent = prod(grid) - image.id.get_num_chunks()
+    else:
+        absent = int(image.id.get_storage_size() == 0)
+    fill = float(np.array(image.fillvalue).astype(opened.dtype))
+    if not absent or fill in opened.no_data or not np.isfinite(fill):
+        return opened
+    taken = "in all bands " * (fill == 0) + "count as not measured"
+    warning = (
+        f"{counted(absent, 'chunk')} of the image never written, and no attribute says what marks them: pixels of "
+        f"{fill:g} {taken}; if these were measured, write the file in full"
+    )
+    return replace(opened, no_data=(*opened.no_data, fill), warnings=(*opened.warnings, warning))
 
 
 def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray]:

@@ -43,7 +43,7 @@ from unmix_plugin.captures.spectral_file import (
     import_extra,
     take_part,
 )
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import allow_decoded, allow_parts, refuse
 from unmix_plugin.spectral.bands import nm_per_unit
 
@@ -85,6 +85,10 @@ class _Stack:
     unlisted_from: int | None = None
     """Where the numbers of all pages lie, if only the first has an entry."""
     warnings: tuple[str, ...] = ()
+    fill: float = 0.0
+    """What strips and tiles read as that are not in the file."""
+    no_data: tuple[float, ...] = ()
+    """Stored numbers that stand for no measurement."""
 
 
 def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
@@ -102,7 +106,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         items = next(filter(None, (gdal_items(_text(page, _GDAL_METADATA)) for page in (first, top))), [])
         stated = bands_of_items(items) or _from_description(first) or _from_description(top)
         stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
-        no_data = gdal_number(_text(first, _GDAL_NODATA))
+        stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)))
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
@@ -127,7 +131,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
         linear=linear_of_items(path, items, shape[2]),
-        no_data=() if no_data is None else (no_data,),
+        no_data=stack.no_data,
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
         warnings=stack.warnings
         + axis_warnings
@@ -235,6 +239,31 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
     return _Stack(like, (len(like), height, width), dtype, None, warnings)
 
 
+def _with_fill(stack: _Stack, no_data: float | None) -> _Stack:
+    """The stack with the no-data value of the file, and with what its absent strips and tiles read as.
+
+    Source: GDAL, GTiff driver, "Sparse files": they hold the no-data value, or 0 where there is none. Without one,
+    floating-point numbers read as NaN here, which is missing.
+    """
+    stated = () if no_data is None else (no_data,)
+    pages = [page for page in stack.pages if not _is_mappable(page)]
+    absent = sum(page.databytecounts[: math.prod(page.chunked)].count(0) for page in pages)
+    if not absent:
+        return replace(stack, no_data=stated)
+    is_float = stack.dtype.kind == "f"
+    with np.errstate(invalid="ignore"):  # numbers that the type can't hold
+        is_usable = no_data is not None and (is_float or np.array(no_data).astype(stack.dtype) == no_data)
+    if no_data is not None and is_usable:
+        return replace(stack, fill=no_data, no_data=stated)
+    taken = "they count as not measured" if is_float else "pixels of 0 in all bands count as not measured"
+    warning = (
+        f"{counted(absent, 'block')} of the image left out in the file, which has no no-data value: {taken}; if these "
+        "are dark and not missing, write the file without gaps (GDAL's SPARSE_OK=FALSE)"
+    )
+    fill, more = (math.nan, ()) if is_float else (0.0, (0.0,))
+    return replace(stack, fill=fill, no_data=(*stated, *more), warnings=(*stack.warnings, warning))
+
+
 def _image_pages(file: TiffFile) -> list[TiffPage]:
     """Pages that are no previews or masks, with those that lie below a page (SubIFDs); of several positions or times of
     an OME-TIFF those of the first."""
@@ -269,8 +298,9 @@ def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
 
 
 def _is_mappable(page: TiffPage) -> bool:
-    """Whether its numbers lie uncompressed, one after the other."""
-    return page.is_contiguous and page.dtype is not None and page.bitspersample == page.dtype.itemsize * 8
+    """Whether its numbers lie uncompressed, one after the other; at the start of the file lies nothing of an image."""
+    is_plain = page.dtype is not None and page.bitspersample == page.dtype.itemsize * 8
+    return is_plain and page.is_contiguous and page.dataoffsets[0] > 0
 
 
 def _read_part(path: Path, stack: _Stack, axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
@@ -278,28 +308,28 @@ def _read_part(path: Path, stack: _Stack, axes: Axes, rows: slice, bands: BandIn
         stored = np.memmap(path, stack.dtype, "r", stack.unlisted_from, stack.shape)
         return take_part(stored, axes, rows, bands)
     if len(stack.pages) == 1:
-        return _read_page(path, stack.pages[0], stack.dtype, rows, bands)
+        return _read_page(path, stack.pages[0], stack, rows, bands)
     wanted = {"y": rows, "x": slice(None), "b": bands}
     of_page = rows if axes[1] == "y" else slice(0, stack.shape[1], 1)
     indices = np.arange(stack.shape[0])[wanted[axes[0]]]
     one = slice(0, 1, 1)
-    planes = np.stack([_read_page(path, stack.pages[i], stack.dtype, of_page, one)[..., 0] for i in indices])
+    planes = np.stack([_read_page(path, stack.pages[i], stack, of_page, one)[..., 0] for i in indices])
     left = {axis: slice(None) if axis == axes[0] or axes[1] == axis == "y" else wanted[axis] for axis in "yb"}
     return take_part(planes, axes, left["y"], left["b"])
 
 
-def _read_page(path: Path, page: TiffPage, dtype: np.dtype, rows: slice, samples: BandIndex) -> np.ndarray:
+def _read_page(path: Path, page: TiffPage, stack: _Stack, rows: slice, samples: BandIndex) -> np.ndarray:
     """Numbers (h, W, s) of some rows and samples, in the normal form of `SpectralFile.read`."""
     num_planes, _, height, width, num_samples = page.shaped
     if _is_mappable(page):
         whole = (num_planes, height, width, num_samples)
-        image = np.memmap(path, dtype, "r", page.dataoffsets[0], whole)[:, rows]
+        image = np.memmap(path, stack.dtype, "r", page.dataoffsets[0], whole)[:, rows]
         chosen = image[0][..., samples] if num_planes == 1 else np.moveaxis(image[..., 0][samples], 0, -1)
         return np.array(chosen, order="C")
     indices = np.arange(num_planes * num_samples)[samples]
     planes = sorted(set(indices.tolist())) if num_planes > 1 else [0]
     # (p, h, W, S): all rows from the first to the last of `rows`
-    block = np.zeros((len(planes), rows.stop - rows.start, width, num_samples), page.dtype)
+    block = np.full((len(planes), rows.stop - rows.start, width, num_samples), stack.fill, page.dtype)
     down, across = page.chunks[0], -(-width // page.chunks[1])
     per_plane = -(-height // down) * across
     with path.open("rb") as file:
