@@ -69,6 +69,24 @@ def test_lists_go_before_folders_and_one_folder_for_all_says_nothing(tmp_path):
     assert {view.split for view in find_unmix_nerf(tmp_path / "one", PLAIN).views} == {None}
 
 
+@pytest.mark.parametrize(
+    ("lists", "expected"),
+    [
+        ({"train": [0, 1]}, ["train", "train", "eval", "eval", "eval"]),
+        ({"val": [2], "test": [4]}, ["train", "train", None, "train", "eval"]),
+        ({"train": [0, 1], "val": [2], "test": [3]}, ["train", "train", None, "eval", None]),
+    ],
+)
+def test_frames_of_some_lists_are_split_as_scenes_are(tmp_path, lists, expected):
+    listed = {f"{k}_filenames": [f"train/frame_0000{i}.png" for i in v] for k, v in lists.items()}
+    write_unmix(tmp_path / "data", "train", "train", **listed)
+    assert [view.split for view in find_unmix_nerf(tmp_path / "data", PLAIN).views] == expected
+    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none", scale=1.0)
+    scene = load_scene(tmp_path / "scene")
+    for indices, split in ((scene.train_indices, "train"), (scene.eval_indices, "eval")):
+        assert list(indices) == [index for index, one in enumerate(expected) if one == split]
+
+
 @pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
 def test_wavelengths_are_never_made_up_and_poses_that_can_not_be_used_are_told(tmp_path, stated):
     write_unmix(tmp_path, wavelengths=stated)

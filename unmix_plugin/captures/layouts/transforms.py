@@ -139,20 +139,23 @@ def _read_frames(root: Path, key: str) -> _FrameList:
 
 
 def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_Frame, ...]:
-    """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation."""
+    """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation, otherwise
+    what training leaves; without a list for training, it is what the others leave."""
     train, val, test = (
         {path_text(text) for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
         for name in ("train", "val", "test")
     )
     evaluation = test or val
-    if not evaluation:
+    if not (train or evaluation):
         return frames
 
     def split_of(frame: _Frame) -> Split | None:
         names = {frame.text(key) for key in _NAME_KEYS}
         if names & evaluation:
             return "eval"
-        return "train" if not train or names & train else None
+        if names & train or not (train or names & val):
+            return "train"
+        return None if evaluation else "eval"
 
     return tuple(replace(frame, split=split_of(frame)) for frame in frames)
 

@@ -164,10 +164,10 @@ def _transforms_json(
         pose = [*written.camera.camera_to_world.tolist(), [0.0, 0.0, 0.0, 1.0]]
         frames.append({**written.record.paths, **own, "transform_matrix": pose})
     splits = {}
-    if all(view.split for view in views) and any(view.split == "eval" for view in views):
+    if {"train", "eval"} <= {view.split for view in views}:  # others are in neither list
         names: dict[str, list[str]] = defaultdict(list)
         for view, written in zip(views, seen, strict=True):
-            names[view.split or ""].append(written.record.paths["file_path"])
+            names[view.split or "neither"].append(written.record.paths["file_path"])
         splits = {"train_filenames": names["train"]}
         splits |= {"val_filenames": names["eval"], "test_filenames": names["eval"]}
     return {
