@@ -87,6 +87,77 @@ def test_frames_of_some_lists_are_split_as_scenes_are(tmp_path, lists, expected)
         assert list(indices) == [index for index, one in enumerate(expected) if one == split]
 
 
+def as_integers(root):
+    """Numbers of 16 bits of which 1000 stands for 1, and widths."""
+    for path in root.rglob("*.npy"):
+        np.save(path, np.rint(1000 * np.load(path)).astype(np.uint16))
+    edit(root, lambda content: content.update(value_scale=1000, fwhm=[5, 6, 7, 8]))
+
+
+def test_a_scene_folder_is_read_with_its_scale_and_widths_and_says_what_it_leaves_out(tmp_path):
+    write_unmix(tmp_path / "data", written="val", materials=["leaf"])
+    as_integers(tmp_path / "data")
+    capture = find_unmix_nerf(tmp_path / "data", PLAIN)
+    assert any("not taken over from transforms.json: materials;" in note for note in capture.notes)
+    for index, view in enumerate(capture.views):
+        check_file(view.cube, scale=1000, fwhm=[5, 6, 7, 8])
+        np.testing.assert_allclose(view.cube.read() / 1000, cube(index), atol=5.01e-4)
+    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none")
+    process(tmp_path / "scene", tmp_path / "again", "unmix-nerf", mask="none")
+    for folder in ("scene", "again"):
+        scene = load_scene(tmp_path / folder)
+        np.testing.assert_allclose(scene.cube(2), cube(2), atol=6e-4)
+        assert present(scene.fwhm_nm).tolist() == [5, 6, 7, 8]
+
+
+def test_frames_of_a_scene_folder_have_bands_sensor_and_shot_of_their_own(tmp_path):
+    write_unmix(tmp_path / "data", written="val")
+    paths = sorted((tmp_path / "data").rglob("*.npy"))
+    order = [[3, 0], [3, 0], [1, 2], None, None]
+    for path, bands in zip(paths, order, strict=True):
+        np.save(path, np.load(path)[..., bands or [0, 1, 2, 3]])
+
+    def change(content):
+        content["fwhm"] = [5, 6, 7, None]
+        for frame, bands in zip(content["frames"], order, strict=True):
+            frame.update({"bands": bands} if bands else {"sensor": "wide", "capture": "shot 1"})
+
+    edit(tmp_path / "data", change)
+    capture = find_unmix_nerf(tmp_path / "data", PLAIN)
+    expected = [[600, 450], [600, 450], [500, 550], [450, 500, 550, 600], [450, 500, 550, 600]]
+    for view, nm in zip(capture.views, expected, strict=True):
+        check_file(view.cube, nm=nm, fwhm=None)
+    assert [view.sensor for view in capture.views] == ["bands 1", "bands 1", "bands 2", "wide", "wide"]
+    assert [view.release for view in capture.views] == ["", "", "", "shot 1", "shot 1"]
+    assert any("'fwhm' has 0 or null for 1 of 4 bands" in text for text in capture.warnings)
+    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none", scale=1.0)
+    scene = load_scene(tmp_path / "scene")
+    for index, bands in enumerate(order):
+        shown = sorted(bands or [0, 1, 2, 3])
+        np.testing.assert_allclose(scene.cube(index), cube(index)[..., shown], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("top", "own", "message"),
+    [
+        ({"value_scale": 0}, {}, "'value_scale' is 0; expected what stands for 1"),
+        ({"fwhm": [5, 5]}, {}, "'fwhm' must have a width in nm above 0 for each"),
+        ({}, {"bands": [0, 1, 2]}, "frame_00001.npy has 4 bands, 'bands' of its frame 3 indices"),
+        ({}, {"bands": [1, 2, 3, 4]}, r"frames\[1\]: 'bands' is \[1, 2, 3, 4\]; expected indices of the 4"),
+        ({}, {"bands": [0, 1, 2, -1]}, r"frames\[1\]: 'bands' is \[0, 1, 2, -1\]; expected indices"),
+        ({}, {"bands": [0, 0, 1, 2]}, "'bands' repeats 0"),
+        ({}, {"responses_path": "a.csv"}, "'responses_path' is set: channels of many bands"),
+        ({}, {"row_poses": [[]]}, "'row_poses' is set: a line camera"),
+        ({}, {"key_poses": [{"row": 0}]}, "'key_poses' is set: a line camera"),
+    ],
+)
+def test_keys_of_a_scene_folder_that_cannot_be_followed_are_refused(tmp_path, top, own, message):
+    write_unmix(tmp_path, **top)
+    edit(tmp_path, lambda content: content["frames"][1].update(own))
+    with pytest.raises(CaptureError, match=message):
+        find_unmix_nerf(tmp_path, PLAIN)
+
+
 @pytest.mark.parametrize("stated", [None, [450, 500], ["blue", "green", "red", "nir"]])
 def test_wavelengths_are_never_made_up_and_poses_that_can_not_be_used_are_told(tmp_path, stated):
     write_unmix(tmp_path, wavelengths=stated)

@@ -10,7 +10,8 @@ primaries; the user gives three numbers.
 `unmix-nerf`, `hs-nerf`: frames have `hyperspectral_file_path`. UnMix-NeRF names .npy cubes, wavelengths and labels,
 HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are lists in the file, otherwise the folder of a frame's file:
 `train` against `eval`, `val` or `test`. Paths with `val` whose files lie in `eval`, as UnMix-NeRF's converter leaves
-them, are followed there.
+them, are followed there. Keys of scene folders are followed, too: `value_scale`, `fwhm`, and `bands`, `sensor` and
+`capture` of a frame.
 
 NeSpoF has one OpenEXR file for each view and wavelength, which holds Stokes components s0 to s3.
 
@@ -33,13 +34,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from jaxtyping import Float64
 
 from unmix_plugin.captures.names import FoundFiles, natural_order, path_text, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
@@ -55,13 +57,16 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
     stack_bands,
 )
-from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.faults import read_number
+from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.scenes.reading.faults import Faults, read_number
+from unmix_plugin.scenes.reading.transforms_json import read_sensor_entry, read_value_scale, read_widths
 
 Split: TypeAlias = Literal["train", "eval"]
 _SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}
 """What transforms_<name>.json is for."""
 _CUBE_KEY = "hyperspectral_file_path"
+_TRUTH_KEYS = ("materials", "endmembers_path", "illuminant_path", "abundance_file_path")
+"""Of a scene folder, for people and evaluation: processing does not change them."""
 _NAME_KEYS = ("file_path", _CUBE_KEY)
 """Of a frame: the first that is there names it in lists and among poses."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")
@@ -161,7 +166,12 @@ def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_F
 
 
 def _make_capture(
-    layout: str, root: Path, listed: _FrameList, views: Sequence[CaptureView], notes: Iterable[str] = ()
+    layout: str,
+    root: Path,
+    listed: _FrameList,
+    views: Sequence[CaptureView],
+    notes: Iterable[str] = (),
+    warnings: Iterable[str] = (),
 ) -> Capture:
     """Views, one a frame, with the poses of these, in the order of their names.
 
@@ -177,7 +187,7 @@ def _make_capture(
     except CaptureError as error:
         said.append(f"the poses of the capture can't be used: {error}")
     ordered = sorted(views, key=lambda view: natural_order(view.name))
-    return Capture(layout, root, tuple(ordered), poses, tuple(said))
+    return Capture(layout, root, tuple(ordered), poses, tuple(said), tuple(warnings))
 
 
 def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
@@ -225,21 +235,23 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     by_folder: list[Split | None] = [_SPLIT_OF_FILE.get(folder) for folder in folders]
     if None in by_folder or len(set(by_folder)) != 2:
         by_folder = [None] * len(by_folder)
-    values = listed.top.get("wavelengths")
-    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
-    wavelengths = None if not numbers or None in numbers else np.array(numbers, dtype=np.float64)
+    stated, warnings = _state_cubes(listed, options)
     views = []
-    for frame, name, cube, split in zip(listed.frames, names, cubes, by_folder, strict=True):
+    for frame, name, cube, split, said in zip(listed.frames, names, cubes, by_folder, stated, strict=True):
         picture, mask, labels = (
             found.look(frame.where, frame.text(key), _in_eval(frame.text(key)), least_parts=least_parts)
             if frame.text(key)
             else None
             for key, least_parts in (("file_path", 1), ("mask_path", 2), ("seg_file_path", 2))
         )
-        file, split = _open_cube(cube, wavelengths, options), frame.split or split
-        views.append(CaptureView(name, file, picture=picture, mask=mask, labels=labels, split=split))
-    followed = f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed"
-    return _make_capture(layout, root, listed, views, [followed] if moved else [])
+        file, split, shot = _open_cube(cube, said, options), frame.split or split, frame.text("capture")
+        view = CaptureView(name, file, said.sensor, picture, mask, labels, release=shot, split=split)
+        views.append(view)
+    notes = [f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed"] * (moved > 0)
+    given = {*listed.top, *(key for frame in listed.frames for key in frame.values)}
+    if left := [key for key in _TRUTH_KEYS if key in given]:
+        notes.append(f"not taken over from transforms.json: {', '.join(left)}; copy what still fits yourself")
+    return _make_capture(layout, root, listed, views, notes, warnings)
 
 
 find_unmix_nerf = partial(_find_cubes, "unmix-nerf")
@@ -257,18 +269,93 @@ def _in_eval(text: str) -> str:
     return str(PurePosixPath(*("eval" if part == "val" else part for part in path.parent.parts), path.name))
 
 
-def _open_cube(path: Path, wavelengths: np.ndarray | None, options: ReadOptions) -> SpectralFile:
-    """A cube; numbers of 8 bits stand for fractions of 255."""
-    file = open_spectral_file(path, options)
+@dataclass(frozen=True)
+class _StatedCube:
+    """What transforms.json says of a frame's cube; None where it says nothing."""
+
+    sensor: str
+    wavelengths_nm: Float64[np.ndarray, " B"] | None
+    fwhm_nm: Float64[np.ndarray, " B"] | None
+    value_scale: float | None
+    """Stored number that stands for 1."""
+    has_bands: bool
+    """Whether the frame lists its bands, among those of the whole scene."""
+
+
+def _state_cubes(listed: _FrameList, options: ReadOptions) -> tuple[list[_StatedCube], list[str]]:
+    """What is said of each frame's cube, and warnings.
+
+    Raises CaptureError: a key of a scene folder is wrong, or can't be followed here.
+    """
+    folder = listed.source if listed.source.is_dir() else listed.source.parent
+    values, faults, warnings = listed.top.get("wavelengths"), Faults(folder), []
+    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
+    is_known = bool(numbers) and None not in numbers and options.wavelengths_nm is None
+    centres = np.array(numbers, dtype=np.float64) if is_known else None
+    scale, widths = read_value_scale(listed.top, faults), read_widths(listed.top, faults)
+    if widths is not None and (unknown := int(np.isnan(widths).sum())):
+        counts = f"{unknown} of {len(widths)} bands"
+        warnings, widths = [f"'fwhm' has 0 or null for {counts}: the widths of all count as unknown"], None
+    entries = []
+    for frame in listed.frames:
+        entry = read_sensor_entry(frame.values, frame.where, faults)
+        for message in _not_followed(frame, entry.bands, None if centres is None else len(centres)):
+            faults.add(frame.where, message)
+        entries.append(entry)
+    try:
+        faults.raise_if_any()
+    except SceneError as error:
+        raise CaptureError(str(error)) from error
+    # Frames without a name are of one sensor if their bands are the same.
+    unnamed = list(dict.fromkeys(entry.bands for entry in entries if entry.name is None))
+    stated = []
+    for entry in entries:
+        number = f"bands {unnamed.index(entry.bands) + 1}" if entry.name is None and len(unnamed) > 1 else ""
+        every = slice(None) if entry.bands is None else list(entry.bands)
+        own = [None if column is None or centres is None else column[every] for column in (centres, widths)]
+        stated.append(_StatedCube(entry.name or number, own[0], own[1], scale, entry.bands is not None))
+    return stated, warnings
+
+
+def _not_followed(frame: _Frame, bands: tuple[int, ...] | None, num_wavelengths: int | None) -> Iterator[str]:
+    """Faults of a frame: keys of scene folders that cubes of captures can't have, and bands that are not there."""
+    for key in ("row_poses", "key_poses"):
+        if frame.values.get(key):
+            yield f"'{key}' is set: a line camera, while views get one pose each; train on the folder as it is"
+    if frame.values.get("responses_path"):
+        yield "'responses_path' is set: channels of many bands each, which can't be calibrated; leave the frame out"
+    if bands is None or num_wavelengths is None:
+        return
+    if min(bands, default=0) < 0 or max(bands, default=0) >= num_wavelengths:
+        yield f"'bands' is {list(bands)}; expected indices of the {num_wavelengths} 'wavelengths', from 0"
+
+
+def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> SpectralFile:
+    """A cube; numbers of 8 bits stand for fractions of 255, unless another number is said to stand for 1."""
+    file, wavelengths = open_spectral_file(path, options), stated.wavelengths_nm
     if wavelengths is not None and len(wavelengths) == file.shape[2] and file.warnings:
         # transforms.json settles which axis is that of bands, which the array alone leaves in doubt.
         sure = open_spectral_file(path, replace(options, axes="yxb"))
         file = sure if sure.shape == file.shape and options.axes is None else file
-    if file.dtype == np.uint8 and file.linear is None:
-        linear = linear_values(path, file.shape[2], [1 / 255], [], "numbers of 8 bits")
-        file = replace(file, linear=linear)
-    if wavelengths is not None and len(wavelengths) == file.shape[2] and file.bands.wavelengths_nm is None:
-        file = replace(file, bands=BandTable(wavelengths, "'wavelengths' of transforms.json, nm"))
+    if stated.value_scale is not None and file.linear is not None:
+        raise CaptureError(
+            f"{path} has gains of its own ({file.linear.evidence}), transforms.json a 'value_scale'; take one of them "
+            "out, as it is unclear which the numbers need"
+        )
+    scale, why = stated.value_scale, "'value_scale' of transforms.json"
+    if scale is None and file.dtype == np.uint8:
+        scale, why = 255.0, "numbers of 8 bits"
+    if scale is not None and file.linear is None:
+        file = replace(file, linear=linear_values(path, file.shape[2], [1 / scale], [], why))
+    if file.bands.wavelengths_nm is not None or wavelengths is None:
+        return file
+    if len(wavelengths) == file.shape[2]:
+        table = BandTable(wavelengths, "'wavelengths' of transforms.json, nm", stated.fwhm_nm)
+        return replace(file, bands=table)
+    if stated.has_bands:
+        raise CaptureError(
+            f"{path} has {file.shape[2]} bands, 'bands' of its frame {len(wavelengths)} indices; expected one a band"
+        )
     return file
 
 

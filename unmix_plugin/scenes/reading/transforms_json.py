@@ -355,7 +355,7 @@ class SensorEntry:
     """Bands of the scene, one a channel, in the order of the channels."""
 
 
-def _read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> SensorEntry:
+def read_sensor_entry(frame: dict[str, Any], where: str, faults: Faults) -> SensorEntry:
     """The keys `sensor` and `bands` of a frame; whether the bands exist is asked later."""
     name, bands = frame.get("sensor"), frame.get("bands")
     if name is not None and (not isinstance(name, str) or not name.strip()):
@@ -446,8 +446,8 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
         materials=_read_materials(content, faults),
         illuminant_path=_read_text(content, "illuminant_path", FILE_NAME, faults),
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
-        value_scale=_read_value_scale(content, faults),
-        fwhm_nm=_read_widths(content, faults),
+        value_scale=read_value_scale(content, faults),
+        fwhm_nm=read_widths(content, faults),
         split_lists=_read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
@@ -492,7 +492,7 @@ def _read_frame(
     lines = read_line_poses(frame, where, faults)
     is_frame_camera = lines is None and faults.noted == noted
     pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
-    lens, sensor = read_intrinsics(content, frame, where, faults), _read_sensor_entry(frame, where, faults)
+    lens, sensor = read_intrinsics(content, frame, where, faults), read_sensor_entry(frame, where, faults)
     named = {key: path for key, path in paths.items() if path is not None}
     shot = frame["capture"] if isinstance(frame.get("capture"), str) else None
     return FrameEntry(where, named, pose if lines is None else lines.middle, lens, sensor, lines, shot)
@@ -508,7 +508,8 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
     return value.replace("\\", "/")
 
 
-def _read_widths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, " B"] | None:
+def read_widths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, " B"] | None:
+    """The key `fwhm`, NaN where a width is unknown; None if it is absent, and with a noted fault if it is wrong."""
     values, centers = content.get("fwhm"), content.get("wavelengths")
     if values is None or not isinstance(centers, list):
         return None
@@ -554,7 +555,8 @@ def _read_wavelengths(
     return wavelengths
 
 
-def _read_value_scale(content: dict[str, Any], faults: Faults) -> float | None:
+def read_value_scale(content: dict[str, Any], faults: Faults) -> float | None:
+    """The stored number that stands for 1; None if it is absent, and with a noted fault if it is wrong."""
     value = content.get("value_scale")
     scale = read_number(value)
     if value is not None and (scale is None or not 1e-30 <= scale <= 1e30):
