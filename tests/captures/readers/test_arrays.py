@@ -161,6 +161,18 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 
+def test_wavelengths_and_widths_may_be_packed_and_no_data_has_many_names(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs.update({"MissingValue": -1, "nodata_value": -2, "FillValue": -3})
+        for name, packed in (("wavelength", NM * 10 - 100), ("fwhm", NM / 10)):
+            file[name] = np.rint(packed).astype("u2")
+            file[name].attrs["scale_factor"] = 0.1
+        file["wavelength"].attrs["add_offset"] = 10
+    file = open_spectral_file(tmp_path / "a.h5")
+    check_file(file, nm=NM, fwhm=NM / 100, no_data=(-3, -1, -2))
+
+
 def test_axes_by_the_names_of_netcdf4(tmp_path):
     square = CUBE[:5, :5]
     with h5py.File(tmp_path / "a.nc", "w") as opened:

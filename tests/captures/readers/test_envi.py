@@ -127,6 +127,7 @@ data ignore value = 65535
             {"fwhm": None, "warning": "FWHM are left out: they would be"},
         ),
         ("data ignore value = -9999 ; none measured", {"no_data": (-9999,)}),
+        ("data ignore value = {-9999, 0}", {"no_data": (-9999, 0), "warnings": ()}),
         ("data ignore value = unset", {"warning": "'data ignore value' is unset, no number: not used"}),
         (
             "wavelength = {400, 500, 600, 700}\nsensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}",

@@ -38,7 +38,10 @@ _CENTRES = re.compile(
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
 _SIDES = re.compile("n(row|col)s?")
 _GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
-_NO_DATA = ("_fillvalue", "missing_value", "data_ignore_value", "nodata", "no_data", "fill_value")
+_NO_DATA = (
+    *("_fillvalue", "fillvalue", "fill_value", "missing_value", "missingvalue", "data_ignore_value"),
+    *("nodata", "no_data", "nodata_value", "no_data_value"),
+)
 _GAINS, _OFFSETS = ("scale_factor", "reflectance_scale_factor"), ("add_offset",)
 _OWN_GAINS = ("scalefactor", "scale", "gain", "gains", "slope")
 _OWN_OFFSETS = ("offset", "offsets", "bias", "intercept")
@@ -249,7 +252,12 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
     """What arrays or attributes say of the bands."""
 
     def numbers(vector: FoundArray | None) -> list[object] | None:
-        return None if vector is None else vector.whole().reshape(-1).tolist()
+        if vector is None:
+            return None
+        stored: Any = vector.whole().reshape(-1)
+        gain, offset = (_first_number(vector.attributes, (name,)) for name in ("scale_factor", "add_offset"))
+        stored = stored if gain is None else stored * gain  # as CF packs any variable
+        return (stored if offset is None else stored + offset).tolist()
 
     centres, widths, good = (_find_vector(arrays, image, names) for names in (_CENTRES, _WIDTHS, _GOOD))
     of_image = [_find_attribute(image, names) for names in (_CENTRES, _WIDTHS, _GOOD)]

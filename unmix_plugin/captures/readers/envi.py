@@ -145,13 +145,11 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     exposure, exposure_warnings = exposure_facts(header, "header field")
     start, lines = _number(header, _DARK_START), file.shape[0]
     dark_lines = lines - int(start) if start is not None and 1 <= start < lines else 0
-    own, no_data = file.bands, _number(header, "data ignore value")
-    if no_data is None and header.get("data ignore value"):
-        linear_warnings += (f"'data ignore value' is {header['data ignore value']}, no number: not used",)
     if start is None and header.get(_DARK_START):
         linear_warnings += (
             f"'{_DARK_START}' is {header[_DARK_START]}, no number: dark lines may be left in the image",
         )
+    own, (no_data, no_data_warnings) = file.bands, _no_data(header)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
@@ -163,10 +161,20 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         notes=(*file.notes, _DARK_LINES) if dark_lines else file.notes,
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
-        no_data=file.no_data if no_data is None else tuple(dict.fromkeys((no_data, *file.no_data))),
-        warnings=file.warnings + band_warnings + linear_warnings + exposure_warnings,
+        no_data=tuple(dict.fromkeys((*no_data, *file.no_data))),
+        warnings=file.warnings + band_warnings + linear_warnings + no_data_warnings + exposure_warnings,
         metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
     )
+
+
+def _no_data(header: dict[str, str]) -> tuple[list[float], tuple[str, ...]]:
+    """Numbers that stand for no measurement, a comment behind them cut off; and warnings."""
+    key = "data ignore value"
+    items = header_items({key: header.get(key, "").partition(";")[0]}, key)
+    try:
+        return [float(item) for item in items], ()
+    except ValueError:
+        return [], (f"'{key}' is {header[key]}, no number: not used",)
 
 
 def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear | None, tuple[str, ...]]:
