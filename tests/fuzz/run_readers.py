@@ -46,7 +46,10 @@ def config_reader() -> Reader:
 
 def _read_config(path: Path) -> None:
     config = load_config(path.parent)
-    assert config.pipeline.model.eval_num_rays_per_chunk > 0
+    assert (
+        config.pipeline.model.eval_num_rays_per_chunk == "auto"
+        or config.pipeline.model.eval_num_rays_per_chunk > 0
+    )
 
 
 def _cameras(count: int = 1) -> Cameras:
