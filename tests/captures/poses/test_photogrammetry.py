@@ -100,10 +100,11 @@ def test_pixels_are_interpolated_where_skew_is_large(tmp_path):
     np.testing.assert_allclose(seen - plain, [[80 * y, 0.0]], atol=0.5)
 
 
-def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_path):
+@pytest.mark.parametrize("off", ["false", "0"])
+def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_path, off):
     extra = (
         '<camera id="90" sensor_id="0" label="loose"/>'
-        '<camera id="91" sensor_id="0" label="off" enabled="false"><transform>1</transform></camera>'
+        f'<camera id="91" sensor_id="0" label="off" enabled="{off}"><transform>1</transform></camera>'
     )
     found = read_metashape(tmp_path, ring(), extra=extra)
     assert_same_poses(found, ring())
@@ -111,6 +112,17 @@ def test_cameras_that_are_disabled_or_not_aligned_are_left_out_and_named(tmp_pat
     assert "1 disabled camera left out" in found.notes
     with pytest.raises(CaptureError, match="none of 2 cameras is enabled and has a transform"):
         read_metashape(tmp_path, {}, extra=extra)
+
+
+@pytest.mark.parametrize(("on", "off"), [("true", "false"), ("1", "0")])
+def test_a_chunk_that_is_disabled_is_left_out_even_if_it_has_the_most_cameras(tmp_path, on, off):
+    def chunk_of(count, enabled):
+        text = metashape_document(ring(count)).replace('enabled="true"', f'enabled="{enabled}"')
+        return text[text.index("<chunk") : text.index("</document>")]
+
+    path = tmp_path / "cameras.xml"
+    path.write_text(f'<document version="1.5.0">{chunk_of(8, off)}{chunk_of(4, on)}</document>')
+    assert_same_poses(read_poses(path), ring(4))
 
 
 @pytest.mark.parametrize(

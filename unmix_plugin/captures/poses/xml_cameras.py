@@ -52,7 +52,7 @@ _RADIAL = ("k1", "k2", "k3", "k4")
 def read_metashape(path: Path, root: _Element) -> PoseSet:
     """Poses of all enabled cameras with a transform, in or out of groups. Raises CaptureError: no chunk, no aligned
     camera, several components without a common world, or a lens that can't be represented."""
-    chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled", "true") != "false"]
+    chunks = [chunk for chunk in root.iter("chunk") if _is_enabled(chunk)]
     chunks = [chunk for chunk in chunks if chunk.find("cameras") is not None]
     if not chunks:
         raise CaptureError(f"{path} has no chunk with cameras; use File > Export > Export Cameras")
@@ -91,9 +91,14 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
     return replace(found, metres_per_unit=1.0 if is_geocentric else None)
 
 
+def _is_enabled(element: _Element) -> bool:
+    """Whether the user left a chunk or a camera switched on; up to version 1.5 it is written as 1 or 0."""
+    return element.get("enabled", "true").strip().lower() not in ("false", "0")
+
+
 def _aligned(chunk: _Element, path: Path, notes: list[str]) -> list[_Element]:
     cameras = [camera for group in chunk.findall("cameras") for camera in group.iter("camera")]
-    enabled = [camera for camera in cameras if camera.get("enabled", "true") != "false"]
+    enabled = [camera for camera in cameras if _is_enabled(camera)]
     if len(enabled) < len(cameras):
         notes.append(f"{counted(len(cameras) - len(enabled), 'disabled camera')} left out")
     aligned = [camera for camera in enabled if camera.find("transform") is not None]
