@@ -100,11 +100,12 @@ def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
 
 def _lens_opensfm(camera: Any, where: str) -> tuple[lens.Lens, str | None]:
     values = camera if isinstance(camera, dict) else {}
-    numbers = {key: read_number(value) for key, value in values.items()}
 
     def number(key: str, default: float = 0.0) -> float:
-        value = numbers.get(key)
-        return default if value is None else value
+        value = read_number(values.get(key, default))
+        if value is None:
+            raise CaptureError(f"{where}: '{key}' is {describe(values[key])}; expected a finite number")
+        return value
 
     width, height = int(number("width")), int(number("height"))
     kind = values.get("projection_type", "perspective")
