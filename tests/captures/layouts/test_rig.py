@@ -308,6 +308,15 @@ def test_a_lens_of_tags_sees_what_formulas_of_their_makers_say(tags, exif, by_ha
     assert notes == ()
 
 
+def test_a_picture_that_dji_has_dewarped_has_no_distortion():
+    for flag, terms in (("0", (0.008, -0.042, -0.0004, 0.0002, -0.06)), ("1", (0.0,) * 5)):
+        lens, notes = lens_of(file_with(DJI | {"drone-dji:DewarpFlag": flag}, {}))
+        lens = present(lens)
+        assert (*lens.distortion, lens.higher_radial[0]) == terms
+        assert (lens.focal_px, lens.center_px) == ((2200.5, 2199.5), (636.25, 488.0))
+        assert any("DewarpFlag 1" in note for note in notes) == (flag == "1")
+
+
 def fisheye_by_hand(x, y):
     radius = math.hypot(x, y)
     theta = 2 / math.pi * math.atan(radius)

@@ -223,7 +223,7 @@ def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
     tags = file.metadata.get("xmp") or {}
     try:
         if tag_numbers(tags, "DewarpData") is not None:
-            lens, notes = _dji_lens(file, tags), ()
+            lens, notes = _dji_lens(file, tags)
         else:
             lens, notes = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
         if not lens.is_possible:
@@ -267,15 +267,24 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
     return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2)), ()
 
 
-def _dji_lens(file: SpectralFile, tags: XmpTags) -> Lens:
-    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre."""
+def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens, tuple[str, ...]]:
+    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre.
+
+    Where `DewarpFlag` is not 0, the camera has taken the distortion out of its picture already.
+    """
     text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
     numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
     middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
     if len(numbers) != 9 or not np.isfinite(middle).all():
         raise _NoLensError("DewarpData or CalibratedOpticalCenter is incomplete")
+    notes: tuple[str, ...] = ()
+    flag = (tag_numbers(tags, "DewarpFlag") or [0.0])[0]
+    if flag:
+        numbers[4:] = [0.0] * 5
+        notes = (f"the camera took out the distortion (DewarpFlag {flag:g}), so the lens has none",)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    return _lens(file, (fx, fy), (middle[0] + cx + 0.5, middle[1] + cy + 0.5), (k1, k2, k3), (p1, p2))
+    center = (middle[0] + cx + 0.5, middle[1] + cy + 0.5)
+    return _lens(file, (fx, fy), center, (k1, k2, k3), (p1, p2)), notes
 
 
 def _lens(
