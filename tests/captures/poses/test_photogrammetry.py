@@ -145,14 +145,20 @@ def test_damaged_documents_are_refused(tmp_path, spoil, message):
         read_poses(path)
 
 
-def write_micmac(tmp_path, distortion="<ModNoDist/>", convention="eConvApero_DistM2C"):
+def same(text):
+    return text
+
+
+def write_micmac(
+    tmp_path, distortion="<ModNoDist/>", convention="eConvApero_DistM2C", orientation=same, calibration=same
+):
     folder = tmp_path / "Ori-All"
     folder.mkdir(exist_ok=True)
     for name, pose in ring().items():
         rows = dict(zip(("l1", "l2", "l3"), map(text_of, pose[:, :3] @ FLIP), strict=True))
         text = ORIENTATION.format(center=text_of(pose[:, 3]), convention=convention, **rows)
-        (folder / f"Orientation-{name.split('/')[-1]}.xml").write_text(text)
-    (folder / "AutoCal.xml").write_text(CALIBRATION.format(distortion=distortion))
+        (folder / f"Orientation-{name.split('/')[-1]}.xml").write_text(orientation(text))
+    (folder / "AutoCal.xml").write_text(calibration(CALIBRATION.format(distortion=distortion)))
     return folder
 
 
@@ -186,9 +192,46 @@ def test_distortion_in_pixels_about_its_own_centre_is_ours_within_half_a_pixel(t
     assert np.abs(500 * ideal + [321, 239] - wanted).max() > 3
 
 
+def affinity(shift, axis="1 0"):
+    return f"<I00>{shift}</I00><V10>{axis}</V10><V01>0 1</V01>"
+
+
+def before(tag, *texts):
+    """What puts elements before another one."""
+    return lambda document: document.replace(tag, "".join(texts) + tag)
+
+
+def moved(*args):
+    return before("<FileInterne>", f"<OrIntImaM2C>{affinity(*args)}</OrIntImaM2C>")
+
+
+@pytest.mark.parametrize("distortion", ["<ModNoDist/>", f"<ModRad>{RADIAL.format(a='-2e-7')}</ModRad>"])
+def test_the_lens_of_a_cut_picture_is_that_of_the_whole_seen_from_its_corner(tmp_path, distortion):
+    whole = lens_of(read_poses(write_micmac(tmp_path, distortion, orientation=moved("0 0"))))
+    sized = before("<CalibDistortion>", "<PixelSzIm>320 240</PixelSzIm>")
+    cut = lens_of(
+        read_poses(write_micmac(tmp_path, distortion, orientation=moved("-100 -80"), calibration=sized))
+    )
+    assert (whole.width, whole.height, cut.width, cut.height) == (640, 480, 320, 240)
+    ideal = np.array([[0.0, 0.0], [0.1, -0.05]])
+    np.testing.assert_allclose(cut.pixels_of(ideal), whole.pixels_of(ideal) - (100, 80))
+
+
 @pytest.mark.parametrize(
     ("options", "spoil", "message"),
     [
+        ({"orientation": moved("-100 -80")}, None, "no <PixelSzIm>"),
+        ({"orientation": moved("0 0", "0.5 0")}, None, "<OrIntImaM2C> turns or stretches"),
+        ({"orientation": before("<FileInterne>", "<OrIntImaM2C/>")}, None, "<OrIntImaM2C> lacks <I00>"),
+        (
+            {
+                "calibration": before(
+                    "<CalibDistortion>", f"<OrIntGlob><Affinite>{affinity('-9 0')}</Affinite></OrIntGlob>"
+                )
+            },
+            None,
+            "<OrIntGlob> moves the picture",
+        ),
         ({"distortion": "<ModUnif/>"}, None, "ModUnif"),
         ({"distortion": "<ModRad/>"}, None, "no centre <CDist>"),
         ({"convention": "eConvAngErdas"}, None, "eConvAngErdas; expected eConvApero_DistM2C"),
@@ -252,7 +295,10 @@ def test_poses_of_a_rig_are_composed(tmp_path):
         ({"cameras": {}}, "names the camera"),
         ({"cameras": {"c": {**PERSPECTIVE, "projection_type": "omni"}}}, "omni.*expected one of"),
         ({"cameras": {"c": {**PERSPECTIVE, "focal": 0}}}, "not above 0"),
-        ({"cameras": {"c": {**BROWN, "k1": float("nan")}}}, "camera c: 'k1' is NaN; expected a finite number"),
+        (
+            {"cameras": {"c": {**BROWN, "k1": float("nan")}}},
+            "camera c: 'k1' is NaN; expected a finite number",
+        ),
         ({"cameras": {"c": {**BROWN, "c_x": None}}}, "'c_x' is null"),
         ({"cameras": {"c": {**BROWN, "p1": "0.001"}}}, "'p1' is \"0.001\""),
         ({"cameras": {"c": {**PERSPECTIVE, "width": True}}}, "'width' is true"),

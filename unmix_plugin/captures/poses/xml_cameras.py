@@ -11,13 +11,15 @@ which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote u = cx + x' fx + y' skew, v
 MicMac: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it.
 
 Rotations lead from camera (OpenCV axes) to world. Distortion is in pixels about its own centre and acts on ideal
-pixels. Pixels are counted from the centre of the first one.
+pixels; <OrIntImaM2C> moves what comes of it to where it is in a picture that was cut. Pixels are counted from the
+centre of the first one.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeAlias
 from xml.etree import ElementTree
 
 import numpy as np
@@ -228,6 +230,9 @@ def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
 
 _PREFIX = "Orientation-"
 _CONVENTION = "eConvApero_DistM2C"
+_Shift: TypeAlias = tuple[float, float]
+_AFFINITY_TOLERANCE = 1e-6
+"""Of an affinity's axes from those of the identity, which moves no pixel by a tenth."""
 
 
 def find_orientations(folder: Path) -> list[Path]:
@@ -246,7 +251,7 @@ def find_orientations(folder: Path) -> list[Path]:
 def read_micmac(paths: list[Path]) -> PoseSet:
     """Poses of orientation files. Raises CaptureError: a file is damaged, of another convention, or its calibration is
     missing or can't be represented."""
-    lenses: dict[str, Lens] = {}
+    lenses: dict[tuple[str, _Shift], Lens] = {}
     notes: list[str] = []
     raw = []
     for path in paths:
@@ -276,10 +281,13 @@ def _pose_micmac(orientation: _Element, where: str) -> Float64[np.ndarray, "3 4"
     return np.column_stack([np.array(rows) @ FLIP, center])
 
 
-def _lens_micmac(orientation: _Element, path: Path, lenses: dict[str, Lens], notes: list[str]) -> Lens:
+def _lens_micmac(
+    orientation: _Element, path: Path, lenses: dict[tuple[str, _Shift], Lens], notes: list[str]
+) -> Lens:
     inner = orientation.find("Interne")
     name = (orientation.findtext("FileInterne") or "").strip()
-    key = name if inner is None else str(path)
+    shift = _shift_micmac(orientation.find("OrIntImaM2C"), str(path))
+    key = (name if inner is None else str(path), shift)
     if key not in lenses:
         where = str(path)
         if inner is None:
@@ -292,12 +300,44 @@ def _lens_micmac(orientation: _Element, path: Path, lenses: dict[str, Lens], not
             inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
         if inner is None:
             raise CaptureError(f"{where} holds no <CalibrationInternConique> of MicMac")
-        lenses[key], said = _calibration_micmac(inner, where)
+        lens, said = _calibration_micmac(inner, where)
         notes += said
+        lenses[key] = _cut_micmac(lens, inner, shift, where) if any(shift) else lens
     return lenses[key]
 
 
+def _shift_micmac(affinity: _Element | None, where: str) -> _Shift:
+    """Pixels x and y that an affinity adds to those of the calibration; CaptureError where it does more."""
+    if affinity is None:
+        return 0.0, 0.0
+    shift, *axes = (_numbers_of(affinity.find(tag), 2, where) for tag in ("I00", "V10", "V01"))
+    if shift is None or any(axis is None for axis in axes):
+        raise CaptureError(f"{where}: <{affinity.tag}> lacks <I00>, <V10> or <V01>; the file is damaged")
+    if np.abs(np.array(axes) - np.eye(2)).max() > _AFFINITY_TOLERANCE:
+        raise CaptureError(
+            f"{where}: <{affinity.tag}> turns or stretches the picture, which is not supported; resample scanned "
+            "pictures (ReSampFid) and orient them again"
+        )
+    return float(shift[0]), float(shift[1])
+
+
+def _cut_micmac(lens: Lens, inner: _Element, shift: _Shift, where: str) -> Lens:
+    """The lens of a picture cut out of the calibrated one, as ClipChantier does: <SzIm> stays that of the whole."""
+    size = _numbers_of(inner.find("PixelSzIm"), 2, where)
+    if size is None or size.min() < 1 or size.max() > 1e6:
+        raise CaptureError(
+            f"{where}: <OrIntImaM2C> says that the picture was cut, and no <PixelSzIm> of the calibration how large it "
+            "is; add its width and height"
+        )
+    return lens.seen_as(int(size[0]), int(size[1]), (-shift[0], -shift[1]), (1.0, 1.0))
+
+
 def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
+    if any(_shift_micmac(inner.find("OrIntGlob/Affinite"), where)):
+        raise CaptureError(
+            f"{where}: <OrIntGlob> moves the picture against its calibration, which is not supported; calibrate "
+            "pictures as they are"
+        )
     center, size = _numbers_of(inner.find("PP"), 2, where), _numbers_of(inner.find("SzIm"), 2, where)
     focal = _number_of(inner, "F", where)
     if center is None or size is None or focal <= 0 or size.min() < 1 or size.max() > 1e6:
