@@ -232,6 +232,16 @@ def test_the_lens_of_a_cut_picture_is_that_of_the_whole_seen_from_its_corner(tmp
             None,
             "<OrIntGlob> moves the picture",
         ),
+        (
+            {"orientation": lambda text: text.replace("eProjStenope", "eProjOrthographique")},
+            None,
+            "the projection eProjOrthographique; expected eProjStenope",
+        ),
+        (
+            {"calibration": lambda text: text.replace("_DistM2C", "_DistC2M")},
+            None,
+            "AutoCal.xml has the convention eConvApero_DistC2M; expected eConvApero_DistM2C",
+        ),
         ({"distortion": "<ModUnif/>"}, None, "ModUnif"),
         ({"distortion": "<ModRad/>"}, None, "no centre <CDist>"),
         ({"convention": "eConvAngErdas"}, None, "eConvAngErdas; expected eConvApero_DistM2C"),

@@ -229,7 +229,7 @@ def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
 # MicMac.
 
 _PREFIX = "Orientation-"
-_CONVENTION = "eConvApero_DistM2C"
+_CONVENTION, _PROJECTION = "eConvApero_DistM2C", "eProjStenope"
 _Shift: TypeAlias = tuple[float, float]
 _AFFINITY_TOLERANCE = 1e-6
 """Of an affinity's axes from those of the identity, which moves no pixel by a tenth."""
@@ -270,15 +270,21 @@ def read_micmac(paths: list[Path]) -> PoseSet:
 
 def _pose_micmac(orientation: _Element, where: str) -> Float64[np.ndarray, "3 4"]:
     stated = [orientation.findtext(f"{holder}/KnownConv") for holder in ("ConvOri", "Externe")]
-    convention = next(filter(None, stated), _CONVENTION)
-    if convention.strip() != _CONVENTION:
-        raise CaptureError(f"{where} has the convention {convention.strip()}; expected {_CONVENTION}")
+    _require_known("convention", next(filter(None, stated), None), _CONVENTION, where)
+    _require_known("projection", orientation.findtext("TypeProj"), _PROJECTION, where)
     center = _numbers_of(orientation.find("Externe/Centre"), 3, where)
     code = orientation.find("Externe/ParamRotation/CodageMatr")
     rows = [None if code is None else _numbers_of(code.find(tag), 3, where) for tag in ("L1", "L2", "L3")]
     if center is None or any(row is None for row in rows):
         raise CaptureError(f"{where}: <Centre> or the rotation's <L1>, <L2>, <L3> are missing")
     return np.column_stack([np.array(rows) @ FLIP, center])
+
+
+def _require_known(what: str, found: str | None, expected: str, where: str) -> None:
+    """Refuse what an element of MicMac names, unless it names the one that we follow, or is absent."""
+    name = (found or "").strip()
+    if name not in ("", expected):
+        raise CaptureError(f"{where} has the {what} {name}; expected {expected}")
 
 
 def _lens_micmac(
@@ -333,6 +339,7 @@ def _cut_micmac(lens: Lens, inner: _Element, shift: _Shift, where: str) -> Lens:
 
 
 def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
+    _require_known("convention", inner.findtext("KnownConv"), _CONVENTION, where)
     if any(_shift_micmac(inner.find("OrIntGlob/Affinite"), where)):
         raise CaptureError(
             f"{where}: <OrIntGlob> moves the picture against its calibration, which is not supported; calibrate "
