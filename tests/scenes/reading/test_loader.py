@@ -272,6 +272,14 @@ def test_keys_that_are_not_followed_or_not_known_are_said(tmp_path):
     assert unknown == "transforms.json: keys that are not known and not used: mask_file"
 
 
+def test_lens_keys_that_a_frame_has_otherwise_than_the_scene_are_said(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][1].update(fl_x=FOCAL, fl_y=None))
+    assert not load_scene(folder.root).warnings
+    folder.edit(lambda c: c["frames"][1].update(fl_x=33.0, k1=0.01))
+    (said,) = load_scene(folder.root).warnings
+    assert said.startswith("transforms.json: fl_x: frames have other values than the scene")
+
+
 def test_poses_of_three_rows_read_like_those_of_four(tmp_path):
     folder = make_scene(tmp_path / "scene")
     expected = load_scene(folder.root).cameras.camera_to_world

@@ -1,6 +1,7 @@
 """What can be wrong in transforms.json: each wrong value gets one clear message."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -37,6 +38,32 @@ def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):
     read_lens({**content, "k6": 0.1}, {"k6": None}, "frame 0", faults)
     with pytest.raises(SceneError, match="'k6' is set"):
         faults.raise_if_any()
+
+
+@pytest.mark.parametrize(
+    ("scene", "frame", "expected"),
+    [
+        ({"distortion_params": [0.1, 0.2, 0, 0, 0, 0]}, {"k1": -0.3}, {"distortion": (-0.3, 0.2, 0, 0)}),
+        (
+            {"k1": 0.1, "k2": 0.2},
+            {"distortion_params": [-0.3, 0, 0, 0, 0, 0]},
+            {"distortion": (-0.3, 0, 0, 0)},
+        ),
+        ({"k1": 0.1, "distortion_params": [-0.3, 0, 0, 0, 0, 0]}, {}, {"distortion": (-0.3, 0, 0, 0)}),
+        ({"camera_angle_x": 1.0}, {"x_fov": 30}, {"angles": (math.radians(30), None)}),
+        ({"x_fov": 30}, {"camera_angle_x": 1.0}, {"angles": (1.0, None)}),
+        ({"camera_angle_y": 1.0, "y_fov": 30}, {}, {"angles": (None, math.radians(30))}),
+        ({}, {"camera_angle_x": 1.0, "x_fov": 30}, {"angles": (math.radians(30), None)}),
+        ({"fl_x": 500, "fl_y": 510}, {"fl_x": 900}, {"focal_px": (900, 510)}),
+    ],
+)
+def test_a_lens_given_twice_is_that_of_the_frame_and_degrees_go_before_radians(
+    tmp_path, scene, frame, expected
+):
+    faults = Faults(tmp_path)
+    lens = read_lens(scene, frame, "frame 0", faults)
+    assert lens is not None
+    assert {name: getattr(lens, name) for name in expected} == expected
 
 
 @pytest.mark.parametrize(

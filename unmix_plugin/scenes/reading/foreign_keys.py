@@ -45,6 +45,8 @@ _SAID = {
     "black_transparent": "black pixels that instant-ngp takes for background: --mask black leaves them out",
     "fix_premult": "colours that instant-ngp divides by their opacity: they are taken as they are",
 }
+_LENS_KEYS = "fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model".split()  # noqa: SIM905
+"""Lens keys of frames, which nerfstudio does not look at where the scene has them."""
 _KNOWN = frozenset(
     """
     fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model camera_angle_x camera_angle_y x_fov y_fov
@@ -87,6 +89,12 @@ def keys_to_say(
         for key, meaning in _SAID.items()
         if any(_is_set(own.get(key)) for own in every)
     ]
+    twice = [key for key in _LENS_KEYS if any(_differs(content.get(key), own.get(key)) for own in every[1:])]
+    if twice:
+        warnings.append(
+            f"{', '.join(twice)}: frames have other values than the scene; the frames' are used, nerfstudio takes the "
+            "scene's. Take out those that are wrong"
+        )
     if len({repr(own["time"]) for own in every[1:] if "time" in own}) > 1:
         warnings.append("frames have a 'time': what moves between views is taken to stand still")
     unknown = sorted(
@@ -94,6 +102,11 @@ def keys_to_say(
     )
     notes = [f"keys that are not known and not used: {', '.join(unknown[:8])}"] if unknown else []
     return warnings, notes
+
+
+def _differs(common: Any, own: Any) -> bool:
+    """Whether a frame and the scene both give a value, and not the same."""
+    return common is not None and own is not None and common != own
 
 
 def _is_set(value: Any) -> bool:

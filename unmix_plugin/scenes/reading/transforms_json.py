@@ -1,7 +1,8 @@
 """transforms.json in nerfstudio's form with the keys of UnMix-NeRF: from text of unknown origin to typed entries.
 
 Nothing here opens a file other than transforms.json; a value of the wrong type becomes a noted fault and None. Keys of
-a frame come before those of the whole scene (nerfstudio's rule).
+a frame come before those of the whole scene. nerfstudio reads a lens key of a frame only where the scene has none, so
+a warning says where both are given and differ.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ _SMALLEST_ANGLE = 1e-6
 """Field of view in radians that is still one, and how much less than pi it must be."""
 _BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Also the order of nerfstudio's `distortion_params`."""
-_FOCAL_KEYS, _ANGLE_KEYS = ("fl_x", "fl_y"), ("camera_angle_x", "camera_angle_y", "x_fov", "y_fov")
+_FOCAL_KEYS = ("fl_x", "fl_y")
+_ANGLES = (("camera_angle_x", "x_fov"), ("camera_angle_y", "y_fov"))
+"""Keys of the field of view along x and along y, in radians and in degrees."""
 _A_NUMBER = "a finite number, at most 1e9"
 
 _RIGID_TOLERANCE = 5e-3
@@ -107,16 +110,10 @@ def read_lens(
         None, with noted faults, if a number is impossible.
     """
     noted_before = faults.noted
-    own, common = (
-        _read_intrinsic_matrix(one.get("intrinsic_matrix"), where, faults)
-        | {key: value for key, value in one.items() if value is not None}
-        for one in (frame, content)
-    )
+    own, common = (_lens_keys(one, where, faults) for one in (frame, content))
     for message in refused_keys(common, own, is_scene):
         faults.add(where, message)
-    has_angle, has_focal = (any(key in own for key in keys) for keys in (_ANGLE_KEYS, _FOCAL_KEYS))
-    if has_angle and not has_focal:  # which the focal length of others would go before
-        common = {key: value for key, value in common.items() if key not in _FOCAL_KEYS}
+    common = _not_overridden(common, own)
 
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
         source = own if key in own else common
@@ -143,13 +140,6 @@ def read_lens(
         for angle, field in zip(angles, fields, strict=True)
     )
     bending = [read(key, -GREATEST_PX, GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
-    listed = own.get("distortion_params", common.get("distortion_params"))
-    if listed is not None:
-        bending = [read_number(value) for value in listed] if isinstance(listed, list) else []
-        are_sound = all(number is not None and abs(number) <= GREATEST_PX for number in bending)
-        if len(bending) != len(_BENDING_KEYS) or not are_sound:
-            names = ", ".join(_BENDING_KEYS)
-            faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")
     if faults.noted > noted_before:
         return None
     width, height = (None if side is None else int(side) for side in sides)
@@ -160,6 +150,24 @@ def read_lens(
     return Intrinsics(
         model, width, height, focal_px, (angles[0], angles[1]), center_px, (k1, k2, p1, p2), (k3, k4)
     )
+
+
+def _lens_keys(one: dict[str, Any], where: str, faults: Faults) -> dict[str, Any]:
+    """Keys of a frame or of the scene that have a value, the lens by our own keys; of a field of view given twice, that
+    in degrees, as in nerfstudio."""
+    keys = _read_intrinsic_matrix(one.get("intrinsic_matrix"), where, faults)
+    keys |= {key: value for key, value in one.items() if value is not None}
+    keys |= _read_distortion_list(one.get("distortion_params"), where, faults)
+    twice = [in_radians for in_radians, in_degrees in _ANGLES if in_degrees in keys]
+    return {key: value for key, value in keys.items() if key not in twice}
+
+
+def _not_overridden(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Keys of the scene, less those that would go before a field of view of the frame."""
+    hidden = [key for names in _ANGLES if any(name in own for name in names) for key in names]
+    if hidden and not any(key in own for key in _FOCAL_KEYS):
+        hidden += _FOCAL_KEYS
+    return {key: value for key, value in common.items() if key not in hidden}
 
 
 def _read_model(lens: dict[str, Any], where: str, faults: Faults) -> Any:
@@ -188,6 +196,19 @@ def _read_intrinsic_matrix(matrix: Any, where: str, faults: Faults) -> dict[str,
         faults.add(where, f"'intrinsic_matrix' has {found}; expected focal lengths above 0 and no skew")
         return {}
     return {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+
+
+def _read_distortion_list(listed: Any, where: str, faults: Faults) -> dict[str, float]:
+    """The terms of `distortion_params` by our keys; none where there is no list."""
+    if listed is None:
+        return {}
+    numbers = [read_number(value) for value in listed] if isinstance(listed, list) else []
+    terms = [number for number in numbers if number is not None and abs(number) <= GREATEST_PX]
+    if len(numbers) != len(_BENDING_KEYS) or len(terms) != len(numbers):
+        names = ", ".join(_BENDING_KEYS)
+        faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")
+        return {}
+    return dict(zip(_BENDING_KEYS, terms, strict=True))
 
 
 def read_intrinsics(
