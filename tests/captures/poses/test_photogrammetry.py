@@ -91,6 +91,30 @@ def test_photoscans_old_form_counts_the_principal_point_from_the_corner(tmp_path
         assert (lens.focal_px, lens.center_px) == ((500, 510), center)
 
 
+@pytest.mark.parametrize("kind", ["frame", "fisheye"])
+def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
+    terms = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"
+    found = read_metashape(tmp_path, ring(), terms=terms, kind=kind)
+    x, y, squared = 0.3, 0.2, 0.13  # of the bent point; a fisheye sees the angle, a frame camera its tangent
+    growth = 1 + 8 * squared - 3 * squared**2
+    bent_x = x * (1 + 0.01 * squared) + growth * (0.003 * (squared + 2 * x**2) - 2 * 0.002 * x * y)
+    bent_y = y * (1 + 0.01 * squared) + growth * (-0.002 * (squared + 2 * y**2) + 2 * 0.003 * x * y)
+    radius = squared**0.5
+    ideal = np.array([[x, y]]) * (np.tan(radius) / radius if kind == "fisheye" else 1.0)
+    lens = lens_of(found)
+    seen = lens.resampled_from.project(ideal) if lens.resampled_from else lens.pixels_of(ideal)
+    np.testing.assert_allclose(seen, [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1)
+    said = "Metashape fisheye" if kind == "fisheye" else "Metashape with p3, p4"
+    assert any(said in note for note in found.notes)
+
+
+def test_terms_that_are_not_known_are_named(tmp_path):
+    terms = "<p3>8</p3><k5>0.1</k5><k6>0</k6><date>2019-05-01</date>"
+    found = read_metashape(tmp_path, ring(), terms=terms)
+    assert found.notes == ("sensor lens: numbers that are not known and not used: k5",)
+    assert lens_of(found).distortion == (0, 0, 0, 0)
+
+
 def test_pixels_are_interpolated_where_skew_is_large(tmp_path):
     sheared = read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
     assert any("pixels are interpolated" in note for note in sheared.notes)

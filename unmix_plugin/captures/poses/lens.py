@@ -299,8 +299,26 @@ def _equidistant(ideal: Points) -> Points:
 
 def bend_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
     """An equidistant lens bent as OpenCV bends a perspective one: with terms of theta^2, theta^4, ... (OPENCV_FISHEYE),
-    and with tangential ones (Metashape's fisheye)."""
+    and with tangential ones."""
     return _brown(_equidistant(ideal), radial, tangential)
+
+
+def bend_agisoft(
+    ideal: Points,
+    radial: Sequence[float],
+    tangential: Sequence[float],
+    growth: Sequence[float],
+    is_fisheye: bool,
+) -> Points:
+    """Metashape's frame and fisheye cameras; up to version 1.5 the tangential terms grow with 1 + p3 r^2 + p4 r^4.
+
+    Args:
+        tangential: In OpenCV's order.
+        growth: p3 and p4.
+    """
+    points = _equidistant(ideal) if is_fisheye else ideal
+    grown = _series((points**2).sum(axis=1), growth)[:, None]
+    return _brown(points, radial) + _tangential(points, tangential) * grown
 
 
 def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:

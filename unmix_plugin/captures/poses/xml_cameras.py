@@ -17,6 +17,7 @@ centre of the first one.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -28,8 +29,8 @@ from jaxtyping import Float64
 from unmix_plugin.captures.poses.lens import (
     Lens,
     Points,
+    bend_agisoft,
     bend_equirectangular,
-    bend_fisheye,
     bent_lens,
     fit_lens,
 )
@@ -49,6 +50,7 @@ _Element = ElementTree.Element
 _EARTH_RADII = (6.2e6, 6.6e6)
 """Metres from the middle of the Earth between which a position is geocentric."""
 _RADIAL = ("k1", "k2", "k3", "k4")
+_TERMS = ("f", "cx", "cy", "b1", "b2", "p1", "p2", "p3", "p4", *_RADIAL)
 
 
 def read_metashape(path: Path, root: _Element) -> PoseSet:
@@ -165,8 +167,7 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
         around, said = bent_lens(bend_equirectangular, (), start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
-    tags = ("f", "cx", "cy", "b1", "b2", "p1", "p2", *_RADIAL)
-    values = {tag: _number_of(calibration, tag, where) for tag in tags}
+    values = {tag: _number_of(calibration, tag, where) for tag in _TERMS}
     f_x = _number_of(calibration, "fx", where, values["f"] + values["b1"])
     f_y = _number_of(calibration, "fy", where, values["f"])
     skew = _number_of(calibration, "skew", where, values["b2"])
@@ -185,18 +186,31 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
     center, tangential = (center_x, center_y), (values["p2"], values["p1"])
     start, (k1, k2, k3, k4) = Lens(width, height, (f_x, f_y), center), [values[key] for key in _RADIAL]
     frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
-    if kind == "frame" and not skew:
-        return frame, []
+    growth, notes = (values["p3"], values["p4"]), _unknown_terms(calibration, name)
+    has_growth = any(growth) and any(tangential)
+    if kind == "frame" and not skew and not has_growth:
+        return frame, notes
 
     def bent_and_skewed(ideal: Points) -> Points:
-        bent = frame.pixels_of(ideal)
-        if kind == "fisheye":
-            bent = bend_fisheye(ideal, k1, k2, k3, k4, tangential=tangential) * (f_x, f_y) + center
-        return bent + np.column_stack([skew * (bent[:, 1] - center[1]) / f_y, np.zeros(len(bent))])
+        bent = bend_agisoft(ideal, frame.radial, tangential, growth, is_fisheye=kind == "fisheye")
+        return bent * (f_x, f_y) + center + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))])
 
-    model = "Metashape fisheye" if kind == "fisheye" else "Metashape with b2"
+    terms = " and ".join(term for term, is_there in (("b2", skew), ("p3, p4", has_growth)) if is_there)
+    model = "Metashape fisheye" if kind == "fisheye" else f"Metashape with {terms}"
     fitted, note = fit_lens(bent_and_skewed, start, model, where)
-    return fitted, [f"sensor {name}: {note}"]
+    return fitted, [*notes, f"sensor {name}: {note}"]
+
+
+def _unknown_terms(calibration: _Element, name: str) -> list[str]:
+    """A note that names numbers of a calibration that are not followed, if there are any."""
+    unknown = []
+    for child in calibration:
+        with suppress(ValueError):
+            if child.tag not in (*_TERMS, "fx", "fy", "skew") and float(child.text or ""):
+                unknown.append(child.tag)
+    return (
+        [f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}"] if unknown else []
+    )
 
 
 def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | None, tuple[int, int]]:
