@@ -4,7 +4,7 @@
 
 Cases are shared evenly among the readers of `tests/fuzz/readers.py`: valid samples with damage, each read, and each
 either accepted or refused with the error that the reader promises. A seed and a case's number reproduce its bytes.
-A million took five minutes on two quiet cores with 34 readers; there are 54 now. With `--minutes` it ends when the time
+A million take about ten minutes on two cores. With `--minutes` it ends when the time
 is up and reports the cases it did.
 """
 

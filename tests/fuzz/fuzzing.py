@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import time
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,6 +45,10 @@ def prepare(reader: Reader, folder: Path) -> Path:
     return folder / reader.file_name
 
 
+_DOUBTFUL_S = 2.0
+"""Processor time from which on a case is timed once more: a virtual machine that stood still counts that as work."""
+
+
 def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
     """Run cases of a reader.
 
@@ -67,6 +72,11 @@ def fuzz(name: str, folder: Path, seed: int, cases: range) -> Outcome:
         except Exception as error:  # noqa: BLE001 - any other exception is what fuzzing looks for
             outcome.foreign.append((case, f"{type(error).__name__}: {error}"))
         seconds = time.process_time() - started
+        if seconds > _DOUBTFUL_S:
+            started = time.process_time()
+            with suppress(Exception):
+                reader.read(path)
+            seconds = min(seconds, time.process_time() - started)
         if seconds > outcome.slowest_s:
             outcome.slowest_s, outcome.slowest_case = seconds, case
         if (grown := most_memory() - size) > outcome.most_bytes:
