@@ -13,12 +13,18 @@ samplings = st.lists(st.floats(1, 3000), min_size=1, max_size=40, unique_by=lamb
 
 
 @given(samplings)
-def test_intervals_tile_the_range_and_hold_their_centres(bands):
+def test_intervals_hold_their_centres_and_tile_all_but_the_gaps(bands):
     edges = bands.edges_nm
     assert len(edges) == len(bands) + 1
     assert (edges[:-1] < bands.centers_nm).all()
     assert (bands.centers_nm < edges[1:]).all()
-    np.testing.assert_allclose(bands.widths_nm.sum(), edges[-1] - edges[0])
+    low, high = bands.intervals_nm.T
+    assert ((edges[:-1] <= low) & (low < bands.centers_nm)).all()
+    assert ((bands.centers_nm < high) & (high <= edges[1:])).all()
+    np.testing.assert_array_equal(bands.widths_nm, high - low)
+    np.testing.assert_allclose(np.diff(bands.ranges_nm).sum(), bands.widths_nm.sum())
+    if len(bands.ranges_nm) == 1:
+        np.testing.assert_array_equal(bands.intervals_nm, np.stack([edges[:-1], edges[1:]], axis=1))
 
 
 @given(samplings)
@@ -39,6 +45,47 @@ def test_nearest_decides_by_distance_and_refuses_a_wavelength_outside_every_inte
 def test_edges_lie_midway_with_symmetric_outermost_bands_and_a_stated_width_of_a_lone_one():
     np.testing.assert_array_equal(Bands.of([400, 420, 480]).edges_nm, [390, 410, 450, 510])
     np.testing.assert_array_equal(Bands.of([550]).edges_nm, [545, 555])
+
+
+def without_water(step: float = 10.0) -> Bands:
+    """1000-1700 nm without 1345-1455 nm."""
+    nm = np.arange(1000, 1700 + step / 2, step)
+    return Bands.of(nm[(nm < 1345) | (nm > 1455)])
+
+
+def test_bands_beside_a_gap_reach_no_farther_into_it_than_half_their_spacing():
+    bands = without_water()
+    np.testing.assert_array_equal(bands.ranges_nm, [[995, 1345], [1455, 1705]])
+    np.testing.assert_array_equal(bands.widths_nm, 10)
+    assert bands.coverage == "995-1345, 1455-1705 nm"
+    assert [bands.contains(nm) for nm in (1345, 1346, 1400, 1455)] == [True, False, False, True]
+    assert bands.contains(1000, up_to_nm=1345)
+    assert not bands.contains(1300, up_to_nm=1500)
+    assert bands.nearest(1344) == bands.nearest(1340)
+    with pytest.raises(SpectrumError, match=r"no band at 1395 nm: .* cover 995-1345, 1455-1705 nm"):
+        bands.nearest(1395)
+
+
+def test_bands_reach_as_far_into_a_gap_as_the_instrument_is_known_to_see():
+    centers = without_water().centers_nm
+    np.testing.assert_array_equal(
+        Bands(centers, np.full(len(centers), 30.0)).ranges_nm, [[995, 1355], [1445, 1705]]
+    )
+    assert len(Bands(centers, np.full(len(centers), 4.0)).ranges_nm) == 2
+    assert len(Bands(centers, np.full(len(centers), 200.0)).ranges_nm) == 1
+
+
+@pytest.mark.parametrize(
+    "centers",
+    [
+        [400, 410, 420, 440, 450, 460],  # one band left out
+        [475, 560, 668, 717, 842],  # a multispectral camera
+        [400, 400.3, 405, 405.4, 410, 410.5, 415],  # two cameras of 5 nm
+        [400, 900],
+    ],
+)
+def test_uneven_steps_are_no_gaps(centers):
+    assert len(Bands.of(centers).ranges_nm) == 1
 
 
 def test_visible_mask_takes_380_to_780_nm_with_ends():

@@ -45,9 +45,8 @@ def test_a_flat_spectrum_is_1_in_every_channel(first, second):
 
 def test_a_channel_that_is_a_band_or_lies_in_one_gives_that_band():
     uneven = Bands.of([420, 440, 500, 510, 600])
-    edges = uneven.edges_nm
-    for index in range(len(uneven)):
-        seen = box(edges[index], edges[index + 1]).seen_by(uneven)
+    for index, (low, high) in enumerate(uneven.intervals_nm):
+        seen = box(low, high).seen_by(uneven)
         np.testing.assert_allclose(seen.matrix[:, 0], np.eye(5)[index], atol=1e-12)
     seen = sensor([400, 546, 547, 548, 700], line=[0, 0, 1, 0, 0]).seen_by(BANDS)
     assert seen.bands == Bands.of([547])
@@ -94,6 +93,20 @@ def test_channels_beyond_the_bands_are_left_out_and_named():
         SpectrumError, match=r"'toy' sees nothing: the bands cover 395-705 nm, .*SWIR1 \(1565-1655 nm\)"
     ):
         sensor(nm, SWIR1=[0, 0, 0, 0, 1, 1]).seen_by(BANDS)
+
+
+def test_a_channel_in_a_gap_of_the_bands_is_left_out_and_one_beside_it_is_as_without_the_gap():
+    nm = np.arange(1000.0, 1701, 10)
+    every, some = Bands.of(nm), Bands.of(nm[(nm < 1345) | (nm > 1455)])
+    both = sensor([1310, 1330, 1344, 1390, 1400, 1410], dry=[0, 1, 0, 0, 0, 0], wet=[0, 0, 0, 0, 1, 0])
+    seen = both.seen_by(some)
+    assert seen.names == ("dry",)
+    [note] = seen.notes
+    assert note.startswith("left out wet (139")
+    assert note.endswith("the bands cover 995-1345, 1455-1705 nm")
+    whole = both.seen_by(every)
+    assert (whole.names, whole.notes) == (("dry", "wet"), ())
+    np.testing.assert_allclose(seen.matrix[:35, 0], whole.matrix[:35, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(("beyond", "is_kept"), [(0.009, True), (0.011, False)])

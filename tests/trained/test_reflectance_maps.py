@@ -184,6 +184,23 @@ def test_a_map_that_makes_no_sense_is_refused(library, name, error, said):
         parse_reflectance_map(name.format(library), Bands.of(WAVELENGTHS_NM))
 
 
+@pytest.mark.parametrize("name", ["absorption:1300-1500", "absorption:area:1300-1500", "index:r1240/r1400"])
+def test_what_lies_where_bands_were_left_out_is_refused(name):
+    """Water takes 83 % away at 1400 nm: of the bands beside it alone 1 % would be found."""
+    nm = np.arange(1000.0, 1701, 10)
+    spectrum = torch.tensor(0.6 - 0.5 * np.exp(-(((nm - 1400) / 25) ** 2)))[None]
+    whole = parse_reflectance_map("absorption:1300-1500", Bands.of(nm)).fit(spectrum)(spectrum)
+    assert whole.item() == pytest.approx(0.5 / 0.6, abs=1e-3)
+    bands = Bands.of(nm[(nm < 1345) | (nm > 1455)])
+    with pytest.raises(SpectrumError, match="cover 995-1345, 1455-1705 nm"):
+        parse_reflectance_map(name, bands)
+    if name.startswith("absorption:"):
+        lit = torch.tensor((nm < 1345) | (nm > 1455))
+        with pytest.raises(SpectrumError, match=r"with light from 1300 to 1500 nm, .* cover 995-1345, 1455"):
+            parse_reflectance_map(name, Bands.of(nm), lit)
+    assert parse_reflectance_map("absorption:1200-1340", bands).what.endswith("1200 to 1340 nm")
+
+
 def test_reflectance_is_an_output_where_the_light_is_known_and_words_follow_the_light():
     lit, flat, unknown = make_scene(light=LIGHT), make_scene(light=[0.7] * 5), make_scene()
     view = lit.look(CAMERA)

@@ -1,8 +1,9 @@
 """Spectral sampling of a sensor.
 
 Notation: `B` bands, index `i` rising with wavelength; wavelengths in nm. Each band stands for an interval of the
-spectrum; the intervals tile the covered range without gaps: inner edges lie halfway between neighbouring centres, and
-the outermost bands are symmetric about their centres.
+spectrum: its edges lie halfway between neighbouring centres, and the outermost bands are symmetric about their centres.
+Where bands were left out there is a gap, into which those beside it reach no farther than half their spacing: what lies
+in there was not measured.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from unmix_plugin.errors import SpectrumError, counted
+from unmix_plugin.errors import SpectrumError, counted, name_some
 
 VISIBLE_RANGE_NM = (380.0, 780.0)
 """What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
@@ -27,6 +28,10 @@ _LEAST_NM = 100.0
 
 _LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
+
+_LEAST_GAP = 2.5
+"""A step so many times the spacing beside it is a gap. Two bands missing from an even sampling leave one; a single one,
+or the uneven steps of a multispectral camera, do not."""
 
 _NM_PER_UNIT = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
@@ -86,7 +91,8 @@ class Bands:
 
     @property
     def edges_nm(self) -> Float64[np.ndarray, " edges"]:
-        """The B + 1 borders of the bands' intervals in nm, increasing."""
+        """B + 1 borders halfway between the bands in nm, increasing; they pass over gaps, so colours are made of them:
+        a display has to show something for all of the eye's response."""
         centers = self.centers_nm
         if len(centers) == 1:
             return centers + _LONE_BAND_WIDTH_NM * np.array([-0.5, 0.5])
@@ -95,8 +101,37 @@ class Bands:
 
     @property
     def widths_nm(self) -> Float64[np.ndarray, " B"]:
-        """Widths of the bands' intervals in nm: an estimate of the sensor's from its spacing alone."""
-        return np.diff(self.edges_nm)
+        """Widths of the bands' intervals in nm: an estimate of the sensor's from its spacing."""
+        return np.diff(self.intervals_nm)[:, 0]
+
+    @property
+    def intervals_nm(self) -> Float64[np.ndarray, "B 2"]:
+        """From where to where each band stands for the spectrum, nm: up to its edges, but into a gap by half its
+        spacing, or half its width at half maximum where that is known and larger."""
+        centers, edges = self.centers_nm, self.edges_nm
+        fwhm = 0.0 if self.fwhm_nm is None else self.fwhm_nm
+        spacing = np.stack([_spacings_above(centers), _spacings_above(-centers[::-1])[::-1]], axis=1)
+        to_edge = np.stack([centers - edges[:-1], edges[1:] - centers], axis=1)
+        own = np.fmax(spacing, np.reshape(fwhm, (-1, 1))) / 2
+        reach = np.where(2 * to_edge > _LEAST_GAP * spacing, np.minimum(to_edge, own), to_edge)
+        tiled = np.stack([edges[:-1], edges[1:]], axis=1)
+        return np.where(reach < to_edge, centers[:, None] + reach * np.array([-1.0, 1.0]), tiled)
+
+    @property
+    def ranges_nm(self) -> Float64[np.ndarray, "R 2"]:
+        """What the intervals cover without a gap, from where to where, nm: one range, and one more for each gap."""
+        low, high = self.intervals_nm.T
+        is_gap = low[1:] > high[:-1]
+        return np.stack([low[np.append(True, is_gap)], high[np.append(is_gap, True)]], axis=1)
+
+    @property
+    def coverage(self) -> str:
+        """The covered ranges in words, for a message.
+
+        >>> Bands.of([450, 460, 470, 500, 510]).coverage
+        '445-475, 495-515 nm'
+        """
+        return name_some([f"{low:g}-{high:g}" for low, high in self.ranges_nm], most=6) + " nm"
 
     @property
     def visible_mask(self) -> Bool[np.ndarray, " B"]:
@@ -104,10 +139,11 @@ class Bands:
         low, high = VISIBLE_RANGE_NM
         return (self.centers_nm >= low) & (self.centers_nm <= high)
 
-    def contains(self, wavelength_nm: float | int) -> bool:
-        """Whether a wavelength lies in some band's interval (half a spacing beyond the outermost centres)."""
-        edges = self.edges_nm
-        return bool(edges[0] <= wavelength_nm <= edges[-1])
+    def contains(self, wavelength_nm: float | int, up_to_nm: float | int | None = None) -> bool:
+        """Whether a wavelength lies in some band's interval; or all that lies from it to another."""
+        low, high = self.ranges_nm.T
+        last = wavelength_nm if up_to_nm is None else up_to_nm
+        return bool(((low <= wavelength_nm) & (last <= high)).any())
 
     def nearest(self, wavelength_nm: float | int) -> int:
         """Index of the band whose centre is nearest; of two equally near the shorter wavelength.
@@ -119,9 +155,8 @@ class Bands:
         1
         """
         if not self.contains(wavelength_nm):
-            edges = self.edges_nm
             raise SpectrumError(
-                f"no band at {wavelength_nm:g} nm: {self} cover {edges[0]:g}-{edges[-1]:g} nm; choose one in there"
+                f"no band at {wavelength_nm:g} nm: {self} cover {self.coverage}; choose one in there"
             )
         return int(np.argmin(np.abs(self.centers_nm - wavelength_nm)))
 
@@ -168,6 +203,16 @@ def are_band_numbers(values: np.ndarray, may_have_gaps: bool = False) -> bool:
     if may_have_gaps:
         return bool((values == np.round(values)).all() and values.min() < _LEAST_NM)
     return float(values[0]) in (0.0, 1.0) and np.array_equal(values, values[0] + np.arange(len(values)))
+
+
+def _spacings_above(centers: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
+    """Mean of the next two steps above each centre, so that near duplicates don't count alone. Where only one is left
+    the median of all steps counts if it is larger, and where none is the spacing is infinite: nothing is known of it.
+    """
+    if len(centers) == 1:
+        return np.array([np.inf])
+    steps = np.diff(centers)
+    return np.concatenate([(steps[1:] + steps[:-1]) / 2, [max(steps[-1], np.median(steps)), np.inf]])
 
 
 def _require_one_axis(centers: np.ndarray) -> None:

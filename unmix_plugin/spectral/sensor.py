@@ -101,11 +101,12 @@ class Sensor:
         Raises:
             SpectrumError: no channel is left.
         """
-        in_bands = np.diff(self._responses_up_to(bands.edges_nm), axis=1)
+        integrals = self._responses_up_to(bands.intervals_nm.ravel())
+        in_bands = np.diff(integrals.reshape(len(integrals), len(bands), 2))[..., 0]
         seen = in_bands.sum(axis=1)
         [total] = self._responses_up_to(self.responses.bands.centers_nm[-1:]).T
         is_covered = seen >= (1 - _MOST_UNSEEN) * total
-        covered = f"the bands cover {bands.edges_nm[0]:g}-{bands.edges_nm[-1]:g} nm"
+        covered = f"the bands cover {bands.coverage}"
         names = self.responses.names
         left_out = [f"{names[s]} ({self._span(s)})" for s in np.flatnonzero(~is_covered).tolist()]
         if not is_covered.any():

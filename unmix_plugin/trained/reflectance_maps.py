@@ -184,11 +184,12 @@ def _absorption(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Ref
     low, high = float(match["low"]), float(match["high"])
     within = (bands.centers_nm >= low) & (bands.centers_nm <= high)
     chosen = np.flatnonzero(within & lit)
-    if low >= high or not (bands.contains(low) and bands.contains(high)) or len(chosen) < 3:
-        with_light = "" if lit[within].all() else " with light"
+    seen = Bands(bands.centers_nm[lit], None if bands.fwhm_nm is None else bands.fwhm_nm[lit])
+    if low >= high or not seen.contains(low, up_to_nm=high) or len(chosen) < 3:
+        with_light = "" if lit.all() else " with light"
         raise SpectrumError(
             f"absorption:{argument} needs three bands or more{with_light} from {low:g} to {high:g} nm, all of it "
-            f"covered; found {len(chosen)} of {bands}"
+            f"covered; found {len(chosen)} of {bands}, which cover {seen.coverage}"
         )
     measure, what = _MEASURES[match["measure"] or "depth"]
     window = bands.centers_nm[chosen]

@@ -244,9 +244,17 @@ def test_a_light_linear_in_wavelength_is_sampled_at_band_centres(tmp_path):
     path.write_text("wavelength,power\n300,0\n800,5\n")
     uneven = Bands.of([400, 410, 430, 480, 600])
     power = illuminant_power(path, uneven)
-    widths = uneven.edges_nm
-    middles = (widths[1:] + widths[:-1]) / 2
+    middles = uneven.intervals_nm.mean(axis=1)
     np.testing.assert_allclose(power / power[0], (middles - 300) / (middles[0] - 300))
+
+
+def test_what_a_light_lacks_in_a_gap_of_the_bands_is_not_missing_in_those_beside_it(tmp_path):
+    path = tmp_path / "sun.csv"
+    path.write_text("wavelength,power\n1000,1\n1346,1\n1347,0\n1453,0\n1454,1\n1700,1\n")
+    nm = np.arange(1000.0, 1700, 10)
+    bands = Bands.of(nm[(nm < 1345) | (nm > 1455)])
+    np.testing.assert_allclose(illuminant_power(path, bands), 1.0)
+    assert brightness(np.where(bands.centers_nm == 1340, 1.0, 0.0), bands) == pytest.approx(1 / len(bands))
 
 
 @pytest.mark.parametrize(

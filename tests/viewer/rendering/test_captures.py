@@ -124,19 +124,29 @@ def test_pictures_that_would_not_fit_are_refused(size, message):
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
     with source.borrowed() as scene:
-        products = choose_formats((output_of(replace(chosen, layer=layer)),), ("mp4",), scene, True)
+        products = choose_formats(
+            (output_of(replace(chosen, layer=layer), scene.bands),), ("mp4",), scene, True
+        )
     assert [product.format for product in products] == ["mp4"]
     if layer in ("band", "false-colour"):  # the first settings are outputs for bands anywhere
         bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
         materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
-        find_output(output_of(replace(first_settings(bands), layer=layer)), materials)
+        find_output(output_of(replace(first_settings(bands), layer=layer), bands), materials)
 
 
 def test_an_absorption_goes_by_its_own_name_and_what_is_no_output_is_refused():
-    assert output_of(LayerSettings(layer="index", index="absorption:650-700")) == "absorption:650-700"
+    bands = Bands.of([450.0, 550.0, 650.0])
+    assert output_of(LayerSettings(layer="index", index="absorption:650-700"), bands) == "absorption:650-700"
     for layer in ("error", "index"):
         with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
-            output_of(LayerSettings(layer=layer))
+            output_of(LayerSettings(layer=layer), bands)
+
+
+def test_a_wavelength_in_a_gap_of_the_bands_goes_by_the_band_that_is_shown():
+    bands = Bands.of([1000.0, 1010, 1020, 1330, 1340])
+    settings = LayerSettings("band", 1200.0, (1335.0, 1200.0, 990.0))
+    assert output_of(settings, bands) == "band:1330nm"
+    assert output_of(replace(settings, layer="false-colour"), bands) == "false-colour:1330,1330,1000"
 
 
 def test_the_words_are_those_of_the_command(tmp_path):

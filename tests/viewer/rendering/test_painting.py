@@ -319,7 +319,12 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
     [
         ("error", "", ConfigError, "no error to show: the scene is not at hand"),
         ("x-ray", "", ConfigError, "there is no layer named 'x-ray'; known: rgb, false-colour"),
-        ("index", "", ConfigError, r"type a formula of the wavelengths from 425 to 675 nm.*r650/r450"),
+        (
+            "index",
+            "",
+            ConfigError,
+            r"type a formula of wavelengths that the bands cover, 425-675 nm, .*r650/r450",
+        ),
         ("index", "prri", ConfigError, "nearest: pri"),
         ("index", "ndvi", SpectrumError, "needs 800 nm"),
     ],

@@ -349,7 +349,7 @@
     index: () => {
       const known = facts.indices[state.index];
       const text = state.formula || known?.formula || "";
-      const formula = Spectra.parseFormula(text, facts.wavelengths_nm, facts.edges_nm);
+      const formula = Spectra.parseFormula(text, facts.wavelengths_nm, facts.ranges_nm);
       const values = new Float32Array(V);
       const reflectance = new Array(B).fill(NaN);
       for (let v = 0; v < V; v++) {
@@ -665,9 +665,11 @@
     return facts.wavelengths_nm.map((_, b) => b).filter((b) => facts.wavelengths_nm[b] >= low && facts.wavelengths_nm[b] <= high && isLit[b]);
   };
   const isRemoved = () => $("curve").value === "continuum removed";
+  // Whether there are bands all over the window: without them nobody knows what absorbs there.
+  const isCovered = (bands) => facts.ranges_nm.some(([low, high]) => bands.every((b) => low <= facts.wavelengths_nm[b] && facts.wavelengths_nm[b] <= high));
   const absorptionOf = (probe) => {
     const bands = windowBands();
-    if (!isRemoved() || bands.length < 3) return null;
+    if (!isRemoved() || bands.length < 3 || !isCovered(bands)) return null;
     const reflectance = reflectanceOf(probe.spectrum);
     return Spectra.absorption(bands.map((b) => reflectance[b]), bands.map((b) => facts.wavelengths_nm[b]));
   };
@@ -729,13 +731,17 @@
     });
     draw("text", { x: (left + right) / 2, y: bottom + 27, "text-anchor": "middle" }, `wavelength (nm); up: ${quantity}`);
     const at = (value, i) => (Number.isFinite(value) ? `${x(nm[i]).toFixed(1)},${y(value).toFixed(1)}` : "");
+    // No line over a gap: what is between was not measured.
+    const parts = facts.ranges_nm.map(([low, high]) => nm.map((_, i) => i).filter((i) => low <= nm[i] && nm[i] <= high));
     lines.forEach(({ values, spread, colour, style = { "stroke-width": 1.8 } }) => {
-      if (spread) {
-        const above = values.map((value, i) => at(value + spread[i], i));
-        const below = values.map((value, i) => at(Math.max(value - spread[i], 0), i)).reverse();
-        draw("polygon", { points: [...above, ...below].join(" "), fill: colour, "fill-opacity": 0.2 });
+      for (const part of parts.filter((one) => one.length)) {
+        if (spread) {
+          const above = part.map((i) => at(values[i] + spread[i], i));
+          const below = part.map((i) => at(Math.max(values[i] - spread[i], 0), i)).reverse();
+          draw("polygon", { points: [...above, ...below].join(" "), fill: colour, "fill-opacity": 0.2 });
+        }
+        draw("polyline", { points: part.map((i) => at(values[i], i)).join(" "), fill: "none", stroke: colour, ...style });
       }
-      draw("polyline", { points: values.map(at).join(" "), fill: "none", stroke: colour, ...style });
     });
     return svg;
   };
@@ -760,7 +766,7 @@
     ["base colour red", "base colour green", "base colour blue", "roughness", "metallicity"].forEach((what, i) =>
       add(what, (probe) => probe.finish?.[i]));
     const bands = windowBands();
-    if (isRemoved() && bands.length >= 3) {
+    if (isRemoved() && bands.length >= 3 && isCovered(bands)) {
       const of = `of the absorption from ${facts.wavelengths_nm[bands[0]]} to ${facts.wavelengths_nm[bands.at(-1)]} nm`;
       ["depth", "centre", "area"].forEach((what) => add(`${what} ${of}`, (probe) => absorptionOf(probe)[what]));
     }

@@ -255,7 +255,16 @@ def _kept_regions(
 def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
     """Spectra, lights and names, as page.js reads them; empty where there are no bands."""
     if materials is None:
-        names = ("wavelengths_nm", "edges_nm", "names", "colours", "endmembers", "specular", "rgb", "indices")
+        names = (
+            "wavelengths_nm",
+            "ranges_nm",
+            "names",
+            "colours",
+            "endmembers",
+            "specular",
+            "rgb",
+            "indices",
+        )
         return {**{name: [] for name in names}, "light": None, "is_lit": [], "colour_map": _colour_map()}
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
@@ -268,7 +277,7 @@ def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
         lights.append({"name": light, "factors": rounded(factors), "notes": notes})
     return {
         "wavelengths_nm": rounded(bands.centers_nm),
-        "edges_nm": rounded(bands.edges_nm),
+        "ranges_nm": rounded(bands.ranges_nm),
         "is_lit": materials.is_lit.tolist(),
         "names": list(materials.names),
         "colours": rounded(endmember_colours(materials)),

@@ -110,7 +110,7 @@ const Spectra = (() => {
 
   // A formula of reflectances: { value, bands }, the function that evaluates it and the bands that it looks at.
   // Numbers, r800, + - * / ^ **, parentheses, sqrt log exp abs min max; what is not finite is NaN.
-  const parseFormula = (text, nm, edges) => {
+  const parseFormula = (text, nm, ranges) => {
     const tokens = text.toLowerCase().match(/\d+\.?\d*(?:e[+-]?\d+)?|\.\d+|[a-z_][a-z0-9_.]*|\*\*|\S/g) || [];
     const used = new Set();
     let at = 0;
@@ -127,7 +127,7 @@ const Spectra = (() => {
     );
     const finite = (value) => (Number.isFinite(value) ? value : NaN);
     const reflectanceAt = (wavelength) => {
-      if (wavelength < edges[0] || wavelength > edges.at(-1)) throw new Error(`${wavelength} nm is outside the bands`);
+      if (!ranges.some(([low, high]) => low <= wavelength && wavelength <= high)) throw new Error(`${wavelength} nm is outside the bands`);
       let right = nm.findIndex((centre) => centre >= wavelength);
       if (right < 0) right = nm.length - 1;
       const left = nm[right] <= wavelength || right === 0 ? right : right - 1;

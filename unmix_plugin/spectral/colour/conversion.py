@@ -7,11 +7,11 @@ greatest band 1; a band sees its mean over the band's interval, so that narrow l
 and a light that is known only up to the outermost band centres is taken to continue at its last value.
 
 White. The flat spectrum 1 (illuminant E at the sensor's full scale) is rendered as the display's white: linear RGB
-(1, 1, 1), hence Y = 1. Each colour matching function is integrated over each band's interval, and the three linear RGB
-columns are then scaled one by one to sum to 1 (a von Kries adaptation whose cones are the sRGB primaries; it also
-compensates a channel that a range cut at 450 or 650 nm shortens). The scene's lamp is not divided out: a yellow lamp
-stays yellow. Of the conventions tried (no adaptation, Bradford from E or from the lamp to D65, XYZ scaling), this one
-reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
+(1, 1, 1), hence Y = 1. Each colour matching function is integrated between each band's edges, gaps included, and the
+three linear RGB columns are then scaled one by one to sum to 1 (a von Kries adaptation whose cones are the sRGB
+primaries; it also compensates a channel that a range cut at 450 or 650 nm shortens). The scene's lamp is not divided
+out: a yellow lamp stays yellow. Of the conventions tried (no adaptation, Bradford from E or from the lamp to D65, XYZ
+scaling), this one reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
 
 Sensors whose bands cannot tell colours get a false-colour composite instead: see `colour_mode`.
 """
@@ -132,9 +132,8 @@ def power_in_bands(
         return power
     if beyond == "refuse":
         resample_spectra(power, source, bands)
-    edges = bands.edges_nm
-    [integrals] = integrals_up_to(edges, power[None], source.centers_nm)
-    return np.diff(integrals) / np.diff(edges)
+    [integrals] = integrals_up_to(bands.intervals_nm.ravel(), power[None], source.centers_nm)
+    return np.diff(integrals.reshape(-1, 2))[:, 0] / bands.widths_nm
 
 
 def covered_bands(light: str | Path, bands: Bands) -> Bool[np.ndarray, " B"]:

@@ -354,9 +354,8 @@ def parse_index(text: str, bands: Bands) -> _SpectralIndex:
     formula = parse_formula(named.formula if named else _require_formula(text))
     missing = _missing(formula, bands)
     if missing:
-        edges = bands.edges_nm
         raise SpectrumError(
-            f"index {name} needs {_listed(missing)} nm but the bands cover {edges[0]:g}-{edges[-1]:g} nm; "
+            f"index {name} needs {_listed(missing)} nm but the bands cover {bands.coverage}; "
             f"nothing is extrapolated; named ones that these bands reach: "
             f"{', '.join(available_indices(bands)) or 'none'}"
         )

@@ -204,7 +204,7 @@ class CapturePanel:
         session, services = self._session, self._session.services
         if self._video is not None:
             raise ConfigError("a video is being rendered already; wait for it or cancel it")
-        output = output_of(session.view.settings)
+        output = output_of(session.view.settings, session.materials().bands)
         check_size(_side(self._width), _side(self._height))
         cameras = self._save_path()
         recipe = None

@@ -24,13 +24,14 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.video import OWN_GROUP
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.rendering.painting import index_output
-from unmix_plugin.viewer.rendering.settings import LayerSettings
+from unmix_plugin.viewer.rendering.settings import LayerSettings, covered
 
 SIDE_BOUNDS = (16, 8192)
 """Least and greatest width and height of a picture."""
@@ -186,16 +187,20 @@ def _end(process: subprocess.Popen[str]) -> None:
             return
 
 
-def output_of(settings: LayerSettings) -> str:
-    """The output of renders that a layer shows.
+def output_of(settings: LayerSettings, bands: Bands) -> str:
+    """The output of renders that a layer shows, by the bands that it shows.
 
     Raises:
         ConfigError: renders have no such output.
     """
+
+    def shown(wavelength_nm: float) -> str:
+        return f"{bands.centers_nm[bands.nearest(covered(bands, wavelength_nm))]:g}"
+
     if settings.layer == "band":
-        return f"band:{settings.wavelength_nm:g}nm"
+        return f"band:{shown(settings.wavelength_nm)}nm"
     if settings.layer == "false-colour":
-        return "false-colour:" + ",".join(f"{value:g}" for value in settings.false_colour_nm)
+        return "false-colour:" + ",".join(map(shown, settings.false_colour_nm))
     if settings.layer == "index" and settings.index:
         return index_output(settings.index)
     if settings.layer == "abundance":

@@ -244,10 +244,10 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     """The index or absorption that is chosen, over the background where it is undefined or hardly anything is seen."""
     materials, bands = frame.materials, frame.materials.bands
     if not settings.index:
-        edges, centers = bands.edges_nm, bands.centers_nm
+        centers = bands.centers_nm
         raise ConfigError(
-            f"no spectral index is chosen: type a formula of the wavelengths from {edges[0]:g} to {edges[-1]:g} nm "
-            f"that the bands cover, such as r{float(centers[-1]):g}/r{float(centers[0]):g}"
+            f"no spectral index is chosen: type a formula of wavelengths that the bands cover, {bands.coverage}, "
+            f"such as r{float(centers[-1]):g}/r{float(centers[0]):g}"
         )
     asked = parse_reflectance_map(index_output(settings.index), bands, materials.is_lit)
     index, rows = asked.fit(torch.empty(0, len(bands))), frame.coefficients.flatten()

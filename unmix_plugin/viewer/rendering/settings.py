@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.viewer.page import choice, number, text
@@ -104,5 +106,6 @@ _CHECKS: dict[str, Callable[[Any, Any], Any]] = {
 
 def covered(bands: Bands, wavelength_nm: float) -> float:
     """The wavelength, or the nearest that some band covers."""
-    low, high = float(bands.edges_nm[0]), float(bands.edges_nm[-1])
-    return min(max(low, wavelength_nm), high)
+    low, high = bands.ranges_nm.T
+    within = np.clip(wavelength_nm, low, high)
+    return float(within[np.argmin(abs(within - wavelength_nm))])
