@@ -77,6 +77,16 @@ def test_a_name_that_means_nothing_is_refused_with_what_could_be_meant(name, mes
         SCENE.output(name)
 
 
+def test_bands_are_told_by_the_wavelength_that_is_shown():
+    band, exact = SCENE.output("band:530nm"), SCENE.output("band:550nm")
+    assert band.what.endswith(": 550 nm (asked: 530 nm)")
+    assert exact.what.endswith(": 550 nm")
+    composite = SCENE.output("false-colour:640, 550,460nm")
+    assert composite.what.endswith(": 650, 550, 450 nm (asked: 640, 550, 460 nm)")
+    assert (band.centers_nm, composite.centers_nm) == ((550.0,), (650.0, 550.0, 450.0))
+    assert SCENE.output("spectral").centers_nm == ()
+
+
 @pytest.mark.parametrize("name", ["band:900nm", "false-colour:860,650,550", "index:ndvi"])
 def test_bands_that_are_not_there_are_refused_before_anything_is_rendered(monkeypatch, name):
     monkeypatch.setattr(type(SCENE), "look", None)

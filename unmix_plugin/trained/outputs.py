@@ -5,7 +5,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
@@ -18,6 +18,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.registry import Output, OutputKind, no_output
 from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import band_composite_matrix, linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.features import FEWEST_BANDS, continuum_removed, derivative_matrix
 from unmix_plugin.spectral.materials import Coefficients, Materials
@@ -103,6 +104,8 @@ class MaterialOutput(Output):
 
     compute: Callable[[MaterialView], Tensor] = field(kw_only=True)
     """From a rendered view to (H, W, ...)."""
+    centers_nm: tuple[float, ...] = field(default=(), kw_only=True)
+    """Of the bands that are chosen, one for each of its channels; empty where it is made of no single bands."""
 
 
 def _linear_rgb(view: MaterialView) -> Tensor:
@@ -294,16 +297,27 @@ class _Family:
     SpectrumError where the bands don't cover it."""
 
 
-def _made(name: str, what: str, compute: Callable[[MaterialView], Tensor]) -> MaterialOutput:
+def _made(
+    name: str, what: str, compute: Callable[[MaterialView], Tensor], centers_nm: tuple[float, ...]
+) -> MaterialOutput:
     family = FAMILIES[name.partition(":")[0]]
-    return MaterialOutput(name, family.kind, family.title, what, compute=compute)
+    return MaterialOutput(name, family.kind, family.title, what, compute=compute, centers_nm=centers_nm)
+
+
+def _shown_nm(bands: Bands, wavelengths_nm: Sequence[float]) -> tuple[tuple[float, ...], str]:
+    """Centres of the bands that are nearest to the wavelengths asked for, and both in words where they differ."""
+    centers = tuple(float(bands.centers_nm[bands.nearest(asked)]) for asked in wavelengths_nm)
+    shown, asked = (", ".join(f"{nm:g}" for nm in values) for values in (centers, wavelengths_nm))
+    return centers, f"{shown} nm" + (f" (asked: {asked} nm)" if shown != asked else "")
 
 
 def _band(name: str, argument: str, materials: Materials) -> MaterialOutput:
-    band = materials.bands.nearest(_wavelength_nm(argument, name))
+    wavelength = _wavelength_nm(argument, name)
+    centers, shown = _shown_nm(materials.bands, [wavelength])
+    band = materials.bands.nearest(wavelength)
     column = torch.eye(len(materials.bands))[:, band : band + 1]
-    what = f"{materials.quantity} of one band on black, 1 = full scale: {argument}"
-    return _made(name, what, lambda view: view.materials.through(view.coefficients, column)[..., 0])
+    what = f"{materials.quantity} of one band on black, 1 = full scale: {shown}"
+    return _made(name, what, lambda view: view.materials.through(view.coefficients, column)[..., 0], centers)
 
 
 def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOutput:
@@ -312,9 +326,12 @@ def _false_colour(name: str, argument: str, materials: Materials) -> MaterialOut
         raise ConfigError(
             f"false-colour takes three wavelengths, as in {FAMILIES['false-colour'].example}; got {name}"
         )
-    matrix = band_composite_matrix(materials.bands, (wavelengths[0], wavelengths[1], wavelengths[2]))
-    what = f"three bands as red, green and blue, {materials.quantity} on black: {argument}"
-    return _made(name, what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1))
+    matrix = band_composite_matrix(materials.bands, wavelengths)
+    centers, shown = _shown_nm(materials.bands, wavelengths)
+    what = f"three bands as red, green and blue, {materials.quantity} on black: {shown}"
+    return _made(
+        name, what, lambda view: view.materials.through(view.coefficients, matrix).clamp(0, 1), centers
+    )
 
 
 def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:

@@ -51,6 +51,10 @@ def test_numbers_are_what_the_model_renders_bit_for_bit(written, kind, count):
                 assert str(metadata["description"]).startswith(name)
                 if name == "spectral":
                     assert [float(str(nm)) for nm in metadata["wavelength"]] == [450, 500, 550, 600, 650]
+                if name == "false-colour:650,550,450":
+                    assert [float(str(nm)) for nm in metadata["wavelength"]] == [650, 550, 450]
+                if name == "band:550nm":
+                    assert [float(str(nm)) for nm in metadata["wavelength"]] == [550]
                 if name == "abundances":
                     assert metadata["band names"] == list(SCENE.materials.names)
                     assert "wavelength" not in metadata

@@ -37,6 +37,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES
 from unmix_plugin.spectral.segmentation import NOTHING_ID
+from unmix_plugin.trained.outputs import MaterialOutput
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -316,7 +317,10 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     shape = (height, width, len(names))
     bands = setting.bands if output.kind in ("channels", "spectra") else None
     description = f"{output.name}: {output.what}"
-    more = None if setting.map_info is None else setting.map_info.envi
+    more = {} if setting.map_info is None else dict(setting.map_info.envi)
+    if isinstance(output, MaterialOutput) and output.centers_nm:
+        # In the order of the channels, which for a false colour is seldom that of bands.
+        more |= {"wavelength units": "Nanometers", "wavelength": output.centers_nm}
     with envi_cube_rows(path.with_suffix(""), shape, bands, list(names), description, more) as add:
         yield lambda rows: add(rows.values[output.name].reshape(-1, *shape[1:]))
 
