@@ -108,6 +108,31 @@ def test_a_scene_relit_by_a_light_that_ends_among_its_bands_renders_and_says_whi
     assert view["index:r500"].isfinite().any()
 
 
+def test_spectra_in_a_flat_light_are_reflectance_only_where_a_white_is_1():
+    lit = edited(lit_scene(), light="E")
+    assert lit.light is not None
+    assert_close(lit.light, lit.light.max().expand(5))
+    assert lit.light.max() < 0.95
+    assert lit.materials.quantity == "radiance"
+    assert lit.output("spectral").what.startswith("radiance on black")
+    assert "reflectance" in [one.name for one in lit.outputs]
+    assert edited(make_scene(light=[1.0] * 5), light="E").materials.quantity == "reflectance"
+    assert edited(make_scene(light=[1.0] * 5), light="A").materials.quantity == "radiance"
+
+
+def test_an_unknown_light_stays_unknown_in_any_other():
+    unknown = make_scene()
+    for light in ("E", "A"):
+        lit = edited(edited(unknown, light=light), "rename: {endmember: 0, name: clay}", light=light)
+        assert lit.materials.quantity == "radiance"
+        assert not with_sensor(lit, SENSOR).materials.is_light_known
+        assert lit.output("spectral").what.startswith("radiance on black")
+        assert "of radiance, since the scene's light is unknown" in lit.output("continuum").what
+        with pytest.raises(SpectrumError, match="the scene's light is unknown"):
+            lit.output("reflectance")
+        assert sum("taken as flat" in note for note in lit.notes) == 2  # each time that it is lit
+
+
 WIDE_BANDS = Bands.of(np.linspace(400, 700, 31))
 WIDE_LIGHT = illuminant_power("D50", WIDE_BANDS)
 TO_RGB = WIDE_LIGHT[:, None] * rgb_matrix(WIDE_BANDS, torch.float64).numpy()

@@ -152,6 +152,13 @@ def test_areas_are_as_good_on_small_triangles_as_on_large_ones():
     np.testing.assert_allclose(found, areas, rtol=1e-3)
 
 
+@pytest.mark.parametrize(("light", "is_assumed"), [(None, False), (torch.ones(len(SCENE.bands)), True)])
+def test_a_page_says_that_the_light_is_unknown_though_another_was_lit(light, is_assumed):
+    assert page._spectral_facts(SCENE.materials)["is_light_known"]
+    unknown = replace(SCENE.materials, light=light, is_light_assumed=is_assumed)
+    assert not page._spectral_facts(unknown)["is_light_known"]
+
+
 def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
     light = torch.ones(len(SCENE.bands))
     light[2] = 1e-4

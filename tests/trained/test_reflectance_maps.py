@@ -202,16 +202,17 @@ def test_what_lies_where_bands_were_left_out_is_refused(name):
 
 
 def test_reflectance_is_an_output_where_the_light_is_known_and_words_follow_the_light():
-    lit, flat, unknown = make_scene(light=LIGHT), make_scene(light=[0.7] * 5), make_scene()
+    lit, white, unknown = make_scene(light=LIGHT), make_scene(light=[1.0] * 5), make_scene()
+    dim = make_scene(light=[0.7] * 5)  # flat, but a white is 0.7
     view = lit.look(CAMERA)
     seen = view.opacity >= 0.5
     expected = view["spectral"][seen] / view.opacity[seen][:, None] / torch.tensor(LIGHT)
     assert_close(view["reflectance"][seen], expected)
     assert view["reflectance"][~seen].isnan().all()
-    words = [scene.materials.quantity for scene in (lit, flat, unknown)]
-    assert words == ["radiance", "reflectance", "radiance"]
-    assert flat.output("spectral").what.startswith("reflectance on black")
-    assert flat.output("band:500nm").what.startswith("reflectance of one band")
+    words = [scene.materials.quantity for scene in (lit, white, dim, unknown)]
+    assert words == ["radiance", "reflectance", "radiance", "radiance"]
+    assert white.output("spectral").what.startswith("reflectance on black")
+    assert white.output("band:500nm").what.startswith("reflectance of one band")
     assert lit.output("spectral").what.startswith("radiance on black")
     assert "of radiance, since the scene's light is unknown" in unknown.output("continuum").what
     assert "reflectance" not in [output.name for output in unknown.outputs]

@@ -368,7 +368,8 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     )
     if recipe.illuminant is not None:
         lit = factors if light is None else light * factors
-        materials = replace(materials, light=_tensor(lit, scene))
+        is_assumed = not scene.materials.is_light_known
+        materials = replace(materials, light=_tensor(lit, scene), is_light_assumed=is_assumed)
     field = scene.field
     if gloss is not None or not state.is_kept.all():
         shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
@@ -390,7 +391,7 @@ def changes_geometry(recipe: Recipe) -> bool:
 def assumption_of_light(scene: TrainedScene, recipe: Recipe) -> str | None:
     """What a user has to be told of the light that edits start from; None if nothing."""
     depends = any(isinstance(one, Replace | Retint) for one in recipe.operations)
-    if scene.light is not None or not (depends or recipe.illuminant):
+    if scene.materials.is_light_known or not (depends or recipe.illuminant):
         return None
     return "the scene does not say what light it was recorded in: taken as flat (CIE illuminant E)"
 

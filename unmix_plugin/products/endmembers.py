@@ -45,7 +45,7 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
     known, light = library_of(asked.library, materials.bands), job.scene.light_power
     paths.append(folder / "angles.csv")
     job.claim(paths)
-    if light is None:
+    if not materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     _write_endmembers(folder, materials)
     table = materials.table()

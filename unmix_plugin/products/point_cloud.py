@@ -128,7 +128,7 @@ class _PointScore:
 
     def comment(self, materials: Materials) -> str:
         """What a file says of it."""
-        caveat = "" if materials.light is not None else "; of radiance, since the scene's light is unknown"
+        caveat = "" if materials.is_light_known else "; of radiance, since the scene's light is unknown"
         return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
 
 

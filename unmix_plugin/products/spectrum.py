@@ -90,7 +90,7 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
         )
     light, matches = job.scene.light_power, []
     known = library_of(asked.library, job.materials.bands)
-    if light is None:
+    if not job.materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
         job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")

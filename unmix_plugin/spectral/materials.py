@@ -23,8 +23,8 @@ from unmix_plugin.spectral.library.material_library import DARK_LIGHT
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable
 from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
-_FLAT = 0.999
-"""Least power of a band relative to the greatest for light to be flat."""
+_WHITE = 1e-3
+"""Power of every band differs from 1 by no more where radiance is reflectance."""
 
 OCCUPIED_ACCUMULATION = 0.5
 """A ray shows a material only where at least this much of it ends on something."""
@@ -160,6 +160,8 @@ class Materials:
     """One for each endmember, distinct. None given: `default_names`."""
     light: Float[Tensor, "B"] | None = None
     """Relative power of the light that the spectra are seen in; None where it is unknown."""
+    is_light_assumed: bool = False
+    """Whether `light` was lit in place of an unknown one, which was taken as flat."""
     margin_error: Float[Tensor, ""] | None = None
     """Standard error of the margin of the largest abundance over the second; None where it is unknown."""
     sensor: str | None = None
@@ -178,10 +180,17 @@ class Materials:
             raise SpectrumError(f"{count} endmembers need {count} distinct names; found {list(self.names)}")
 
     @property
+    def is_light_known(self) -> bool:
+        """Whether radiance over `light` is reflectance."""
+        return self.light is not None and not self.is_light_assumed
+
+    @property
     def quantity(self) -> Literal["reflectance", "radiance"]:
-        """What the spectra are: reflectance where the light is flat, as after a white reference; radiance otherwise."""
-        is_flat = self.light is not None and bool((self.light >= _FLAT * self.light.max()).all())
-        return "reflectance" if is_flat else "radiance"
+        """What the spectra are: reflectance where the light is known to be 1 in every band, as after a white reference;
+        radiance otherwise, as in a flat light in which a white is darker than 1."""
+        if self.light is None or not self.is_light_known:
+            return "radiance"
+        return "reflectance" if bool(((self.light - 1).abs() <= _WHITE).all()) else "radiance"
 
     @property
     def is_lit(self) -> Bool[Tensor, "B"]:

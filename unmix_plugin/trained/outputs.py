@@ -341,7 +341,7 @@ def _reflectance_map(name: str, _: str, materials: Materials) -> MaterialOutput:
             f"{materials.sensor}; leave out --sensor"
         )
     asked = parse_reflectance_map(name, materials.bands, materials.is_lit)
-    caveat = _OF_RADIANCE if materials.light is None else ""
+    caveat = "" if materials.is_light_known else _OF_RADIANCE
     undefined = "; NaN where undefined" if asked.kind == "map" else ""
 
     def compute(view: MaterialView) -> Tensor:
@@ -406,12 +406,12 @@ def available_outputs(materials: Materials) -> tuple[MaterialOutput, ...]:
 
 
 def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
-    """An output with the right words for its spectra: reflectance in flat light, radiance in any other."""
+    """An output with the right words for its spectra: reflectance where a white is 1 in every band, else radiance."""
     if output.kind == "channels" and materials.quantity == "reflectance":
         return replace(output, what=output.what.replace("radiance", "reflectance"))
     if output.kind != "spectra":
         return output
-    if output.name == "reflectance" and materials.light is None:
+    if output.name == "reflectance" and not materials.is_light_known:
         raise SpectrumError(
             "the scene's light is unknown, so that it has no reflectance: process it with a white reference (--white), "
             "or name the light as illuminant_path in transforms.json"
@@ -419,4 +419,4 @@ def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
     if output.name.endswith("derivative"):
         lit_nm = materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
         derivative_matrix(lit_nm[:FEWEST_BANDS])  # which refuses fewer
-    return replace(output, what=output.what + (_OF_RADIANCE if materials.light is None else ""))
+    return replace(output, what=output.what + ("" if materials.is_light_known else _OF_RADIANCE))

@@ -54,7 +54,11 @@
   const offset = facts.arrays.positions.offset;
   const [V, K, J, B] = [positions.length / 3, facts.names.length, facts.specular.length, facts.wavelengths_nm.length];
   const names = [...facts.names];
-  const isWhite = relit || (facts.light && Math.max(...facts.light) - Math.min(...facts.light) < 1e-6);
+  // Radiance is reflectance where the light shown is known to be 1 in every band.
+  const isWhite = () => {
+    const { factors } = facts.lights[$("light").value];
+    return relit || (facts.is_light_known && facts.light.every((power, b) => Math.abs(power * factors[b] - 1) <= 1e-3));
+  };
   const colours = facts.colours.map((colour) => [...colour]);
   const tinted = new Set();
   const hidden = new Set();
@@ -331,7 +335,7 @@
     metallicity: () => { paintValues((v) => polish[3 * v + 1], 0, 1); return "0 (no metal) to 1 (bare metal)"; },
     band: () => {
       paintLight(bandsAsColour([state.band, state.band, state.band]));
-      return `${isWhite ? "reflectance" : "radiance"} at ${facts.wavelengths_nm[state.band]} nm${isWhite ? "" : ", 1 = full scale"}, shown as grey`;
+      return `${isWhite() ? "reflectance" : "radiance"} at ${facts.wavelengths_nm[state.band]} nm${isWhite() ? "" : ", 1 = full scale"}, shown as grey`;
     },
     false: () => {
       paintLight(bandsAsColour(state.false));
@@ -365,7 +369,7 @@
       let [low, high] = state.formula ? [finite[Math.floor(finite.length / 100)], finite[Math.floor(finite.length * 0.99)]] : known.range;
       if (!(high > low)) high = low + 1;
       paintValues((v) => values[v], low, high);
-      const of = facts.light ? "" : "; of radiance, since the light is unknown";
+      const of = facts.is_light_known ? "" : "; of radiance, since the light is unknown";
       return (state.formula ? text : `${known.title}, ${text}`) + of;
     },
   };
@@ -693,8 +697,9 @@
       const ratios = Spectra.continuumRemoved(there.map((i) => values[i]), there.map((i) => nm[i]));
       return values.map((_, i) => (there.includes(i) ? ratios[there.indexOf(i)] : NaN));
     };
+    const what = facts.is_light_known ? "reflectance" : "radiance";
     return {
-      nm, quantity: isRemoved() ? "reflectance over its continuum" : facts.light ? "reflectance" : "radiance, 1 = full scale",
+      nm, quantity: isRemoved() ? `${what} over its continuum` : facts.is_light_known ? what : `${what}, 1 = full scale`,
       lines: found.map((curve) => ({
         ...curve, values: isRemoved() ? removed(inWindow(curve.values)) : inWindow(curve.values), spread: curve.spread && inWindow(curve.spread),
       })),
@@ -774,7 +779,7 @@
       add(`known spectrum ${rank + 1}`, ({ likeness }) => likeness[rank] && quoted(likeness[rank].name));
       add(`angle to known spectrum ${rank + 1} (rad)`, ({ likeness }) => likeness[rank]?.angle);
     });
-    const what = facts.light ? "reflectance" : "radiance";
+    const what = facts.is_light_known ? "reflectance" : "radiance";
     facts.wavelengths_nm.forEach((nm, b) => add(`${what} at ${nm} nm`, (probe) => reflectanceOf(probe.spectrum)[b]));
     facts.wavelengths_nm.forEach((nm, b) =>
       add(`standard deviation at ${nm} nm`, (probe) => probe.spread && reflectanceOf(probe.spread)[b]));
@@ -929,7 +934,7 @@
     facts.subtitle, `${V.toLocaleString("en")} vertices, ${(faces.length / 3).toLocaleString("en")} triangles`,
     ...(B ? [
       `${B} bands, ${facts.wavelengths_nm[0]} to ${facts.wavelengths_nm[B - 1]} nm`,
-      facts.light ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
+      facts.is_light_known ? "spectra of points are reflectance" : "the light is unknown: spectra are radiance, 1 = full scale",
     ] : []),
     ...(facts.scale ? [`scale: ${facts.scale}`] : []), ...facts.notes, facts.made, "Keys: 1 to 7 layers, [ and ] bands, 0 whole object, D draw a region, R ruler, T light or dark, P panel, Esc clears; arrows move, with shift they turn.",
   ];

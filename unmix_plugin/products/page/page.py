@@ -255,17 +255,9 @@ def _kept_regions(
 def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
     """Spectra, lights and names, as page.js reads them; empty where there are no bands."""
     if materials is None:
-        names = (
-            "wavelengths_nm",
-            "ranges_nm",
-            "names",
-            "colours",
-            "endmembers",
-            "specular",
-            "rgb",
-            "indices",
-        )
-        return {**{name: [] for name in names}, "light": None, "is_lit": [], "colour_map": _colour_map()}
+        names = "wavelengths_nm ranges_nm names colours endmembers specular rgb indices is_lit".split()  # noqa: SIM905
+        empty: dict[str, Any] = {name: [] for name in names}
+        return {**empty, "light": None, "is_light_known": False, "colour_map": _colour_map()}
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
     lights = [{"name": "the scene's own", "factors": [1.0] * len(bands), "notes": []}]
@@ -284,6 +276,7 @@ def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
         "endmembers": rounded(endmembers),
         "specular": rounded(materials.specular_spectra.detach().cpu().double().numpy()),
         "light": None if power is None else rounded(power),
+        "is_light_known": materials.is_light_known,
         "rgb": rounded(rgb_matrix(bands, torch.float64).numpy()),
         "colour": describe_colour(bands),
         "lights": lights,

@@ -158,7 +158,7 @@ def _page(
             "regions": regions,
             "quantity": materials.quantity,
             "num_known": len(library.names),
-            "light_unknown": LIGHT_UNKNOWN if light is None else None,
+            "light_unknown": None if materials.is_light_known else LIGHT_UNKNOWN,
             "figures": None if figures is None else _figure_rows(figures),
             "num_main": sum(name in _MAIN_FIGURES for name, *_ in _figure_rows(figures or {})),
             "unknown": unknown,
@@ -275,7 +275,7 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
 
 
 def _light_in_words(materials: Materials) -> str:
-    if materials.light is None:
+    if not materials.is_light_known:
         return "unknown, taken as flat"
     return "taken out: values are reflectance" if materials.quantity == "reflectance" else "recorded"
 

@@ -261,7 +261,7 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
         seen = index(materials.reflectance(aids.reference))
         scale = _percentile_range(seen[seen.isfinite()])
     what = asked.what if len(asked.what) <= _LONGEST_LABEL else f"{asked.what[:_LONGEST_LABEL]}..."
-    label = what if materials.light is not None else f"{what}; of radiance: light unknown"
+    label = what if materials.is_light_known else f"{what}; of radiance: light unknown"
     if bool((frame.opacity > OCCUPIED_ACCUMULATION).any()) and not bool(values.isfinite().any()):
         label += (
             "; undefined wherever something is: the light has no power at its wavelengths, or it divides by 0"
