@@ -16,6 +16,9 @@ from unmix_plugin.formats.envi import write_envi_cube
 from unmix_plugin.spectral.bands import Bands
 
 
+UNKNOWN_LIGHT = "does not say that it holds reflectance. If it does not, the light of the scene is unknown"
+
+
 @pytest.fixture
 def cube():
     return image_of(smooth_endmembers(3)).astype(np.float32)
@@ -29,6 +32,7 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     ended = done(image, *words)
     assert "40 x 40 pixels, 24 bands" in ended.out
     assert ended.out.count("% of the area") == 3
+    assert UNKNOWN_LIGHT in ended.out
     folder = tmp_path / "out" / "field"
     with (folder / "endmembers.csv").open() as file:
         rows = list(csv.reader(file))
@@ -47,6 +51,23 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
         assert min(picture_size(folder / name)) > 200
     assert "exist already; give --overwrite" in refused(image, *words)
     done(image, *words, "--overwrite")
+
+
+@pytest.mark.parametrize(
+    ("field", "is_said"),
+    [
+        ("reflectance scale factor = 2", True),
+        ("reflectance scale factor = 1", True),
+        ("data gain values = {2}", False),
+    ],
+)
+def test_angles_are_of_radiance_unless_the_file_says_that_it_is_reflectance(field, is_said, cube, tmp_path):
+    write_envi_cube(tmp_path / "field", cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
+    with (tmp_path / "field.hdr").open("a") as header:
+        header.write(f"{field}\n")
+    words = (tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
+    assert (UNKNOWN_LIGHT not in done(image, *words, "--library", "+builtin").out) == is_said
+    assert UNKNOWN_LIGHT not in done(image, *words, "--overwrite").out
 
 
 def test_bands_without_wavelengths_are_numbered_and_pixels_without_measurement_left_out(cube, tmp_path):

@@ -74,6 +74,7 @@ def image(argv: list[str]) -> None:
         write_unmixed_image,
     )
     from unmix_plugin.spectral.unmixing.image import unmix_image
+    from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
@@ -97,6 +98,8 @@ def image(argv: list[str]) -> None:
         print(f"note: {note}")
     if is_srgb(opened):
         print("the picture is taken as sRGB and brought to linear light")
+    if library is not None and not _says_reflectance(opened):
+        print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
         print(
             f"{counted(left_out, 'band')} left out: marked as bad in the file, or of a wavelength that is there twice"
@@ -110,6 +113,13 @@ def image(argv: list[str]) -> None:
     _say(found, mask, names)
     for path in paths:
         print(f"  {path}")
+
+
+def _says_reflectance(opened: SpectralFile) -> bool:
+    """Whether the calibration that the file states gives reflectance; a scale of 1 is one, too."""
+    evidence = "" if opened.linear is None else opened.linear.evidence.lower()
+    scale = opened.metadata.get("header", {}).get("reflectance scale factor", "")
+    return "reflectance" in evidence or "l2scale" in evidence or scale.strip() in ("1", "1.0")
 
 
 def _say(found: UnmixedImage, mask: np.ndarray, names: list[str]) -> None:
