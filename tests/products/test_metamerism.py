@@ -2,6 +2,7 @@
 
 import csv
 import io
+from dataclasses import replace
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -19,6 +20,7 @@ from unmix_plugin.spectral.colour.conversion import illuminant_power, xyz_matrix
 from unmix_plugin.spectral.colour.difference import lab_to_srgb, reflectance_to_lab
 from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
 BANDS = Bands.of(np.linspace(400, 700, 31))
 SCENE_LIGHT = illuminant_power("D50", BANDS)
@@ -87,6 +89,14 @@ def test_pairs_are_of_the_run_or_of_the_library_or_of_both_with_the_runs_first()
     assert {"slate", "own/a"} in every
     assert {"slate", "paint"} in every
     assert every[-1] == {"own/a", "own/b"}
+
+
+@pytest.mark.parametrize(("surfaces", "is_said"), [("run", True), ("all", True), ("library", False)])
+def test_surfaces_of_a_run_in_unknown_light_are_said_to_be_radiance(surfaces, is_said, tmp_path):
+    for unknown in (replace(MATERIALS, light=None), replace(MATERIALS, is_light_assumed=True)):
+        job = exported(tmp_path, unknown, surfaces=surfaces)
+        assert (((LIGHT_UNKNOWN,),) in job.say.call_args_list) == is_said
+    assert exported(tmp_path, MATERIALS, surfaces=surfaces).say.call_count == 1
 
 
 def test_materials_that_do_not_reach_all_bands_are_passed_over(known):

@@ -1,7 +1,8 @@
 """Materials that look alike in one light and differ in another: a table and a figure of swatches.
 
-Surfaces are the endmembers of a run, as reflectances (radiance over the scene's light), and measured materials of the
-library that reach all of the run's visible bands with light; the other bands play no part.
+Surfaces are the endmembers of a run, as reflectances (radiance over the scene's light, which is taken as flat where it
+is unknown), and measured materials of the library that reach all of the run's visible bands with light; the other
+bands play no part.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from unmix_plugin.spectral.colour.difference import (
     reflectance_to_lab,
 )
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
 _MOST_DRAWN = 12
 _NAME_WIDTH, _CELL, _ROW, _HEADING, _MARGIN = 3.4, 1.5, 0.62, 0.75, 0.2
@@ -52,6 +54,8 @@ def export(job: Job, asked: Metamerism) -> list[Path]:
     """Compare all pairs in all lights; write them as CSV, and swatches of the first dozen in every light."""
     table_path, figure_path = job.folder / "metamerism.csv", job.folder / "metamerism.png"
     job.claim([table_path, figure_path])
+    if asked.surfaces != "library" and not job.materials.is_light_known:
+        job.say(LIGHT_UNKNOWN)
     with job.working("comparing colours"):
         found = _find_metamers(job.materials, asked)
         written = [write_file(table_path, _table(found)), write_file(figure_path, _draw_metamers(found))]
