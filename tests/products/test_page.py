@@ -19,6 +19,7 @@ import trimesh
 from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
 from tests.products.ball_model import ALL_ROUND, RADIUS, SHADE, ball_scene, cameras_around
 from tests.trained.camera_scenes import FRAME
+from unmix_plugin.editing import Light, Recipe, edit_scene
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.page import page
@@ -73,6 +74,7 @@ def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=4
         scene_name="ball",
         folder=SimpleNamespace(path=Path("ball/unmix-nerf/run")),
         config=SimpleNamespace(method_name="unmix-nerf"),
+        record=SimpleNamespace(summary={}),
     )
     job = Job(
         cast("Any", loaded),
@@ -152,11 +154,27 @@ def test_areas_are_as_good_on_small_triangles_as_on_large_ones():
     np.testing.assert_allclose(found, areas, rtol=1e-3)
 
 
+def test_a_relit_page_names_the_light_that_it_shows_and_offers_the_recorded_one():
+    count = len(SCENE.bands)
+    recorded = np.linspace(0.5, 1.0, count)
+    light = torch.from_numpy(recorded).float()
+    scene = replace(SCENE, materials=replace(SCENE.materials, light=light))
+    relit = edit_scene(scene, Recipe(illuminant=Light("A"))).materials
+    shown, own, *others = page._spectral_facts(relit, recorded.tolist())["lights"]
+    assert (shown["name"], shown["factors"]) == ("A", [1.0] * count)
+    assert own["name"] == "the scene's own"
+    spectra = relit.endmembers.numpy() * np.array(own["factors"])
+    np.testing.assert_allclose(spectra, scene.materials.endmembers.numpy(), rtol=1e-4)
+    assert "A" not in [one["name"] for one in others]
+    before = page._spectral_facts(scene.materials, recorded.tolist())["lights"]
+    assert [one["name"] for one in before[:2]] == ["the scene's own", "D65"]
+
+
 @pytest.mark.parametrize(("light", "is_assumed"), [(None, False), (torch.ones(len(SCENE.bands)), True)])
 def test_a_page_says_that_the_light_is_unknown_though_another_was_lit(light, is_assumed):
-    assert page._spectral_facts(SCENE.materials)["is_light_known"]
+    assert page._spectral_facts(SCENE.materials, None)["is_light_known"]
     unknown = replace(SCENE.materials, light=light, is_light_assumed=is_assumed)
-    assert not page._spectral_facts(unknown)["is_light_known"]
+    assert not page._spectral_facts(unknown, None)["is_light_known"]
 
 
 def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
@@ -164,7 +182,7 @@ def test_bands_that_the_light_leaves_dark_are_those_of_the_package():
     light[2] = 1e-4
     lit = replace(SCENE.materials, light=light)
     assert (
-        page._spectral_facts(lit)["is_lit"]
+        page._spectral_facts(lit, None)["is_lit"]
         == lit.is_lit.tolist()
         == [band != 2 for band in range(len(light))]
     )

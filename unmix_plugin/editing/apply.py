@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -369,7 +370,10 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
     if recipe.illuminant is not None:
         lit = factors if light is None else light * factors
         is_assumed = not scene.materials.is_light_known
-        materials = replace(materials, light=_tensor(lit, scene), is_light_assumed=is_assumed)
+        asked = recipe.illuminant.light
+        name = asked.stem if isinstance(asked, Path) else asked
+        lamp = _tensor(lit, scene)
+        materials = replace(materials, light=lamp, is_light_assumed=is_assumed, light_name=name)
     field = scene.field
     if gloss is not None or not state.is_kept.all():
         shine = np.ones((1, len(state.gloss))) if gloss is None else gloss

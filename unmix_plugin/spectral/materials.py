@@ -162,6 +162,8 @@ class Materials:
     """Relative power of the light that the spectra are seen in; None where it is unknown."""
     is_light_assumed: bool = False
     """Whether `light` was lit in place of an unknown one, which was taken as flat."""
+    light_name: str | None = None
+    """Of the light that was lit in place of the recorded one; None: it is the recorded one."""
     margin_error: Float[Tensor, ""] | None = None
     """Standard error of the margin of the largest abundance over the second; None where it is unknown."""
     sensor: str | None = None

@@ -43,7 +43,7 @@ from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.measured_surface import MeasuredSurface
-from unmix_plugin.trained.run_materials import endmember_colours
+from unmix_plugin.trained.run_materials import endmember_colours, relit
 from unmix_plugin.trained.run_views import RunView, directions_to_world, world_up
 from unmix_plugin.trained.surface import look_at
 from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
@@ -186,7 +186,7 @@ def _page(job: Job, content: PageContent, known: _KnownSpectra, title: str) -> b
         "arrays": layout,
         "metres_per_unit": None if scale is None else scale.metres_per_unit,
         "scale": None if scale is None else scale.said,
-        **_spectral_facts(content.materials),
+        **_spectral_facts(content.materials, job.loaded.record.summary.get("illuminant")),
         "known": known.sources,
         "regions": [],
         **content.facts,
@@ -252,16 +252,30 @@ def _kept_regions(
     return names, shares[: len(names)]
 
 
-def _spectral_facts(materials: Materials | None) -> dict[str, Any]:
-    """Spectra, lights and names, as page.js reads them; empty where there are no bands."""
+def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | None) -> dict[str, Any]:
+    """Spectra, lights and names, as page.js reads them; empty where there are no bands.
+
+    Args:
+        materials: As they are lit.
+        recorded: Light that the scene was recorded in, relative power; None where it is unknown.
+    """
     if materials is None:
         names = "wavelengths_nm ranges_nm names colours endmembers specular rgb indices is_lit".split()  # noqa: SIM905
         empty: dict[str, Any] = {name: [] for name in names}
         return {**empty, "light": None, "is_light_known": False, "colour_map": _colour_map()}
     bands, power = materials.bands, _light_of(materials)
     endmembers = materials.endmembers.detach().cpu().double().numpy()
-    lights = [{"name": "the scene's own", "factors": [1.0] * len(bands), "notes": []}]
+    own, shown = "the scene's own", materials.light_name
+    lights = [{"name": shown or own, "factors": [1.0] * len(bands), "notes": []}]
+    if shown is not None and materials.sensor is None:  # whose channels the recorded light is not known in
+        assert power is not None
+        before = np.ones(len(bands)) if recorded is None else np.array(recorded, dtype=np.float64)
+        back = relit(np.ones(len(bands)), power.tolist(), before)
+        notes = [f"black where {shown} does not reach"] if not materials.is_lit.all() else []
+        lights.append({"name": own, "factors": rounded(back), "notes": notes})
     for light in _LIGHTS:
+        if light == shown:
+            continue
         try:
             factors, notes = relighting_factors(bands, power, Light(light))
         except SpectrumError:
