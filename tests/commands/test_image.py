@@ -15,7 +15,6 @@ from unmix_plugin.commands.image import image
 from unmix_plugin.formats.envi import write_envi_cube
 from unmix_plugin.spectral.bands import Bands
 
-
 UNKNOWN_LIGHT = "does not say that it holds reflectance. If it does not, the light of the scene is unknown"
 
 
