@@ -380,6 +380,24 @@ def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
         assert notice[1].endswith("taken as flat (CIE illuminant E)")
 
 
+def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
+    source = make_source(tmp_path, light=[1.0] * 5)
+
+    def axes(page):
+        charts = [one for one in page.controls.values() if one.get("type") == "GuiUplotMessage"]
+        return sorted(chart["axes"][1]["label"] for chart in charts)
+
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        page.click(0.5, 0.5)
+        page.wait_until(
+            lambda: axes(page) == ["reflectance"] * 3
+        )  # of materials, of the probe, of all probes
+        page.set("light", "A")
+        page.wait_until(lambda: axes(page) == ["radiance", "reflectance", "reflectance"])
+        page.click(0.5, 0.5)  # the first probe keeps its light
+        page.wait_until(lambda: axes(page) == ["radiance", "radiance", "radiance or reflectance"])
+
+
 def test_spectra_are_saved_as_exr(viewer):
     with opened(viewer) as page:
         page.set("width", 32)

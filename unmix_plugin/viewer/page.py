@@ -200,8 +200,11 @@ class Chart:
         self._handle: viser.GuiUplotHandle | None = None
         self._place = gui.add_folder(title, visible=False)
 
-    def draw(self, x: Float[np.ndarray, " N"], lines: Sequence[Line]) -> None:
-        """Show lines over a common axis; nothing without lines or values."""
+    def draw(self, x: Float[np.ndarray, " N"], lines: Sequence[Line], y_label: str = "") -> None:
+        """Show lines over a common axis; nothing without lines or values. A plot keeps its axes, so that one with
+        another `y_label` than before, if one is given, is made anew."""
+        is_same_label = y_label in ("", self._y_label)
+        self._y_label = y_label or self._y_label
         if len(x) == 0:
             lines = ()
         values = (np.nan_to_num(np.asarray(line.values, np.float64)) for line in lines)
@@ -215,7 +218,7 @@ class Chart:
             ),
         )
         self._place.visible = bool(lines)
-        if self._handle is not None and len(self._handle.series) == len(series):
+        if self._handle is not None and is_same_label and len(self._handle.series) == len(series):
             self._handle.data, self._handle.series = data, series
             return
         if self._handle is not None:

@@ -264,8 +264,8 @@ class MaterialsPanel:
         finally:
             self._is_showing = False
         colours, spectra = self._session.colours_of(materials), materials.endmembers.double().cpu().numpy()
-        lines = zip(materials.names, spectra, colours, strict=True)
-        self._chart.draw(materials.bands.centers_nm, [Line(name, row, colour) for name, row, colour in lines])
+        lines = [Line(*one) for one in zip(materials.names, spectra, colours, strict=True)]
+        self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         self._listing.content = self._list(materials, colours)
         self._show_chosen(materials)
 

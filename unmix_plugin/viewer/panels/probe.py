@@ -206,10 +206,11 @@ class ProbePanel:
             Line(names[index], shown.contributions[index], colours[index], is_thin=True)
             for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
         ]
-        self._chart.draw(wavelengths, lines)
-        self._comparison.draw(
-            wavelengths, [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
-        )
+        self._chart.draw(wavelengths, lines, shown.materials.quantity)
+        # Probes keep the light in which they were taken.
+        quantities = " or ".join(sorted({one.materials.quantity for one in self._probes}))
+        every = [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
+        self._comparison.draw(wavelengths, every, quantities)
 
     def _save(self) -> None:
         if not self._probes:

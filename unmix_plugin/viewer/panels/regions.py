@@ -179,7 +179,7 @@ class RegionsPanel:
             Line("mean + std. dev.", region.mean + region.spread, colour, is_dashed=True, is_thin=True),
             Line("mean - std. dev.", region.mean - region.spread, colour, is_dashed=True, is_thin=True),
         ]
-        self._chart.draw(materials.bands.centers_nm, lines)
+        self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         part = surface.mesh.select(region.faces)
         if len(part.faces):
             lifted = part.vertices + _LIFT_PX * scene.pixel_size * part.normals
