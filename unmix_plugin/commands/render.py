@@ -112,7 +112,7 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, say, working
     from unmix_plugin.editing.edited_run import load_edited_run
     from unmix_plugin.products.render.cameras import choose_cameras
-    from unmix_plugin.products.render.files import choose_formats
+    from unmix_plugin.products.render.files import choose_formats, with_units
 
     console = CommandConsole(quiet=not processes.is_first)
     with processes.together():
@@ -124,6 +124,7 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
         for line in loaded.scene.notes:
             say(console, line)
         outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
+        outputs = with_units(outputs, cameras.map_info)
     _render(options, loaded, cameras, outputs, console, processes)
 
 
@@ -208,7 +209,7 @@ def _render(
     with processes.together():
         if needs_survey(asked):
             with working(console, "looking at all views for what their pictures share"):
-                survey = take_survey(scene, cameras.views, asked)
+                survey = take_survey(scene, cameras.views, asked, cameras.map_info)
     job = RenderJob(scene, cameras, outputs, survey, folder, processes)
     job.render(follow(console, "rendering", job.blocks()))
     if not processes.is_first:

@@ -199,7 +199,8 @@ class Report(Product):
 @dataclass(frozen=True)
 class Scale(RunWork):
     """How long things are: keeps with the run how long a unit of its world is, by two points and their distance, or
-    says what is kept. What measures or exports lengths and areas then does so in metres."""
+    says what is kept. What measures or exports lengths and areas then does so in metres, as maps do;
+    depths of other views stay in units of the world."""
 
     name = "scale"
 

@@ -1,5 +1,6 @@
 """Maps: an independent reader finds a known place within a pixel, in metres, from above and from the side."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import files
 from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
 from unmix_plugin.products.render.files import choose_formats
-from unmix_plugin.products.render.job import RenderJob, Survey
+from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
 from unmix_plugin.products.render.maps import map_camera
 from unmix_plugin.products.render.pictures import Palette
 from unmix_plugin.scenes.scene import Normalisation
@@ -97,6 +98,29 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
     assert info.envi["map info"][-1] == "units=Unknown"
     _, millimetres = map_camera(SCENE, Scale(0.001, "test"), "top", 0.0002)
     assert millimetres.left == pytest.approx(info.left / 1000)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit", "factor"), [(Scale(0.01, "test"), "metres", 0.01), (None, "world units", 1.0)]
+)
+def test_heights_of_a_map_are_in_the_unit_of_its_coordinates_and_say_it(scale, unit, factor, tmp_path):
+    pixel_size = 0.5 * factor
+    cameras = choose_cameras(SCENE, CameraRequest("map", pixel_size=pixel_size), scale)
+    names = ["depth", "ray_distance", "accumulation"]
+    outputs = files.with_units(choose_formats(names, ["tif"], SCENE, False), cameras.map_info)
+    survey = take_survey(SCENE, cameras.views, [one.output for one in outputs], cameras.map_info)
+    job = RenderJob(SCENE, cameras, outputs, survey, tmp_path)
+    job.render(job.blocks())
+    view = SCENE.look(cameras.views[0].camera)
+    for name, units in (("depth", factor), ("ray_distance", factor), ("accumulation", 1.0)):
+        with tifffile.TiffFile(tmp_path / name / "map_top.tif") as file:
+            found, said = file.asarray(), json.loads(file.pages.first.tags[270].value)["what"]
+        np.testing.assert_allclose(found, units * view[name].numpy(), rtol=1e-5)
+        assert (f"in {unit}" in said) == (name != "accumulation")
+    seen = view.opacity > 0.9
+    relief = factor * np.ptp(view["depth"][seen].numpy())  # of half a ball, not known up to its edge
+    assert 0.5 < relief / (factor * RADIUS / 0.25) < 1.05
+    assert survey.scales["depth"].high == pytest.approx(factor * view["depth"][seen].max().item(), rel=0.2)
 
 
 def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -172,6 +172,18 @@ def choose_formats(
             asked = " or ".join(output.name for output in chosen)
             raise ConfigError(f"--formats {one} suits none of the outputs asked for: {asked}")
     return tuple(found)
+
+
+IN_METRES = "in metres"
+"""Words of an output whose numbers are lengths, where they are not in units of the world."""
+
+
+def with_units(outputs: Sequence[FormattedOutput], info: MapInfo | None) -> tuple[FormattedOutput, ...]:
+    """The outputs of a map, whose lengths are metres as its coordinates are, or of other views."""
+    if info is None or not info.is_metric:
+        return tuple(outputs)
+    told = [replace(one.output, what=one.output.what.replace("in world units", IN_METRES)) for one in outputs]
+    return tuple(replace(one, output=output) for one, output in zip(outputs, told, strict=True))
 
 
 def _require_tifffile() -> Any:

@@ -28,6 +28,7 @@ from unmix_plugin.formats.video import FrameSink
 from unmix_plugin.products.render.cameras import RenderCameras
 from unmix_plugin.products.render.files import (
     COVERAGE,
+    IN_METRES,
     FormattedOutput,
     RenderSetting,
     Rows,
@@ -38,6 +39,7 @@ from unmix_plugin.products.render.files import (
     video,
     video_path,
 )
+from unmix_plugin.products.render.maps import MapInfo
 from unmix_plugin.products.render.pictures import Palette, scale_of
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
@@ -74,15 +76,20 @@ def needs_survey(outputs: Collection[Output]) -> bool:
     )
 
 
-def take_survey(scene: RenderableScene, views: Sequence[RunView], outputs: Collection[Output]) -> Survey:
-    """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views share."""
+def take_survey(
+    scene: RenderableScene, views: Sequence[RunView], outputs: Collection[Output], info: MapInfo | None = None
+) -> Survey:
+    """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views, or of the map of
+    `info`, share."""
     maps = [output for output in outputs if is_reflectance_map(output.name)]
     ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
     has_pca = any(output.name == "pca" for output in outputs)
     is_mixed = isinstance(scene, TrainedScene)
     spectra = ["spectral"] if is_mixed and (maps or has_pca) else []
     seen = _seen(scene, views, [*(output.name for output in ranged), *spectra])
-    scales = {output.name: scale_of(output, *_bounds(seen[output.name])) for output in ranged}
+    scales = {
+        output.name: scale_of(output, *_bounds(seen[output.name] * _units(output, info))) for output in ranged
+    }
     if not is_mixed or not spectra:
         return Survey(scales)
     reflectance = scene.materials.reflectance_of(seen["spectral"], seen["accumulation"])
@@ -92,6 +99,13 @@ def take_survey(scene: RenderableScene, views: Sequence[RunView], outputs: Colle
         if output.value_range is None and output.kind == "map":
             scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
     return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
+
+
+def _units(output: Output, info: MapInfo | None) -> float:
+    """What an output's numbers are multiplied with to be in the unit that it says."""
+    if info is None or info.metres_per_unit is None or IN_METRES not in output.what:
+        return 1.0
+    return info.metres_per_unit
 
 
 def _is_ranged(output: Output) -> bool:
@@ -176,6 +190,7 @@ class RenderJob:
         self._still = [one for one in outputs if one not in self._moving]
         # What all views share is computed here, from spectra.
         own = {*survey.scores, *(["pca"] if survey.pca is not None else [])}
+        self._units = {one.output.name: _units(one.output, cameras.map_info) for one in outputs}
         asked = dict.fromkeys("spectral" if one.output.name in own else one.output.name for one in outputs)
         self._asked = [name for name in asked if name != "accumulation"]
 
@@ -253,6 +268,7 @@ class RenderJob:
     def _values(self, camera: Cameras) -> dict[str, np.ndarray]:
         view = self._scene.look(camera)
         rendered = {name: view[name] for name in self._asked}
+        rendered |= {name: view[name] * unit for name, unit in self._units.items() if unit != 1.0}
         rendered["accumulation"] = opacity = view.opacity
         rendered[COVERAGE] = view.coverage
         if self._survey.pca is not None:

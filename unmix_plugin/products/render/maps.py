@@ -82,10 +82,15 @@ class MapInfo:
     """y of the upper edge of the first row."""
     pixel: float
     """Edge of a pixel."""
-    is_metric: bool
-    """Whether coordinates are metres."""
+    metres_per_unit: float | None
+    """Of the world, where coordinates and lengths are metres; None: they are in units of the world."""
     epsg: int | None = None
     """EPSG code of the projected coordinate system; None where it is unknown."""
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether coordinates and lengths are metres."""
+        return self.metres_per_unit is not None
 
     @property
     def envi(self) -> dict[str, Any]:
@@ -148,7 +153,7 @@ def map_camera(
         raise ConfigError(f"--pixel-size is {pixel_size:g}; it must be greater than 0")
     width, height = (max(1, math.ceil(side / pixel_size - 1e-6)) for side in (high - low)[:2])
     check_size(width, height, f"--pixel-size {pixel_size:g}")
-    info = MapInfo(float(low[0]), float(high[1]), pixel_size, scale is not None)
+    info = MapInfo(float(low[0]), float(high[1]), pixel_size, None if scale is None else metres)
     middle = np.array(
         [low[0] + width * pixel_size / 2, high[1] - height * pixel_size / 2, (low[2] + high[2]) / 2]
     )
