@@ -249,6 +249,14 @@ def test_kept_regions_are_shown_by_name_with_area_mean_spread_and_mixture(opened
 
 
 @pytest.mark.slow
+def test_a_band_is_reflectance_only_in_a_light_of_1(opened):
+    opened.evaluate("unmixPage.choose('band')")
+    for light, quantity in (("D65", "radiance"), ("the scene's own", "reflectance")):
+        opened.select_option("#light", label=light)
+        opened.wait_for_function(f"document.getElementById('about').textContent.startsWith('{quantity} at')")
+
+
+@pytest.mark.slow
 def test_a_region_is_what_is_seen_inside_an_outline_and_is_saved(opened):
     opened.evaluate("(unmixPage.wholeObject(), unmixPage.draw())")
     everything = [(2, 2), (560, 2), (560, 598), (2, 598)]
