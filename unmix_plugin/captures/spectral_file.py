@@ -29,6 +29,8 @@ BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 """Some bands: a slice, or their indices in any order."""
 _ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
 """Stored numbers of some rows and bands."""
+_MissingPart: TypeAlias = Callable[[slice, BandIndex], Bool[np.ndarray, "h W"]]
+"""Pixels of some rows without a measurement in one of some bands."""
 
 COLOURS_AS_STORED = (
     "red, green and blue are taken as light, as stored; if they are a picture's for people (sRGB), save it as PNG of "
@@ -173,6 +175,8 @@ class SpectralFile:
     """Files that hold the numbers, where they are not `path` alone."""
     dark_lines: int = 0
     """Lines after the image that were taken with the shutter closed."""
+    missing_part: _MissingPart | None = field(default=None, repr=False)
+    """Which pixels hold no measurement beyond what `no_data` and `valid_range` say of all bands."""
 
     def read(self, rows: slice = slice(None), bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "h W b"]:
         """Stored numbers of some rows and bands, in the machine's byte order.
@@ -218,12 +222,40 @@ class SpectralFile:
                 slice(begin + rows.start, begin + rows.stop, rows.step), bands
             ),
             dark_lines=0,
+            missing_part=None,
         )
 
     @property
     def files(self) -> tuple[Path, ...]:
         """Every file that `read` depends on, `path` first."""
         return (self.path, *(source for source in self.sources if source != self.path))
+
+
+def find_missing(
+    stored: np.ndarray, file: SpectralFile, rows: slice = slice(None), bands: BandIndex = slice(None)
+) -> Bool[np.ndarray, "h W"]:
+    """Pixels without a measurement: no number in some band, a no-data value of the file, out of its valid range, or
+    missing by a mask of the file.
+
+    A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
+
+    Args:
+        stored: Numbers (h, W, b) that were read of these rows and bands.
+    """
+    missing = np.zeros(stored.shape[:2], bool)
+    if stored.dtype.kind == "f":
+        missing |= ~np.isfinite(stored).all(axis=-1)
+    if file.valid_range is not None:
+        low, high = file.valid_range
+        missing |= ((stored < low) | (stored > high)).any(axis=-1)
+    limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
+    for no_data in filter(np.isfinite, file.no_data):
+        if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
+            same = stored == stored.dtype.type(no_data)
+            missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
+    if file.missing_part is not None:
+        missing |= file.missing_part(slice(*rows.indices(file.shape[0])), bands)
+    return missing
 
 
 def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
@@ -261,7 +293,7 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
 def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     """Files of one view that hold one band each, as one file with all of them, in the order given.
 
-    No-data values and metadata are those that all parts share.
+    Metadata are those that all parts share. A number that is no data in one part is missing there alone, but 0 in all.
 
     Args:
         parts: At least one, all of one size.
@@ -301,9 +333,16 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
         gains, offsets = (np.concatenate([getattr(x, name) for x in each]) for name in ("gains", "offsets"))
         linear = Linear(gains, offsets, stated[0].evidence)
-    no_data = {repr(part.no_data) for part in parts}
-    ranges = {part.valid_range for part in parts}
-    differing = ["no-data values"] * (len(no_data) > 1) + ["valid ranges"] * (len(ranges) > 1)
+    own_missing = [
+        replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts
+    ]
+    has_own = len({(repr(part.no_data), part.valid_range) for part in own_missing}) > 1
+    of_all = [number for part in parts for number in part.no_data if number == 0 or not has_own]
+
+    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        chosen = [own_missing[band] for band in np.arange(len(parts))[bands]]
+        return np.any([find_missing(part.read(rows), part, rows) for part in chosen], axis=0)
+
     # Metadata that differ are listed by part.
     same = {
         key: value
@@ -311,6 +350,10 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         if all(repr(part.metadata.get(key)) == repr(value) for part in parts)
     }
     own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
+    headers = [header for part in parts if isinstance(header := part.metadata.get("header"), dict)]
+    if "header" not in same and len(headers) == len(parts):
+        shared = set.intersection(*(set(header.items()) for header in headers))
+        same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
     exposed = [part.metadata.get("exposure_s") for part in parts]
     if "exposure_s" not in same and all(isinstance(time, float) for time in exposed):
         gains = [part.metadata.get("gain", 1.0) for part in parts]
@@ -324,17 +367,17 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         read_part=read_part,
         bands=bands,
         linear=linear,
-        no_data=() if len(no_data) > 1 else first.no_data,
-        valid_range=None if len(ranges) > 1 else first.valid_range,
+        no_data=tuple(dict.fromkeys(of_all)),
+        valid_range=None if has_own else first.valid_range,
         metadata=same | ({"parts": own} if any(own) else {}),
         notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
         warnings=(
             *dict.fromkeys(warning for part in parts for warning in part.warnings),
-            *(f"{what} differ between the files of one view and are not used" for what in differing),
             *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
         ),
         sources=tuple(source for part in parts for source in part.files),
         dark_lines=0,
+        missing_part=missing_part if has_own or any(part.missing_part for part in parts) else None,
     )
 
 

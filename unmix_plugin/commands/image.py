@@ -83,7 +83,7 @@ def image(argv: list[str]) -> None:
     opened = open_spectral_file(options.file, reading)
     bands, wavelengths = _good_bands(opened)
     stored = opened.read(bands=bands)
-    mask = ~find_missing(stored, opened)
+    mask = ~find_missing(stored, opened, bands=bands)
     cube = stated_values(opened, stored, slice(0, opened.shape[0]), bands)
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")

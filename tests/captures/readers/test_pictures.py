@@ -6,7 +6,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import check_file, rows_and_bands_of
+from tests.captures.file_factory import check_file, present, rows_and_bands_of, write_band_file
+from unmix_plugin.captures.calibration.references import find_missing, finished_by
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 
@@ -71,6 +72,54 @@ def test_counted_files_keep_their_order_and_have_no_wavelengths(tmp_path):
     file = open_spectral_file(tmp_path)
     assert file.bands.wavelengths_nm is None
     np.testing.assert_array_equal(file.read()[0, 0], np.arange(1, 12))
+
+
+def test_a_band_in_a_folder_has_what_files_beside_it_say(tmp_path):
+    """In GDAL's XML: gains, and no-data numbers, which may be light in another band."""
+    for nm, scale in ((500, 1e-4), (600, 2e-4)):
+        path, plane = tmp_path / f"{nm}nm.tif", np.full((3, 4), 5000, np.uint16)
+        plane[0] = nm
+        tifffile.imwrite(path, plane, photometric="minisblack", metadata=None)
+        own = f"<NoDataValue>{nm}</NoDataValue><Offset>-0.1</Offset><Scale>{scale}</Scale>"
+        text = f'<PAMDataset><PAMRasterBand band="1">{own}</PAMRasterBand></PAMDataset>'
+        (tmp_path / f"{path.name}.aux.xml").write_text(text)
+    plane[:] = (500, 600, 5000, 5000)
+    tifffile.imwrite(tmp_path / "600nm.tif", plane, photometric="minisblack", metadata=None)
+    file = open_spectral_file(tmp_path)
+    np.testing.assert_allclose(present(file.linear).gains, [1e-4, 2e-4])
+    np.testing.assert_allclose(present(file.linear).offsets, [-0.1, -0.1])
+    expected = np.array([[True] * 4, [False, True, False, False], [False, True, False, False]])
+    np.testing.assert_array_equal(find_missing(file.read(), file), expected)
+    assert (file.dtype, file.warnings) == (np.uint16, ())
+    rows, bands = slice(1, 3), np.array([0])
+    assert not find_missing(file.read(rows, bands), file, rows, bands).any()
+
+
+def test_a_band_in_a_folder_has_what_its_header_says(tmp_path):
+    for nm in (500, 600):
+        plane = np.array([[5000, 0]], np.uint16)
+        tifffile.imwrite(tmp_path / f"{nm}nm.tif", plane, photometric="minisblack", metadata=None)
+        (tmp_path / f"{nm}nm.hdr").write_text(
+            "ENVI\nsamples=2\nlines=1\nbands=1\nfile type=TIFF\ndata type=12\ninterleave=bsq\nbyte order=0\n"
+            f"reflectance scale factor=10000\ndata ignore value=0\nwavelength={{{nm}}}\nwavelength units=nm\n"
+        )
+    file = open_spectral_file(tmp_path)
+    check_file(file, nm=[500, 600], scale=10000, no_data=(0,))
+    assert finished_by(file) == "header field 'reflectance scale factor'"
+    assert find_missing(file.read(), file).tolist() == [[False, True]]
+
+
+def test_a_folder_of_the_lenses_of_a_rig_is_refused_with_the_layout_that_reads_it(tmp_path):
+    xmp = {
+        "MicaSense:RadiometricCalibration": ["0.0001", "1e-7", "1e-6"],
+        "Camera:VignettingCenter": ["4", "4"],
+        "Camera:VignettingPolynomial": ["0"] * 6,
+    }
+    exif = {"ExposureTime": 0.01, "ISOSpeed": 100}
+    for lens in (1, 2):
+        write_band_file(tmp_path / f"IMG_0000_{lens}.tif", np.full((4, 5), 9), xmp, exif)
+    with pytest.raises(CaptureError, match=r"IMG_0000_1.tif: of one lens of a MicaSense.*the layout rig"):
+        open_spectral_file(tmp_path)
 
 
 def test_folders_that_are_no_image_are_refused(tmp_path):

@@ -136,7 +136,7 @@ class Calibration:
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
-        missing = find_missing(stored, file)
+        missing = find_missing(whole, file, rows, self.bands)[:, columns]
         saturated = np.zeros(stored.shape, bool) if self.saturation is None else stored >= self.saturation
         values = self._values(file, whole, rows)
         sound = np.isfinite(values.sum(axis=-1)) & ~missing  # one number that is not finite makes the sum so

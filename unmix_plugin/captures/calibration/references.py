@@ -13,11 +13,17 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import BandIndex, CaptureView, SpectralFile, require_comparable
+from unmix_plugin.captures.spectral_file import (
+    BandIndex,
+    CaptureView,
+    SpectralFile,
+    find_missing,
+    require_comparable,
+)
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError, counted, name_some
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.srgb import decode_srgb
@@ -82,27 +88,8 @@ def _measured(
     """Values of some rows, NaN where nothing was measured."""
     stored = file.read(rows, bands)
     values = stated_values(file, stored, rows, bands)
-    values[find_missing(stored, file)] = np.nan
+    values[find_missing(stored, file, rows, bands)] = np.nan
     return values
-
-
-def find_missing(stored: np.ndarray, file: SpectralFile) -> Bool[np.ndarray, "h W"]:
-    """Pixels without a measurement: no number in some band, a no-data value of the file, or out of its valid range.
-
-    A no-data value of 0 is also what a dark pixel may read in a band, so that all bands must have it.
-    """
-    missing = np.zeros(stored.shape[:2], bool)
-    if stored.dtype.kind == "f":
-        missing |= ~np.isfinite(stored).all(axis=-1)
-    if file.valid_range is not None:
-        low, high = file.valid_range
-        missing |= ((stored < low) | (stored > high)).any(axis=-1)
-    limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
-    for no_data in filter(np.isfinite, file.no_data):
-        if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
-            same = stored == stored.dtype.type(no_data)
-            missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
-    return missing
 
 
 @dataclass(frozen=True)
@@ -229,7 +216,7 @@ def _column_means(file: SpectralFile) -> tuple[Float32[np.ndarray, "1 W B"], flo
     for first in range(0, height, step):
         lines = slice(first, min(first + step, height))
         stored = file.read(lines)
-        missing[lines] = find_missing(stored, file)
+        missing[lines] = find_missing(stored, file, lines)
         values = stated_values(file, stored, lines)
         values[missing[lines]] = np.nan
         total += np.nansum(values, axis=0, dtype=np.float64)

@@ -347,7 +347,7 @@ def _find_saturation(files: Sequence[SpectralFile], bands: np.ndarray) -> tuple[
 def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None)) -> Shaped[np.ndarray, "N b"]:
     """Stored numbers of the pixels of a row that have a measurement."""
     stored = file.read(slice(row, row + 1), bands)
-    return stored[~find_missing(stored, file)]
+    return stored[~find_missing(stored, file, slice(row, row + 1), bands)]
 
 
 def _lit_bands(

@@ -248,7 +248,5 @@ _READERS: dict[str, Callable[[Path, ReadOptions], SpectralFile]] = {
     "tiff": open_tiff,
     "exr": open_exr,
     "picture": open_picture,
-    "folder": lambda path, options: open_band_folder(
-        path, lambda band: _READERS[_file_kind(band)](band, options)
-    ),
+    "folder": lambda path, options: open_band_folder(path, lambda band: _opened(band, options)),
 }

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import band_of, parse_xmp
+from unmix_plugin.captures.camera_tags import band_of, parse_xmp, radiometric_model
 from unmix_plugin.captures.header_values import exif_exposure, wavelengths_in_names
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import (
@@ -103,8 +103,8 @@ _KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".j
 def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) -> SpectralFile:
     """Open the files of a folder as the bands of one image, by rising wavelength or in the order of their names.
 
-    Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, or they hold several
-    bands each or differ in size.
+    Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, they hold several
+    bands each or differ in size, or a lens of a rig took each.
     """
     found = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     kinds = Counter(_KINDS[path.suffix.lower()] for path in found if path.suffix.lower() in _KINDS)
@@ -120,6 +120,11 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     for band in bands:
         if band.shape[2] != 1:
             raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
+        if (model := radiometric_model(band)) is not None:
+            raise CaptureError(
+                f"{band.path}: of one lens of a {model.maker} camera, with a calibration of its own, and bands of "
+                "several lenses do not lie on each other; read the folder with the layout rig"
+            )
     named = wavelengths_in_names([band.path.stem for band in bands])
     if named is not None and any(band.bands.wavelengths_nm is None for band in bands):
         evidence = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
