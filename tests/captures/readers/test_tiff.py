@@ -99,6 +99,8 @@ UM = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 PACKET = xmp_packet(
     {"Camera:BandName": "Red edge", "Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}
 )
+GAIN = '<Item name="gain">4</Item>'
+CAMERA_GAIN = gdal(GAIN, '<Item name="exposure_ms">10</Item>')
 EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True)]
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
 WHOLE = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
@@ -175,6 +177,9 @@ SAID = [
         {"warnings": ()},
     ),
     ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0}),
+    ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
+    ({"extratags": gdal(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
+    ({"extratags": gdal(items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
 ]
 
 

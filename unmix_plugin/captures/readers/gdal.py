@@ -60,9 +60,9 @@ def gdal_items(text: str) -> list[GdalItem]:
 
 
 def linear_of_items(path: Path, items: Sequence[GdalItem], num_bands: int) -> Linear | None:
-    """Gains and offsets: by their role, by names that ENVI and NetCDF give them, or one factor. Raises CaptureError:
-    they are no numbers, or there are both."""
-    columns = []
+    """Gains and offsets: by their role, by names that ENVI and NetCDF give them, or one factor. A lone `gain` of the
+    whole file is a camera's, and part of the exposure. Raises CaptureError: they are no numbers, or there are both."""
+    columns, said = [], []
     for role, names in _GAIN_ITEMS.items():
         by_role = [item for item in items if item.role == role]
         by_name = [item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names]
@@ -78,6 +78,9 @@ def linear_of_items(path: Path, items: Sequence[GdalItem], num_bands: int) -> Li
             found = next(text for text in texts if gdal_number(text) is None)
             raise CaptureError(f"{path}: GDAL's {role} is {found!r}; expected a number a band")
         columns.append(numbers)
+        said.append({(item.name, item.sample, item.role) for item in chosen})
+    if said == [{("gain", None, None)}, set()] and len(columns[0]) == 1:  # that of a camera
+        columns[0] = []
     named = [gdal_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
     factor = named[0] if named and named[0] else 1.0
     gains, offsets = columns
