@@ -65,7 +65,12 @@ def image(argv: list[str]) -> None:
     """
     options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
-    from unmix_plugin.captures.calibration.references import find_missing, is_srgb, stated_values
+    from unmix_plugin.captures.calibration.references import (
+        find_missing,
+        is_srgb,
+        own_dark_mean,
+        stated_values,
+    )
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
     from unmix_plugin.products.unmixed_image import (
@@ -85,6 +90,8 @@ def image(argv: list[str]) -> None:
     stored = opened.read(bands=bands)
     mask = ~find_missing(stored, opened, bands=bands)
     cube = stated_values(opened, stored, slice(0, opened.shape[0]), bands)
+    if (dark := own_dark_mean(opened)) is not None:
+        cube -= dark[..., bands]
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
     height, width, num_bands = cube.shape

@@ -364,6 +364,13 @@ def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> Spectra
     return beside or (None if finished_by(file) else file.dark)
 
 
+def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:
+    """Mean of the lines of a file that were taken with the shutter closed; None where it has none or its numbers are
+    not raw. Raises CaptureError: a column of them holds no measurement."""
+    dark = _own_dark(file)
+    return None if dark is None else _open_reference(dark, "dark frame", file).mean
+
+
 def _each_view(
     files: Sequence[SpectralFile | None], views: Sequence[CaptureView], what: str, is_given: bool
 ) -> Sequence[SpectralFile | None]:
