@@ -48,6 +48,8 @@ _PARTLY_KNOWN = "only some of the files give wavelengths"
 _PARTLY_LINEAR = (
     "only some of the files of one view state gains or a scale: numbers of the others are taken as stored"
 )
+_MEASURES_NOTHING = 1e30
+_FLOAT32_EPS = float(np.finfo(np.float32).eps)
 _KEPT_BYTES = 2**28
 _kept: OrderedDict[tuple[Hashable, ...], np.ndarray] = OrderedDict()
 _lock = threading.Lock()
@@ -248,14 +250,29 @@ def find_missing(
     if file.valid_range is not None:
         low, high = file.valid_range
         missing |= ((stored < low) | (stored > high)).any(axis=-1)
-    limits = None if stored.dtype.kind == "f" else np.iinfo(stored.dtype)
     for no_data in filter(np.isfinite, file.no_data):
-        if limits is None or (limits.min <= no_data <= limits.max and no_data == int(no_data)):
-            same = stored == stored.dtype.type(no_data)
-            missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
+        same = _is_number(stored, no_data)
+        missing |= same.all(axis=-1) if no_data == 0 else same.any(axis=-1)
     if file.missing_part is not None:
         missing |= file.missing_part(slice(*rows.indices(file.shape[0])), bands)
     return missing
+
+
+def _is_number(stored: np.ndarray, number: float) -> Bool[np.ndarray, "*shape"]:
+    """Where stored numbers are a number that a text gives, in floating point up to the digits of that text.
+
+    Source: GDAL, ARE_REAL_EQUAL: equal within two units of the last place. Of the greatest numbers, which measure
+    nothing, six digits are enough, as `%g` writes them.
+    """
+    if stored.dtype.kind != "f":
+        limits = np.iinfo(stored.dtype)
+        is_whole = limits.min <= number <= limits.max and number == int(number)
+        return stored == stored.dtype.type(number) if is_whole else np.zeros(stored.shape, bool)
+    limits = np.finfo(stored.dtype)
+    share = 1e-5 if abs(number) > _MEASURES_NOTHING else 4 * min(float(limits.eps), _FLOAT32_EPS)
+    ends = np.clip(np.sort([number * (1 - share), number * (1 + share)]), limits.min, limits.max)
+    low, high = ends.astype(stored.dtype)
+    return (stored >= low) & (stored <= high)
 
 
 def require_comparable(file: SpectralFile, other: SpectralFile) -> None:

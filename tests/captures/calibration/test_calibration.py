@@ -186,3 +186,25 @@ def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: tupl
 def test_pixels_without_a_measurement_in_some_band_are_missing(stored, facts, expected):
     numbers = np.array([stored], np.float32 if np.isinf(stored).any() else np.uint16)
     np.testing.assert_array_equal(find_missing(numbers, file_of(numbers, **facts))[0], expected)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("stored", "text", "expected"),
+    [
+        (np.finfo(np.float32).min, "-3.402823e+38", True),
+        (np.finfo(np.float32).min, "-3.40282e+38", True),
+        (np.finfo(np.float32).min, "-3.4028234663852886e+38", True),
+        (np.finfo(np.float32).max, "-3.402823e+38", False),
+        (1e20, "1e20", True),
+        (np.float32(-0.1), "-0.1", None),
+        (-9999.0, "-9999", True),
+        (-9998.9, "-9999", False),
+        (1e-30, "0", False),
+    ],
+)
+def test_a_no_data_value_is_found_up_to_the_digits_of_its_text(dtype, stored, text, expected):
+    """Numbers of single precision are no more exact in a file of double precision."""
+    numbers = np.array([[[stored, 0.5]]], dtype)
+    expected = dtype == np.float32 if expected is None else expected
+    assert find_missing(numbers, file_of(numbers, no_data=(float(text),))).item() == expected
