@@ -258,6 +258,27 @@ def find_missing(
     return missing
 
 
+def with_mask(
+    file: SpectralFile, name: str, read_mask: Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
+) -> SpectralFile:
+    """The file with pixels missing where a mask is 0 in one of the bands that are asked for.
+
+    Source: GDAL, RFC 15: band masks: 0 is no data.
+
+    Args:
+        name: What the mask is called in notes.
+        read_mask: Its numbers at some rows of the file, for some of its bands or one for all.
+    """
+    before = file.missing_part
+
+    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        missing = (read_mask(rows, bands) == 0).any(axis=-1)
+        return missing if before is None else missing | before(rows, bands)
+
+    note = f"pixels where {name} is 0 count as not measured"
+    return replace(file, missing_part=missing_part, notes=(*file.notes, note))
+
+
 def _is_number(stored: np.ndarray, number: float) -> Bool[np.ndarray, "*shape"]:
     """Where stored numbers are a number that a text gives, in floating point up to the digits of that text.
 

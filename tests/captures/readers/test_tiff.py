@@ -9,7 +9,7 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import check_file, rows_and_bands_of, xmp_packet
+from tests.captures.file_factory import check_file, present, rows_and_bands_of, xmp_packet
 from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
@@ -280,6 +280,48 @@ def test_tiles_that_are_left_out_in_the_file_are_missing(
     assert (opened.no_data, missing[32:, 16:32].all(), missing.sum()) == (no_data, True, 32 * 16)
     np.testing.assert_array_equal(opened.read()[~missing], image[~missing])
     assert any("6 blocks of the image left out" in text for text in opened.warnings) == is_told
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "zlib", "tile": (16, 32)}])
+@pytest.mark.parametrize("dtype", [bool, np.uint8])
+def test_pixels_of_0_in_a_mask_of_the_file_are_missing(tmp_path, dtype, options):
+    """As GDAL writes internal masks: of one bit, or of 0 and 255."""
+    mask = np.random.default_rng(0).random((70, 50)) < 0.5
+    stored = mask if dtype is bool else 255 * mask.astype(np.uint8)
+    planes: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "separate", "metadata": None}
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        file.write(PLANES, **planes)
+        file.write(stored, subfiletype=1, photometric="minisblack", metadata=None, **options)
+        file.write(stored[::2, ::2], subfiletype=1, photometric="minisblack", metadata=None)
+    with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as file:
+        for page, kind in (
+            (file.pages[1], 4),
+            (file.pages[2], 5),
+        ):  # tifffile itself writes masks of one bit alone
+            present(page.tags.get(254)).overwrite(kind)
+            present(page.tags.get(262)).overwrite(4)
+    opened = open_spectral_file(tmp_path / "a.tif")
+    check_file(opened, values=CUBE, note="where the mask in page 1 is 0 count as not measured", warnings=())
+    np.testing.assert_array_equal(find_missing(opened.read(), opened), ~mask)
+    rows, bands = slice(11, 60, 7), np.array([3])
+    np.testing.assert_array_equal(find_missing(opened.read(rows, bands), opened, rows, bands), ~mask[rows])
+
+
+@pytest.mark.parametrize("bands", [1, 6])
+def test_pixels_of_0_in_a_mask_beside_the_file_are_missing(tmp_path, bands):
+    mask = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (*CUBE.shape[:2], bands))
+    beside: dict[str, Any] = {"photometric": "minisblack"} | ({"planarconfig": "contig"} if bands > 1 else {})
+    tifffile.imwrite(tmp_path / "a.tif.msk", mask[..., 0] if bands == 1 else mask, **beside)
+    file = written(tmp_path, CUBE)
+    check_file(file, values=CUBE, note="where a.tif.msk is 0 count as not measured", warnings=())
+    np.testing.assert_array_equal(find_missing(file.read(), file), (mask == 0).any(axis=-1))
+    rows, wanted = slice(5, 30), np.array([4, 2])
+    expected = mask[rows][..., wanted if bands > 1 else slice(None)] == 0
+    np.testing.assert_array_equal(
+        find_missing(file.read(rows, wanted), file, rows, wanted), expected.any(axis=-1)
+    )
+    tifffile.imwrite(tmp_path / "a.tif.msk", mask[1:, :, 0], photometric="minisblack")
+    check_file(written(tmp_path, CUBE), warning="the mask a.tif.msk has 69 x 50", missing_part=None)
 
 
 def test_a_plain_page_that_is_left_out_in_the_file_is_missing(tmp_path):

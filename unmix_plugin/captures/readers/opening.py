@@ -32,6 +32,7 @@ from unmix_plugin.captures.spectral_file import (
     ReadOptions,
     SpectralFile,
     unreadable,
+    with_mask,
 )
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import open_regular, open_zip
@@ -114,15 +115,41 @@ def open_spectral_file(path: Path, options: ReadOptions | None = None) -> Spectr
 
 
 def _opened(path: Path, options: ReadOptions) -> SpectralFile:
-    """The file by its reader, with what lies beside it: an ENVI header, or an XML of GDAL or EnMAP."""
+    """The file by its reader, with what lies beside it: an ENVI header, an XML of GDAL or EnMAP, a mask of GDAL."""
     kind = _file_kind(path)
     described = described_image(path) if kind == "envi" and path.suffix.lower() == ".hdr" else None
     if described is not None:
         path, kind = described, _file_kind(described)
     opened = _READERS[kind](path, options)
-    if kind in ("envi", "folder"):
-        return opened if kind == "folder" else with_xml_beside(opened)
-    return with_xml_beside(described_by_header(opened))
+    if kind == "folder":
+        return opened
+    return _with_mask_beside(with_xml_beside(opened if kind == "envi" else described_by_header(opened)))
+
+
+def _with_mask_beside(file: SpectralFile) -> SpectralFile:
+    """The file with GDAL's mask NAME.msk, of one band or as many as the file, where there is one.
+
+    Source: GDAL, RFC 15: band masks.
+    """
+    height, width, num_bands = file.shape
+    for path in [path.with_name(f"{path.name}.msk") for path in file.files]:
+        if not path.is_file():
+            continue
+        mask = _READERS[_file_kind(path)](path, ReadOptions())
+        if mask.shape not in {(height + file.dark_lines, width, bands) for bands in (1, num_bands)}:
+            size = " x ".join(map(str, mask.shape))
+            warning = (
+                f"the mask {path.name} has {size} rows, columns and bands, not those of the image: not used"
+            )
+            file = replace(file, warnings=(*file.warnings, warning))
+            continue
+        one = mask.shape[2] == 1
+        file = with_mask(
+            replace(file, sources=(*file.sources, path)),
+            path.name,
+            lambda rows, bands, mask=mask, one=one: mask.read(rows, slice(None) if one else bands),
+        )
+    return file
 
 
 def _file_kind(path: Path) -> str:

@@ -42,6 +42,7 @@ from unmix_plugin.captures.spectral_file import (
     image_shape,
     import_extra,
     take_part,
+    with_mask,
 )
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import allow_decoded, allow_parts, refuse
@@ -108,6 +109,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
         stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)))
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
+        masks = _mask_pages(path, file, first)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
     axes, axis_warnings = "yxb", ()
@@ -122,7 +124,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     # A picture is as bright as its numbers to the eye only.
     is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
     may_be_picture = is_colour and first.dtype in (np.uint8, np.uint16)
-    return SpectralFile(
+    opened = SpectralFile(
         path=path,
         reader="tiff",
         shape=shape,
@@ -143,6 +145,9 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         | ({"orientation": turned} if (turned := tags["exif"].get("Orientation")) in range(2, 9) else {})
         | ({"geo_reference": "GeoTIFF"} if on_map else {}),
     )
+    for page in masks:
+        opened = _with_mask_page(opened, page)
+    return opened
 
 
 def _check_directories(path: Path) -> None:
@@ -275,12 +280,41 @@ def _image_pages(file: TiffFile) -> list[TiffPage]:
     return [page for page in [*listed, *below] if not (page.is_reduced or page.is_mask)]
 
 
+def _mask_pages(path: Path, file: TiffFile, image: TiffPage) -> list[TiffPage]:
+    """Masks of the whole image: pages of its size, one number a pixel, that are marked as masks and are no previews.
+
+    Source: TIFF 6.0, NewSubfileType 4 and PhotometricInterpretation 4; GDAL, GTiff driver, internal masks.
+    """
+    in_file: Any = file.pages
+    below = [sub for page in in_file for sub in (page.pages or ())]
+    # Pages that tifffile takes for more of the first one (OME) have no marks of their own.
+    marked = [page for page in [*in_file, *below] if getattr(page, "is_mask", False)]
+    found = [page for page in marked if not page.is_reduced]
+    masks = [page for page in found if page.shaped[2:] == (*image.shaped[2:4], 1) and page.shaped[0] == 1]
+    for page in masks:
+        _check_page(path, page, path.stat().st_size)
+        _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
+    allow_decoded(path, sum(page.nbytes for page in masks), CaptureError)
+    return masks
+
+
+def _with_mask_page(opened: SpectralFile, page: TiffPage) -> SpectralFile:
+    if opened.shape[:2] != page.shaped[2:4]:  # rows or columns are pages
+        return opened
+    stack = _Stack([page], (*opened.shape[:2], 1), np.dtype(page.dtype).newbyteorder(page.parent.byteorder))
+
+    def read_mask(rows: slice, _: BandIndex) -> np.ndarray:
+        return _read_page(opened.path, page, stack, rows, slice(0, 1))
+
+    return with_mask(opened, f"the mask in page {page.index}", read_mask)
+
+
 def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
     """Refuse a page that is empty, deep, of an unknown type, no light, or promises more than the file holds."""
     where = f"{path}: page {page.index}"
     if 0 in page.shaped or page.dtype is None:
         raise CaptureError(f"{where}: has the shape {page.shape} of {page.dtype or 'an unknown type'}")
-    if page.photometric in _NO_NUMBERS:
+    if page.photometric in _NO_NUMBERS and not page.is_mask:
         raise CaptureError(
             f"{where}: a page {_NO_NUMBERS[page.photometric]}; save it as numbers that grow with light"
         )
