@@ -233,6 +233,45 @@ def test_every_xml_beside_an_image_is_read(tmp_path, more, expected):
     check_file(open_spectral_file(image), nm=[450, 550, 1650], no_data=(7,), **expected)
 
 
+def desis_band(number):
+    values = {
+        "bandNumber": number,
+        "wavelengthCenterOfBand": 400 + 100 * number,
+        "wavelengthWidthOfBand": 3,
+        "gainOfBand": GAINS[number - 1],
+        "offsetOfBand": OFFSETS[number - 1],
+    }
+    return f"<band>{''.join(f'<{name}>{value}</{name}>' for name, value in values.items())}</band>"
+
+
+def test_the_metadata_of_desis_describe_its_bands_by_their_numbers(tmp_path):
+    """As bandCharacterisation/band has them: value = gainOfBand * number + offsetOfBand."""
+    own = "".join(desis_band(number) for number in (2, 3, 1))
+    text = f"<hsi_doc><specific><bandCharacterisation>{own}</bandCharacterisation></specific></hsi_doc>"
+    image = write_tiff(tmp_path, name="a-SPECTRAL_IMAGE.tif", xml=text)
+    expected = {"nm": [500, 600, 700], "fwhm": 3, "calibrated": CUBE * GAINS + OFFSETS, "warnings": ()}
+    check_file(open_spectral_file(image), **expected)
+
+
+@pytest.mark.parametrize(("detector", "first"), [("VNIR", 0), ("SWIR", 2)])
+def test_the_detectors_of_enmap_take_their_part_of_the_bands(tmp_path, detector, first):
+    """L1B: the first bands are those of the VNIR image, the last those of the SWIR image."""
+    nm = np.array([450, 550, 650, 1650, 2250])
+    text = enmap_bands(nm, lambda band: f"<GainOfBand>{band + 1}</GainOfBand>")
+    image = write_tiff(tmp_path, name=f"a-SPECTRAL_IMAGE_{detector}.TIF", xml=text)
+    gains = np.arange(1, 6)[first : first + 3]
+    check_file(open_spectral_file(image), nm=nm[first : first + 3], calibrated=CUBE * gains, warnings=())
+
+
+@pytest.mark.parametrize("nm", [(), (450, 550), (450, 550, 650, 1650)])
+def test_metadata_beside_an_image_that_do_not_describe_its_bands_are_said(tmp_path, nm):
+    image = write_tiff(tmp_path, name="a-SPECTRAL_IMAGE.TIF", xml=enmap_bands(nm))
+    warning = (
+        f"a-METADATA.XML describes {len(nm)} bands, the image has 3: wavelengths and gains in it are not used"
+    )
+    check_file(open_spectral_file(image), nm=None, linear=None, warning=warning)
+
+
 @pytest.fixture
 def header(tmp_path):
     return write_envi(tmp_path / "cube.hdr", CUBE, "bil", BANDS + "\ndata ignore value = nan")

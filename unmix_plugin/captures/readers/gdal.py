@@ -1,4 +1,5 @@
-"""What GDAL says of bands, in a tag of TIFF files or in XML beside any file, and EnMAP's XML, which says the same."""
+"""What GDAL says of bands, in a tag of TIFF files or in XML beside any file, and the XML of EnMAP and DESIS, which says
+the same."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from unmix_plugin.captures.header_values import StatedBands
 from unmix_plugin.captures.spectral_file import Linear, SpectralFile, linear_values
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import parse_xml, read_bounded
 
 _CENTRES = ("wavelength", "wavelengths", "center_wavelength", "central_wavelength", "centre_wavelength")
@@ -22,15 +23,16 @@ _GAIN_ITEMS = {
     "offset": ("offset", "add_offset", "bias", "data_offset_values"),
 }
 """Names of gains and offsets, by the role that GDAL itself marks them with."""
-_ENMAP_IMAGE = "SPECTRAL_IMAGE"
+_IMAGE_NAME = re.compile(r"SPECTRAL_IMAGE(_VNIR|_SWIR)?$")
+"""End of the name of an image of EnMAP or DESIS; those of EnMAP's level L1B have the bands of one detector."""
 _OF_BANDS = {
-    "Scale": 1.0,
-    "GainOfBand": 1.0,
-    "Offset": 0.0,
-    "OffsetOfBand": 0.0,
-    **dict.fromkeys(("wavelengthCenterOfBand", "FWHMOfBand", "NoDataValue"), math.nan),
+    "gain": (1.0, ("Scale", "GainOfBand", "gainOfBand")),
+    "offset": (0.0, ("Offset", "OffsetOfBand", "offsetOfBand")),
+    "centre": (math.nan, ("wavelengthCenterOfBand",)),
+    "width": (math.nan, ("FWHMOfBand", "wavelengthWidthOfBand")),
+    "no data": (math.nan, ("NoDataValue",)),
 }
-"""What XML beside a file says of a band, and what counts where it doesn't."""
+"""What XML beside a file says of a band: what counts where it doesn't, and names in GDAL's, EnMAP's and DESIS's."""
 
 
 @dataclass(frozen=True)
@@ -136,14 +138,14 @@ def _words(text: str) -> list[str]:
 def with_xml_beside(file: SpectralFile) -> SpectralFile:
     """The file with what an XML beside it says of its bands, where it says nothing itself.
 
-    GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; EnMAP's NAME-SPECTRAL_IMAGE.TIF has wavelengths,
-    widths, gains and offsets in NAME-METADATA.XML. Raises CaptureError: gains are impossible.
+    GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; NAME-SPECTRAL_IMAGE.TIF of EnMAP and DESIS has
+    wavelengths, widths, gains and offsets in NAME-METADATA.XML. Raises CaptureError: gains are impossible.
     """
     beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
     beside += [
-        path.with_name(path.stem.removesuffix(_ENMAP_IMAGE) + ending)
+        path.with_name(_IMAGE_NAME.sub("", path.stem) + ending)
         for path in file.files
-        if path.stem.endswith(_ENMAP_IMAGE)
+        if _IMAGE_NAME.search(path.stem)
         for ending in ("METADATA.XML", "METADATA.xml")
     ]
     for path in filter(Path.is_file, beside):
@@ -156,22 +158,37 @@ def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
         root = parse_xml(read_bounded(found))
     except ValueError:
         return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: what it says is not used"))
-    columns = {name: np.full(file.shape[2], usual) for name, usual in _OF_BANDS.items()}
-    for element in [*root.iter("PAMRasterBand"), *root.iterfind(".//bandCharacterisation/bandID")]:
-        index = int(element.get("band") or element.get("number") or 0) - 1
-        for name, column in columns.items():
-            text = element.findtext(name)
-            if text and 0 <= index < len(column):
-                column[index] = float(text)
-    gains, offsets = columns["Scale"] * columns["GainOfBand"], columns["Offset"] + columns["OffsetOfBand"]
-    bands, centres, widths = file.bands, columns["wavelengthCenterOfBand"], columns["FWHMOfBand"]
+    num_bands, first = file.shape[2], 1
+    elements = list(root.iter("PAMRasterBand"))
+    if not found.name.endswith(".aux.xml"):
+        elements = [
+            *root.iterfind(".//bandCharacterisation/bandID"),
+            *root.iterfind(".//bandCharacterisation/band"),
+        ]
+        detector = next((end[1] for path in file.files if (end := _IMAGE_NAME.search(path.stem))), None)
+        if len(elements) < num_bands or (len(elements) > num_bands and detector is None):
+            listed = f"{found.name} describes {counted(len(elements), 'band')}, the image has {num_bands}"
+            return replace(
+                file, warnings=(*file.warnings, f"{listed}: wavelengths and gains in it are not used")
+            )
+        first = 1 + len(elements) - num_bands if detector == "_SWIR" else 1
+    columns = {what: np.full(num_bands, usual) for what, (usual, _) in _OF_BANDS.items()}
+    for element in elements:
+        number = element.get("band") or element.get("number") or element.findtext("bandNumber") or 0
+        index = int(number) - first
+        for what, (_, names) in _OF_BANDS.items():
+            text = next(filter(None, map(element.findtext, names)), None)
+            if text and 0 <= index < num_bands:
+                columns[what][index] = float(text)
+    gains, offsets = columns["gain"], columns["offset"]
+    bands, centres, widths = file.bands, columns["centre"], columns["width"]
     if bands.wavelengths_nm is None and np.isfinite(centres).all():
         known = ((widths > 0) & (widths < np.inf)).all()
         bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
         bands = replace(bands, fwhm_nm=widths) if known else bands
     stated = (gains.tolist(), offsets.tolist(), found.name)
     linear = file.linear or linear_values(file.path, file.shape[2], *stated)
-    beside = columns["NoDataValue"]
+    beside = columns["no data"]
     no_data = tuple(dict.fromkeys((*file.no_data, *beside[~np.isnan(beside)].tolist())))
     more = (*file.sources, found)
     return replace(file, bands=bands, linear=linear, no_data=no_data, sources=more)
