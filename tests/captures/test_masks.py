@@ -10,15 +10,17 @@ from PIL import Image
 
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.calibration import Raster
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.plan import _background_rule as background_rule
 from unmix_plugin.captures.plan import _choose_mask as choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.writing.view_files import ViewRecipe, write_view
 from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
 from unmix_plugin.captures.writing.view_files import _read_view_masks as read_view_masks
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.spectral.colour.srgb import decode_srgb
 
 GENERATOR = np.random.default_rng(0)
 
@@ -71,6 +73,24 @@ def test_masks_of_ones_are_those_of_255(tmp_path, white):
     view = CaptureView("a", CUBE, mask=tmp_path / "mask.png")
     np.testing.assert_array_equal(read_view_masks(view, WHOLE, use_opacity=True).opacity, LEFT * 255)
     np.testing.assert_array_equal(read_view_masks(view, WHOLE, use_opacity=False).valid, LEFT)
+
+
+@pytest.mark.parametrize("binning", [1, 2])
+def test_colours_of_a_png_are_multiplied_by_its_opacity_before_they_are_averaged(tmp_path, binning):
+    """PNG stores colours that are not multiplied by alpha; cubes hold them as seen over black."""
+    pixels = np.random.default_rng(3).integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    pixels[2, 2], pixels[2, 4], pixels[2, 6] = (255, 255, 255, 128), 255, (200, 100, 50, 0)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    raster = Raster.of(6, 8, None, binning)
+    recipe = ViewRecipe(Calibration(raster, np.arange(3)), 1.0, np.eye(3, dtype=np.float32), use_opacity=True)
+    write_view(CaptureView("a", open_spectral_file(tmp_path / "a.png")), recipe, tmp_path / "scene")
+    linear = decode_srgb(pixels[..., :3] / 255) * (pixels[..., 3:] / 255)
+    expected = linear.reshape(raster.height, binning, raster.width, binning, 3).mean(axis=(1, 3))
+    written = np.load(tmp_path / "scene/cubes/a.npy") / 65535
+    np.testing.assert_allclose(written, expected, atol=2e-4)
+    with Image.open(tmp_path / "scene/images/a.png") as picture:
+        seen = decode_srgb(np.asarray(picture)[..., :3] / 255)
+    np.testing.assert_allclose(seen, expected, atol=0.005)
 
 
 def test_a_scene_without_any_matter_is_refused(tmp_path):

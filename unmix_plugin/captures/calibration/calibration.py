@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Shaped
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
 from unmix_plugin.captures.calibration.references import (
     Reference,
@@ -130,9 +130,23 @@ class Calibration:
         """Bands of the result."""
         return len(self.bands) // self.bin_bands
 
-    def rows(self, file: SpectralFile, first: int, last: int) -> CalibratedRows:
-        """Rows `first` to `last` (excluded) of the result from a view's file. Raises CaptureError: the file can't be
-        read."""
+    def rows(
+        self,
+        file: SpectralFile,
+        first: int,
+        last: int,
+        opacity: UInt8[np.ndarray, "h w"] | None = None,
+    ) -> CalibratedRows:
+        """Rows of the result from a view's file.
+
+        Args:
+            file: Of the view.
+            first, last: The first row, and that behind the last.
+            opacity: Of all pixels of the raster before they are averaged, 255 where opaque, if the file's values are
+                not multiplied by it (straight alpha) and should be.
+        Raises:
+            CaptureError: the file can't be read.
+        """
         rows, columns = self.raster.file_rows(first, last), self.raster.columns
         whole = file.read(rows, self.bands)
         stored = whole[:, columns]
@@ -143,6 +157,10 @@ class Calibration:
         if not sound.all():
             values[~sound] = 0.0
             saturated[~sound] = False
+        if opacity is not None:
+            part = opacity[first * self.raster.binning : last * self.raster.binning, :, None]
+            values *= part / np.float32(255.0)
+            saturated &= part == 255
         values, saturated = self.raster.averaged(values), self.raster.any_in_square(saturated)
         if self.bin_bands > 1:
             values = self._in_bins(values).mean(axis=-1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -133,7 +133,8 @@ def write_view(
     if resampling is not None:
         # A pixel is valid where all are that it is made of.
         valid = resampling.smooth(np.where(masks.valid, np.uint8(OPAQUE), np.uint8(0))) == OPAQUE
-        masks = _ViewMasks(valid, None if masks.opacity is None else resampling.smooth(masks.opacity))
+        opacity = None if masks.opacity is None else resampling.smooth(masks.opacity)
+        masks = replace(masks, valid=valid, opacity=opacity)
         labels = None if labels is None else resampling.nearest(labels, outside=UNLABELLED)
     paths = {"file_path": f"images/{view.name}.png", "hyperspectral_file_path": f"cubes/{view.name}.npy"}
     tally = _Tally(raster.height, raster.width, recipe.calibration.num_bands, masks)
@@ -144,7 +145,7 @@ def write_view(
             described = {"descr": "<u2", "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(file, described)
             start = file.tell()
-            read = partial(recipe.calibration.rows, view.cube)
+            read = partial(recipe.calibration.rows, view.cube, opacity=masks.straight)
             values_a_pixel = max(len(recipe.calibration.bands), _WEIGHTS_A_PIXEL if resampling else 0)
             for first, last in raster.blocks(values_a_pixel, _BLOCK_VALUES):
                 part = read(first, last) if resampling is None else resampling.rows(first, last, read)
@@ -324,6 +325,9 @@ class _ViewMasks:
     """Pixels that are not to be ignored."""
     opacity: UInt8[np.ndarray, "H W"] | None
     """255 where matter covers a pixel; None where no file says so."""
+    straight: UInt8[np.ndarray, "h w"] | None = None
+    """Opacity of the raster's pixels before they are averaged, where the cube is a picture whose colours are not
+    multiplied by it. Source: PNG specification, whose colours never are."""
 
 
 def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _ViewMasks:
@@ -337,17 +341,20 @@ def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _V
     Raises:
         CaptureError: a file can't be read or has another size than the cube.
     """
-    valid, opacity = np.ones((raster.height, raster.width), bool), None
+    valid, opacity, straight = np.ones((raster.height, raster.width), bool), None, None
     alpha = _alpha(view) if use_opacity else None
     if alpha is not None:
-        opacity = np.rint(raster.averaged(_cut(alpha, raster).astype(np.float32))).astype(np.uint8)
+        of_file = _cut(alpha, raster)
+        opacity = np.rint(raster.averaged(of_file.astype(np.float32))).astype(np.uint8)
+        if view.alpha is None and view.cube.reader == "picture":
+            straight = of_file
     if view.mask is not None:
         is_black = raster.any_in_square(~_cut(_read(view.mask, white_of, view), raster))
         if use_opacity and opacity is None:
             opacity = np.where(is_black, 0, OPAQUE).astype(np.uint8)
         else:
             valid = ~is_black
-    return _ViewMasks(valid, opacity)
+    return _ViewMasks(valid, opacity, straight)
 
 
 def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] | None:
