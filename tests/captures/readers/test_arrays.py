@@ -161,6 +161,19 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 
+def test_marks_of_bands_may_be_booleans_and_booleans_are_no_wavelengths(tmp_path):
+    good = np.array([True, False, True, True, True])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.update({"cube": CUBE, "wavelength": NM, "bbl": good, "bands": good})
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.update({"cube": CUBE, "wavelength": NM})
+        file["cube"].attrs["good_bands"] = good
+    np.savez(tmp_path / "c.npz", cube=CUBE, wavelength=NM, bbl=good)
+    scipy.io.savemat(tmp_path / "d.mat", {"cube": CUBE, "wl": NM, "bbl": good})
+    for path in sorted(tmp_path.iterdir()):
+        check_file(open_spectral_file(path), nm=NM, bad=[1], warnings=())
+
+
 def test_wavelengths_and_widths_may_be_packed_and_no_data_has_many_names(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["cube"] = CUBE

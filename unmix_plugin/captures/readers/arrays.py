@@ -58,6 +58,8 @@ _AXIS_NAMES = {
     "x": "x lon longitude col cols column columns sample samples crosstrack easting width",
 }
 _AXES = {name: axis for axis, names in _AXIS_NAMES.items() for name in names.split()}
+_NUMBERS = "iuf"
+"""NumPy's kinds of types that measure; marks of bands may also be booleans."""
 _LISTED = 12
 """How many arrays a message names."""
 
@@ -92,10 +94,10 @@ class FoundArray:
         """Its own attributes, and those inherited that it lacks."""
         return {**self.inherited, **self.attributes}
 
-    @property
-    def is_vector(self) -> bool:
-        """Whether it is a number or a list of them, also as MATLAB's matrix of one row or column."""
-        return sum(length != 1 for length in self.shape) <= 1 and self.dtype.kind in "iuf"
+    def is_vector(self, kinds: str = _NUMBERS) -> bool:
+        """Whether it is a number or a list of them, also as MATLAB's matrix of one row or column, of a type of some
+        kinds."""
+        return sum(length != 1 for length in self.shape) <= 1 and self.dtype.kind in kinds
 
 
 def image_of_arrays(
@@ -173,7 +175,7 @@ def _unit_of(attributes: Mapping[str, Any]) -> str | None:
 
 
 def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) -> FoundArray:
-    numeric = [array for array in arrays if array.dtype.kind in "iuf" and 0 not in array.shape]
+    numeric = [array for array in arrays if array.dtype.kind in _NUMBERS and 0 not in array.shape]
     if [(array.name, len(array.shape)) for array in arrays] == [("", 2)] and options.dataset is None:
         return arrays[0]  # the file is one matrix: one band
     listed = ", ".join(f"{array.name or 'one array'} {array.shape}" for array in numeric[:_LISTED])
@@ -212,7 +214,7 @@ def _pixel_list_size(
     Files of unmixing scenes give them as numbers `nRow` and `nCol`.
     """
     size = options.size
-    numbers = {one._own_name.rstrip("s"): one for one in arrays if one.is_vector and prod(one.shape) == 1}
+    numbers = {one._own_name.rstrip("s"): one for one in arrays if one.is_vector() and prod(one.shape) == 1}
     if size is None and "nrow" in numbers and "ncol" in numbers:
         rows, columns = (float(numbers[name].whole().reshape(-1)[0]) for name in ("nrow", "ncol"))
         size = (int(rows), int(columns)) if 1 <= rows < 2**31 and 1 <= columns < 2**31 else None
@@ -234,12 +236,17 @@ def _find_vector(
     found = [
         array
         for array in arrays
-        if array.is_vector
+        if array.is_vector(_kinds_of(names))
         and prod(array.shape) in image.shape
         and names.fullmatch(array._own_name)
         and not _counts(array._own_name, array.whole(), _unit_of(array.attributes))
     ]
     return max(found, key=lambda array: common_groups(array.name), default=None)
+
+
+def _kinds_of(names: re.Pattern[str]) -> str:
+    """Kinds of types that a list with one of these names may have."""
+    return _NUMBERS + "b" if names is _GOOD else _NUMBERS
 
 
 def _counts(name: str, numbers: np.ndarray, unit: str | None = None) -> bool:
@@ -272,6 +279,8 @@ def _state_bands(arrays: Sequence[FoundArray], image: FoundArray) -> StatedBands
         suffix = name.lower()[-2:]
         unit = suffix if suffix in ("nm", "um") else None
     fwhm, marks = numbers(widths) or of_image[1][1], numbers(good) or of_image[2][1]
+    if marks is not None:
+        marks = [int(mark) if isinstance(mark, bool) else mark for mark in marks]
     return StatedBands(where, listed, unit, fwhm, marks)
 
 
@@ -283,7 +292,7 @@ def _find_attribute(image: FoundArray, names: re.Pattern[str]) -> tuple[str, lis
         for key, value in image._all_attributes.items()
         if names.fullmatch(key.lower())
         and (values := np.atleast_1d(value)).ndim == 1
-        and values.dtype.kind in "iufb"
+        and values.dtype.kind in _kinds_of(names)
         and len(values) in image.shape
         and not _counts(key, values)
     }
@@ -387,7 +396,7 @@ def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str
     """Exposure among attributes, and single numbers or lists of one a band beside the image."""
     entries: dict[str, Any] = dict(image._all_attributes)
     for array in arrays:
-        if array.is_vector and prod(array.shape) in (1, *image.shape) and is_exposure(array._own_name):
+        if array.is_vector() and prod(array.shape) in (1, *image.shape) and is_exposure(array._own_name):
             unit, numbers = _unit_of(array.attributes) or "", array.whole().reshape(-1).tolist()
             entries[array._own_name] = ",".join(f"{number} {unit}" for number in numbers)
     return exposure_facts(entries, "data set or attribute")
