@@ -23,6 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
+from unmix_plugin.captures.header_values import PLUS_MINUS
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import DEEPEST
@@ -172,7 +173,7 @@ def band_of(tags: XmpTags) -> BandTable | None:
         centres = [float(number[0]) for number in found if number]
         if not found or len(centres) < len(found) or not all(100 < centre < 20_000 for centre in centres):
             continue
-        halves = [re.search(rf"\+\s*(?:/\s*)?-\s*({_NUMBER})", item) for item in items]
+        halves = [re.search(rf"{PLUS_MINUS} ?({_NUMBER})", item) for item in items]
         widths = tag_numbers(tags, "Camera:WavelengthFWHM") or []
         if all(halves):
             widths = [2.0 * float(half[1]) for half in halves if half]

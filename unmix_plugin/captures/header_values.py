@@ -26,17 +26,28 @@ from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit, require_nanometres
 
-_NUMBER = re.compile(r"(?<![\d.,])(\d+(?:[.,]\d+)?)")
-_WITH_UNIT = re.compile(
-    _NUMBER.pattern + r"[ _-]?(nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])", re.I
+_DIGITS = r"\d+(?:[.,]\d+)?"
+_UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
+PLUS_MINUS = r"(?:±|\+ ?/? ?-)"
+"""Before half of a width, or how far a centre may be off."""
+_NUMBER = re.compile(rf"(?<![\d.,])({_DIGITS})")
+_WITH_UNIT = re.compile(rf"{_NUMBER.pattern}[ _-]?({_UNIT})", re.I)
+_AROUND = re.compile(
+    rf"{_NUMBER.pattern}(?:[ _-]?({_UNIT}))? ?\(? ?{PLUS_MINUS} ?{_DIGITS} ?\)?(?:[ _-]?({_UNIT}))?", re.I
 )
+_RANGE = re.compile(
+    rf"(?<![\d.,])({_DIGITS})(?:[ _]?{_UNIT})? ?(?:[-\u2013\u2014]|to) ?({_DIGITS})[ _-]?({_UNIT})", re.I
+)
+_WIDEST_RANGE = 3.0
+"""Greater over smaller end; a number farther from the one behind it counts files or is a date."""
+_THOUSANDS = re.compile(r"[1-9]\d?\d?,\d{3}")
 _LONGEST_NAME = 1000
 """Longer texts are no names, and looking for counters in them takes long."""
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
 """What precedes a number that counts instead of measuring."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
-_PLAUSIBLE_NM = (100.0, 30_000.0)
+PLAUSIBLE_NM = (100.0, 30_000.0)
 """Range of cameras, from the far ultraviolet to the thermal infrared."""
 _LEAST_WIDTH_NM = 0.05
 """Widths below this are in another unit than the wavelengths, as are those wider than these."""
@@ -84,9 +95,11 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
                     nearest = np.abs(np.subtract.outer(nearest, np.flatnonzero(~unused))).argmin(axis=1)
                 centres, evidence = used[nearest] * factor, found
                 evidence += f"; {int(unused.sum())} are 0: bands that are not used" if unused.any() else ""
+    named_fwhm = None
     named = None if centres is not None or names is None else wavelengths_in_names(list(map(str, names)))
     if named is not None and names is not None:
         centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
+        named_fwhm = named[2] if stated.fwhm is None else None
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
         notes.append("two bands beside each other have the same wavelength")
     fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes)
@@ -97,7 +110,7 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
             notes.append(f"FWHM are left out: they would be {unit}")
             fwhm = None
     else:
-        fwhm = None
+        fwhm = named_fwhm
     good = _numbers("marks of bad bands", stated.good, num_bands, notes)
     bad = unused if good is None else (good == 0) | unused
     table = BandTable(
@@ -146,7 +159,7 @@ def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) ->
     low, high = float(used.min()), float(used.max())
 
     def is_plausible(factor: float) -> bool:
-        return _PLAUSIBLE_NM[0] <= low * factor and high * factor <= _PLAUSIBLE_NM[1]
+        return PLAUSIBLE_NM[0] <= low * factor and high * factor <= PLAUSIBLE_NM[1]
 
     unit = (stated.unit or "").strip()
     factor, evidence = nm_per_unit(unit), f"{stated.where}, {unit}"
@@ -165,35 +178,81 @@ def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) ->
     return factor, evidence
 
 
-def wavelengths_in_names(names: Sequence[str]) -> tuple[Float64[np.ndarray, " B"], str] | None:
+def wavelengths_in_names(
+    names: Sequence[str],
+) -> tuple[Float64[np.ndarray, " B"], str, Float64[np.ndarray, " B"] | None] | None:
     """Wavelengths out of names that each carry one: with a unit, or plain numbers that increase and can be nm.
 
     Returns:
-        Centres in nm, and with which unit or why they are taken for nm.
+        Centres in nm, with which unit or why they are taken for nm, and widths in nm where all names are ranges.
 
     >>> wavelengths_in_names(["red 0.66 um", "red edge 0.705 um"])
-    (array([660., 705.]), 'with the unit um')
+    (array([660., 705.]), 'with the unit um', None)
+    >>> wavelengths_in_names(["Blue (0.45-0.52 um)", "Red (0.63-0.69 um)"])
+    (array([485., 660.]), 'ranges with the unit um', array([70., 60.]))
+    >>> wavelengths_in_names(["Blue 450±16 nm", "NIR 840±26 nm"])[0]
+    array([450., 840.])
     >>> wavelengths_in_names(["Band 1", "Band 2"])
     """
-
-    def number(text: str) -> float:
-        return float(text.replace(",", "."))
-
     if not names or max(map(len, names)) > _LONGEST_NAME:
         return None
-    with_unit = [_WITH_UNIT.findall(name) for name in names]
-    if all(len(found) == 1 for found in with_unit):
-        pairs = [found[0] for found in with_unit]
-        centres = [number(text) * (nm_per_unit(unit) or 1.0) for text, unit in pairs]
-        return np.array(centres), f"with the unit {pairs[0][1]}"
+    ranges = [_ranges(name) for name in names]
+    steps = np.diff([found[0][0] for found in ranges]) if all(len(found) == 1 for found in ranges) else ()
+    if len(steps) and set(np.round(steps, 6)) <= {
+        0.0,
+        1.0,
+    }:  # what stands before the hyphen counts, or is a date
+        ranges = [[] for _ in names]
+    stated = [_with_unit(name, found) for name, found in zip(names, ranges, strict=True)]
+    known = [one for one in stated if one is not None]
+    if len(known) == len(names):
+        centres, widths, units = zip(*known, strict=True)
+        fwhm = None if None in widths else np.array(widths)
+        return np.array(centres), f"{'' if fwhm is None else 'ranges '}with the unit {units[0]}", fwhm
     plain = _varying_numbers(names)
     if any(len(found) != 1 for found in plain):
         return None
-    centres = np.array([number(found[0]) for found in plain])
+    centres = np.array([float(found[0].replace(",", ".")) for found in plain])
     low, high = _USUAL_NM
     if (np.diff(centres) <= 0).any() or centres[0] < low or centres[-1] > high:
         return None
-    return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm"
+    return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm", None
+
+
+def _with_unit(
+    name: str, ranges: Sequence[tuple[float, float, str]]
+) -> tuple[float, float | None, str] | None:
+    """Centre and, of a range, width in nm, and the unit; None where a name has none or several, or what can't be."""
+    around = [(text, before or after) for text, before, after in _AROUND.findall(name) if before or after]
+    if not around and len(ranges) == 1:
+        low, high, unit = ranges[0]
+        return (round((low + high) / 2, 6), round(high - low, 6), unit) if low < high else None
+    found = around or _WITH_UNIT.findall(name)
+    centre = _nm(*found[0]) if len(found) == 1 else None
+    return None if centre is None else (centre, None, found[0][1])
+
+
+def _ranges(name: str) -> list[tuple[float, float, str]]:
+    """First and last wavelength in nm, and the unit, of each `450-520 nm` in a name."""
+    found = []
+    for match in _RANGE.finditer(name):
+        first, last = _nm(match[1], match[3]), _nm(match[2], match[3])
+        counts = _COUNTER.search(name, 0, match.start()) or re.match(r"0\d", match[1])
+        if first and last and not counts and max(first, last) <= _WIDEST_RANGE * min(first, last):
+            found.append((first, last, match[3]))
+    return found
+
+
+def _nm(text: str, unit: str) -> float | None:
+    """A number with its unit in nm; a comma parts thousands only where it can't be a decimal mark. None for what no
+    camera sees.
+
+    >>> _nm("0,450", "um"), _nm("1,002", "nm"), _nm("16", "nm")
+    (450.0, 1002.0, None)
+    """
+    texts = [text.replace(",", "."), text.replace(",", "") if _THOUSANDS.fullmatch(text) else "nan"]
+    values = [round(float(one) * (nm_per_unit(unit) or 1.0), 6) for one in texts]
+    return next((nm for nm in values if PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]), None)
 
 
 def _varying_numbers(names: Sequence[str]) -> list[list[str]]:

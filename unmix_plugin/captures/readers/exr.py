@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.header_values import exposure_facts, wavelengths_in_names
+from unmix_plugin.captures.header_values import PLAUSIBLE_NM, exposure_facts, wavelengths_in_names
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
 from unmix_plugin.errors import CaptureError
@@ -217,7 +217,7 @@ def _choose(
         found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
         if found is not None:
             evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
-            table = replace(table, wavelengths_nm=found[0], evidence=evidence)
+            table = replace(table, wavelengths_nm=found[0], evidence=evidence, fwhm_nm=found[2])
         return table, [by_name[name] for name in bands], ()
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
@@ -259,14 +259,15 @@ def _spectral_channel(name: str, patterns: Sequence[re.Pattern[str]]) -> _Spectr
     layer, number = match["layer"] or "", _number(match[2])
     if match.re is _RANGE:
         low, high = sorted((number, _number(match[3])))
-        return _SpectralChannel(name, layer, (low + high) / 2, high - low or None)
+        is_seen = PLAUSIBLE_NM[0] <= low and high <= PLAUSIBLE_NM[1]
+        return _SpectralChannel(name, layer, (low + high) / 2, high - low or None) if is_seen else None
     nm = number if match.re is _PLAIN else number * 10.0 ** _POWERS[match[3]]
     if match.re is _LENGTH:
         nm *= 1e9
     elif match.re is _FREQUENCY:
         nm = _METRES_PER_SECOND / nm * 1e9 if nm > 0 else 0.0
     is_reradiated = _LENGTH.fullmatch(layer) or _FREQUENCY.fullmatch(layer)
-    if is_reradiated or not 100.0 <= nm <= 30_000.0:
+    if is_reradiated or not PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]:
         return None
     return _SpectralChannel(name, layer, round(nm, 6), None)
 

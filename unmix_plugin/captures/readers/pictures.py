@@ -128,9 +128,11 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     named = wavelengths_in_names([band.path.stem for band in bands])
     if named is not None and any(band.bands.wavelengths_nm is None for band in bands):
         evidence = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
+        centres = named[0][:, None]
+        widths = [band.bands.fwhm_nm for band in bands] if named[2] is None else named[2][:, None]
         tables = [
-            replace(band.bands, wavelengths_nm=nm, evidence=evidence)
-            for band, nm in zip(bands, named[0][:, None], strict=True)
+            replace(band.bands, wavelengths_nm=nm, evidence=evidence, fwhm_nm=fwhm)
+            for band, nm, fwhm in zip(bands, centres, widths, strict=True)
         ]
         bands = [replace(band, bands=table) for band, table in zip(bands, tables, strict=True)]
     centres = [band.bands.wavelengths_nm[0] for band in bands if band.bands.wavelengths_nm is not None]
