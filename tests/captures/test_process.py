@@ -25,6 +25,7 @@ from tests.captures.capture_factory import (
 from tests.captures.file_factory import present
 from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
+from unmix_plugin.captures.header_values import parse_wavelengths
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -325,6 +326,27 @@ def test_a_scene_may_be_written_to_the_working_directory_but_not_to_the_root_of_
     assert (tmp_path / "scene" / "transforms.json").is_file()
     with pytest.raises(ConfigError, match="can't be a scene"):
         process(capture.root, Path("/"))
+
+
+@pytest.mark.parametrize(
+    ("text", "nm"),
+    [
+        ("450.5\n460.5\n", [450.5, 460.5]),
+        ("450,\n460,\n", [450, 460]),
+        ("450,460,470\n", [450, 460, 470]),
+        ("wavelength,width\n450,5\n460,5\n", [450, 460]),
+        ("450,5\n460,5\n", "the line '450,5' has 2 cells; expected one number with a decimal point"),
+        ("wavelength\n450,5\n460,5\n", "the line '450,5' has 2 cells; expected 1, as in the header"),
+    ],
+)
+def test_a_file_of_wavelengths_has_one_a_line_or_a_header(tmp_path: Path, text, nm):
+    """A decimal comma would part a wavelength in two cells."""
+    (tmp_path / "nm.csv").write_text(text)
+    if isinstance(nm, str):
+        with pytest.raises(ConfigError, match=nm):
+            parse_wavelengths(str(tmp_path / "nm.csv"))
+    else:
+        assert parse_wavelengths(str(tmp_path / "nm.csv")).tolist() == nm
 
 
 NAMES = ["view_00", "view_01", "view_02", "view_03"]

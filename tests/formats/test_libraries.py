@@ -196,6 +196,22 @@ def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_chann
     assert (name, wavelengths, values) == ("Olivine GDS70", [500.0, 600.0], [0.31, 0.32])
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "400\t0,25\n500\t1\n",
+        "Wavelength;Reflectance\n400,0;0,25\n500,0;1,0\n",
+        "  400 0,25 \n  500 1e0\n",
+        "nm\tReflectance [%]\n400\t25,0\n500\t100\n",
+        "400,0.25\n500,1\n",
+        "400, 0.25\n500, 1\n",
+        "nm value std\n400 0.25 0.1\n500 1 0.1\n",
+    ],
+)
+def test_a_comma_is_a_decimal_mark_where_something_else_parts_the_columns(tmp_path, text):
+    assert spectra_of(written(tmp_path, "sand.txt", text)) == [("sand", [400.0, 500.0], [0.25, 1.0])]
+
+
 IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelength", "Wavenumber")
 
 
@@ -212,6 +228,10 @@ IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelengt
         ("x.txt", "hello\n", "there are no numbers in it"),
         ("x.txt", "400 1\nend\n", "'end' stands among the numbers"),
         ("x.txt", "400\n500\n", "no lines with a wavelength and a value"),
+        ("x.txt", "Wavelength sand grass\n400 1 1\n", "what column 3, 'grass', means is unknown"),
+        ("x.txt", "nm;dry sand;wet grass\n400;0,1;0,1\n", "what column 3, 'wet grass', means is unknown"),
+        ("x.txt", "400, 1,2\n500, 1,2\n", "3 numbers, and what column 3 means is unknown"),
+        ("x.txt", "400\t0.1\n500\t0,1\t2.0\n", "4 numbers, and what column 3 means is unknown"),
         ("x.txt", IN_WAVENUMBERS, "'X Units' is"),
         ("x.txt", ECOSTRESS.replace("Reflectance", "Transmittance"), "'Y Units' is .* expected reflectance"),
         ("x.pdf", "", r"a library is a \.csv, an ENVI spectral library"),

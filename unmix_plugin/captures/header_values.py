@@ -347,6 +347,15 @@ def _read_words(path: Path) -> list[str]:
         raise ConfigError(f"--wavelengths {path} is empty; expected a column 'wavelength'")
     heads = [cell.lower() for cell in rows[0]]
     column = next((i for i, cell in enumerate(heads) if cell.startswith("wavelength")), None)
+    columns = 1 if column is None else len(heads)
+    longer = next((row for row in rows if any(row[columns:])), None)
+    if longer is not None and (column is not None or len(rows) > 1):
+        expected = f"{columns}, as in the header, and a point as the decimal mark"
+        if column is None:
+            expected = "one number with a decimal point, or a header that names the column 'wavelength'"
+        raise ConfigError(
+            f"--wavelengths {path}: the line '{','.join(longer)[:40]}' has {len(longer)} cells; expected {expected}"
+        )
     if column is not None:
         return [row[column] if column < len(row) else "" for row in rows[1:]]
     return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]

@@ -254,6 +254,7 @@ def _number(header: Mapping[str, str], key: str, default: str = "") -> float:
         raise ValueError(f"'{key}' is {header.get(key)}; expected a number") from None
 
 
+_DEVIATION = re.compile(r"std|stdev|deviation|error|uncertainty|sigma", re.IGNORECASE)
 _UNITS_OF_X = {"micromet": 1000.0, "micron": 1000.0, "nanomet": 1.0}
 
 
@@ -266,9 +267,19 @@ def _read_text(path: Path) -> _Table:
     if record is not None and all(len(row) == 1 for row in numbers):
         values = np.array([row[0] for row in numbers])
         return [" ".join(record[2].split())], _usgs_wavelengths(path, len(values)), values[None], 1.0
-    rows = np.array([row[:2] for row in numbers if 2 <= len(row) <= 3])
+    rows = np.array([row[:2] for row in numbers if len(row) >= 2])
     if not len(rows):
         raise SpectrumError("no lines with a wavelength and a value")
+    head = words[-1] if words else ""
+    count = max(map(len, numbers))
+    if count > 2 + is_usgs:  # those of USGS have deviations in the third column
+        heads = next((x for x in (re.split(r"[\t;,]", head.strip()), head.split()) if len(x) == count), None)
+        third = "column 3" if heads is None else f"column 3, '{heads[2].strip()}',"
+        if count > 3 or heads is None or not _DEVIATION.search(heads[2]):
+            raise SpectrumError(
+                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value, or "
+                "write several spectra as a .csv headed 'wavelength,NAME,...'"
+            )
     kept = rows[:, 0] > 0
     wavelengths, values = rows[kept].T
     unit = said.get("x units", "").lower()
@@ -283,21 +294,27 @@ def _read_text(path: Path) -> _Table:
         raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
     # The second line from the last before the numbers of splib06 is the title.
     title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
-    scale = 100.0 if "percent" in quantity else 1.0
+    scale = 100.0 if "percent" in quantity or _PERCENT.search(head) else 1.0
     return [" ".join(title.split())], wavelengths * factor, values[None], scale
 
 
 def _words_and_numbers(path: Path) -> tuple[list[str], list[list[float]]]:
-    """Lines of text before the numbers, and the numbers of each line after; empty lines left out."""
+    """Lines of text before the numbers, and the numbers of each line after; empty lines left out.
+
+    A comma is the decimal mark between digits of a line whose numbers something else parts: `400<tab>0,25`.
+    """
     text = read_bounded(path).decode("utf-8-sig", "replace")
     words: list[str] = []
     numbers: list[list[float]] = []
     for line in filter(str.strip, text.splitlines()):
-        parts = line.replace(",", " ").split()
+        line = line.strip()
+        if "." not in line and re.search(r"[\s;]", line) and not re.search(r"\D,|,\D", line):
+            line = line.replace(",", ".")
+        parts = re.split(r"[\s,;]+", line.strip(",; \t"))
         if parts and all(map(is_number, parts)):
             numbers.append([float(part) for part in parts])
         elif numbers:
-            raise SpectrumError(f"{line.strip()[:40]!r} stands among the numbers")
+            raise SpectrumError(f"{line[:40]!r} stands among the numbers")
         else:
             words.append(line)
     if not numbers:
