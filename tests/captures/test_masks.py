@@ -15,7 +15,7 @@ from unmix_plugin.captures.plan import _background_rule as background_rule
 from unmix_plugin.captures.plan import _choose_mask as choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
-from unmix_plugin.captures.writing.view_files import ViewRecipe, write_view
+from unmix_plugin.captures.writing.view_files import ViewRecipe, alpha_picture, write_view
 from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
 from unmix_plugin.captures.writing.view_files import _read_view_masks as read_view_masks
@@ -91,6 +91,18 @@ def test_colours_of_a_png_are_multiplied_by_its_opacity_before_they_are_averaged
     with Image.open(tmp_path / "scene/images/a.png") as picture:
         seen = decode_srgb(np.asarray(picture)[..., :3] / 255)
     np.testing.assert_allclose(seen, expected, atol=0.005)
+
+
+def test_a_folder_of_pictures_has_the_opacity_of_the_picture_beside_it_if_there_is_one(tmp_path):
+    (tmp_path / "a").mkdir()
+    for nm in (500, 600):
+        Image.fromarray(np.full((6, 8), 255, np.uint8)).save(tmp_path / "a" / f"{nm}nm.png")
+    Image.fromarray(np.full((6, 8, 4), 128, np.uint8)).save(tmp_path / "a.png")
+    view = CaptureView("a", open_spectral_file(tmp_path / "a"))
+    assert alpha_picture(view) is None
+    masks = read_view_masks(replace(view, picture=tmp_path / "a.png"), WHOLE, use_opacity=True)
+    np.testing.assert_array_equal(masks.opacity, np.full((6, 8), 128))
+    assert masks.straight is None
 
 
 def test_a_scene_without_any_matter_is_refused(tmp_path):

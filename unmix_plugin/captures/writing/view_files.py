@@ -346,7 +346,7 @@ def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _V
     if alpha is not None:
         of_file = _cut(alpha, raster)
         opacity = np.rint(raster.averaged(of_file.astype(np.float32))).astype(np.uint8)
-        if view.alpha is None and view.cube.reader == "picture":
+        if view.alpha is None and _is_picture(view):
             straight = of_file
     if view.mask is not None:
         is_black = raster.any_in_square(~_cut(_read(view.mask, white_of, view), raster))
@@ -392,7 +392,7 @@ def alpha_picture(view: CaptureView) -> Path | None:
     """The picture with an alpha channel: the one beside the cube, or the view itself if it is one."""
     from PIL import Image
 
-    picture = view.cube.path if view.cube.reader == "picture" else view.picture
+    picture = view.cube.path if _is_picture(view) else view.picture
     if picture is None:
         return None
     try:
@@ -401,6 +401,11 @@ def alpha_picture(view: CaptureView) -> Path | None:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise CaptureError(f"{picture} can't be read as a picture ({error}); mend or remove it") from error
     return picture if has_alpha else None
+
+
+def _is_picture(view: CaptureView) -> bool:
+    """Whether the cube is one picture; a folder of them, one a band, has no opacity of its own."""
+    return view.cube.reader == "picture" and not view.cube.path.is_dir()
 
 
 def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
