@@ -67,7 +67,6 @@ def image(argv: list[str]) -> None:
 
     from unmix_plugin.captures.calibration.references import (
         find_missing,
-        is_srgb,
         own_dark_mean,
         stated_values,
     )
@@ -79,7 +78,6 @@ def image(argv: list[str]) -> None:
         write_unmixed_image,
     )
     from unmix_plugin.spectral.unmixing.image import unmix_image
-    from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
@@ -94,9 +92,25 @@ def image(argv: list[str]) -> None:
         cube -= dark[..., bands]
     if not mask.any():
         raise CaptureError(f"{options.file}: no pixel holds a measurement in all bands")
-    height, width, num_bands = cube.shape
     library = _library(options, wavelengths)
-    print(f"{options.file}: {height} x {width} pixels, {counted(num_bands, 'band')}", flush=True)
+    _say_what_was_read(opened, mask, len(bands), library is not None)
+    fractions = _fractions(cube, mask, options.mnf)
+    found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
+    axis = BandAxis(wavelengths, bands + 1, opened.metadata.get("map"))
+    names = write_unmixed_image(folder, found, axis, library, fractions)
+    _say(found, mask, names)
+    for path in paths:
+        print(f"  {path}")
+
+
+def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
+    """Size, doubts and notes of a file, and what of it is left out."""
+    from unmix_plugin.captures.calibration.references import is_srgb
+    from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
+
+    print(
+        f"{opened.path}: {mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}", flush=True
+    )
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
     if "geo_reference" in opened.metadata:
@@ -105,7 +119,7 @@ def image(argv: list[str]) -> None:
         print(f"note: {note}")
     if is_srgb(opened):
         print("the picture is taken as sRGB and brought to linear light")
-    if library is not None and not _says_reflectance(opened):
+    if is_compared and not _says_reflectance(opened):
         print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
         print(
@@ -113,13 +127,6 @@ def image(argv: list[str]) -> None:
         )
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
-    fractions = _fractions(cube, mask, options.mnf)
-    found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
-    axis = BandAxis(wavelengths, bands + 1, opened.metadata.get("map"))
-    names = write_unmixed_image(folder, found, axis, library, fractions)
-    _say(found, mask, names)
-    for path in paths:
-        print(f"  {path}")
 
 
 def _says_reflectance(opened: SpectralFile) -> bool:
