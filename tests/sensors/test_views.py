@@ -143,6 +143,16 @@ def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
     assert_close(align_gain(predicted, truth, WAVELENGTHS).spectra, truth.spectra, atol=1e-4, rtol=0)
 
 
+def test_a_view_in_another_light_is_aligned_without_the_pixels_that_were_measured_blown_out():
+    shown = torch.rand(8, 9, NUM_BANDS, generator=torch.Generator().manual_seed(0)) * 0.5
+    measured = shown.clone()
+    measured[:2] = 1.0
+    ones = torch.ones(8, 9)
+    truth = ViewTruth("view", measured, ones.bool()).in_light(np.full(NUM_BANDS, 0.5))
+    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    assert_close(align_gain(predicted, truth, WAVELENGTHS).spectra, 0.5 * shown, atol=1e-4, rtol=0)
+
+
 def test_a_view_without_matter_stays_as_it_is():
     spectra = torch.zeros(4, 4, NUM_BANDS)
     truth = ViewTruth("void", spectra, torch.ones(4, 4, dtype=torch.bool), torch.zeros(4, 4))

@@ -252,3 +252,21 @@ def test_views_counted_apart_and_merged_are_views_counted_together(scene, view):
     assert finite_or_none(first.figures()) == finite_or_none(together.figures())
     assert list(first.per_view) == ["c", "a", "b"]
     assert first.segmentation() == together.segmentation()
+
+
+def test_pixels_that_were_measured_blown_out_stay_so_in_another_light_and_others_do_not_become_so():
+    """A darker light in one band, a stronger one in the other: what the sensor could not tell is what was measured."""
+    measured = torch.full((10, 12, 2), 0.4)
+    measured[:3, :, 0] = 1.0
+    view = ViewTruth("a", measured, torch.ones(10, 12, dtype=torch.bool))
+    relit = view.in_light(np.array([0.5, 2.4]))
+    assert float(relit.spectra[5, 5, 1]) > 0.9
+    assert torch.equal(relit.blown_out, measured[..., 0] == 1.0)
+    assert torch.equal(relit.in_light(np.array([1.5, 1.0])).blown_out, relit.blown_out)
+    shown = relit.spectra.clone()
+    shown[:3] -= 0.3
+    flat = torch.ones(10, 12)
+    predicted = PredictedView(shown - 0.01, flat, flat[..., None], flat.byte(), flat[..., None])
+    figures = Evaluation(_SceneTruth(Bands.of([500, 600]), 0), torch.ones(1, 2)).add(relit, predicted)
+    assert figures["psnr_unsaturated"] == pytest.approx(40.0, abs=1e-2)
+    assert figures["psnr"] < 20

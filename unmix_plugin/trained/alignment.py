@@ -33,7 +33,6 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.poses.row_fitting import fit_rows, main_axes
 from unmix_plugin.sensors.views import smooth_terms
-from unmix_plugin.spectral.evidence import is_blown_out
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -45,7 +44,7 @@ def align_gain(
     predicted: PredictedView, truth: ViewTruth, wavelengths_nm: Float[Tensor, "B"]
 ) -> PredictedView:
     """The prediction times the smooth gain with which it comes nearest to the measured view."""
-    counts = truth.shows_matter & ~is_blown_out(truth.spectra)
+    counts = truth.shows_matter & ~truth.blown_out
     if not bool(counts.any()):
         return predicted
     shown, measured = predicted.spectra[counts].double(), truth.spectra[counts].double()

@@ -179,6 +179,13 @@ class ViewTruth:
     abundances: Float[Tensor, "H W K"] | None = None
     sensor: SceneSensor | None = None
     """What measured the spectra; None where it sees the scene's bands as they are."""
+    measured_blown_out: Bool[Tensor, "H W"] | None = None
+    """`blown_out` of a view in another light; None in the light that it was measured in."""
+
+    @property
+    def blown_out(self) -> Bool[Tensor, "H W"]:
+        """Pixels in which a band was measured near full scale, whatever light the view is in now."""
+        return is_blown_out(self.spectra) if self.measured_blown_out is None else self.measured_blown_out
 
     def seen(self, spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels b"]:
         """Spectra on the scene's bands as the view's sensor sees them."""
@@ -208,7 +215,8 @@ class ViewTruth:
         if factors is None:
             return self
         own = self.seen(torch.from_numpy(factors))
-        return replace(self, spectra=(self.spectra * own.to(self.spectra)).clamp(0, 1))
+        spectra = (self.spectra * own.to(self.spectra)).clamp(0, 1)
+        return replace(self, spectra=spectra, measured_blown_out=self.blown_out)
 
 
 @dataclass(frozen=True)
@@ -278,7 +286,7 @@ class Evaluation:
             )
         valid = None if bool(view.valid.all()) else view.valid
         spectra = view.seen(predicted.spectra)
-        blown_out = is_blown_out(view.spectra)
+        blown_out = view.blown_out
         fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
         figures = {
             "psnr": psnr(spectra, view.spectra, valid),
