@@ -270,3 +270,11 @@ def test_pixels_that_were_measured_blown_out_stay_so_in_another_light_and_others
     figures = Evaluation(_SceneTruth(Bands.of([500, 600]), 0), torch.ones(1, 2)).add(relit, predicted)
     assert figures["psnr_unsaturated"] == pytest.approx(40.0, abs=1e-2)
     assert figures["psnr"] < 20
+
+
+def test_errors_of_bands_are_of_clamped_predictions_as_all_figures_are(scene, view):
+    bright = replace(perfect(view, SHUFFLED), spectra=torch.full_like(view.spectra, 3.0))
+    evaluation = evaluated(scene, view, bright, SHUFFLED)
+    errors = evaluation.bands["view"].mse
+    assert errors == pytest.approx(((1 - view.spectra.double()) ** 2).mean(dim=(0, 1)).numpy())
+    assert math.sqrt(errors.mean()) == pytest.approx(evaluation.per_view["view"]["rmse"])

@@ -246,7 +246,7 @@ class BandErrors:
     mean: Float[np.ndarray, " b"]
     """Of what was measured."""
     mse: Float[np.ndarray, " b"]
-    """Mean squared error of what was predicted."""
+    """Mean squared error of what was predicted, clamped to [0, 1]."""
     num_pixels: int
 
 
@@ -311,7 +311,7 @@ class Evaluation:
         centers = torch.tensor(self.truth.bands.centers_nm)
         measured, error = (
             view.spectra[view.valid].double(),
-            spectra[view.valid].double() - view.spectra[view.valid],
+            spectra[view.valid].double().clamp(0, 1) - view.spectra[view.valid],
         )
         self.bands[view.name] = BandErrors(
             as_numpy(view.seen(centers)),
