@@ -77,6 +77,7 @@ def _unmix_nerf_published() -> TrainerConfig:
                     finest_resolution=2048,
                     log2_rows_per_level=19,
                     temperature=0.4,
+                    scale="per-endmember",
                 ),
                 renderer=RendererConfig(visible_weight=1.0),
                 losses=LossConfig(

@@ -134,7 +134,7 @@ class UnmixFieldConfig:
     temperature: float = 1.0
     """T of the abundances' softmax: lower is purer."""
     scale: Literal["shared", "per-endmember"] = "shared"
-    """One brightness a point, or one a point and endmember."""
+    """One brightness a point, or one a point and endmember, as published."""
 
     def __post_init__(self) -> None:
         finest, rows = self.finest_resolution, self.log2_rows_per_level
@@ -333,6 +333,8 @@ class UnmixModelConfig(ModelConfig):
             or (len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)),
             "light fixed or per-view: the field as published has no shading": not self.as_published
             or self.light != "camera",
+            "a scale per-endmember: the method as published has no shared one": not self.as_published
+            or self.field.scale == "per-endmember",
             "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
             == (self.endmember_file is not None),
         }

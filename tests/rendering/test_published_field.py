@@ -14,7 +14,12 @@ from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.settings import UnmixFieldConfig, UnmixModelConfig
 
 SMALL = UnmixFieldConfig(
-    temperature=0.4, num_levels=3, log2_rows_per_level=8, finest_resolution=32, hidden_width=16
+    temperature=0.4,
+    num_levels=3,
+    log2_rows_per_level=8,
+    finest_resolution=32,
+    hidden_width=16,
+    scale="per-endmember",
 )
 
 
@@ -66,11 +71,17 @@ def test_a_known_encoding_changes_no_value_and_no_gradient(field):
     assert_close(found[0], found[1])
 
 
-def test_the_registered_settings_are_written_down_and_read_back_and_allow_no_light_that_moves():
+def test_the_registered_settings_are_written_down_and_read_back_and_refuse_what_is_not_published():
     config = unmix_nerf_published.config
     assert config_from_json(config_to_json(config), config) == config
     with pytest.raises(ConfigError, match="light fixed or per-view: the field as published has no shading"):
         replace(config.pipeline.model, light="camera")
+    assert isinstance(config.pipeline.model, UnmixModelConfig)
+    assert config.pipeline.model.field.scale == "per-endmember"
+    with pytest.raises(
+        ConfigError, match="needs a scale per-endmember: the method as published has no shared one"
+    ):
+        replace(config.pipeline.model, field=replace(SMALL, scale="shared"))
 
 
 def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_chooses():
