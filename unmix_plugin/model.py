@@ -99,8 +99,8 @@ class UnmixModel(Model):
         self.endmembers = nn.Parameter(torch.zeros(shape), requires_grad=config.train_endmembers)
         num_dictionary = config.num_dictionary_spectra(self.preset, self.num_endmembers)
         self.specular_spectra = nn.Parameter(torch.zeros(num_dictionary, len(self.bands)))
-        lamp = config.lamp if config.light == "camera" else ()
-        self._lamp = None if lamp in ("auto", ()) else Lamp.of_numbers([float(x) for x in lamp])
+        unknown = config.lamp in ("auto", ())
+        self._lamp = None if unknown else Lamp.of_numbers([float(x) for x in config.lamp])
         self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
         self.step = config.renderer.sample_distance(

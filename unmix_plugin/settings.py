@@ -296,8 +296,8 @@ class UnmixModelConfig(ModelConfig):
     lamp: tuple[float, ...] | Auto = "auto"
     """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
     it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp
-    (right, up, towards the camera), in model space. Auto finds it where light is `auto` too; no numbers: not known, so
-    shading is a smooth function of direction and shadows that move are blurred."""
+    (right, up, towards the camera), in model space; numbers need light `camera`. Auto finds it where light is `auto`
+    too; no numbers: not known, so shading is a smooth function of direction and shadows that move are blurred."""
     poses: Annotated[Literal["fixed", "refine"], Common, short("poses")] = "fixed"
     """Whether training takes the poses as they are, or corrects them with the field."""
     pose_refinement: PoseConfig = PoseConfig()
@@ -331,6 +331,8 @@ class UnmixModelConfig(ModelConfig):
             "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
             "a lamp of no or ten numbers, the first 0 or 1, or auto": self.lamp in ("auto", ())
             or (len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)),
+            "light camera where numbers of a lamp are given": self.lamp in ("auto", ())
+            or self.light == "camera",
             "light fixed or per-view: the field as published has no shading": not self.as_published
             or self.light != "camera",
             "a scale per-endmember: the method as published has no shared one": not self.as_published

@@ -216,3 +216,13 @@ def test_a_lamp_is_ten_numbers():
     assert Lamp.of_numbers(NUMBERS) == TURNTABLE
     with pytest.raises(ConfigError, match="ten numbers"):
         UnmixModelConfig(lamp=(0.0, 1.0))
+
+
+@pytest.mark.parametrize("light", ["auto", "fixed", "per-view"])
+def test_a_lamp_is_refused_in_a_light_that_does_not_move_with_the_camera(light):
+    with pytest.raises(
+        ConfigError, match=f"light camera where numbers of a lamp are given .got light {light}, lamp"
+    ):
+        UnmixModelConfig(light=light, lamp=NUMBERS)
+    assert UnmixModelConfig(light=light, lamp=()).lamp == ()
+    assert UnmixModelConfig(light="camera", lamp=NUMBERS).lamp == NUMBERS
