@@ -105,6 +105,17 @@ def test_a_given_number_is_taken_and_its_residual_said(tmp_path):
         PixelTable(scene, CPU, (1,), components=2)
 
 
+def test_a_given_number_that_does_not_make_the_pixels_fit_is_said_to_have_no_effect(tmp_path):
+    scene = make(tmp_path / "scene")
+    pool, ignored = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components=2).notes
+    assert "stay on disk" in pool
+    assert ignored.startswith("target-components 2 has no effect: ")
+    [held] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-4, components=2).notes
+    assert "kept as 2 numbers" in held
+    [automatic] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components="auto").notes
+    assert "no effect" not in automatic
+
+
 def test_bad_values_are_replaced_before_pixels_are_projected(tmp_path):
     def spike(cube: np.ndarray) -> None:
         cube[8, 10, 40] = 0.0

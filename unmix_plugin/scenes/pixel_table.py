@@ -143,7 +143,14 @@ class PixelTable:
             held, total = _pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
             for block in self.blocks:
                 block.hold_part(held * block.num_bytes // total)
-            return [_describe_pool(self.blocks)]
+            notes = [_describe_pool(self.blocks)]
+            if not isinstance(components, str):
+                notes.append(
+                    f"target-components {components} has no effect: even as so many numbers each the training pixels "
+                    f"need {sum(needed.values()) / _GIB:.3g} GiB, and pixels on disk keep all their bands; choose "
+                    "fewer, or more memory (memory-gb)"
+                )
+            return notes
         for block in self.blocks:
             limits = self._limits(block)
             if block.sensor in found:
