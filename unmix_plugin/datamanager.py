@@ -336,7 +336,11 @@ class HyperspectralDataManager(DataManager):
         train = self.scene.train_indices
         alike = commonest([self.scene.frames[view].sensor for view in train])
         cameras = self.train_cameras[alike]
-        points = find_matched_points(cameras, lambda row, part: self.scene.cube(train[alike[row]], part))
+        points = find_matched_points(
+            cameras,
+            lambda row, part: self.scene.cube(train[alike[row]], part),
+            lambda row: self.scene.valid_mask(train[alike[row]]),
+        )
         if points is None:
             return "fixed"
         return judge_exposure(cameras, points.places, points.seen_by(len(alike)))

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from tests.scenes.geometry.ground_views import (
     FOCAL,
@@ -66,6 +67,29 @@ def test_pixels_that_are_not_valid_are_no_features():
     assert above_ground(found.places).abs().quantile(0.9) < 0.1
 
 
+def test_what_masks_leave_out_is_no_feature_and_does_not_tell_exposures():
+    """Beside the mask exposures differ, as of an instrument's own parts in another light."""
+    cameras = flight_cameras(flight_poses(16))
+    gains = np.exp(np.random.default_rng(2).normal(size=16) * 0.3).astype(np.float32)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[:, WIDTH * 2 // 5 :] = False
+    views = ground_views(cameras)
+    for view, gain in zip(views, gains, strict=True):
+        view[~valid] *= gain
+    everything = find_matched_points(cameras, read_from(views))
+    assert everything is not None
+    assert judge_exposure(cameras, everything.places, everything.seen_by(16)) == "per-view"
+    valid[::31, ::29] = False  # dead pixels spoil no feature
+    found = find_matched_points(cameras, read_from(views), lambda _: valid)
+    assert found is not None
+    assert judge_exposure(cameras, found.places, found.seen_by(16)) == "fixed"
+    for end in (0, 1):
+        for view in found.pairs[:, end].unique().tolist():
+            coords, _ = cameras.project(found.places[found.pairs[:, end] == view], view)
+            assert float(coords[:, 0].max()) < WIDTH * 2 // 5 - 7.5
+    assert find_matched_points(cameras, read_from(views), lambda _: valid & False) is None
+
+
 def test_views_that_share_nothing_show_one_colour_or_stand_at_one_place_have_no_matched_places():
     cameras = flight_cameras(flight_poses())
     unrelated = [np.random.default_rng(view).random((HEIGHT, WIDTH, 1), np.float32) for view in range(5)]
@@ -101,7 +125,17 @@ def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen
     assert 0.1 < high < 0.6
 
 
-def test_a_flight_is_read_as_a_bounded_scene_on_the_ground(tmp_path):
+def test_a_flight_is_read_as_a_bounded_scene_on_the_ground_by_what_its_masks_leave(tmp_path, monkeypatch):
+    asked = []
+
+    def find(cameras, read_view, read_valid):
+        asked.append(read_valid(0))
+        return find_matched_points(cameras, read_view, read_valid)
+
+    monkeypatch.setattr("unmix_plugin.scenes.reading.loader.find_matched_points", find)
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[:20, :30] = False
+    Image.fromarray(valid).save(tmp_path / "mask.png")
     cameras = flight_cameras(flight_poses())
     frames = []
     for index, (pose, view) in enumerate(zip(flight_poses(), ground_views(cameras), strict=True)):
@@ -110,6 +144,7 @@ def test_a_flight_is_read_as_a_bounded_scene_on_the_ground(tmp_path):
             frames.append(
                 {
                     "hyperspectral_file_path": f"{index}_{band}.npy",
+                    "mask_path": "mask.png",
                     "sensor": f"lens {band}",
                     "bands": [band],
                     "transform_matrix": pose.tolist(),
@@ -119,6 +154,7 @@ def test_a_flight_is_read_as_a_bounded_scene_on_the_ground(tmp_path):
     content["test_filenames"] = [frame["hyperspectral_file_path"] for frame in frames[4:6]]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     scene = load_scene(tmp_path)
+    assert np.array_equal(asked[0], valid)
     assert not scene.is_unbounded
     low, high = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())[:, 2]
     assert -0.6 < low < 0.0 < high < 0.6

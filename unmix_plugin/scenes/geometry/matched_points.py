@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness
-from unmix_plugin.scenes.geometry.view_agreement import ReadView, Thinning
+from unmix_plugin.scenes.geometry.view_agreement import ReadValid, ReadView, Thinning
 
 LONGEST_SIDE_PX = 320
 """Of the views that are compared."""
@@ -43,6 +43,10 @@ _ENDS = torch.tensor([0.05, 0.95])
 _NEAR = 0.25
 _BRIGHT = 0.99
 """Quantile of a view's brightness that is taken for white."""
+_REACH = 7.5
+"""Half the edge of what a descriptor looks at, in the width of its feature."""
+_SPECK_PX = 3
+"""Along an edge of the thinned-out view; smaller parts that are not valid, such as dead pixels, spoil no descriptor."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +85,22 @@ class MatchedPoints:
         return MatchedPoints(*(values[kept] for values in vars(self).values()))
 
 
-def find_matched_points(cameras: Cameras, read_view: ReadView) -> MatchedPoints | None:
+def find_matched_points(
+    cameras: Cameras, read_view: ReadView, read_valid: ReadValid | None = None
+) -> MatchedPoints | None:
     """Places that the views agree on; None if those are too few to say anything.
 
     Args:
         cameras: Of views that show the same bands. All have one size; line cameras may be among them.
         read_view: Reads a part of a view.
+        read_valid: Says which pixels of a view count; None where all do. Others have no feature and no brightness.
     """
     thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
     pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
-    features = {view: _features_of(thinning, read_view, view) for view in sorted({*sum(pairs, ())})}
+    features = {}
+    for view in sorted({*sum(pairs, ())}):
+        share = None if read_valid is None else thinning.valid_share(read_valid(view))
+        features[view] = _features_of(thinning.read(read_view, view), thinning, share)
     found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]
     if sum(len(points.depths) for points in found) < _LEAST_POINTS:
         return None
@@ -120,20 +130,48 @@ def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _features_of(thinning: Thinning, read_view: ReadView, view: int) -> _Features:
+def _features_of(
+    image: Float[Tensor, "h w B"], thinning: Thinning, valid_share: Float[Tensor, "h w"] | None
+) -> _Features:
+    """What stands out in a view thinned out; `valid_share` as `Thinning` tells it, None where all is valid."""
     from skimage.feature import SIFT  # slow to import
 
-    brightness = thinning.read(read_view, view).mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
-    dark, bright = brightness.flatten().quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
+    brightness = image.mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+    counts = torch.ones_like(brightness, dtype=torch.bool) if valid_share is None else valid_share == 1
     sift = SIFT(upsampling=1)
     try:
+        dark, bright = brightness[counts].quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
         sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
-    except (RuntimeError, ValueError, IndexError):  # nothing stands out, or the view is too small for it
+    except (
+        RuntimeError,
+        ValueError,
+        IndexError,
+    ):  # nothing counts or stands out, or the view is too small for it
         return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32), torch.zeros(0))
     coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
+    descriptors = np.array(sift.descriptors, dtype=np.float32)
     columns, rows = coords.long().unbind(-1)
-    seen = torch.from_numpy(local_log_brightness(brightness)).float()[rows, columns]
-    return _Features(thinning.whole(coords), np.array(sift.descriptors, dtype=np.float32), seen)
+    if not bool(counts.all()):
+        reach = _REACH * torch.from_numpy(np.array(sift.sigmas, dtype=np.float32))
+        kept = _away_from_invalid(counts)[rows, columns] > reach
+        coords, descriptors, rows, columns = (
+            coords[kept],
+            descriptors[kept.numpy()],
+            rows[kept],
+            columns[kept],
+        )
+    seen = local_log_brightness(torch.where(counts, brightness, 0.0))
+    return _Features(thinning.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
+
+
+def _away_from_invalid(counts: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """How far each pixel is from the nearest part, larger than a speck, that does not count; inf without any."""
+    from scipy import ndimage  # slow to import
+
+    parts = ndimage.binary_opening(~counts.numpy(), np.ones((_SPECK_PX, _SPECK_PX)))
+    if not parts.any():
+        return torch.full(counts.shape, torch.inf)
+    return torch.from_numpy(ndimage.distance_transform_edt(np.logical_not(parts))).float()
 
 
 def _triangulate(

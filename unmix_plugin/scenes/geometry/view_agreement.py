@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -79,6 +79,8 @@ _REMEDIES = {
 _Poses = Float64[np.ndarray, "N 3 4"]
 ReadView = Callable[[int, tuple[slice, ...]], Float32[np.ndarray, "H W B"]]
 """From a view, and the rows, columns and bands wanted, to its picture."""
+ReadValid = Callable[[int], Bool[np.ndarray, "H W"]]
+"""From a view to its pixels that count: the others show what is no part of the scene."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,11 @@ class Thinning:
         picture = read_view(view, (some, some, slice(None, None, self.band_step)))
         image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)
         return torch.nn.functional.avg_pool2d(image, self.pooled).permute(1, 2, 0)
+
+    def valid_share(self, valid: Bool[np.ndarray, "H W"]) -> Float[Tensor, "h w"]:
+        """Of what is averaged to each pixel of a view thinned out, the share that is valid."""
+        some = torch.from_numpy(valid[:: self.fine, :: self.fine].astype(np.float32))
+        return torch.nn.functional.avg_pool2d(some[None], self.pooled)[0]
 
     def whole(self, coords: Float[Tensor, "P 2"]) -> Float[Tensor, "P 2"]:
         """Coordinates in the whole view of those in the thinned-out one; pixel centres are at + 0.5 in both."""

@@ -462,6 +462,11 @@ def _find_model_space(
     def read_view(view: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
         return read_cube(cubes[train[alike[view]]], options.value_scale, options.invalid_pixels, part)
 
+    def read_valid(view: int) -> Bool[np.ndarray, "H W"]:
+        index = train[alike[view]]
+        missing = checked.unknown[index]
+        return np.ones(checked.sizes[index], dtype=bool) if missing is None else ~missing
+
     before = first_box = points = None
     if foreground is None and options.world == "auto" and len(alike) == len(train):
         sizes, unknown = [cameras.size(row) for row in alike], [checked.unknown[index] for index in train]
@@ -473,7 +478,7 @@ def _find_model_space(
             before = None
     has_masks = first_box is not None or foreground is not None
     if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
-        points = find_matched_points(cameras[alike], read_view)
+        points = find_matched_points(cameras[alike], read_view, read_valid)
         points = None if points is None else replace(points, pairs=torch.tensor(alike)[points.pairs])
     try:
         first_box = first_box or find_bounds(root, cameras, foreground, points)
@@ -485,7 +490,7 @@ def _find_model_space(
     if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
         evidence = find_world_evidence(first_box, cameras[alike], read_view)
         if not evidence.goes_on:
-            places = points or find_matched_points(cameras[alike], read_view)
+            places = points or find_matched_points(cameras[alike], read_view, read_valid)
             evidence = evidence if places is None else evidence.with_places(first_box, places.places)
         is_unbounded, reason = evidence.goes_on, evidence.in_words()
     low, high = first_box.aabb.double().numpy()
