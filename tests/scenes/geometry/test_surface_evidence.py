@@ -123,6 +123,26 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
     assert right > 0.85
 
 
+def test_the_distances_of_what_masks_leave_out_stay_unknown(scene):
+    train = list(scene.train_indices[:6])
+    cameras = scene.cameras[train]
+    valid = np.ones((cameras.height, cameras.width), bool)
+    valid[:, : cameras.width // 2] = False
+
+    def swept(read_valid):
+        depths = _sweep_depths(
+            cameras, scene.scene_box, lambda view, part: scene.cube(train[view], part), read_valid
+        )
+        assert depths is not None
+        return depths.distances
+
+    found, everything = swept(lambda _: valid), swept(None)
+    middle = found.shape[2] // 2
+    assert torch.isfinite(everything[..., :middle]).any()
+    assert torch.isinf(found[..., :middle]).all()
+    assert torch.equal(found[..., middle + 1 :], everything[..., middle + 1 :])
+
+
 def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_not(scene, evidence):
     before = carve(scene, 64)
     after = evidence.carved(before)

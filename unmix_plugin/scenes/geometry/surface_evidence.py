@@ -26,6 +26,7 @@ from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes.geometry.view_agreement import (
     LONGEST_SIDE_PX,
     NUM_AGREEING,
+    ReadValid,
     ReadView,
     Thinning,
     choose_neighbours,
@@ -78,13 +79,16 @@ class _SweptDepths:
     """Pixels of the whole view from one that is asked to the next; the first stands at `stride` / 2."""
 
 
-def _sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> _SweptDepths | None:
+def _sweep_depths(
+    cameras: Cameras, box: SceneBox, read_view: ReadView, read_valid: ReadValid | None = None
+) -> _SweptDepths | None:
     """Distances of the pixels of all views, or of `_MOST_VIEWS`; None if views are too few, too small or too plain.
 
     Args:
         cameras: Of the training views, all of one size, each with one pose.
         box: In the cameras' space.
         read_view: Reads a part of a view.
+        read_valid: Says which pixels of a view count, None where all do: the distances of others stay unknown.
     """
     count = min(len(cameras), _MOST_VIEWS)
     views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
@@ -101,6 +105,10 @@ def _sweep_depths(cameras: Cameras, box: SceneBox, read_view: ReadView) -> _Swep
     if torch.isfinite(found).float().mean() < _LEAST_KNOWN:
         relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
         found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
+    if read_valid is not None:
+        every = slice(_PIXEL_STRIDE // 2, None, _PIXEL_STRIDE)
+        shares = torch.stack([thinning.valid_share(read_valid(view))[every, every] for view in views])
+        found = found.masked_fill(shares < 1, torch.inf)
     return _SweptDepths(tuple(views), found, thinning.stride * _PIXEL_STRIDE)
 
 
@@ -231,7 +239,10 @@ class SurfaceEvidence:
         if scene.is_unbounded and not scene.is_rig and self._cameras.key_poses is None:
             train = scene.train_indices
             self._depths = _sweep_depths(
-                self._cameras, self._box, lambda view, part: scene.cube(train[view], part)
+                self._cameras,
+                self._box,
+                lambda view, part: scene.cube(train[view], part),
+                lambda view: scene.valid_mask(train[view]),
             )
 
     @property
