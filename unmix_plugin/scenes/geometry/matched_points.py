@@ -142,11 +142,7 @@ def _features_of(
     try:
         dark, bright = brightness[counts].quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
         sift.detect_and_extract(((brightness - dark) / (bright - dark).clamp(min=1e-9)).clamp(0, 1).numpy())
-    except (
-        RuntimeError,
-        ValueError,
-        IndexError,
-    ):  # nothing counts or stands out, or the view is too small for it
+    except (RuntimeError, ValueError, IndexError):  # nothing counts or stands out, or the view is too small
         return _Features(torch.zeros(0, 2), np.zeros((0, 128), dtype=np.float32), torch.zeros(0))
     coords = torch.from_numpy(np.array(sift.keypoints, dtype=np.float32)[:, ::-1].copy()) + 0.5
     descriptors = np.array(sift.descriptors, dtype=np.float32)
