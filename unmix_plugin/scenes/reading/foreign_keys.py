@@ -90,7 +90,7 @@ def keys_to_say(
         if any(_is_set(own.get(key)) for own in every)
     ]
     twice = [key for key in _LENS_KEYS if any(_differs(content.get(key), own.get(key)) for own in every[1:])]
-    if twice:
+    if twice and not any("sensor" in own for own in every[1:]):  # which nerfstudio has no word for
         warnings.append(
             f"{', '.join(twice)}: frames have other values than the scene; the frames' are used, nerfstudio takes the "
             "scene's. Take out those that are wrong"
