@@ -159,3 +159,11 @@ def test_a_view_without_matter_stays_as_it_is():
     ones = torch.ones(4, 4)
     predicted = PredictedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
     assert align_gain(predicted, truth, WAVELENGTHS) is predicted
+
+
+def test_a_prediction_that_is_black_stays_as_it_is():
+    truth = ViewTruth("view", torch.full((4, 4, NUM_BANDS), 0.4), torch.ones(4, 4, dtype=torch.bool))
+    zeros = torch.zeros(4, 4)
+    black = torch.zeros(4, 4, NUM_BANDS)
+    predicted = PredictedView(black, zeros, zeros[..., None], zeros.to(torch.uint8), zeros[..., None])
+    assert torch.equal(align_gain(predicted, truth, WAVELENGTHS).spectra, black)

@@ -58,7 +58,8 @@ def _fitted_gain(
     """Smooth gain g of least squared error, by Gauss-Newton steps."""
     terms = smooth_terms(wavelengths_nm)
     logs = torch.zeros(len(terms), dtype=terms.dtype)
-    ridge = 1e-9 * power.sum() * torch.eye(len(terms), dtype=terms.dtype)
+    # Of a prediction that is black everywhere nothing can be fitted: its gain stays 1.
+    ridge = (1e-9 * power.sum()).clamp(min=1e-30) * torch.eye(len(terms), dtype=terms.dtype)
     for _ in range(_NUM_STEPS):
         gain = (logs @ terms).exp()
         slopes = (terms * (power * gain * gain)) @ terms.T + ridge
