@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,14 @@ from tests.formats.cubes import full_disk
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.train import train
 from unmix_plugin.datamanager import HyperspectralDataManager
+from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline
+from unmix_plugin.products.evaluation import evaluate_scene
 from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
+from unmix_plugin.trained.open_run import open_run
 
 KEYS = list(DEFINITIONS)
 
@@ -191,6 +196,21 @@ def test_the_gain_of_an_evaluation_view_does_not_count(tmp_path):
     halved, _ = evaluated_psnr(scene, tmp_path / "halved")
     # Half the light has half the error after alignment: 6 dB.
     assert abs(halved - plain - 6.02) < 0.5
+
+
+def test_the_gain_of_a_view_of_a_rig_does_not_count_either(trained, tmp_path):
+    fitting = replace(open_run(trained.run, "cpu"), fitted=("gain",))
+    measured = load_scene(trained.scene)
+    rig = replace(measured, sensors=measured.sensors * 2)
+    plain, seen = (
+        evaluate_scene(fitting, scene, None, tmp_path, lambda _, items: iter(items), ALONE)
+        for scene in (measured, rig)
+    )
+    assert seen is not None
+    assert plain is not None
+    assert rig.is_rig
+    assert seen.more["aligned"] == ["gain"]
+    assert seen.figures["psnr"] == pytest.approx(plain.figures["psnr"])
 
 
 def test_several_runs_are_compared_in_one_table(run_copy, tmp_path):

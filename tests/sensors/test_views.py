@@ -13,8 +13,9 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.sensors.batches import MeasuredPixels
-from unmix_plugin.sensors.views import ViewGains, smooth_terms
+from unmix_plugin.sensors.views import SensorViews, ViewGains, smooth_terms
 from unmix_plugin.settings import LossConfig, UnmixModelConfig
+from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.spectral.unmixing.abundances import sparse_abundances
 from unmix_plugin.trained.alignment import align_gain
 from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
@@ -140,7 +141,27 @@ def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
     truth = ViewTruth("view", shown * gain, torch.ones(8, 9, dtype=torch.bool))
     ones = torch.ones(8, 9)
     predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
-    assert_close(align_gain(predicted, truth, WAVELENGTHS).spectra, truth.spectra, atol=1e-4, rtol=0)
+    found = truth.shown(align_gain(predicted, truth, WAVELENGTHS))
+    assert_close(found, truth.spectra, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("num_channels", [4, 2, 1])
+def test_a_view_of_a_rig_is_aligned_in_the_channels_of_its_sensor_as_in_training(num_channels):
+    generator = torch.Generator().manual_seed(0)
+    shown = torch.rand(8, 9, NUM_BANDS, generator=generator) * 0.5
+    responses = torch.rand(num_channels, NUM_BANDS, generator=generator).double()
+    sensor = SceneSensor("colour", (responses / responses.sum(dim=1, keepdim=True)).numpy())
+    gains, seen_by = ViewGains(2, WAVELENGTHS), SensorViews([sensor.to_json()], torch.zeros(NUM_BANDS, 3))
+    with torch.no_grad():
+        gains.log_gains.copy_(torch.tensor([[0.4, -0.2, 0.1], [-0.4, 0.2, -0.1]]))
+        terms = seen_by.project(gains.terms, 0)
+        measured = seen_by.project(shown, 0) * gains(torch.tensor([0]), terms / terms[:1])
+    truth = ViewTruth("view", measured, torch.ones(8, 9, dtype=torch.bool), sensor=sensor)
+    ones = torch.ones(8, 9)
+    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
+    assert float((truth.shown(predicted) - measured).abs().max()) > 0.05
+    found = truth.shown(align_gain(predicted, truth, WAVELENGTHS))
+    assert_close(found, measured, atol=1e-4, rtol=0)
 
 
 def test_a_view_in_another_light_is_aligned_without_the_pixels_that_were_measured_blown_out():
@@ -166,4 +187,4 @@ def test_a_prediction_that_is_black_stays_as_it_is():
     zeros = torch.zeros(4, 4)
     black = torch.zeros(4, 4, NUM_BANDS)
     predicted = PredictedView(black, zeros, zeros[..., None], zeros.to(torch.uint8), zeros[..., None])
-    assert torch.equal(align_gain(predicted, truth, WAVELENGTHS).spectra, black)
+    assert torch.equal(truth.shown(align_gain(predicted, truth, WAVELENGTHS)), black)

@@ -142,7 +142,7 @@ def evaluate_scene(
     # Of segmentations the ids alone are kept: their colours are known after the last view.
     ids: dict[int, UInt8[np.ndarray, "H W"]] = {}
     views = list(zip(measured.eval_indices, views_of(scene.views, "eval"), strict=True))
-    fits_gain = "gain" in scene.fitted and not measured.is_rig
+    fits_gain = "gain" in scene.fitted
     with processes.together():
         for index, own in follow("evaluating views", views[processes.rank :: processes.count]):
             view, camera = view_truth(measured, index).in_light(light_factors), own.camera
@@ -225,7 +225,7 @@ def material_look(evaluation: Evaluation) -> MaterialLook:
 
 def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_db: float) -> bytes:
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
-    weights, spectra = view.colour_weights(bands), view.seen(predicted.spectra)
+    weights, spectra = view.colour_weights(bands), view.shown(predicted)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
     seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage))
     panels = [

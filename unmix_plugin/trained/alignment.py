@@ -12,7 +12,8 @@ does so first, since a shift as well would be drawn away. What is found is taken
 what the given pose leads to: coarse pictures also move a view that is right, and a line camera whose rows can hardly be
 told apart. The rows of a line camera wobble, so they are fitted one by one afterwards.
 
-Notation: `B` bands, `T` terms, `P` pixels of a coarse picture, `C` spectral channels compared, `D` those and opacity.
+Notation: `B` bands, `b` channels of the view's sensor, `T` terms, `P` pixels of a coarse picture, `C` spectral channels
+compared, `D` those and opacity.
 
 Source: Lin et al. 2021, BARF (alignment of views at test time); here by Levenberg-Marquardt steps with central
 differences of renders, since one-sided ones stop early.
@@ -24,7 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -43,20 +44,27 @@ _NUM_STEPS = 20
 def align_gain(
     predicted: PredictedView, truth: ViewTruth, wavelengths_nm: Float[Tensor, "B"]
 ) -> PredictedView:
-    """The prediction times the smooth gain with which it comes nearest to the measured view."""
+    """The prediction with the smooth gain with which it comes nearest to the measured view."""
     counts = truth.shows_matter & ~truth.blown_out
     if not bool(counts.any()):
         return predicted
-    shown, measured = predicted.spectra[counts].double(), truth.spectra[counts].double()
-    gain = _fitted_gain((shown * shown).sum(dim=0), (shown * measured).sum(dim=0), wavelengths_nm.double())
-    return replace(predicted, spectra=predicted.spectra * gain.to(predicted.spectra))
+    shown, measured = truth.seen(predicted.spectra)[counts].double(), truth.spectra[counts].double()
+    terms = _terms_seen(truth, wavelengths_nm)
+    return replace(
+        predicted, gain=_fitted_gain((shown * shown).sum(dim=0), (shown * measured).sum(dim=0), terms)
+    )
+
+
+def _terms_seen(truth: ViewTruth, wavelengths_nm: Float[Tensor, "B"]) -> Float64[Tensor, "T b"]:
+    """Terms of smooth gains as the view's sensor sees them, as in training."""
+    terms = truth.seen(smooth_terms(wavelengths_nm.double()))
+    return terms / terms[:1]
 
 
 def _fitted_gain(
-    power: Float[Tensor, "B"], agreement: Float[Tensor, "B"], wavelengths_nm: Float[Tensor, "B"]
-) -> Float[Tensor, "B"]:
+    power: Float[Tensor, "b"], agreement: Float[Tensor, "b"], terms: Float[Tensor, "T b"]
+) -> Float[Tensor, "b"]:
     """Smooth gain g of least squared error, by Gauss-Newton steps."""
-    terms = smooth_terms(wavelengths_nm)
     logs = torch.zeros(len(terms), dtype=terms.dtype)
     # Of a prediction that is black everywhere nothing can be fitted: its gain stays 1.
     ridge = (1e-9 * power.sum()).clamp(min=1e-30) * torch.eye(len(terms), dtype=terms.dtype)

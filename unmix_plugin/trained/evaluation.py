@@ -65,6 +65,8 @@ class PredictedView:
     """Whether a sky is behind all that is seen."""
     confidence: Float[Tensor, "H W"] | None = None
     """Estimated probability that the segmentation is right."""
+    gain: Float[Tensor, "b"] | None = None
+    """With which each channel of the sensor that measured the view is multiplied; None: 1."""
 
     @property
     def coverage(self) -> Float[Tensor, "H W"]:
@@ -193,6 +195,11 @@ class ViewTruth:
             return spectra
         return spectra @ torch.from_numpy(self.sensor.matrix).to(spectra).T
 
+    def shown(self, predicted: PredictedView) -> Float[Tensor, "H W b"]:
+        """What the view's sensor sees of a prediction, times its gain."""
+        spectra = self.seen(predicted.spectra)
+        return spectra if predicted.gain is None else spectra * predicted.gain.to(spectra)
+
     def colour_weights(self, bands: Bands) -> Float[Tensor, "b 3"]:
         """From the view's spectra to linear sRGB, or to false colours where its sensor lacks bands."""
         if self.sensor is None:
@@ -285,7 +292,7 @@ class Evaluation:
                 f"{rendered[1]} x {rendered[0]}; name the scene that the run was trained on with --data"
             )
         valid = None if bool(view.valid.all()) else view.valid
-        spectra = view.seen(predicted.spectra)
+        spectra = view.shown(predicted)
         blown_out = view.blown_out
         fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
         figures = {
