@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
@@ -10,6 +11,7 @@ from tests.method_factory import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP
+from unmix_plugin.spectral.sensor import SceneSensor
 from unmix_plugin.trained import alignment as pose_alignment
 from unmix_plugin.trained.alignment import _moved, align_pose, align_rows
 from unmix_plugin.trained.evaluation import ViewTruth
@@ -55,6 +57,16 @@ def test_a_view_that_is_off_by_a_quarter_of_its_width_is_brought_back_too():
     assert float((points_seen(given) - points_seen(CAMERA)).norm(dim=1).mean()) > 7
     found = align_pose(SCENE, given, truth_of(SCENE, CAMERA))
     assert float((points_seen(found) - points_seen(CAMERA)).norm(dim=1).mean()) < 0.5
+
+
+@pytest.mark.parametrize("share", [1.0, 0.0])
+@pytest.mark.parametrize("exposure", [0.6, 1.6])
+@pytest.mark.parametrize("sensor", [None, SceneSensor("three", np.eye(5)[[3, 0, 2]])])
+def test_where_gains_are_fitted_no_pose_makes_up_for_another_exposure(share, exposure, sensor):
+    fitting, given = replace(SCENE, fitted=("pose", "gain")), _moved(CAMERA, share * OFF, SCENE)
+    truth = replace(truth_of(SCENE, CAMERA), sensor=sensor)
+    found = align_pose(fitting, given, replace(truth, spectra=exposure * truth.seen(truth.spectra)))
+    assert off_by(found, CAMERA) < max(0.1 * off_by(given, CAMERA), 0.05)
 
 
 def test_a_view_of_something_else_does_not_leave_the_scene():
@@ -103,3 +115,17 @@ def test_rows_that_wobble_are_aligned_and_those_that_are_right_or_show_nothing_s
     assert points_seen(again).isfinite().all()
     empty = replace(measured, valid=torch.zeros_like(measured.valid))
     assert off_by(align_rows(SCENE, truth, empty), truth) < 1e-3
+
+
+@pytest.mark.parametrize("exposure", [0.6, 1.6])
+def test_where_gains_are_fitted_no_row_makes_up_for_another_exposure(exposure):
+    fitting, truth, given = replace(SCENE, fitted=("pose", "gain")), swept_rows(0.02), swept_rows(0.0)
+    seen = truth_of(SCENE, truth)
+    measured = replace(seen, spectra=exposure * seen.spectra)
+    assert off_by(align_rows(fitting, truth, measured), truth) < 0.25
+    # Turns and shifts of rows can hardly be told apart here, so the picture tells.
+    errors = [
+        float((exposure * truth_of(SCENE, camera).spectra - measured.spectra).square().mean().sqrt())
+        for camera in (given, align_rows(fitting, given, measured))
+    ]
+    assert errors[1] < 0.3 * errors[0]

@@ -10,7 +10,9 @@ turn and one shift are found with which the field shows it best, coarse pictures
 its width must first be brought near: pictures three pixels wide are alike within a third of the width. A turn alone
 does so first, since a shift as well would be drawn away. What is found is taken only where it is clearly better than
 what the given pose leads to: coarse pictures also move a view that is right, and a line camera whose rows can hardly be
-told apart. The rows of a line camera wobble, so they are fitted one by one afterwards.
+told apart. The rows of a line camera wobble, so they are fitted one by one afterwards. Where gains are fitted too, each
+pose that is tried has its own, so that none makes up for an exposure; rows are fitted to what was measured divided by
+the gain of the means, which hardly depends on how rows wobble.
 
 Notation: `B` bands, `b` channels of the view's sensor, `T` terms, `P` pixels of a coarse picture, `C` spectral channels
 compared, `D` those and opacity.
@@ -62,16 +64,16 @@ def _terms_seen(truth: ViewTruth, wavelengths_nm: Float[Tensor, "B"]) -> Float64
 
 
 def _fitted_gain(
-    power: Float[Tensor, "b"], agreement: Float[Tensor, "b"], terms: Float[Tensor, "T b"]
-) -> Float[Tensor, "b"]:
+    power: Float64[Tensor, "*views b"], agreement: Float64[Tensor, "*views b"], terms: Float64[Tensor, "T b"]
+) -> Float64[Tensor, "*views b"]:
     """Smooth gain g of least squared error, by Gauss-Newton steps."""
-    logs = torch.zeros(len(terms), dtype=terms.dtype)
+    logs = terms.new_zeros(*power.shape[:-1], len(terms))
     # Of a prediction that is black everywhere nothing can be fitted: its gain stays 1.
-    ridge = (1e-9 * power.sum()).clamp(min=1e-30) * torch.eye(len(terms), dtype=terms.dtype)
+    ridge = (1e-9 * power.sum(dim=-1)).clamp(min=1e-30)[..., None, None] * torch.eye(len(terms)).to(terms)
     for _ in range(_NUM_STEPS):
         gain = (logs @ terms).exp()
-        slopes = (terms * (power * gain * gain)) @ terms.T + ridge
-        step = torch.linalg.solve(slopes, terms @ (agreement * gain - power * gain * gain))
+        slopes = (terms * (power * gain * gain)[..., None, :]) @ terms.T + ridge
+        step = torch.linalg.solve(slopes, (agreement * gain - power * gain * gain) @ terms.T)
         logs = logs + step.clamp(-0.5, 0.5)
     return (logs @ terms).exp()
 
@@ -141,25 +143,35 @@ class _Comparison:
     scene: TrainedScene
     camera: Cameras
     truth: ViewTruth
-    axes: Float[Tensor, "B C"]
+    axes: Float[Tensor, "b C"]
+    """In which differences of spectra are compared."""
     wanted: Float[Tensor, "P D"]
+    """Along the axes, but all channels where a gain is fitted; then opacity."""
     counts: Float[Tensor, "P 1"]
     """Share of each pixel that counts."""
+    exposed: Float[Tensor, "P 1"]
+    """Share that counts and isn't blown out: a gain is fitted to it."""
+    terms: Float64[Tensor, "T b"] | None
+    """Of a gain that is fitted anew to each picture, so that no pose makes up for an exposure; None: no gain."""
     block: int = 1
     """Edge of the blocks of pixels whose means are compared."""
 
     @classmethod
     def of(
-        cls, scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "B C"]
+        cls, scene: TrainedScene, camera: Cameras, truth: ViewTruth, axes: Float[Tensor, "b C"]
     ) -> _Comparison:
         """In as many pixels as the camera has."""
         alpha = truth.opacity.float()[..., None]
-        values = torch.cat([truth.spectra.float() @ axes, alpha], dim=-1) * truth.valid[..., None]
-        both = torch.cat([values, truth.valid[..., None].float()], dim=-1).permute(2, 0, 1)[None]
+        terms = _terms_seen(truth, torch.tensor(scene.bands.centers_nm)) if "gain" in scene.fitted else None
+        spectra = truth.spectra.float() if terms is not None else truth.spectra.float() @ axes
+        values = torch.cat([spectra, alpha], dim=-1) * truth.valid[..., None]
+        masks = torch.stack([truth.valid, truth.valid & ~is_blown_out(truth.spectra)], dim=-1).float()
+        both = torch.cat([values, masks], dim=-1).permute(2, 0, 1)[None]
         size = (camera.height, camera.width)
         found = torch.nn.functional.adaptive_avg_pool2d(both, size)[0].flatten(1).T
-        counts = found[:, -1:]
-        return cls(scene, camera, truth, axes, found[:, :-1] / counts.clamp(min=1e-6), counts)
+        counts, exposed = found[:, -2:-1], found[:, -1:]
+        wanted = found[:, :-2] / counts.clamp(min=1e-6)
+        return cls(scene, camera, truth, axes, wanted, counts, exposed, terms)
 
     @property
     def difference(self) -> float:
@@ -168,15 +180,44 @@ class _Comparison:
 
     def residuals(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m n"]:
         """Shown less measured, of each pixel or block and channel, after each step."""
+        seen = self._shown(steps)
+        if self.terms is None:
+            return self._blocks((seen - self.wanted) * self.counts).flatten(1)
+        gains = self._gains(seen)[:, None].to(seen)
+        seen, wanted = self._blocks(seen * self.counts), self._blocks((self.wanted * self.counts)[None])
+        spectra = (seen[..., :-1] * gains - wanted[..., :-1]) @ self.axes
+        return torch.cat([spectra, seen[..., -1:] - wanted[..., -1:]], dim=-1).flatten(1)
+
+    def mean_gain(self) -> Float64[Tensor, "b"] | None:
+        """With which the mean of what is shown comes nearest to that of what was measured, however rows are shifted;
+        None where no gain is fitted."""
+        if self.terms is None:
+            return None
+        whole = replace(self, block=2 * max(self.camera.width, self.camera.height))
+        return whole._gains(self._shown(torch.zeros(1, 6)))[0]
+
+    def _gains(self, seen: Float[Tensor, "m P D"]) -> Float64[Tensor, "m b"]:
+        """Of each picture, by what is not blown out."""
+        assert self.terms is not None
+        shown, measured = (
+            self._blocks(values[..., :-1] * self.exposed).double() for values in (seen, self.wanted[None])
+        )
+        power, agreement = ((shown * other).sum(dim=1) for other in (shown, measured))
+        return _fitted_gain(power, agreement, self.terms)
+
+    def _shown(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m P D"]:
         is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= _SIDES_PX[0]
         cameras = [_moved(self.camera, step, self.scene) for step in steps]
-        seen = _shown(self.scene, cameras, self.truth, self.axes, subpixels=2 if is_coarse else 1)
-        errors = (seen - self.wanted) * self.counts
+        axes = self.axes if self.terms is None else None
+        return _shown(self.scene, cameras, self.truth, axes, subpixels=2 if is_coarse else 1)
+
+    def _blocks(self, pixels: Float[Tensor, "m P x"]) -> Float[Tensor, "m n x"]:
+        """Means over blocks of pixels."""
         if self.block == 1:
-            return errors.flatten(1)
-        rows = errors.unflatten(1, (self.camera.height, self.camera.width)).permute(0, 3, 1, 2)
+            return pixels
+        rows = pixels.unflatten(1, (self.camera.height, self.camera.width)).permute(0, 3, 1, 2)
         height, width = (max(1, round(edge / self.block)) for edge in rows.shape[2:])
-        return torch.nn.functional.adaptive_avg_pool2d(rows, (height, width)).flatten(1)
+        return torch.nn.functional.adaptive_avg_pool2d(rows, (height, width)).flatten(2).mT
 
     def error(self, step: Float[Tensor, "6"]) -> float:
         """Sum of the squares."""
@@ -246,15 +287,20 @@ def _shrunk(camera: Cameras, side: int) -> Cameras:
 
 
 def _shown(
-    scene: TrainedScene, cameras: list[Cameras], truth: ViewTruth, axes: Float[Tensor, "B C"], subpixels: int
+    scene: TrainedScene,
+    cameras: list[Cameras],
+    truth: ViewTruth,
+    axes: Float[Tensor, "b C"] | None,
+    subpixels: int,
 ) -> Float[Tensor, "m P D"]:
-    """What each camera sees: pictures of equal size, rendered as one."""
+    """What each camera sees: pictures of equal size, rendered as one; all channels without axes."""
     height, width = subpixels * cameras[0].height, subpixels * cameras[0].width
     rays = [camera.resized(width, height).to(scene.device).image_rays(0) for camera in cameras]
     found = scene.renderer.composite(scene.field, RayBundle.join(rays))
     view = MaterialView(scene, cameras[0], found.unflatten(len(cameras) * height, width))
     opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
-    seen = truth.seen(view["spectral"]).float() @ axes.to(view.opacity)
+    seen = truth.seen(view["spectral"]).float()
+    seen = seen if axes is None else seen @ axes.to(view.opacity)
     values = torch.cat([seen, opacity[..., None]], dim=-1).unflatten(0, (len(cameras), height))
     return torch.nn.functional.avg_pool2d(values.permute(0, 3, 1, 2), subpixels).flatten(2).mT.cpu()
 
@@ -269,5 +315,8 @@ def align_rows(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         seen = scene.materials.through(found, matrix)
         return seen if truth.alpha is None else torch.cat([seen, found.accumulation[:, None]], dim=1)
 
-    turned = align_pose(scene, camera, truth).to(scene.device)
-    return fit_rows(turned, truth.spectra, truth.valid, truth.alpha, scene.scene_box, look)
+    turned = align_pose(scene, camera, truth)
+    small, axes = _shrunk(turned, _SIDES_PX[-1]), main_axes(truth.spectra[truth.valid])
+    gain = _Comparison.of(scene, small, truth, axes).mean_gain()
+    spectra = truth.spectra if gain is None else truth.spectra / gain.to(truth.spectra)
+    return fit_rows(turned.to(scene.device), spectra, truth.valid, truth.alpha, scene.scene_box, look)
