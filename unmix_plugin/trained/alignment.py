@@ -165,7 +165,7 @@ class _Comparison:
         terms = _terms_seen(truth, torch.tensor(scene.bands.centers_nm)) if "gain" in scene.fitted else None
         spectra = truth.spectra.float() if terms is not None else truth.spectra.float() @ axes
         values = torch.cat([spectra, alpha], dim=-1) * truth.valid[..., None]
-        masks = torch.stack([truth.valid, truth.valid & ~is_blown_out(truth.spectra)], dim=-1).float()
+        masks = torch.stack([truth.valid, truth.valid & ~truth.blown_out], dim=-1).float()
         both = torch.cat([values, masks], dim=-1).permute(2, 0, 1)[None]
         size = (camera.height, camera.width)
         found = torch.nn.functional.adaptive_avg_pool2d(both, size)[0].flatten(1).T
