@@ -224,7 +224,7 @@ def _may_be_reflectance(file: SpectralFile) -> bool:
         return False
     parts = [(_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])]
     values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
-    return len(values) > 0 and 0.0 < np.percentile(values, _BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE
+    return len(values) > 0 and bool(0.0 < np.percentile(values, _BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE)
 
 
 def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
