@@ -91,17 +91,8 @@ def main(options: Options) -> None:
 
 def run_tests() -> _common.Figure:
     """Every test that computes on CUDA."""
-    words = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "--tb=short",
-        *IN_PARALLEL,
-        "-k",
-        "cuda or gpu or CUDA",
-        *TESTS,
-    ]
+    words = ["-q", "--tb=short", *IN_PARALLEL, "-k", "cuda or gpu or CUDA", *TESTS]
+    words = [sys.executable, "-m", "pytest", *words]
     ended = subprocess.run(words, cwd=_common.REPOSITORY, capture_output=True, text=True, check=False)
     print(ended.stdout, ended.stderr, flush=True)
     return _common.required(
@@ -142,17 +133,8 @@ def train(
         make_demo_scene(data, 32 if options.rehearse else SIDE)
     seconds = 3 if options.rehearse else seconds
     device = ("--device", options.device)
-    words = [
-        "unmix-nerf",
-        "--data",
-        data,
-        "--output-dir",
-        work / data.name,
-        "--max-seconds",
-        seconds,
-        *device,
-    ]
-    words += ["--endmembers", materials, "--viewer.no-enabled"]
+    words = ["unmix-nerf", "--data", data, "--output-dir", work / data.name, *device]
+    words += ["--max-seconds", seconds, "--endmembers", materials, "--viewer.no-enabled"]
     run = _common.run_command([_common.console_script("unmix-train"), *map(str, words)]).run
     _common.run_command([_common.console_script("unmix-eval"), "--run", str(run), *device])
     values = json.loads((run / "eval" / "metrics.json").read_text())

@@ -198,10 +198,8 @@ def wavelengths_in_names(
         return None
     ranges = [_ranges(name) for name in names]
     steps = np.diff([found[0][0] for found in ranges]) if all(len(found) == 1 for found in ranges) else ()
-    if len(steps) and set(np.round(steps, 6)) <= {
-        0.0,
-        1.0,
-    }:  # what stands before the hyphen counts, or is a date
+    # Equal or one apart, what stands before the hyphen is a date or counts.
+    if len(steps) and np.isin(np.round(steps, 6), (0.0, 1.0)).all():
         ranges = [[] for _ in names]
     stated = [_with_unit(name, found) for name, found in zip(names, ranges, strict=True)]
     known = [one for one in stated if one is not None]

@@ -150,12 +150,8 @@ def _features_of(
     if not bool(counts.all()):
         reach = _REACH * torch.from_numpy(np.array(sift.sigmas, dtype=np.float32))
         kept = _away_from_invalid(counts)[rows, columns] > reach
-        coords, descriptors, rows, columns = (
-            coords[kept],
-            descriptors[kept.numpy()],
-            rows[kept],
-            columns[kept],
-        )
+        coords, rows, columns = (values[kept] for values in (coords, rows, columns))
+        descriptors = descriptors[kept.numpy()]
     seen = local_log_brightness(torch.where(counts, brightness, 0.0))
     return _Features(thinning.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
 
