@@ -34,7 +34,8 @@ from unmix_plugin.scenes.reading.faults import (
     read_json_file,
     read_number,
 )
-from unmix_plugin.scenes.reading.transforms_json import read_intrinsics, read_line_poses, read_pose
+from unmix_plugin.scenes.reading.lenses import read_intrinsics
+from unmix_plugin.scenes.reading.transforms_json import read_line_poses, read_pose
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import RunView
 

@@ -9,8 +9,8 @@ import pytest
 from tests.scenes.scene_factory import SceneFolder, fault_of, make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.faults import Faults
+from unmix_plugin.scenes.reading.lenses import read_lens
 from unmix_plugin.scenes.reading.loader import load_scene
-from unmix_plugin.scenes.reading.transforms_json import read_lens
 
 
 @pytest.fixture

@@ -35,9 +35,9 @@ from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number
-from unmix_plugin.scenes.reading.foreign_keys import keys_to_say
+from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, keys_to_say
 from unmix_plugin.scenes.reading.images import FORMATS
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, Intrinsics, read_lens
+from unmix_plugin.scenes.reading.lenses import Intrinsics, read_lens
 
 _KNOWN = (
     "transforms.json, a COLMAP model (.bin or .txt), Metashape's cameras as XML, OpenSfM's reconstruction.json, "

@@ -41,9 +41,10 @@ from unmix_plugin.scenes.reading.faults import (
     resolve_path,
     sha256_of,
 )
+from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 from unmix_plugin.scenes.reading.loader import read_endmembers
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, read_transforms
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry, read_transforms
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.bands import Bands
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+FILE_NAME = "transforms.json"
 _UNDISTORT = "undistort the pictures and write the poses with a pinhole or OPENCV lens"
 _ONLY_IN_CAPTURES = {
     **dict.fromkeys(

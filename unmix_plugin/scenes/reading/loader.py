@@ -37,10 +37,11 @@ from unmix_plugin.scenes.reading.cubes import (
     read_cube,
 )
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
+from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry, Size, read_transforms
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size, read_transforms
 from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands

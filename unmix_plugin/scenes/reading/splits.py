@@ -11,7 +11,8 @@ from pathlib import PurePosixPath
 from typing import Literal
 
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import FILE_NAME, SceneEntry
+from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry
 
 _SPLIT_NAMES = ("train", "eval", "val", "test")
 _SPLIT_NAME = re.compile(
