@@ -35,13 +35,16 @@ def test_with_nothing_left_out_both_ways_are_equal(opacity):
     assert_close(renderer.composite(field, bundle).packed, careful, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("at_once", [front_to_back.FEWEST_SAMPLES, front_to_back.SAMPLES_MARCHED])
 @pytest.mark.parametrize(
     ("smallest_weight", "opacity"), [(1e-3, 0.05), (4e-3, 0.01), (4e-3, 0.3), (1e-3, 0.9)]
 )
 def test_what_is_left_out_costs_no_more_than_the_careful_way_and_a_few_smallest_weights(
-    smallest_weight, opacity
+    monkeypatch, smallest_weight, opacity, at_once
 ):
-    """Light behind the end, samples that carry too little, and the bend of a network within merged samples."""
+    """Light behind the end, samples that carry too little, and the bend of a network within merged samples; as many
+    samples of a ray at once as on the CPU, and as on a GPU."""
+    monkeypatch.setattr("unmix_plugin.rendering.renderer.FEWEST_SAMPLES", at_once)
     renderer, field = textured(smallest_weight, opacity)
     bundle = rays(80)
     with torch.no_grad():
@@ -68,7 +71,7 @@ def test_a_ray_ends_where_hardly_any_light_is_left_and_counts_as_opaque(monkeypa
     with torch.no_grad():
         field.table.zero_()
     found = renderer.composite(field, rays(50))
-    assert sum(looked_at) == 50 * front_to_back._SAMPLES_AT_ONCE
+    assert sum(looked_at) == 50 * front_to_back.FEWEST_SAMPLES
     assert_close(found.accumulation, torch.ones(50))
 
 

@@ -16,7 +16,14 @@ from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import volume_weights
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
-from unmix_plugin.rendering.renderer import VolumeRenderer, _mean_log, _points_of, _visible_samples
+from unmix_plugin.rendering.renderer import (
+    _FIRST_ON_GPU,
+    _FIRST_SAMPLES,
+    VolumeRenderer,
+    _mean_log,
+    _points_of,
+    _visible_samples,
+)
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -151,7 +158,9 @@ def test_impossible_settings_are_refused(settings, message):
 
 @pytest.mark.parametrize("smallest_weight", [0.0, 4e-3, 0.2])
 @pytest.mark.parametrize("opacity", [1e-4, 0.05, 0.9])
-def test_samples_found_from_the_front_are_those_of_all(smallest_weight, opacity):
+@pytest.mark.parametrize("at_first", [_FIRST_SAMPLES, _FIRST_ON_GPU])
+def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_weight, opacity, at_first):
+    monkeypatch.setattr("unmix_plugin.rendering.renderer._FIRST_SAMPLES", at_first)
     renderer, field = make(smallest_weight=smallest_weight)
     bundle, step = rays(30), renderer.step
     with torch.no_grad():

@@ -30,11 +30,11 @@ _ENDING_LIGHT = 3.0
 """Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""
 _MERGED_WEIGHT = 125.0
 """Most of a ray's light that merged samples carry together, in the same unit."""
-_SAMPLES_AT_ONCE = 4
+FEWEST_SAMPLES = 4
 """Of each ray, that are looked at before it is known whether light gets farther; later at most as many as so far, since
 light that gets through those gets through more."""
-_MARCHED_AT_ONCE = 16
-"""Samples of each ray that are marched before it is known whether light gets behind them."""
+SAMPLES_MARCHED = 16
+"""Of each ray, before it is known whether light gets behind them."""
 _DENSER = 2.0
 """How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
 
@@ -59,6 +59,9 @@ class FrontToBack:
     """Whether the last sample of a ray takes all the light that is left."""
     rays_at_once: int = 32_768
     """Rays under way."""
+    samples_at_once: int = FEWEST_SAMPLES
+    """Samples of each ray that are looked at together at first; with as many as are marched always that many, since a
+    GPU computes more of them in less time than the processor takes to ask again."""
 
 
 @dataclass(frozen=True)
@@ -82,11 +85,11 @@ class _Front:
     """The next of them."""
 
     @classmethod
-    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _Front:
+    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"], samples_at_once: int) -> _Front:
         """Rays before they are marched."""
         none, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
-        t = like.new_zeros(len(rays), _MARCHED_AT_ONCE)
-        return cls(rays, numbers + 1, none + _SAMPLES_AT_ONCE, none, numbers, t, none, none)
+        t = like.new_zeros(len(rays), SAMPLES_MARCHED)
+        return cls(rays, numbers + 1, none + samples_at_once, none, numbers, t, none, none)
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -102,7 +105,7 @@ class _Front:
 
     def marched(self, ray_bundle: RayBundle, march: _March) -> _Front:
         """With the next samples of each ray that has some."""
-        found = march(*_lines(ray_bundle, self.rays), self.ends, _MARCHED_AT_ONCE)
+        found = march(*_lines(ray_bundle, self.rays), self.ends, SAMPLES_MARCHED)
         marched = replace(self, t=found.t, counts=found.counts, ends=found.ends, at=torch.zeros_like(self.at))
         return marched.select(found.counts.nonzero()[:, 0])
 
@@ -110,16 +113,17 @@ class _Front:
         """How many samples of each are looked at next."""
         return torch.minimum(self.wanted, self.counts - self.at)
 
-    def after(self, left: Float[Tensor, "A"], ending_light: float) -> tuple[_Front, _Front]:
+    def after(self, left: Float[Tensor, "A"], how: FrontToBack, ending_light: float) -> tuple[_Front, _Front]:
         """Behind these samples: rays with enough light of which there are more, and those to be marched on."""
         looked = self.next_counts()
         at, num_seen = self.at + looked, self.num_seen + looked
         enough = looked / _DENSER * (left / ending_light).log() / (self.left / left).log()
         enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
-        wanted = torch.minimum(enough, num_seen.clamp(min=_SAMPLES_AT_ONCE)).clamp(min=1).long()
+        fewest = 1 if how.samples_at_once < SAMPLES_MARCHED else SAMPLES_MARCHED
+        wanted = torch.minimum(enough, num_seen.clamp(min=how.samples_at_once)).clamp(min=fewest).long()
         front = replace(self, left=left, wanted=wanted, num_seen=num_seen, at=at)
         is_lit, has_more = left > ending_light, at < self.counts
-        may_have_more = ~has_more & (self.counts == _MARCHED_AT_ONCE)
+        may_have_more = ~has_more & (self.counts == SAMPLES_MARCHED)
         chosen = ((is_lit & which).nonzero()[:, 0] for which in (has_more, may_have_more))
         going, waiting = (front.select(rays) for rays in chosen)
         return going, waiting
@@ -132,12 +136,13 @@ def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how:
     limits = MergeLimits(how.step, how.smallest_weight, _MERGED_WEIGHT * how.smallest_weight)
     left = torch.ones_like(origins[:, 0])
     all_rays = torch.arange(len(left), device=left.device)
-    going = waiting = _Front.before(all_rays[:0], origins)
+    going = waiting = _Front.before(all_rays[:0], origins, how.samples_at_once)
     num_begun, totals, last = 0, None, None
     while True:
         new = all_rays[num_begun : num_begun + max(how.rays_at_once - len(going) - len(waiting), 0)]
         num_begun += len(new)
-        marched = waiting.join(_Front.before(new, origins)).marched(ray_bundle, how.march)
+        begun = _Front.before(new, origins, how.samples_at_once)
+        marched = waiting.join(begun).marched(ray_bundle, how.march)
         front = going.join(marched)
         merged = _look(field, ray_bundle, front, limits)
         values = _values(field, ray_bundle, front.rays, merged, how.light_at)
@@ -149,7 +154,7 @@ def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how:
             found = merged.packed_info[:, 1].nonzero()[:, 0]
             last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
         left[front.rays] = merged.left
-        going, waiting = front.after(merged.left, ending_light)
+        going, waiting = front.after(merged.left, how, ending_light)
         if num_begun == len(left) and len(going) == len(waiting) == 0:
             break
     if how.residual_on_last_sample:
@@ -168,7 +173,7 @@ def _look(
     size = int(ends[-1]) if len(ends) else 0
     starts = ends - counts
     owners = torch.repeat_interleave(counts, output_size=size)
-    firsts = torch.arange(len(front), device=ends.device) * _MARCHED_AT_ONCE + front.at
+    firsts = torch.arange(len(front), device=ends.device) * SAMPLES_MARCHED + front.at
     chosen = (firsts - starts).index_select(0, owners).add_(torch.arange(size, device=ends.device))
     t = front.t.view(-1).index_select(0, chosen)
     origins, along = _lines(ray_bundle, front.rays.index_select(0, owners))

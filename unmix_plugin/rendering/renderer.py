@@ -25,13 +25,18 @@ from unmix_plugin.operators.compositing import accumulate, scale_gradient, volum
 from unmix_plugin.operators.contracted_marching import march_contracted, march_contracted_first
 from unmix_plugin.operators.marching import FirstSamples, PackedSamples, march, march_first
 from unmix_plugin.operators.occupancy import cells_at
-from unmix_plugin.rendering.front_to_back import FrontToBack, composite_front_to_back
+from unmix_plugin.rendering.front_to_back import (
+    FEWEST_SAMPLES,
+    SAMPLES_MARCHED,
+    FrontToBack,
+    composite_front_to_back,
+)
 from unmix_plugin.spectral.materials import Coefficients
 
 _SMALLEST_SHARE = 1e-30
 """Of an abundance whose logarithm is taken: 0 has none."""
-_FIRST_SAMPLES = 8
-"""Of each ray, that are evaluated before it is known whether light gets farther."""
+_FIRST_SAMPLES, _FIRST_ON_GPU = 8, 32
+"""Of each ray, that are evaluated before it is known whether light gets farther; asking a GPU again costs more."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +98,9 @@ def _visible_samples(
     all_positions: list[Tensor] = []
     all_densities: list[Tensor] = []
     first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
+    at_first = _FIRST_SAMPLES if depths.device.type == "cpu" else _FIRST_ON_GPU
     while True:
-        wanted = (counts - first).clamp(0, max(first, _FIRST_SAMPLES)) * (left > smallest_weight)
+        wanted = (counts - first).clamp(0, max(first, at_first)) * (left > smallest_weight)
         ends = wanted.cumsum(0)
         size = int(ends[-1]) if len(ends) else 0
         if size == 0 and all_encoded:
@@ -110,7 +116,7 @@ def _visible_samples(
         depths[chosen] = densities * step
         rows[chosen] = torch.arange(num_seen, num_seen + size, device=rows.device)
         left = left * torch.exp(-torch.zeros_like(left).index_add_(0, part.ray_indices, densities * step))
-        first, num_seen = first + max(first, _FIRST_SAMPLES), num_seen + size
+        first, num_seen = first + max(first, at_first), num_seen + size
     keep = volume_weights(depths, samples.packed_info) > smallest_weight
     return _VisibleSamples(
         samples.select(keep),
@@ -258,6 +264,7 @@ class VolumeRenderer:
             lambda starts, positions: self._lamplight(field, starts, positions),
             self.residual_on_last_sample,
             self.rays_per_chunk,
+            FEWEST_SAMPLES if self.skips.device.type == "cpu" else SAMPLES_MARCHED,
         )
         found = composite_front_to_back(field, ray_bundle, how)
         chunk = self.rays_per_chunk
