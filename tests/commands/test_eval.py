@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +19,13 @@ from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.engine.runs.load_run import load_pipeline
 from unmix_plugin.products.evaluation import evaluate_scene
+from unmix_plugin.products.product import Job
+from unmix_plugin.products.report.report import _aligned_in_words, _look
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.spectral.metrics import psnr
 from unmix_plugin.trained.evaluation import DEFINITIONS
-from unmix_plugin.trained.open_run import open_run
+from unmix_plugin.trained.open_run import load_run, open_run
 
 KEYS = list(DEFINITIONS)
 
@@ -211,6 +214,26 @@ def test_the_gain_of_a_view_of_a_rig_does_not_count_either(trained, tmp_path):
     assert rig.is_rig
     assert seen.more["aligned"] == ["gain"]
     assert seen.figures["psnr"] == pytest.approx(plain.figures["psnr"])
+
+
+def test_a_report_compares_views_aligned_as_the_evaluation_does(trained, tmp_path):
+    loaded, measured = load_run(trained.run, "cpu"), load_scene(trained.scene)
+    fitting = replace(loaded.materials_scene, fitted=("gain",))
+    expected = evaluate_scene(fitting, measured, None, tmp_path, lambda _, items: iter(items), ALONE)
+    assert expected is not None
+    job = Job(
+        replace(loaded, scene=fitting),
+        tmp_path,
+        False,
+        say=lambda _: None,
+        working=lambda _: nullcontext(),
+        follow=lambda _, items: iter(items),
+        processes=ALONE,
+    )
+    views = _look(job, job.views("eval"), measured)
+    assert views.evaluation is not None
+    assert views.evaluation.figures() == pytest.approx(expected.figures)
+    assert "exposure" in _aligned_in_words(job)
 
 
 def test_several_runs_are_compared_in_one_table(run_copy, tmp_path):

@@ -42,7 +42,7 @@ from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.alignment import align_gain, align_pose, align_rows
+from unmix_plugin.trained.alignment import render_aligned
 from unmix_plugin.trained.evaluation import (
     DEFINITIONS,
     BandErrors,
@@ -52,9 +52,7 @@ from unmix_plugin.trained.evaluation import (
     as_numpy,
     coloured_picture,
     finite_or_none,
-    render_view,
     scene_truth,
-    subpixels_for,
     view_truth,
 )
 from unmix_plugin.trained.run_views import views_of
@@ -142,17 +140,10 @@ def evaluate_scene(
     # Of segmentations the ids alone are kept: their colours are known after the last view.
     ids: dict[int, UInt8[np.ndarray, "H W"]] = {}
     views = list(zip(measured.eval_indices, views_of(scene.views, "eval"), strict=True))
-    fits_gain = "gain" in scene.fitted
     with processes.together():
         for index, own in follow("evaluating views", views[processes.rank :: processes.count]):
-            view, camera = view_truth(measured, index).in_light(light_factors), own.camera
-            if "pose" in scene.fitted:
-                align = align_rows if camera.is_line_camera(0) else align_pose
-                camera = align(scene, camera, view)
-            rays = subpixels_for(measured, index, scene.subpixels, scene.pixel_size)
-            predicted = render_view(scene, camera, rays)
-            if fits_gain:
-                predicted = align_gain(predicted, view, torch.from_numpy(measured.wavelengths_nm))
+            view = view_truth(measured, index).in_light(light_factors)
+            predicted = render_aligned(scene, own.camera, measured, index, view)
             if measured.is_rig:
                 evaluation.sensors[view.name] = measured.sensor_of(index).name
             psnr_db, name = evaluation.add(view, predicted)["psnr"], f"{view.name}.png"
@@ -168,14 +159,15 @@ def evaluate_scene(
         ids = {index: found for _, part in parts for index, found in part.items()}
     matching = evaluation.segmentation().matching
     for index in follow("drawing segmentations", list(ids)):
-        name = measured.frames[index].name
-        drawn = _draw_matched_segmentation(name, measured.labels(index), ids[index], look, matching)
+        name, labels = measured.frames[index].name, measured.labels(index)
+        if labels is not None:
+            labels = np.where(measured.valid_mask(index), labels, np.uint8(NOTHING_ID))
+        drawn = _draw_matched_segmentation(name, labels, ids[index], look, matching)
         write_file(folder / "segmentation" / f"{name}.png", drawn)
     more: dict[str, Any] = {"definitions": DEFINITIONS}
     per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
     more |= {"per_sensor": per_sensor} if per_sensor else {}
-    aligned = [*(["pose"] if "pose" in scene.fitted else []), *(["gain"] if fits_gain else [])]
-    more |= {"aligned": aligned} if aligned else {}
+    more |= {"aligned": list(scene.fitted)} if scene.fitted else {}
     per_view = [{"name": name, **finite_or_none(found)} for name, found in evaluation.per_view.items()]
     return Evaluated(
         finite_or_none(evaluation.figures()), per_view, more, 3 * len(ids), bands=evaluation.bands
@@ -227,11 +219,11 @@ def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_d
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.shown(predicted)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
-    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage))
+    shown = as_numpy(view.shows_error(predicted))
     panels = [
         TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
         TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
-        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
+        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), shown), "error"),
     ]
     colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
     heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"
@@ -258,7 +250,7 @@ def _draw_matched_segmentation(
         true = TitledPicture(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
         panels = [true, *panels, TitledPicture(agreement, "disagreement")]
         seen |= set(np.unique(labels).tolist())
-        extra = [("right", RIGHT), ("wrong", WRONG), ("unlabelled", (NEUTRAL,) * 3)]
+        extra = [("right", RIGHT), ("wrong", WRONG), ("not counted", (NEUTRAL,) * 3)]
     true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
     surplus = [
         (name, colours[index])

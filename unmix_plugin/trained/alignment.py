@@ -35,12 +35,35 @@ from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.poses.row_fitting import fit_rows, main_axes
+from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.sensors.views import smooth_terms
-from unmix_plugin.trained.evaluation import PredictedView, ViewTruth
+from unmix_plugin.trained.evaluation import PredictedView, ViewTruth, render_view, subpixels_for
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _NUM_STEPS = 20
+
+
+def render_aligned(
+    scene: TrainedScene, camera: Cameras, measured: Scene, index: int, truth: ViewTruth
+) -> PredictedView:
+    """A view as it is compared with what was measured of it: aligned as far as the scene's `fitted` says, with a rig
+    in as many rays a pixel as its sensor asks for.
+
+    Args:
+        scene: What renders.
+        camera: Of the view.
+        measured: The scene that the view is of.
+        index: Of the view among its frames.
+        truth: What was measured of it.
+    """
+    if "pose" in scene.fitted:
+        align = align_rows if camera.is_line_camera(0) else align_pose
+        camera = align(scene, camera, truth)
+    predicted = render_view(scene, camera, subpixels_for(measured, index, scene.subpixels, scene.pixel_size))
+    if "gain" in scene.fitted:
+        predicted = align_gain(predicted, truth, torch.from_numpy(measured.wavelengths_nm))
+    return predicted
 
 
 def align_gain(

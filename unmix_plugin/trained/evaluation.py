@@ -217,6 +217,15 @@ class ViewTruth:
         opaque = self.opacity > _OPAQUE_ALPHA
         return self.valid & (opaque if self.labels is None else opaque | (self.labels != NOTHING_ID))
 
+    @property
+    def counted_labels(self) -> UInt8[Tensor, "H W"] | None:
+        """True material of valid pixels, 255 elsewhere."""
+        return None if self.labels is None else self.labels.where(self.valid, NOTHING_ID)
+
+    def shows_error(self, predicted: PredictedView) -> Bool[Tensor, "H W"]:
+        """Valid pixels in which something was measured or is predicted: elsewhere pictures of errors show nothing."""
+        return self.valid & (torch.maximum(self.opacity, predicted.coverage.to(self.opacity)) > 0.01)
+
     def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
         """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
         if factors is None:
@@ -311,9 +320,9 @@ class Evaluation:
             else math.nan,
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
-        if self._tally is not None and view.labels is not None:
-            counted = torch.where(view.valid, view.labels, torch.full_like(view.labels, NOTHING_ID))
-            self._tally.add(predicted.segmentation, counted)
+        labels = view.counted_labels
+        if self._tally is not None and labels is not None:
+            self._tally.add(predicted.segmentation, labels)
         self.per_view[view.name] = figures
         centers = torch.tensor(self.truth.bands.centers_nm)
         measured, error = (

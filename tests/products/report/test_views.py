@@ -3,6 +3,7 @@
 import base64
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,15 @@ import torch
 from PIL import Image
 
 from tests.products.report.page_outline import Outline, assert_self_contained
-from unmix_plugin.products.report.pictures import ReportViews, TrueMaterials, evenly, material_cards
+from unmix_plugin.figures.pictures import NEUTRAL
+from unmix_plugin.formats.files import eight_bits
+from unmix_plugin.products.report.pictures import (
+    ReportViews,
+    TrueMaterials,
+    evenly,
+    material_cards,
+    segmentation_pictures,
+)
 from unmix_plugin.products.report.report import _figure_rows, _png_url, _render_page, _view_values
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.material_library import measured_library
@@ -174,3 +183,31 @@ def test_a_picture_holds_its_pixels_and_a_large_one_is_shrunk():
     np.testing.assert_array_equal(decoded(pixels / 255), pixels)
     for size, expected in (((10, 1280), (5, 640)), ((2000, 1), (640, 1))):
         assert decoded(np.zeros((*size, 3))).shape[:2] == expected
+
+
+def test_pixels_that_do_not_count_show_neither_error_nor_agreement():
+    view, truth = striped("masked", 0.5)
+    assert truth.labels is not None
+    hidden = torch.zeros(10, 12, dtype=torch.bool)
+    hidden[3:7, 2:9] = True
+    wrong = replace(view, segmentation=(view.segmentation + 1) % 3)
+    views = gathered([])
+    views.add("masked", wrong, replace(truth, valid=~hidden))
+    [shown] = views.shown
+    assert shown.error is not None
+    grey = eight_bits(np.full(3, NEUTRAL))
+    assert (shown.error[hidden] == grey).all()
+    assert (shown.error[8] != grey).any(axis=-1).all()
+    agreement = segmentation_pictures(views).pictures[-1].image
+    np.testing.assert_allclose(agreement[hidden], NEUTRAL)
+    assert (agreement[8] != NEUTRAL).any(axis=-1).all()
+
+
+def test_the_gain_fitted_to_a_view_counts_in_its_pictures_and_errors():
+    view, truth = striped("bright")
+    gain = torch.linspace(0.5, 1.0, 5)
+    views = gathered([])
+    views.add("bright", replace(view, gain=gain), replace(truth, spectra=truth.spectra * gain))
+    [shown] = views.shown
+    np.testing.assert_allclose(views.rmse_of_bands, 0, atol=1e-7)
+    np.testing.assert_array_equal(shown.predicted, shown.measured)

@@ -288,6 +288,7 @@ class _ShownView:
     measured: _EightBits | None = None
     error: _EightBits | None = None
     labels: UInt8[np.ndarray, "H W"] | None = None
+    """True material of pixels that count, 255 elsewhere."""
     psnr_db: float = math.nan
     shares: tuple[_EightBits, ...] = ()
     """One for each endmember, of views chosen for it."""
@@ -334,13 +335,14 @@ class ReportViews:
             self._seen += float(opacity.sum())
         maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
         shares = tuple(eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
-        predicted = eight_bits(picture(view.spectra, view.coverage, self.materials.bands))
+        spectra = view.spectra if truth is None else truth.shown(view)
+        predicted = eight_bits(picture(spectra, view.coverage, self.materials.bands))
         ids = view.segmentation.numpy()
         if truth is None or self.evaluation is None:
             self.shown.append(_ShownView(name, predicted, ids, shares=shares))
             return
         figures = self.evaluation.add(truth, view)
-        labels = None if truth.labels is None else truth.labels.numpy()
+        labels = None if truth.counted_labels is None else truth.counted_labels.numpy()
         measured = eight_bits(picture(truth.spectra, truth.opacity, self.materials.bands))
         error = self._count_error(view, truth)
         shown = _ShownView(name, predicted, ids, measured, error, labels, figures["psnr"], shares)
@@ -373,11 +375,10 @@ class ReportViews:
         return sorted(known, key=lambda view: view.psnr_db)
 
     def _count_error(self, view: PredictedView, truth: ViewTruth) -> _EightBits:
-        difference = as_numpy(view.spectra.clamp(0, 1)) - as_numpy(truth.spectra)
+        difference = as_numpy(truth.shown(view).clamp(0, 1)) - as_numpy(truth.spectra)
         matter = truth.shows_matter.numpy()
         self._squares += (difference[matter] ** 2).sum(axis=0)
         self._offsets += difference[matter].sum(axis=0)
         self._pixels += int(matter.sum())
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
-        seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
-        return eight_bits(over_neutral(painted, seen.astype(np.float64)))
+        return eight_bits(over_neutral(painted, as_numpy(truth.shows_error(view))))

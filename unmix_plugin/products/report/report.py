@@ -44,6 +44,7 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.trained.alignment import render_aligned
 from unmix_plugin.trained.evaluation import DEFINITIONS, Evaluation, finite_or_none, scene_truth, view_truth
 from unmix_plugin.trained.measures import describe_length
 from unmix_plugin.trained.open_run import LoadedRun, find_scene
@@ -97,7 +98,8 @@ def _region_cards(job: Job, notes: list[str]) -> list[Any]:
 
 
 def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
-    """Render the views, and compare each with what was measured, if the scene folder is found and unchanged."""
+    """Render the views, and compare each with what was measured, if the scene folder is found and unchanged; aligned
+    first, as unmix-eval does."""
     materials, evaluation, indices = job.materials, None, {}
     if scene is not None:
         evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
@@ -107,7 +109,11 @@ def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportVie
         truth = None if scene is None else view_truth(scene, indices[view.name])
         if truth is not None and truth.sensor is not None:
             truth = None  # of a rig, only views with all bands are put beside the prediction
-        views.add(view.name, job.render(view), truth)
+        if scene is None or truth is None:
+            predicted = job.render(view)
+        else:
+            predicted = render_aligned(job.scene, view.camera, scene, indices[view.name], truth)
+        views.add(view.name, predicted, truth)
     return views
 
 
@@ -122,6 +128,13 @@ def _stored_figures(job: Job) -> dict[str, Any] | None:
     if not isinstance(words, dict) or not all(isinstance(found.get(name), _FIGURE) for name in DEFINITIONS):
         raise RunError(f"{path} is not what unmix-eval writes; run it again, or remove the file")
     return found
+
+
+def _aligned_in_words(job: Job) -> str:
+    """What of a view is fitted to what was measured of it before they are compared."""
+    fitted = {"pose": "pose", "gain": "exposure and white balance"}
+    words = " and ".join(fitted[what] for what in job.scene.fitted)
+    return f", each aligned first in {words}" if words else ""
 
 
 _FIGURE = (int, float, type(None))
@@ -141,7 +154,7 @@ def _page(
     figures, source = _stored_figures(job), "From the run's eval/metrics.json."
     if figures is None and views.evaluation is not None:
         figures = finite_or_none(views.evaluation.figures())
-        source = f"Of the {len(views.shown)} views rendered for this report."
+        source = f"Of the {len(views.shown)} views rendered for this report{_aligned_in_words(job)}."
     truth = _true_materials(loaded, light)
     cards = material_cards(materials, views.proportions, light, library, truth)
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
