@@ -272,6 +272,12 @@ def _colour(one: _ProbedPoint) -> tuple[float, float, float]:
 _MOST_NUMBERS = 8
 
 
+def _first_numbers(values: Float64[np.ndarray, " N"]) -> str:
+    """The first `_MOST_NUMBERS`, and how many there are if there are more."""
+    more = f", ... ({len(values)} numbers)" if len(values) > _MOST_NUMBERS else ""
+    return ", ".join(f"{value:.4g}" for value in values[:_MOST_NUMBERS]) + more
+
+
 class ValuesPanel:
     """The numbers of the outputs of a scene without endmembers at the point that was clicked last."""
 
@@ -282,12 +288,9 @@ class ValuesPanel:
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
         column, row = place
-        with self._session.services.source.borrowed() as scene:
-            found = scene.probe(camera, int(column), int(row))
-        rows = [
-            (name, ", ".join(f"{value:.4g}" for value in values[:_MOST_NUMBERS]))
-            for name, values in found.values.items()
-        ]
+        with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):
+            found = shown.probe(camera, int(column), int(row))
+        rows = [(name, _first_numbers(values)) for name, values in found.values.items()]
         if found.world_position is not None:
             rows.append(("position", ", ".join(f"{value:.3f}" for value in found.world_position)))
         self._text.content = table(rows)
