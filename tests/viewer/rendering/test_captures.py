@@ -26,7 +26,9 @@ from unmix_plugin.viewer.rendering.captures import (
     SpectraCanvas,
     VideoJob,
     VideoQueue,
+    _NO_VIDEO,
     check_size,
+    differences,
     output_of,
     render_argv,
 )
@@ -120,7 +122,7 @@ def test_pictures_that_would_not_fit_are_refused(size, message):
     check_size(1024, 1024, 31)
 
 
-@pytest.mark.parametrize("layer", [name for name in LAYERS if name != "error"])
+@pytest.mark.parametrize("layer", [name for name in LAYERS if name not in _NO_VIDEO])
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
     chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
     with source.borrowed() as scene:
@@ -137,7 +139,7 @@ def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
 def test_an_absorption_goes_by_its_own_name_and_what_is_no_output_is_refused():
     bands = Bands.of([450.0, 550.0, 650.0])
     assert output_of(LayerSettings(layer="index", index="absorption:650-700"), bands) == "absorption:650-700"
-    for layer in ("error", "index"):
+    for layer in ("error", "index", "diffuse", "specular"):
         with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
             output_of(LayerSettings(layer=layer), bands)
 
@@ -147,6 +149,21 @@ def test_a_wavelength_in_a_gap_of_the_bands_goes_by_the_band_that_is_shown():
     settings = LayerSettings("band", 1200.0, (1335.0, 1200.0, 990.0))
     assert output_of(settings, bands) == "band:1330nm"
     assert output_of(replace(settings, layer="false-colour"), bands) == "false-colour:1330,1330,1000"
+
+
+def test_what_a_video_has_otherwise_than_the_page_is_said():
+    def said(**settings):
+        shown = LayerSettings(**settings)
+        return differences(shown, LAYERS[shown.layer].controls)
+
+    assert said() == said(layer="segmentation") == said(layer="false-colour", colour_map="magma") == []
+    assert said(exposure_ev=1.0) == said(gamma=2.0) == said(view_transform="agx") != []
+    assert said(layer="segmentation", exposure_ev=1.0, background="black") == ["light grey behind it"]
+    assert "side by side" in said(layer="abundance")[0]
+    assert "side by side" in said(layer="abundances")[0]
+    assert "grey values" in said(layer="band", colour_map="magma")[0]
+    assert "range of its own" in said(layer="depth")[0]
+    assert "principal components" in said(layer="pca")[0]
 
 
 def test_the_words_are_those_of_the_command(tmp_path):

@@ -24,9 +24,11 @@ from unmix_plugin.viewer.rendering.captures import (
     SpectraCanvas,
     VideoJob,
     check_size,
+    differences,
     output_of,
     render_argv,
 )
+from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, path_poses, sized_camera
@@ -204,7 +206,8 @@ class CapturePanel:
         session, services = self._session, self._session.services
         if self._video is not None:
             raise ConfigError("a video is being rendered already; wait for it or cancel it")
-        output = output_of(session.view.settings, session.materials().bands)
+        settings = session.view.settings
+        output = output_of(settings, session.materials().bands if services.has_materials else None)
         check_size(_side(self._width), _side(self._height))
         cameras = self._save_path()
         recipe = None
@@ -226,7 +229,9 @@ class CapturePanel:
 
         self._video = VideoJob(argv, folder, show, done)
         services.videos.start(self._video)
-        session.say("video", f"unmix-render writes it to {folder}, after those of other pages")
+        others = differences(settings, layer_named(settings.layer, services.maker.layers).controls)
+        unlike = f"; unlike the page, it has {'; '.join(others)}" if others else ""
+        session.say("video", f"unmix-render writes it to {folder}, after those of other pages{unlike}")
 
     def _cancel_video(self) -> None:
         if self._video is not None:

@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -187,14 +187,18 @@ def _end(process: subprocess.Popen[str]) -> None:
             return
 
 
-def output_of(settings: LayerSettings, bands: Bands) -> str:
+def output_of(settings: LayerSettings, bands: Bands | None) -> str:
     """The output of renders that a layer shows, by the bands that it shows.
 
+    Args:
+        settings: Of the layer.
+        bands: Of the scene; None of one without spectra.
     Raises:
-        ConfigError: renders have no such output.
+        ConfigError: renders have no such output, or no such picture of it.
     """
 
     def shown(wavelength_nm: float) -> str:
+        assert bands is not None
         return f"{bands.centers_nm[bands.nearest(covered(bands, wavelength_nm))]:g}"
 
     if settings.layer == "band":
@@ -205,9 +209,32 @@ def output_of(settings: LayerSettings, bands: Bands) -> str:
         return index_output(settings.index)
     if settings.layer == "abundance":
         return "abundances"
-    if settings.layer in ("error", "index"):
+    if settings.layer in _NO_VIDEO:
         raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
     return settings.layer
+
+
+_NO_VIDEO = ("error", "index", "diffuse", "specular")
+"""Layers that no output of a render is, or one that a video goes through band by band."""
+
+
+def differences(settings: LayerSettings, controls: Collection[str]) -> list[str]:
+    """What a video has by `unmix-render` that a layer with these controls has otherwise on the page, in words."""
+    found = []
+    if settings.layer in ("abundance", "abundances"):
+        found.append("a map of each endmember, side by side")
+    elif settings.layer == "band":
+        found.append("grey values from 0 to 1")
+    elif settings.layer == "pca":
+        found.append("the principal components of its own views")
+    elif "scale" in controls:
+        found.append("a colour map and a range of its own")
+    tones = (settings.exposure_ev, settings.gamma, settings.view_transform)
+    if "tone" in controls and tones != (0.0, 1.0, "srgb"):
+        found.append("no exposure, gamma or kept highlights")
+    if settings.background != "grey":
+        found.append("light grey behind it")
+    return found
 
 
 def render_argv(
