@@ -118,6 +118,16 @@ def test_files_lie_beside_the_recipe_that_names_them(tmp_path, monkeypatch):
     assert recipe.source == "recipes/edits.yml"
 
 
+def test_a_recipe_may_be_written_to_another_folder_than_its_files_are_named_from(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    recipe = Recipe((Replace(0, file=Path("paint.csv")),), Light(Path("lamp.csv")))
+    (tmp_path / "recipes").mkdir()
+    (tmp_path / "recipes" / "edits.yml").write_text(recipe_to_yaml(recipe))
+    found = read_recipe(tmp_path / "recipes" / "edits.yml")
+    assert found.operations == (Replace(0, file=tmp_path / "paint.csv"),)
+    assert found.illuminant == Light(tmp_path / "lamp.csv")
+
+
 def test_a_recipe_that_cannot_be_read_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"can't read the recipe .*gone\.yml: No such file"):
         read_recipe(tmp_path / "gone.yml")

@@ -93,7 +93,7 @@ def recipe_from_yaml(text: str, source: str = "recipe", folder: Path = Path()) -
 
 
 def recipe_to_yaml(recipe: Recipe) -> str:
-    """The text of a recipe, without comments."""
+    """The text of a recipe, without comments; its paths are absolute, so that it can lie anywhere."""
     content: dict[str, Any] = {}
     if recipe.illuminant is not None:
         light = _written(recipe.illuminant)
@@ -205,7 +205,11 @@ def _written(value: Any) -> dict[str, Any]:
             found[one.name] = css_colour(part)  # which is exact
         else:
             found[one.name] = (
-                str(part) if isinstance(part, Path) else list(part) if isinstance(part, tuple) else part
+                str(part.absolute())
+                if isinstance(part, Path)
+                else list(part)
+                if isinstance(part, tuple)
+                else part
             )
     return found
 

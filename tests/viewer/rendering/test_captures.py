@@ -23,10 +23,10 @@ from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import (
+    _NO_VIDEO,
     SpectraCanvas,
     VideoJob,
     VideoQueue,
-    _NO_VIDEO,
     check_size,
     differences,
     output_of,
