@@ -103,6 +103,10 @@ def test_a_spectrum_from_a_file_is_found_by_name_and_extrapolated_only_when_aske
     result = edited(lit_scene(), f"replace: {{{words}, extrapolate: true}}")
     reflectance = (result.materials.endmembers[0] / torch.tensor(LIGHT)).numpy()
     np.testing.assert_allclose(reflectance[[0, -1]], [0.6, 0.5], rtol=1e-5)
+    (note,) = result.notes
+    assert "ochre was not measured at 2 of 5 bands" in note
+    write_paints(path, (440, 660))
+    assert edited(lit_scene(), f"replace: {{{words}, extrapolate: true}}").notes == ()
 
 
 def test_a_scaled_endmember_is_that_much_brighter_by_its_new_name_which_ends_up_in_tables():

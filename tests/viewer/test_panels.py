@@ -322,6 +322,20 @@ def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_ch
         load(page, "broken.yml", "broken.yml")
 
 
+@pytest.mark.parametrize(
+    ("first_nm", "title", "said"),
+    [(600.0, "edited", "was not measured at 1 of 5 bands"), (850.0, "not done", "ColorChecker/red")],
+)
+def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it_never_was(
+    tmp_path, first_nm, title, said
+):
+    source = source_of_bands(tmp_path, *(first_nm + 50.0 * index for index in range(5)))
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        page.set("known material", "ColorChecker/red")
+        page.set("replace by the known material", True)
+        page.wait_until(lambda: any(title == one and said in text for one, text in page.notices))
+
+
 @pytest.mark.slow
 def test_every_light_that_is_offered_can_be_chosen(tmp_path):
     source = source_of_bands(tmp_path, 700.0, 800.0, 900.0, 1000.0, 1100.0)

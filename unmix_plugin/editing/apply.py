@@ -211,11 +211,15 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_REPLACED, index, where)
     library, name = _library_of(edit)
-    library.find(name)
+    material = library.find(name)
     try:
         reflectance = library.reflectance(name, state.bands, "hold" if edit.extrapolate else "refuse")
     except SpectrumError as error:
         raise SpectrumError(f"{error}; extrapolate: true holds the outermost values instead") from error
+    is_unknown = ~np.isfinite(MaterialLibrary((material,)).resampled(state.bands)[0])
+    if edit.extrapolate and is_unknown.any():
+        unknown = _listed(state.bands, is_unknown)
+        state.notes.append(f"{where}: {name} was not measured at {unknown}: the values beside are held there")
     if reflectance.max() > _GREATEST_REFLECTANCE:
         raise SpectrumError(
             f"{name} has reflectances of up to {reflectance.max():g}; give values from 0 to 1, not per cent"

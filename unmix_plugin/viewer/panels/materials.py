@@ -216,7 +216,9 @@ class MaterialsPanel:
             raise ConfigError("choose a known material first")
         library = chosen.name if chosen.origin is None else None
         file, spectrum = chosen.origin or (None, None)
-        self._change(Replace(self._index, library, file, spectrum, extrapolate=True))
+        known = MaterialLibrary((chosen,)).resampled(self._session.materials().bands)
+        is_partly_known = bool(np.isfinite(known).any())  # what is known nowhere is refused
+        self._change(Replace(self._index, library, file, spectrum, extrapolate=is_partly_known))
 
     def _type_name(self) -> None:
         self._named = self._index
