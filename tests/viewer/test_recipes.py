@@ -1,7 +1,13 @@
 """Recipes as a panel builds them: one change of a kind an endmember, all of it undoable."""
 
-import pytest
+from functools import partial
 
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.editing.scenes import lit_scene
 from unmix_plugin.editing import (
     Gloss,
     Isolate,
@@ -13,6 +19,7 @@ from unmix_plugin.editing import (
     Retint,
     Scale,
     Swap,
+    edit_scene,
     recipe_from_yaml,
     recipe_to_yaml,
 )
@@ -35,6 +42,68 @@ def test_the_last_change_of_a_kind_to_an_endmember_counts():
     assert recipe.operations == (Scale(1, 3.0), Retint(0, (0.1, 0.2, 0.3)), Scale(0, 5.0))
     assert change_of(recipe, Scale, 0) == Scale(0, 5.0)
     assert change_of(recipe, Gloss, 0) is None
+
+
+def test_a_change_takes_the_place_of_those_of_which_it_leaves_nothing():
+    red, blue = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+    recipe = with_change(Recipe((Scale(1, 2.0), Rename(0, "clay"))), Scale(0, 3.0))
+    coloured = with_change(recipe, Retint(0, red))
+    assert coloured.operations == (Scale(1, 2.0), Rename(0, "clay"), Retint(0, red))
+    brighter = with_change(coloured, Scale(0, 1.5))
+    assert change_of(brighter, Retint, 0) == Retint(0, red)
+    replaced = with_change(brighter, Replace(0, "ColorChecker/blue"))
+    assert replaced.operations == (Scale(1, 2.0), Rename(0, "clay"), Replace(0, "ColorChecker/blue"))
+    by_hand = Recipe((Scale(0, 3.0), Retint(0, red), Replace(0, "ColorChecker/blue")))
+    assert change_of(by_hand, Scale, 0) is change_of(by_hand, Retint, 0) is None
+    assert change_of(with_change(by_hand, Retint(0, blue)), Replace, 0) == Replace(0, "ColorChecker/blue")
+
+
+def test_a_swap_carries_the_changes_of_a_spectrum_along():
+    red, blue = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+    swapped = with_swap(Recipe((Rename(0, "clay"), Retint(0, red), Scale(3, 2.0))), Swap(0, 3))
+    assert change_of(swapped, Retint, 3) == Retint(0, red)
+    assert change_of(swapped, Retint, 0) is change_of(swapped, Scale, 3) is None
+    assert change_of(swapped, Scale, 0) == Scale(3, 2.0)
+    assert change_of(swapped, Rename, 0) == Rename(0, "clay")
+    both = with_change(swapped, Retint(0, blue))
+    assert both.operations == (Rename(0, "clay"), Retint(0, red), Swap(0, 3), Retint(0, blue))
+    assert with_change(swapped, Retint(3, blue)).operations[1:] == (
+        Scale(3, 2.0),
+        Swap(0, 3),
+        Retint(3, blue),
+    )
+
+
+panel_changes = st.one_of(
+    st.builds(partial, st.just(Scale), st.integers(0, 2), st.floats(0.1, 5.0)),
+    st.builds(
+        partial,
+        st.just(Retint),
+        st.integers(0, 2),
+        st.tuples(*[st.floats(0.2, 0.8)] * 3),
+        st.just("spectrum"),
+    ),
+    st.builds(partial, st.just(Replace), st.integers(0, 2), st.just("ColorChecker/red")),
+    st.sampled_from([partial(Swap, 0, 1), partial(Swap, 1, 2), partial(Swap, 0, 2)]),
+)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(panel_changes, max_size=8))
+def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_alone(changes):
+    scene, recipe = lit_scene(), Recipe()
+    for make in changes:
+        change = make()
+        before = edit_scene(scene, recipe).materials.endmembers
+        recipe = with_swap(recipe, change) if isinstance(change, Swap) else with_change(recipe, change)
+        after = edit_scene(scene, recipe).materials.endmembers
+        if isinstance(change, Swap):
+            order = [{change.first: change.second, change.second: change.first}.get(i, i) for i in range(3)]
+            torch.testing.assert_close(after, before[order])
+            continue
+        assert change_of(recipe, type(change), change.endmember) == change
+        others = [index for index in range(3) if index != change.endmember]
+        torch.testing.assert_close(after[others], before[others])
 
 
 def test_the_same_swap_twice_in_a_row_takes_it_back():

@@ -1,7 +1,8 @@
 """Recipes as panels build them: each change is an edit of the recipe, and can be undone.
 
-Endmembers are given by their number, which no edit changes. A second change of the same kind to the same endmember
-replaces the first.
+Endmembers are given by their number, which no edit changes. A change takes the place of earlier ones that it leaves no
+trace of: of the same kind, and of the brightness where a colour is given, of both where a spectrum is replaced. A swap
+carries the changes of a spectrum along to the other endmember.
 """
 
 from __future__ import annotations
@@ -68,10 +69,21 @@ class RecipeHistory:
         return self.present
 
 
+_SUPERSEDED: dict[type[Operation], tuple[type[Operation], ...]] = {
+    Replace: (Replace, Retint, Scale),
+    Retint: (Retint, Scale),
+    Scale: (Scale,),
+    Rename: (Rename,),
+    Gloss: (Gloss,),
+}
+"""Kinds of earlier changes of which one of a kind leaves nothing."""
+
+
 def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
-    """The recipe with a change of one endmember, in place of an earlier one of the same kind."""
-    kind, endmember = type(change), change.endmember
-    others = [one for one in recipe.operations if not _is_change(one, kind, endmember)]
+    """The recipe with a change of one endmember, in place of earlier ones of which it leaves nothing."""
+    earlier = _changes(recipe, change.endmember)
+    gone = {id(one) for one in earlier if isinstance(one, _SUPERSEDED[type(change)])}
+    others = [one for one in recipe.operations if id(one) not in gone]
     return _with_operations(recipe, [*others, change])
 
 
@@ -134,12 +146,27 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
 
 
 def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
-    """The change of a kind that a recipe makes to an endmember by its number."""
-    return next((one for one in recipe.operations if _is_change(one, kind, endmember)), None)
+    """The change of a kind, in force, that a recipe makes to what an endmember is by its number now."""
+    found = None
+    for one in _changes(recipe, endmember):
+        if kind in _SUPERSEDED[type(one)]:
+            found = one if type(one) is kind else None
+    return found
 
 
-def _is_change(one: Operation, kind: type[Operation], endmember: str | int | None) -> bool:
-    return type(one) is kind and getattr(one, "endmember", None) == endmember
+def _changes(recipe: Recipe, endmember: str | int | None) -> list[Operation]:
+    """Changes of what an endmember is now, in order: of its own name and gloss, and of its spectrum wherever that was
+    before swaps."""
+    found: list[Operation] = []
+    place = endmember
+    for one in reversed(recipe.operations):
+        if isinstance(one, Swap) and place in (one.first, one.second):
+            place = one.second if place == one.first else one.first
+        elif isinstance(one, Rename | Gloss):
+            found += [one] if one.endmember == endmember else []
+        elif isinstance(one, Replace | Retint | Scale) and one.endmember == place:
+            found.append(one)
+    return found[::-1]
 
 
 def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:
