@@ -213,7 +213,7 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> _
         middle = [
             0.5 * side if x is None else x for x, side in zip(lens.center_px, (width, height), strict=True)
         ]
-        focal_px = lens.focal_at(width, height)
+        focal_px = lens.focal_at(width, height, lines is not None)
         assert focal_px is not None
         one = lines.middle if lines is not None else pose
         assert one is not None

@@ -45,6 +45,13 @@ def test_rays_start_where_the_row_was_taken(lines):
     assert_close(lines.cameras.camera_to_world[2, :, 3].double().numpy(), middle, atol=1e-5, rtol=0)
 
 
+def test_the_focal_length_along_the_sweep_does_not_count(folder, lines):
+    for index in range(6):
+        folder.edit(set_frame(index, fl_y=(1.0, 5.0, 500.0)[index % 3]))
+    found = load_scene(folder.root).cameras
+    assert torch.equal(found.focal_px, lines.cameras.focal_px)
+
+
 def test_the_box_and_the_hull_hold_what_the_sweeps_show(lines):
     corners = lines.normalisation.to_world(lines.scene_box.aabb.double().numpy())
     assert (corners[0] < -0.55).all()

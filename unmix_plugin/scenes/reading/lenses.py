@@ -51,17 +51,18 @@ class Intrinsics:
         """k1, k2, p1, p2, and k3, k4 where one of them is not 0."""
         return (*self.distortion, *(self.higher_radial if any(self.higher_radial) else ()))
 
-    def focal_at(self, width: int, height: int) -> tuple[float, float] | None:
+    def focal_at(self, width: int, height: int, is_line: bool = False) -> tuple[float, float] | None:
         """Focal lengths x, y in pixels of an image of this size; None if the file gives none.
 
-        Each is the one given, or follows from the field of view, or is that of the other axis.
+        Each is the one given, or follows from the field of view, or is that of the other axis. A line camera
+        (`is_line`) has that of x along both: where one pose stands for the view, its pixels are square.
         """
         x, y = (
             focal if focal is not None or angle is None else 0.5 * side / math.tan(0.5 * angle)
             for focal, angle, side in zip(self.focal_px, self.angles, (width, height), strict=True)
         )
         x, y = y if x is None else x, x if y is None else y
-        return None if x is None or y is None else (x, y)
+        return None if x is None or y is None else (x, x if is_line else y)
 
 
 def read_lens(

@@ -378,7 +378,10 @@ def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisat
     ]
     count = max(len(lens.coefficients) for lens in lenses)  # 6 where any has higher radial terms, or 4
     distortion = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
-    focal_px = [lens.focal_at(width, height) for lens, (height, width) in zip(lenses, sizes, strict=True)]
+    focal_px = [
+        lens.focal_at(width, height, frame.line_poses is not None)
+        for lens, (height, width), frame in zip(lenses, sizes, entry.frames, strict=True)
+    ]
     return Cameras.of_sizes(
         camera_to_world=_model_poses(_world_poses(entry), normalisation),
         focal_px=torch.tensor(focal_px, dtype=torch.float32),
