@@ -59,6 +59,26 @@ def test_a_line_has_a_gap_where_a_value_is_missing():
     assert sum(len(part) for part in found) <= 3
 
 
+@pytest.mark.parametrize(
+    ("values", "is_log", "count"),
+    [
+        ([0.7], False, 1),
+        ([1.0, 2.0, np.nan, 3.0], False, 1),
+        ([np.nan, 1.0, np.nan, 2.0], False, 2),
+        ([1.0, -1.0, 2.0, 3.0], True, 1),
+        ([1.0, 2.0, 3.0], False, 0),
+    ],
+)
+def test_a_value_without_neighbours_is_a_dot(values, is_log, count):
+    drawing = ET.fromstring(draw_chart(chart(values, is_log=is_log)))
+    dots = [
+        use
+        for use in drawing.iter("{http://www.w3.org/2000/svg}use")
+        if COLOUR in use.attrib.get("style", "")
+    ]
+    assert len(dots) == count
+
+
 def test_a_logarithmic_axis_has_equal_steps_for_equal_factors_and_leaves_out_what_is_not_positive():
     [points] = strokes(draw_chart(chart([0.001, 0.1, 10.0, 0.0], is_log=True)))
     assert len(points) == 3

@@ -84,6 +84,17 @@ def plain_axes(axes: Any) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+def mark_lone_points(axes: Any) -> None:
+    """Give a dot to each value that no line can lead to: those beside it are missing."""
+    for line in axes.get_lines():
+        values = np.asarray(line.get_ydata(), dtype=np.float64)
+        is_known = np.pad(np.isfinite(values) & ((values > 0) | (axes.get_yscale() != "log")), 1)
+        is_alone = is_known[1:-1] & ~is_known[:-2] & ~is_known[2:]
+        if is_alone.any():
+            size = 2 * line.get_linewidth()
+            line.set(marker="o", markevery=is_alone, markersize=size, markeredgecolor="none")
+
+
 _FONT_PX = 12
 _INK, _SOFT = "#1c2024", "#5d6670"
 
@@ -136,6 +147,7 @@ def draw_chart(chart: LineChart) -> bytes:
             values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
             least = values[np.isfinite(values)].min(initial=0.0)
             axes.set_ylim(min(low, 0.0) if least < 0 else 0.0, max(high, 0.0))
+        mark_lone_points(axes)
         axes.margins(x=0)
         axes.set_xlabel(chart.x_label, color=_INK)
         axes.set_ylabel(chart.y_label, color=_INK)

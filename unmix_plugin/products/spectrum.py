@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.plotting import figure_bytes, plain_axes
+from unmix_plugin.figures.plotting import figure_bytes, mark_lone_points, plain_axes
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import NOT_PORTABLE, make_folder, safe_name, write_file
 from unmix_plugin.formats.libraries import library_of
@@ -235,6 +235,7 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
         lines.plot(wavelengths, shown.spectrum, linestyle=style, linewidth=1.3, label=label)
+    mark_lone_points(lines)
     lines.set(xlabel="wavelength (nm)", ylabel=f"{materials.quantity} (1 = full scale)")
     lines.set_ylim(bottom=0.0)
     lines.set_title(place.title, loc="left", fontweight="bold")

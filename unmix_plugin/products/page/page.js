@@ -745,7 +745,10 @@
           const below = part.map((i) => at(Math.max(values[i] - spread[i], 0), i)).reverse();
           draw("polygon", { points: [...above, ...below].join(" "), fill: colour, "fill-opacity": 0.2 });
         }
-        draw("polyline", { points: part.map((i) => at(values[i], i)).join(" "), fill: "none", stroke: colour, ...style });
+        // A band between two gaps is a dot.
+        const dot = part.length === 1 && { "stroke-linecap": "round", "stroke-width": 4, "stroke-dasharray": "none" };
+        const points = [...part, part.at(-1)].map((i) => at(values[i], i)).join(" ");
+        draw("polyline", { points, fill: "none", stroke: colour, ...style, ...dot });
       }
     });
     return svg;
