@@ -168,6 +168,13 @@ _LEVELS = 21
 """Steps of each sRGB channel among which colours are looked for."""
 
 
+def id_colours() -> Float64[np.ndarray, "255 3"]:
+    """sRGB colours of ids that have no colours of their own, neighbours well apart; they come again after 20."""
+    from matplotlib import colormaps
+
+    return colormaps["tab20"](np.arange(255) % 20)[:, :3].astype(np.float64)
+
+
 def own_colours(spectra: Float[Tensor, "K B"], bands: Bands) -> Float64[np.ndarray, "K 3"]:
     """The sRGB colour of each spectrum, [0, 1]: what a surface of it looks like, or its false colour."""
     linear = spectra.detach().cpu().double().clamp(min=0) @ rgb_matrix(bands, torch.float64)

@@ -11,17 +11,21 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from tests.method_factory import with_a_sky
-from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer
+from tests.viewer.view_factory import make_aids, make_frame, make_source, paint_layer, ring
+from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.figures.pictures import ColourScale
+from unmix_plugin.products.render.pictures import Palette, opaque_tiles
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.viewer.rendering import painting
 from unmix_plugin.viewer.rendering.painting import (
     LAYERS,
     _colour_table,
+    _layer_of,
     _over_background,
     _paint_values,
     _to_display,
@@ -225,6 +229,17 @@ def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
         picture, legend = painted(row, aids, layer)
         assert_close(picture[0], colours, atol=1e-6, rtol=0)
         assert [name for name, _ in legend] == list(frame.materials.names)
+
+
+@pytest.mark.parametrize("classes", [(), (("clay", (0.8, 0.4, 0.2)), ("wax", (0.1, 0.2, 0.9)))])
+def test_labels_have_the_colours_and_the_names_that_they_have_in_renders(classes):
+    output = Output("segmentation", "labels", "segmentation", "what is there", classes=classes)
+    ids = torch.tensor([[0, 1, 7, 255]], dtype=torch.uint8)
+    view = ModelView(ring()[0], {"segmentation": ids, "accumulation": (ids != 255).float()})
+    picture, legend = _layer_of(output).paint(view, LayerSettings(), None)
+    expected = opaque_tiles(output, ids.numpy(), (ids != 255).float().numpy(), Palette.of(None, {}))[:, :, 0]
+    assert_close(picture, torch.from_numpy(expected / 255).float(), atol=0.003, rtol=0)
+    assert [name for name, _ in legend] == ["clay", "wax"] if classes else legend == "what is there"
 
 
 @pytest.mark.parametrize("layer", [name for name in PAINTED if name != "accumulation"])

@@ -22,7 +22,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes
+from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes, id_colours
 from unmix_plugin.formats.files import csv_bytes, eight_bits
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.materials import Materials
@@ -47,9 +47,7 @@ class Palette:
     def of(materials: Materials | None, surveyed: dict[str, ColourScale]) -> Palette:
         """The palette of a scene, with the scales that depend on the views."""
         if materials is None:
-            from matplotlib import colormaps
-
-            return Palette((), colormaps["tab20"](np.arange(255) % 20)[:, :3].astype(np.float64), surveyed)
+            return Palette((), id_colours(), surveyed)
         return Palette(materials.names, endmember_colours(materials), surveyed)
 
     def _entries(self, output: Output) -> list[tuple[str, Colour]]:

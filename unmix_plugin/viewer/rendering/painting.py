@@ -23,8 +23,8 @@ from torch import Tensor
 
 from unmix_plugin.engine.registry import Output, OutputKind
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.figures.pictures import ColourScale
-from unmix_plugin.figures.plotting import css_colour
+from unmix_plugin.figures.pictures import NEUTRAL, ColourScale
+from unmix_plugin.figures.plotting import css_colour, id_colours
 from unmix_plugin.spectral.colour.conversion import (
     agx,
     band_composite_matrix,
@@ -194,10 +194,14 @@ def _layer_of(output: Output) -> _Layer:
             # Opacity itself is shown everywhere, also where there is little of it.
             part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
             return _paint_scaled(values, part, settings, scale, output.what)
-        # Neighbours of the palette are far apart.
-        palette = _colour_table("turbo")[torch.arange(256) * 389 % 1024].to(opacity)
+        palette = torch.from_numpy(id_colours()).to(opacity)
         if output.kind == "labels":
-            opacity, values = (values != NOTHING_ID).to(opacity), palette[values.long()]
+            if output.classes:
+                palette = palette.new_tensor([colour for _, colour in output.classes])
+                legend = _swatches([name for name, _ in output.classes], palette)
+            of_ids = palette.new_full((256, 3), NEUTRAL)
+            of_ids[: len(palette)] = palette
+            opacity, values = (values != NOTHING_ID).to(opacity), of_ids[values.long()]
         elif output.kind == "shares":
             palette = palette[: values.shape[-1]]
             values = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6) @ palette
