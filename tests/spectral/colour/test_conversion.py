@@ -119,6 +119,13 @@ def test_false_colour_shows_the_longest_third_red_and_the_shortest_blue_and_says
     assert_close(rgb_matrix(Bands.of([900])), torch.ones(1, 3))
 
 
+def test_a_third_without_bands_is_shown_by_those_beside_it_and_says_so():
+    bands = Bands.of([400, 420, 440, 460, 640, 660, 680, 700])
+    said = "false colour: red 603-710 nm, green of bands at 460 and 640 nm, blue 390-497 nm"
+    assert describe_colour(bands) == said
+    assert (rgb_matrix(bands)[:, 1] > 0).tolist() == [False] * 3 + [True] * 2 + [False] * 3
+
+
 def test_band_composite_picks_the_nearest_band_of_each_channel():
     spectrum = torch.arange(31.0)
     picked = spectrum @ band_composite_matrix(Bands.of(range(400, 701, 10)), (698, 551, 404))

@@ -215,10 +215,15 @@ def describe_colour(bands: Bands) -> str:
     if colour_mode(bands) == "true-colour":
         return "true colour: CIE 1931 2 degree observer, flat spectrum shown as white"
     thirds = np.linspace(bands.edges_nm[0], bands.edges_nm[-1], 4)
-    names = [
-        f"{name} {thirds[i]:.0f}-{thirds[i + 1]:.0f} nm" for i, name in enumerate(("blue", "green", "red"))
-    ]
-    return "false colour: " + ", ".join(names[::-1])
+    (low, high), parts = bands.ranges_nm.T, []
+    for name, first, last, weights in zip(
+        ("red", "green", "blue"), thirds[-2::-1], thirds[:0:-1], _thirds_of_range(bands).T, strict=True
+    ):
+        part = f"{first:.0f}-{last:.0f} nm"
+        if not ((low < last) & (high > first)).any():  # a gap, over which those beside it reach
+            part = f"of bands at {' and '.join(f'{nm:.0f}' for nm in bands.centers_nm[weights > 0])} nm"
+        parts.append(f"{name} {part}")
+    return "false colour: " + ", ".join(parts)
 
 
 def rgb_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor, "B 3"]:
