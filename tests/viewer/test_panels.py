@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from viser import SceneApi
 
 from tests.engine.rgb_nerf_plugin import RgbNerf, RgbNerfConfig
 from tests.method_factory import make_model
@@ -94,6 +95,54 @@ def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_
         page.set("own range", False)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
         assert not low["visible"]
+
+
+def test_a_range_that_ends_below_its_beginning_is_refused_and_the_one_before_stays(viewer):
+    with opened(viewer) as page:
+        show_layer(page, "depth")
+        page.set("own range", True)
+        (session,) = viewer._sessions.values()
+        page.wait_until(lambda: session.view.settings.value_range is not None)
+        assert page.notices == []
+        before = session.view.settings.value_range
+        page.set("high", before[0] - 1)
+        page.wait_until(lambda: any("until low is below high" in text for _, text in page.notices))
+        assert session.view.settings.value_range == before
+        page.set("low", before[0] - 2)
+        page.wait_until(lambda: session.view.settings.value_range == (before[0] - 2, before[0] - 1))
+
+
+def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, monkeypatch):
+    clouds = []
+    add = SceneApi.add_point_cloud
+    monkeypatch.setattr(
+        SceneApi, "add_point_cloud", lambda *args, **more: (clouds.append(args[2:]), add(*args, **more))[1]
+    )
+    with opened(viewer) as page:
+        page.set("point cloud", True)
+        page.wait_until(lambda: len(clouds) == 1)
+        page.set("light", "A")
+        page.wait_until(lambda: len(clouds) == 2)
+        (points, colours), (same, relit) = clouds
+        assert np.array_equal(points, same)
+        assert relit[:, 2].mean() < colours[:, 2].mean() - 5
+        page.set("visible", False)
+        page.wait_until(lambda: len(clouds) == 3)
+        assert 0 < len(clouds[-1][0]) < len(points)
+        page.set("point cloud", False)
+        page.set("visible", True)
+        show_layer(page, "depth")
+        assert len(clouds) == 3
+
+
+def test_a_region_that_is_kept_or_removed_elsewhere_is_listed_or_no_longer(tmp_path):
+    source = make_source(tmp_path, initial_opacity=0.6)
+    with serving(source) as (viewer, _), opened(viewer) as page:
+        options = lambda: page.controls[page.control("region")]["options"]  # noqa: E731
+        keep_region(source.run, "cup", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
+        page.wait_until(lambda: "cup" in options())
+        keep_region(source.run, "cup", None)
+        page.wait_until(lambda: "cup" not in options())
 
 
 def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(viewer):

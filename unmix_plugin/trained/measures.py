@@ -126,7 +126,7 @@ def read_measures(run: RunFolder) -> Measures:
     Raises:
         RunError: the file is damaged.
     """
-    path = _path(run)
+    path = measures_path(run)
     if not path.exists() and not path.is_symlink():
         return Measures()
     values = read_run_json(path)
@@ -153,8 +153,8 @@ def _write_measures(run: RunFolder, measures: Measures) -> Path:
     scale = measures.scale
     kept = {} if scale is None else {"scale": {"metres_per_unit": scale.metres_per_unit, "how": scale.how}}
     regions = {name: region_to_json(region) for name, region in measures.regions.items()}
-    write_run_json(_path(run), {**kept, "regions": regions})
-    return _path(run)
+    write_run_json(measures_path(run), {**kept, "regions": regions})
+    return measures_path(run)
 
 
 def keep_scale(run: RunFolder, scale: Scale) -> Path:
@@ -254,5 +254,6 @@ def _regions_from_json(values: Any) -> dict[str, Region]:
     return {check_name(name, values): region_from_json(region) for name, region in values.items()}
 
 
-def _path(run: RunFolder) -> Path:
+def measures_path(run: RunFolder) -> Path:
+    """The file that keeps the measures of a run."""
     return run.path / "measures.json"

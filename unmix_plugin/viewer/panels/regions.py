@@ -40,6 +40,7 @@ class RegionsPanel:
         self._corners: list[tuple[float, float]] = []
         """Column and row in its picture."""
         self._is_busy = False
+        self._changed_at = session.services.regions.changed_at
         gui = session.client.gui
         add_click_switch(session, "draw where I click", self._take, is_on=False)
         self._shape = gui.add_dropdown("shape", _SHAPES)
@@ -55,6 +56,7 @@ class RegionsPanel:
         self._chart = Chart(gui, "mean spectrum", session.materials().quantity)
         session.add_button("remove the region", self._remove, is_minor=True)
         session.guarded(lambda: self._list(_NO_REGION[0]))()
+        session.on_tick.append(self._follow)
 
     @property
     def _outline(self) -> list[tuple[float, float]]:
@@ -144,6 +146,17 @@ class RegionsPanel:
         self._chosen.options = (*_NO_REGION, *self._session.services.regions.kept)
         self._chosen.value = chosen
         self._show_chosen()
+
+    def _follow(self) -> None:
+        """Other pages and commands keep and remove regions, too."""
+        changed_at = self._session.services.regions.changed_at
+        if changed_at == self._changed_at:
+            return
+        self._changed_at = changed_at
+        names = (*_NO_REGION, *self._session.services.regions.kept)
+        if tuple(self._chosen.options) != names:
+            chosen = str(self._chosen.value)
+            self._list(chosen if chosen in names else _NO_REGION[0])
 
     def _show_chosen(self) -> None:
         self._show(None)  # numbers of another region never stand under this name while it is measured

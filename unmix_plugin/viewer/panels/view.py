@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
+from unmix_plugin.viewer.recipes import visibility
 from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 from unmix_plugin.viewer.rendering.scene import Edit
@@ -45,6 +47,7 @@ class LayerPanel:
         self._settings = settings = session.view.settings
         self._gui = session.client.gui
         self._of_control: dict[str, list[Any]] = {}
+        self._is_filling = False
         self._layers = session.services.maker.layers
         titles = {one.title: name for name, one in self._layers.items()}
         shown = layer_named(settings.layer, self._layers).title
@@ -132,12 +135,22 @@ class LayerPanel:
         ]
 
         def value_range() -> tuple[Any, ...] | None:
-            return tuple(end.value for end in ends) if is_own.value else None
+            if not is_own.value or self._is_filling:
+                return None
+            low, high = (number(end.value, -math.inf, math.inf, fallback=math.nan) for end in ends)
+            if low >= high:
+                raise ConfigError(
+                    f"low is {low:g} and high {high:g}; the range stays until low is below high"
+                )
+            return low, high
 
         def start_from_shown() -> None:
             if is_own.value and self._session.value_range_shown is not None:
-                for end, value in zip(ends, self._session.value_range_shown, strict=True):
+                shown = self._session.value_range_shown
+                self._is_filling = True
+                for end, value in zip(ends, shown, strict=True):
                     end.value = value
+                self._is_filling = False
 
         is_own.on_update(self._session.guarded(start_from_shown))
         self._connect(is_own, "value_range", "scale", value_range)
@@ -247,6 +260,14 @@ class ScenePanel:
             self._add_switch("scene box", self._add_box)
             if services.has_materials:
                 self._add_switch("point cloud", self._add_points)
+                session.on_edit.append(self._renew_points)
+
+    def _renew_points(self) -> None:
+        """Materials may have other colours, or be hidden."""
+        if "point cloud" in self._objects:
+            for handle in self._objects["point cloud"]:
+                handle.remove()
+            self._objects["point cloud"] = self._add_points()
 
     def _add_switch(self, label: str, make: Callable[[], list[Any]]) -> None:
         switch = self._session.client.gui.add_checkbox(label, False)
@@ -305,14 +326,21 @@ class ScenePanel:
         return [scene.add_line_segments("/box", points, colors=(120, 120, 120))]
 
     def _add_points(self) -> list[viser.PointCloudHandle]:
-        """Surface points in the colours that the materials have now; every n-th where there are too many."""
+        """Surface points of the materials that are visible, in the colours that these have now; every n-th where there
+        are too many."""
         aids, materials = self._session.services.maker.aids.for_layers(), self._session.materials()
         assert aids is not None
-        spectra, points = aids.reference_spectra(materials), aids.reference_points.cpu().numpy()
+        hidden, isolated = visibility(self._session.history.present)
+        is_shown = [i not in hidden and (not isolated or i in isolated) for i in range(len(materials.names))]
+        main = aids.reference.abundances.argmax(dim=-1).cpu().numpy()
+        spectra, kept = aids.reference_spectra(materials), np.array(is_shown)[main]
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
-        colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()
+        colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()[kept]
+        points = aids.reference_points.cpu().numpy()[kept]
         step = max(1, -(-len(points) // _MOST_POINTS))
         scene = self._session.client.scene
+        if len(points) == 0:
+            return []
         return [scene.add_point_cloud("/points", points[::step], colours[::step], point_size=_POINT_SIZE)]
 
 

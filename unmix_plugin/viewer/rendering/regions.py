@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
-from unmix_plugin.trained.measures import keep_region, read_measures
+from unmix_plugin.trained.measures import keep_region, measures_path, read_measures
 from unmix_plugin.trained.regions import Region, region_to_json
 from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
@@ -35,6 +35,12 @@ class RunRegions:
     def kept(self) -> Mapping[str, Region]:
         """By name, as they are by now: commands and other pages keep some, too."""
         return read_measures(self._source.run).regions
+
+    @property
+    def changed_at(self) -> int:
+        """When what is kept with the run was written last, in ns; 0 where nothing is."""
+        path = measures_path(self._source.run)
+        return path.stat().st_mtime_ns if path.exists() else 0
 
     def measured(self, region: Region) -> tuple[MeasuredRegion, MeasuredSurface] | None:
         """What a region is, and on which surface; None if it was not measured yet."""
