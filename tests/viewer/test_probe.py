@@ -77,11 +77,14 @@ def test_the_files_of_probes_hold_every_number(taken):
     values = np.array(rows[1:], dtype=float)
     np.testing.assert_allclose(values[:, 0], taken.materials.bands.centers_nm)
     np.testing.assert_allclose(values[:, 3], 2 * taken.predicted, rtol=1e-7)
+    measured = replace(measured, materials=replace(odd, light=torch.ones(5), light_name="A"))
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken, measured]).decode())))
     assert rows[0][:7] == ["probe", "x", "y", "z", "metres_per_unit", "material", "measured_in"]
-    assert rows[0][7:] == list(taken.materials.names)
-    assert [rows[2][4], rows[2][6]] == ["", "train_003"]
-    np.testing.assert_allclose([float(value) for value in rows[1][7:]], taken.abundances, atol=1e-5)
+    assert rows[0][7:9] == ["quantity", "light"]
+    assert rows[0][9:] == list(taken.materials.names)
+    assert [rows[2][4], *rows[2][6:9]] == ["", "train_003", "reflectance", "A"]
+    assert rows[1][7:9] == ["radiance", ""]
+    np.testing.assert_allclose([float(value) for value in rows[1][9:]], taken.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
     assert rows[1][4] == "0.25"

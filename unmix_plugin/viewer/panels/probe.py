@@ -111,9 +111,10 @@ def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
 
 def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
     """One row a probe: number, position in the world, metres in a unit of it (empty where unknown), material, the
-    training view measured in, abundances."""
+    training view measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
     metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
-    header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", *probes[0].materials.names]
+    header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", "quantity", "light"]
+    header += probes[0].materials.names
     rows = [
         [
             str(one.number),
@@ -121,6 +122,8 @@ def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) 
             metres,
             one.name,
             one.measured_in,
+            one.materials.quantity,
+            one.materials.light_name or "",
             *(f"{value:.6g}" for value in one.abundances),
         ]
         for one in probes
