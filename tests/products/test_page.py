@@ -63,7 +63,7 @@ REGIONS = {
 }
 
 
-def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48):
+def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=48, edits=None):
     """The facts of a page, what was said while it was made, and its file."""
     said: list[str] = []
     loaded = SimpleNamespace(
@@ -85,7 +85,7 @@ def export(folder, scene: Any = SCENE, regions=REGIONS, library=(), resolution=4
         lambda _, items: iter(items),
         cast("Any", None),
     )
-    (path,) = page.export(job, page.Page(resolution=resolution, library=library))
+    (path,) = page.export(job, page.Page(resolution=resolution, library=library, edits=edits))
     facts = json.loads(path.read_text().split('id="data-facts">')[1].split("</script>")[0])
     return facts, said, path
 
@@ -100,6 +100,14 @@ def test_regions_that_can_not_be_shown_are_said(exported):
     assert facts["regions"] == ["cap <b>", "below"]
     assert "The region nowhere is left out: nothing of the surface is in it." in said
     assert any("of no material is left out: the scene has no material 7; it has 3." in text for text in said)
+
+
+def test_a_page_of_an_edited_run_says_so(exported, tmp_path):
+    facts, said, _ = export(tmp_path, regions={}, edits=Path("aged.yml"))
+    note = "Edited: shown with the edits of aged.yml, not as found."
+    assert note in facts["notes"]
+    assert note in said
+    assert not any("Edited" in text for text in exported[0]["notes"])
 
 
 def test_a_library_is_given_in_full_and_too_large_or_strange_ones_are_refused(tmp_path, monkeypatch):

@@ -113,6 +113,10 @@ def export(job: Job, asked: Page) -> list[Path]:
         else:
             content, resolution = _mixture_content(job, resolution)
         known = known or _known_spectra(content.materials, asked.library)
+        if asked.edits is not None:
+            content.facts["notes"].append(
+                f"Edited: shown with the edits of {asked.edits.name}, not as found."
+            )
         if resolution < asked.resolution:
             content.facts["notes"].append(
                 f"The surface is as fine as {resolution} cells along the longest edge, not {asked.resolution}: "
