@@ -278,19 +278,3 @@ def test_errors_of_bands_are_of_clamped_predictions_as_all_figures_are(scene, vi
     errors = evaluation.bands["view"].mse
     assert errors == pytest.approx(((1 - view.spectra.double()) ** 2).mean(dim=(0, 1)).numpy())
     assert math.sqrt(errors.mean()) == pytest.approx(evaluation.per_view["view"]["rmse"])
-
-
-def test_pictures_of_errors_show_valid_pixels_in_which_something_is_measured_or_predicted(view):
-    nothing = replace(perfect(view, [0, 1, 2]), accumulation=torch.zeros(10, 12))
-    hidden = torch.zeros(10, 12, dtype=torch.bool)
-    hidden[4:6] = True
-    masked = replace(view, valid=~hidden)
-    shown = masked.shows_error(nothing)
-    assert not shown[0].any()
-    assert not shown[hidden].any()
-    assert shown[1:4].all()
-    assert masked.shows_error(replace(nothing, accumulation=torch.ones(10, 12)))[0].all()
-    assert masked.counted_labels is not None
-    assert view.labels is not None
-    assert (masked.counted_labels[hidden] == 255).all()
-    assert_close(masked.counted_labels[6:], view.labels[6:])

@@ -219,11 +219,12 @@ def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_d
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.shown(predicted)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
-    shown = as_numpy(view.shows_error(predicted))
+    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage)) > 0.01
+    counted = (seen & view.valid.numpy()).astype(np.float64)
     panels = [
         TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
         TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
-        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), shown), "error"),
+        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), counted), "error"),
     ]
     colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
     heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"

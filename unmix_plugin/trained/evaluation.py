@@ -219,12 +219,10 @@ class ViewTruth:
 
     @property
     def counted_labels(self) -> UInt8[Tensor, "H W"] | None:
-        """True material of valid pixels, 255 elsewhere."""
-        return None if self.labels is None else self.labels.where(self.valid, NOTHING_ID)
-
-    def shows_error(self, predicted: PredictedView) -> Bool[Tensor, "H W"]:
-        """Valid pixels in which something was measured or is predicted: elsewhere pictures of errors show nothing."""
-        return self.valid & (torch.maximum(self.opacity, predicted.coverage.to(self.opacity)) > 0.01)
+        """Labels, 255 also in pixels that don't count."""
+        if self.labels is None:
+            return None
+        return torch.where(self.valid, self.labels, torch.full_like(self.labels, NOTHING_ID))
 
     def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
         """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
@@ -320,8 +318,7 @@ class Evaluation:
             else math.nan,
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
-        labels = view.counted_labels
-        if self._tally is not None and labels is not None:
+        if self._tally is not None and (labels := view.counted_labels) is not None:
             self._tally.add(predicted.segmentation, labels)
         self.per_view[view.name] = figures
         centers = torch.tensor(self.truth.bands.centers_nm)

@@ -381,4 +381,5 @@ class ReportViews:
         self._offsets += difference[matter].sum(axis=0)
         self._pixels += int(matter.sum())
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
-        return eight_bits(over_neutral(painted, as_numpy(truth.shows_error(view))))
+        seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
+        return eight_bits(over_neutral(painted, (seen & truth.valid.numpy()).astype(np.float64)))
