@@ -54,6 +54,19 @@ def test_a_scene_says_what_training_fitted_for_each_view():
     assert scene_of(model_with(light="per-view")).fitted == ("gain",)
 
 
+def test_a_scene_knows_the_gain_with_which_each_training_view_is_as_it_was_measured():
+    model = model_with(light="per-view")
+    with torch.no_grad():
+        model.view_gains.log_gains[:, 0] = torch.tensor([0.3, -0.1, -0.2])
+    found = scene_of(model)
+    expected = torch.tensor([0.3, -0.1, -0.2]).exp()[:, None].expand(3, len(found.bands))
+    assert_close(found.view_gains, expected)
+    with torch.no_grad():
+        model.view_gains.log_gains.zero_()  # training that goes on
+    assert_close(found.view_gains, expected)
+    assert scene_of(model_with()).view_gains is None
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return make_scene(tmp_path_factory.mktemp("scene") / "ball").root

@@ -128,8 +128,15 @@ def _measured(
 
 
 def _read_pixel(job: Job, scene: Scene, index: int, column: int, row: int) -> Float[np.ndarray, " B"]:
-    """What a view has in a pixel, in the light asked for."""
+    """What a view has in a pixel, in the light asked for; of a training view, as exposed as the trained scene."""
     spectrum = scene.cube(index, (slice(row, row + 1), slice(column, column + 1)))[0, 0]
+    gains = job.scene.view_gains
+    if gains is not None and index in scene.train_indices:
+        spectrum = spectrum / gains[scene.train_indices.index(index)].numpy()
+    elif gains is not None:
+        job.say(
+            f"no exposure was fitted to {scene.frames[index].name}: what it measured is as it was exposed"
+        )
     return relit(spectrum, job.loaded.record.summary.get("illuminant"), job.scene.light_power)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from unmix_plugin.engine.configs import TrainerConfig
@@ -53,6 +54,7 @@ def unmix_scene(
             eval_cameras=own.corrected_lens(record.eval_cameras),
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
+    gains = copy.deepcopy(model.view_gains, frozen)  # type: ignore[arg-type]
     opaque = renderer.opaque_skips
     renderer = replace(
         renderer,
@@ -73,6 +75,7 @@ def unmix_scene(
             *(["gain"] if model.view_gains is not None else []),
         ),
         scale=recorded_scale(record.summary),
+        view_gains=None if gains is None else gains(torch.arange(len(gains.log_gains)), gains.terms).cpu(),
     )
 
 

@@ -77,6 +77,8 @@ class TrainedScene:
     """What training found for each of its views, so that other views are aligned before they are measured."""
     scale: Scale | None = None
     """How long a unit of its world is; None where that is unknown."""
+    view_gains: Float[Tensor, "V B"] | None = None
+    """What is rendered, times this, is as bright as each training view measured it; on the CPU. None: 1."""
 
     @property
     def bands(self) -> Bands:

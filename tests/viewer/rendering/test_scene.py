@@ -197,6 +197,21 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
     assert_close(relit[1], plain[1] * light)
 
 
+def test_what_was_measured_is_compared_as_exposed_as_the_scene(views, scene, ball_of):
+    number = 2
+    camera, frame = scene.cameras[scene.train_indices[number]], ball_of(scene.cameras[scene.train_indices[2]])
+    gains = torch.ones(len(scene.train_indices), 6)
+    gains[number] = torch.linspace(0.5, 2.0, 6)
+    fitted = replace(frame.scene, view_gains=gains)
+    errors, is_known, _ = views.error(replace(frame, scene=fitted))
+    measured = torch.from_numpy(scene.cube(scene.train_indices[number]))
+    expected = (measured / gains[number] - 0.25).abs().mean(dim=-1)
+    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
+    point = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm() * BALL
+    plain, alike = (views.measurement(point, camera, None, shown) for shown in (frame.scene, fitted))
+    assert_close(alike[1], plain[1] / gains[number])
+
+
 def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_of, source, monkeypatch):
     camera = scene.cameras[scene.train_indices[1]]
     ball = replace(source, take=lambda: ball_of(camera).scene)

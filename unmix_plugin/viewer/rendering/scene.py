@@ -223,7 +223,8 @@ class MeasuredViews:
             rays = frame.camera.to(device).image_rays(0)
             points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
             rows, columns, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
-            cube = self._in_light(self._scene.cube(self._indices[index]), frame.scene.light_power)
+            cube = self._scene.cube(self._indices[index])
+            cube = self._alike(index, cube, frame.scene, frame.scene.light_power)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
             places = seen[sees].cpu()
             errors[places] = (spectra - cube[rows[sees], columns[sees]]).abs().mean(dim=-1)
@@ -253,18 +254,23 @@ class MeasuredViews:
             rows, columns, sees = self._pixels_of(point[None], index, own, scene)
             if bool(sees[0]):
                 cube = self._scene.cube(self._indices[index])
-                spectrum = self._in_light(cube[int(rows[0]), int(columns[0])].copy(), light)
+                spectrum = self._alike(index, cube[int(rows[0]), int(columns[0])].copy(), scene, light)
                 return self._scene.frames[self._indices[index]].name, spectrum
         return None
 
-    def _in_light(
-        self, measured: Float32[np.ndarray, "*pixels B"], light: Float64[np.ndarray, " B"] | None
+    def _alike(
+        self,
+        index: int,
+        measured: Float32[np.ndarray, "*pixels B"],
+        scene: TrainedScene,
+        light: Float64[np.ndarray, " B"] | None,
     ) -> Float32[Tensor, "*pixels B"]:
-        """Radiance as it is in the light that the scene is shown in."""
+        """Radiance of a training view as it is in the light that the scene is shown in, and as exposed as the scene."""
         recorded = self._source.record.summary.get("illuminant")
         is_same = light is None or (recorded is not None and np.allclose(light, recorded, rtol=1e-4))
         found = measured if is_same else relit_measurement(measured, recorded, light).astype(np.float32)
-        return torch.from_numpy(found)
+        spectra = torch.from_numpy(found)
+        return spectra if scene.view_gains is None else spectra / scene.view_gains[self._rows[index]]
 
     def _camera(self, index: int, scene: TrainedScene) -> Cameras:
         """Of a training view, as training corrected it."""
