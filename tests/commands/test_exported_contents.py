@@ -5,9 +5,6 @@ import csv
 import gzip
 import json
 import re
-from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -23,7 +20,6 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.products.spectrum import _read_pixel
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measures import keep_region
@@ -149,20 +145,6 @@ def test_a_place_has_mean_and_spread_of_what_the_views_measured_that_see_it(soli
         rows = list(csv.DictReader(file))
     found = [[float(row[f"{name} over views"]) for row in rows] for name in ("mean", "standard deviation")]
     np.testing.assert_allclose(found, [np.mean(spectra, axis=0), np.std(spectra, axis=0, ddof=1)], atol=1e-6)
-
-
-def test_what_a_training_view_measured_is_as_exposed_as_the_trained_scene(solid):
-    loaded, scene = load_run(solid.run, "cpu"), load_scene(solid.scene, SceneOptions())
-    gains, said = torch.rand(len(scene.train_indices), len(loaded.materials_scene.bands)) + 0.5, []
-    shown = replace(loaded.materials_scene, view_gains=gains)
-    job: Any = SimpleNamespace(scene=shown, loaded=loaded, say=said.append)
-    for number, index in enumerate(scene.train_indices):
-        expected = scene.cube(index)[8, 7] / gains[number].numpy()
-        np.testing.assert_allclose(_read_pixel(job, scene, index, 7, 8), expected, rtol=1e-5)
-    assert said == []
-    index = scene.eval_indices[0]
-    np.testing.assert_allclose(_read_pixel(job, scene, index, 7, 8), scene.cube(index)[8, 7], rtol=1e-5)
-    assert "no exposure was fitted to eval_002" in said[0]
 
 
 def test_a_point_goes_by_its_coordinates(solid, tmp_path):

@@ -98,8 +98,8 @@ def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_
         recipe = with_swap(recipe, change) if isinstance(change, Swap) else with_change(recipe, change)
         after = edit_scene(scene, recipe).materials.endmembers
         if isinstance(change, Swap):
-            order = [{change.first: change.second, change.second: change.first}.get(i, i) for i in range(3)]
-            torch.testing.assert_close(after, before[order])
+            places = {change.first: change.second, change.second: change.first}
+            torch.testing.assert_close(after, torch.stack([before[places.get(i, i)] for i in range(3)]))
             continue
         assert change_of(recipe, type(change), change.endmember) == change
         others = [index for index in range(3) if index != change.endmember]
