@@ -1,6 +1,7 @@
 """Recipes as a panel builds them: one change of a kind an endmember, all of it undoable."""
 
 from functools import partial
+from typing import Any
 
 import pytest
 import torch
@@ -98,7 +99,7 @@ def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_
         recipe = with_swap(recipe, change) if isinstance(change, Swap) else with_change(recipe, change)
         after = edit_scene(scene, recipe).materials.endmembers
         if isinstance(change, Swap):
-            places = {change.first: change.second, change.second: change.first}
+            places: dict[Any, Any] = {change.first: change.second, change.second: change.first}
             torch.testing.assert_close(after, torch.stack([before[places.get(i, i)] for i in range(3)]))
             continue
         assert change_of(recipe, type(change), change.endmember) == change
