@@ -122,7 +122,8 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
         page.set("point cloud", True)
         page.wait_until(lambda: len(clouds) == 1)
         page.set("light", "A")
-        page.wait_until(lambda: len(clouds) == 2)
+        recipe = page.controls[page.control("recipe")]
+        page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
         (points, colours), (same, relit) = clouds
         assert np.array_equal(points, same)
         assert relit[:, 2].mean() < colours[:, 2].mean() - 5
