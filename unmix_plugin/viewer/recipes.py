@@ -81,9 +81,12 @@ _SUPERSEDED: dict[type[Operation], tuple[type[Operation], ...]] = {
 
 def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
     """The recipe with a change of one endmember, in place of earlier ones of which it leaves nothing."""
-    earlier = _changes(recipe, change.endmember)
-    gone = {id(one) for one in earlier if isinstance(one, _SUPERSEDED[type(change)])}
-    others = [one for one in recipe.operations if id(one) not in gone]
+    earlier, kinds = _changes_of(recipe, change.endmember), _SUPERSEDED[type(change)]
+    others = [
+        one
+        for position, one in enumerate(recipe.operations)
+        if position not in earlier or not isinstance(one, kinds)
+    ]
     return _with_operations(recipe, [*others, change])
 
 
@@ -148,25 +151,25 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
 def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
     """The change of a kind, in force, that a recipe makes to what an endmember is by its number now."""
     found = None
-    for one in _changes(recipe, endmember):
+    for one in (recipe.operations[position] for position in _changes_of(recipe, endmember)):
         if kind in _SUPERSEDED[type(one)]:
             found = one if type(one) is kind else None
     return found
 
 
-def _changes(recipe: Recipe, endmember: str | int | None) -> list[Operation]:
-    """Changes of what an endmember is now, in order: of its own name and gloss, and of its spectrum wherever that was
-    before swaps."""
-    found: list[Operation] = []
+def _changes_of(recipe: Recipe, endmember: str | int | None) -> list[int]:
+    """Positions of the changes of what an endmember is now, the first first: of its own name and gloss, and of its
+    spectrum wherever that was before swaps."""
+    positions: list[int] = []
     place = endmember
-    for one in reversed(recipe.operations):
+    for position, one in reversed(list(enumerate(recipe.operations))):
         if isinstance(one, Swap) and place in (one.first, one.second):
             place = one.second if place == one.first else one.first
         elif isinstance(one, Rename | Gloss):
-            found += [one] if one.endmember == endmember else []
+            positions += [position] if one.endmember == endmember else []
         elif isinstance(one, Replace | Retint | Scale) and one.endmember == place:
-            found.append(one)
-    return found[::-1]
+            positions.append(position)
+    return positions[::-1]
 
 
 def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:
