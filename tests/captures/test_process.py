@@ -67,6 +67,16 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
         assert (source["sha256"], source["bytes"]) == (hashlib.sha256(data).hexdigest(), len(data))
 
 
+@pytest.mark.parametrize("suffix", ["hdr", "raw"])
+def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_named(tmp_path: Path, suffix):
+    capture = make_capture(tmp_path / "capture")
+    for path in capture.root.glob("white.*"):
+        path.rename(path.with_stem("spectralon"))
+    told: list[str] = []
+    process(capture.root, tmp_path / "scene", "cubes", told.append, white=capture.root / f"spectralon.{suffix}")
+    assert told[0] == f"{capture.root}: 4 views of the layout cubes"
+
+
 BRIGHT_SQUARE = np.zeros((HEIGHT, WIDTH), bool)
 BRIGHT_SQUARE[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 4 : 3 * WIDTH // 4] = True
 
