@@ -73,7 +73,9 @@ def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_name
     for path in capture.root.glob("white.*"):
         path.rename(path.with_stem("spectralon"))
     told: list[str] = []
-    process(capture.root, tmp_path / "scene", "cubes", told.append, white=capture.root / f"spectralon.{suffix}")
+    process(
+        capture.root, tmp_path / "scene", "cubes", told.append, white=capture.root / f"spectralon.{suffix}"
+    )
     assert told[0] == f"{capture.root}: 4 views of the layout cubes"
 
 
@@ -314,6 +316,39 @@ def test_other_options_or_inputs_start_again(interrupted, writer, tmp_path: Path
         numbers.tofile(interrupted.root / "view_03.raw")
     process(interrupted.root, tmp_path / "scene", **options)
     assert len(writer.written) == 4
+
+
+@pytest.mark.parametrize("changed", ["panel", "wavelengths", "scale"])
+def test_numbers_that_are_mended_in_a_table_start_again(tmp_path: Path, monkeypatch, changed):
+    """Those beside the capture that options name, and those in its transforms.json."""
+    capture = make_capture(tmp_path / "capture", kind="npy")
+    panel, wavelengths, listed = tmp_path / "panel.csv", tmp_path / "nm.csv", capture.root / "transforms.json"
+    layout, options = "unmix-nerf" if changed == "scale" else "cubes", {"mask": "none"}
+    content = json.loads(listed.read_text()) | {"wavelengths": WAVELENGTHS_NM.tolist()}
+    for name, frame in zip(capture.reflectance, content["frames"], strict=True):
+        frame["hyperspectral_file_path"] = f"{name}.npy"
+    if changed != "scale":
+        named = {"white_reflectance": str(panel), "wavelengths": str(wavelengths)}
+        options |= references_of(capture, "npy") | named
+
+    def write(is_mended: bool) -> None:
+        wrong = {changed} if not is_mended else set()
+        listed.write_text(json.dumps(content | {"value_scale": 6000 if "scale" in wrong else 8000}))
+        panel.write_text(f"wavelength,panel\n400,{0.5 if 'panel' in wrong else 0.99}\n900,0.99")
+        centres = WAVELENGTHS_NM[:: -1 if "wavelengths" in wrong else 1]
+        wavelengths.write_text("\n".join(["wavelength", *map(str, centres)]))
+
+    write(is_mended=False)
+    monkeypatch.setattr(process_module, "write_view", _Writer(stop_at=2))
+    with pytest.raises(KeyboardInterrupt):
+        process(capture.root, tmp_path / "scene", layout, **options)
+    write(is_mended=True)
+    writer = _Writer()
+    monkeypatch.setattr(process_module, "write_view", writer)
+    process(capture.root, tmp_path / "scene", layout, **options)
+    assert len(writer.written) == 4
+    hashed = {Path(file["path"]) for file in record_of(tmp_path / "scene")["references"]}
+    assert {panel, wavelengths} <= hashed or changed == "scale"
 
 
 def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):

@@ -57,20 +57,29 @@ class Plan:
     """What a user should know, one sentence each."""
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each."""
-    reference_files: tuple[Path, ...] = ()
-    """Of dark frame and white reference."""
+    option_files: tuple[Path, ...] = ()
+    """What options name: dark frame, white reference, tables of its reflectance and of wavelengths."""
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
         own = ["output_dir", "overwrite", "poses", "marker_size", "marker_family", "known_distance", "angles"]
         asked = {key: value for key, value in plain_options(options).items() if key not in own}
-        files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
+        files = [path for view in self.views for path in input_files(view)] + list(self.option_files)
         stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
         for file in _files_of(files):
             with reading(file):
                 facts = file.stat()
             stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
-        return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps}
+        # What transforms.json states may change while its poses, which views don't depend on, are mended.
+        stated = [view.cube.linear for view in self.views if view.cube.linear is not None]
+        return {
+            "version": __version__,
+            "options": asked,
+            "decisions": self.decisions,
+            "bands": {name: sensor.centers_nm.tolist() for name, sensor in self.sensors.items()},
+            "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
+            "files": stamps,
+        }
 
 
 def make_plan(
@@ -136,6 +145,8 @@ def make_plan(
     said += _notes_on_pictures([view.cube for view in views])
     said += dict.fromkeys(note for view in views for note in view.cube.notes)
     opened = [file for file in references if file is not None]
+    texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
+    tables = filter(os.path.isfile, texts)
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
         units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
@@ -155,7 +166,7 @@ def make_plan(
         decisions,
         (*capture.notes, *said),
         (*capture.warnings, *warned, *_warnings_of_files(each)),
-        tuple(path for file in opened for path in file.files),
+        (*(path for file in opened for path in file.files), *map(Path, tables)),
     )
 
 

@@ -60,7 +60,9 @@ def test_each_view_of_a_tree_has_its_own_references(tmp_path, white, dark, folde
         assert stems(tmp_path / "flat") == expected
 
 
-def test_headers_named_after_the_whole_file_of_numbers_belong_to_views_references_and_pictures_alike(tmp_path):
+def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_picture(
+    tmp_path,
+):
     """Resonon writes x.bil and x.bil.hdr."""
     made = make_capture(tmp_path / "flat", views=2)
     write_tree(tmp_path / "tree")

@@ -88,7 +88,7 @@ def write_scene_files(
         "what_looks_wrong": findings,
         "measured": measured,
         "totals": {key: sum(view[key] for view in views) for key in totals},
-        "references": hashes(plan.reference_files),
+        "references": hashes(plan.option_files),
         "views": views,
     }
     _write_json(folder / RECORD_NAME, record)
