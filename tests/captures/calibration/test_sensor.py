@@ -78,6 +78,23 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
 
 
 @pytest.mark.parametrize(
+    ("wavelengths_nm", "dropped", "expected"),
+    [
+        ([500, 510, 520, 530, 540], [], [505, 525]),
+        ([500, 510, 520, 530, 540, 550, 560], [3], [505, 545]),
+        ([1320, 1330, 1340, 1460, 1470, 1480, 1490], [], [1325, 1465, 1485]),  # cut out of the file
+        ([500, 510, 510, 520, 530], [2], [505, 525]),  # of two bands of one wavelength the other is there
+        ([450, 550, 610, 790], [], [500, 700]),
+        ([500, 900], [], [700]),
+    ],
+)
+def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
+    choice = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")).without_rests(2)
+    np.testing.assert_allclose(choice.centers_nm(2), expected)
+    assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
+
+
+@pytest.mark.parametrize(
     ("top", "facts", "part", "value", "expected"),
     [
         (4095, {}, np.s_[:0], 0, 4095.0),

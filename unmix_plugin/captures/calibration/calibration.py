@@ -114,7 +114,7 @@ class Calibration:
     bands: np.ndarray
     """Indices of the kept bands in the file, in the order of the result."""
     bin_bands: int = 1
-    """Neighbouring kept bands that become one; what does not fill one at the end is left out."""
+    """Neighbouring kept bands that become one, of which there are whole multiples."""
     dark: Reference | None = None
     white: Reference | None = None
     saturation: float | None = None
@@ -196,8 +196,7 @@ class Calibration:
 
     def _in_bins(self, values: np.ndarray) -> np.ndarray:
         """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
-        used = values[..., : self.num_bands * self.bin_bands]
-        return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
+        return values.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
 # Pictures brought from the lens of their file into that of the scene, while they are written.

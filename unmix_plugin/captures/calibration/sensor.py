@@ -52,6 +52,8 @@ _MOST_SATURATED_WHITE = 0.5
 _NEAR_TOP, _MOST_CLIPPED = 0.99, 0.05
 """Share of the detector's end that means of lines reach where some are above it; share of a white reference's values at
 that end from which a band is left out."""
+_GAP = 3.0
+"""Between neighbouring bands, as a multiple of the steps beside it, from which bands are missing in the file itself."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 _BRIGHT_PERCENTILE = 99.9
@@ -80,9 +82,7 @@ class _BandChoice:
 
     def centers_nm(self, binning: int) -> Float64[np.ndarray, " c"]:
         """Wavelengths of the scene: means over binned bands."""
-        kept = self.wavelengths_nm[self.kept]
-        count = len(kept) // binning
-        return kept[: count * binning].reshape(count, binning).mean(axis=1)
+        return self.wavelengths_nm[self.kept].reshape(-1, binning).mean(axis=1)
 
     def without(self, marks: Bool[np.ndarray, " B"], reason: str) -> _BandChoice:
         """The choice without some more bands."""
@@ -95,6 +95,20 @@ class _BandChoice:
         first = left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]
         repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(left, first))
         return self.without(repeated, "an earlier band has the same wavelength")
+
+    def without_rests(self, binning: int) -> _BandChoice:
+        """The choice without bands that fill no bin up to the next gap: a bin across a gap would stand for light that
+        was not measured, such as that of bands in which air absorbs."""
+        kept = self.kept
+        own, others = self.wavelengths_nm[kept], self.wavelengths_nm[list(self.dropped)]
+        steps_nm, is_between = np.diff(own), (own[:-1, None] < others) & (others < own[1:, None])
+        around = np.pad(steps_nm, 1)
+        beside_nm = np.maximum(around[:-2], around[2:])
+        is_gap = is_between.any(axis=1) | ((steps_nm > _GAP * beside_nm) & (beside_nm > 0))
+        marks = np.zeros(len(self.wavelengths_nm), bool)
+        for run in np.split(kept, np.flatnonzero(is_gap) + 1):
+            marks[run[len(run) // binning * binning :]] = True
+        return self.without(marks, f"too few up to a gap or the end for --bin-bands {binning}")
 
     def require(self, binning: int, where: str) -> None:
         """Refuse to go on with fewer bands than are averaged into one. Raises CaptureError: so few are left."""
@@ -193,6 +207,7 @@ def prepare_sensor(
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
+    choice = choice.without_rests(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
     if lamp is not None:
@@ -453,5 +468,4 @@ def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B
 
 
 def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
-    count = values.shape[1] // binning
-    return values[:, : count * binning].reshape(len(values), count, binning).mean(axis=2)
+    return values.reshape(len(values), -1, binning).mean(axis=2)
