@@ -232,6 +232,56 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
 
 
+@pytest.mark.parametrize(
+    ("name", "top", "dtype", "header", "unit", "is_known"),
+    [
+        (
+            "leaf_{}",
+            10000,
+            np.uint16,
+            {"reflectance scale factor": 10000},
+            "reflectance, as header field",
+            True,
+        ),
+        ("REFLECTANCE_{}", 1, np.float32, {}, "reflectance, as the name REFLECTANCE_0 says", True),
+        (
+            "REFLECTANCE_{}",
+            100,
+            np.float32,
+            {},
+            "reflectance, as the name REFLECTANCE_0 says",
+            False,
+        ),  # per cent
+        (
+            "REFLECTANCE_{}",
+            4000,
+            np.uint16,
+            {},
+            "relative reflectance, as the name REFLECTANCE_0 says",
+            False,
+        ),
+        ("leaf_{}", 1, np.float32, {"data gain values": 0.5}, "stored numbers divided", False),
+        ("leaf_{}", 1, np.float32, {}, "relative radiance", False),
+    ],
+)
+def test_reflectances_that_files_hold_are_seen_in_flat_light_if_a_white_is_1(
+    tmp_path: Path, name, top, dtype, header, unit, is_known
+):
+    capture = make_capture(tmp_path / "capture")
+    for path in capture.root.glob("*.*"):
+        path.unlink()
+    names = [name.format(index) for index in range(len(capture.reflectance))]
+    for view, values in zip(names, capture.reflectance.values(), strict=True):
+        write_cube(capture.root, view, (values * top).astype(dtype), header=header)
+    write_poses(capture.root / "transforms.json", names)
+    scene, _ = made(tmp_path, capture)
+    assert f"values are {unit}" in (tmp_path / "scene" / "report.txt").read_text().replace("\n  ", " ")
+    assert (scene.illuminant is not None) == is_known
+    if is_known:
+        np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
+        np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"], atol=1e-3)
+
+
 def test_what_was_done_is_written_for_people(tmp_path: Path):
     _, findings = made(tmp_path, make_capture(tmp_path / "capture"), drop_bands="500-600")
     report = (tmp_path / "scene" / "report.txt").read_text()

@@ -27,6 +27,7 @@ from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.loader import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +134,7 @@ def test_a_panel_before_the_flight_makes_reflectances(tmp_path):
     scene = _process(tmp_path / "flight", tmp_path / "scene", tmp_path / "poses.json", **options)
     one = json.loads((scene / "process.json").read_text())["stored"]["calibrated_value_of_1"]
     assert not list((scene / "cubes").glob("*_9999_*"))
+    np.testing.assert_array_equal(load_scene(scene).illuminant, np.ones(len(LENSES)))
     for lens in LENSES:
         found = np.load(next((scene / "cubes").glob(f"*_0001_{lens.ending}.npy")))[..., 0] / 65535 * one
         expected = np.minimum(0.5 * image(1, lens) / PANEL_LIGHT[lens.ending], one)

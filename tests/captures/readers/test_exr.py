@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 
 from tests.captures.file_factory import check_file, rows_and_bands_of
+from unmix_plugin.captures.calibration.references import stated_reflectance
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
@@ -93,6 +94,8 @@ def test_one_of_several_layers_is_taken_or_named(tmp_path):
     check_file(open_spectral_file(tmp_path / "a.exr"), values=channels["S0.450,0nm"][..., None], warning=said)
     named = open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="T"))
     check_file(named, values=channels["T.450,0nm"][..., None])
+    assert stated_reflectance(named) == "the layer T"
+    assert stated_reflectance(open_spectral_file(tmp_path / "a.exr")) is None
     with pytest.raises(CaptureError, match="no layer, part or channel 'S3'"):
         open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="S3"))
 

@@ -36,8 +36,8 @@ _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
-_FINISHED = ("reflectance", "data gain", "data offset")
-"""In the evidence of gains that make reflectance or radiance of numbers."""
+_OF_REFLECTANCE, _OF_RADIANCE = ("reflectance", "l2scale"), ("data gain", "data offset")
+"""In the evidence of gains that make reflectance or radiance of numbers; l2scale is PRISMA's."""
 _REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
 """The word in names: REFLECTANCE_212, site/reflectance."""
 
@@ -47,22 +47,39 @@ def is_srgb(file: SpectralFile) -> bool:
     return file.metadata.get("encoding") == "sRGB"
 
 
+def stated_reflectance(file: SpectralFile, by_name: bool = True) -> str | None:
+    """Where a file says that its values are reflectances; None where it does not, or says what else they are.
+
+    Args:
+        by_name: Whether its name may say so.
+    Source: NV5, ENVI Header Files (`reflectance scale factor`); Fichet et al. 2021, spectral OpenEXR (layer `T`).
+    """
+    if is_srgb(file) or radiometric_model(file) is not None:
+        return None
+    evidence = "" if file.linear is None else file.linear.evidence
+    if any(word in evidence.lower() for word in _OF_REFLECTANCE):
+        return evidence
+    header = file.metadata.get("header")
+    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
+        return "header field 'reflectance scale factor'"
+    if file.reader == "exr" and (file.bands.names or ("",))[0].startswith("T."):
+        return "the layer T"
+    names = (file.path.stem, str(file.metadata.get("dataset", "")))
+    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
+    return None if named is None else f"the name {named}"
+
+
 def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
     """Where a file says that its values are reflectance or radiance, in which the exposure is accounted for; None where
     it does not. Software keeps the exposure time of the raw file in the header of such values.
 
     Args:
-        by_name: Whether its name may say so.
-    Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr), `reflectance scale factor`).
+        by_name: Whether its name may say that they are reflectance.
+    Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr)).
     """
-    if file.linear is not None and any(word in file.linear.evidence for word in _FINISHED):
-        return file.linear.evidence
-    header = file.metadata.get("header")
-    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
-        return "header field 'reflectance scale factor'"
-    names = (file.path.stem, str(file.metadata.get("dataset", "")))
-    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
-    return None if named is None else f"the name {named}"
+    evidence = "" if file.linear is None else file.linear.evidence
+    is_radiance = any(word in evidence for word in _OF_RADIANCE)
+    return evidence if is_radiance else stated_reflectance(file, by_name)
 
 
 def stated_values(

@@ -25,6 +25,7 @@ from unmix_plugin.captures.calibration.references import (
     find_missing,
     find_references,
     is_srgb,
+    stated_reflectance,
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
@@ -145,6 +146,8 @@ class Sensor:
 
     is_stated: bool = False
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
+    is_reflectance: bool = False
+    """Whether values are reflectances, of which 1 is a white: by a white reference, or as the files say."""
 
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
@@ -216,13 +219,16 @@ def prepare_sensor(
     # Floating-point numbers may have been brought to what stands for 1 already.
     has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
     linear = None if model is not None else first.linear
-    states_one = linear is not None and (linear.scale is not None or "reflectance" in linear.evidence)
+    states_one = linear is not None and linear.scale is not None
+    states_one |= has_one and stated_reflectance(first, by_name=False) is not None
+    said = [stated_reflectance(file) for file in files]
+    finished = said[0] if None not in said else None
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
     return Sensor(
         name,
         replace(calibration, bands=choice.kept, bin_bands=binning),
         choice,
-        "reflectance" if whites else _unit(first),
+        "reflectance" if whites else _unit(first, finished, has_one),
         bool(whites) or has_one,
         _binned(sample[0][:, still_kept], binning),
         evidence | _evidence(views, choice, (dark, white), own),
@@ -230,6 +236,7 @@ def prepare_sensor(
         (*exposures.notes, *noted),
         (*warnings, *exposures.warnings),
         bool(whites) or states_one,
+        bool(whites) or (has_one and finished is not None),
     )
 
 
@@ -264,9 +271,12 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
     return choice
 
 
-def _unit(file: SpectralFile) -> str:
+def _unit(file: SpectralFile, finished: str | None, has_one: bool) -> str:
+    """What values are without a white reference; `finished` is where all files say that they are reflectances."""
     if is_srgb(file):
         return "linear light of pictures in sRGB"
+    if finished is not None:
+        return f"{'' if has_one else 'relative '}reflectance, as {finished} says"
     model = radiometric_model(file)
     if model is not None:
         return model.description
