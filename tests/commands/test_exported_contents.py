@@ -124,6 +124,20 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exp
     assert min(picture_size(base.with_suffix(".png"))) > 300
 
 
+def test_a_pixel_without_a_valid_value_has_no_measured_spectrum(solid, tmp_path, monkeypatch):
+    valid = np.ones((16, 16), bool)
+    valid[9, 8] = False
+    monkeypatch.setattr("unmix_plugin.scenes.scene.Scene.valid_mask", lambda *_: valid)
+    common = ["spectrum", "--view", "eval_002", "--run", solid.run, "--output", tmp_path]
+    heads = {}
+    for pixel, is_said in (("8,8", False), ("8,9", True)):
+        said = " ".join(done(export, *common, "--pixel", pixel).out.split())
+        assert ("no valid value in that pixel, or its mask leaves it out: no measured" in said) is is_said
+        file = tmp_path / f"eval_002_x8_y{pixel[-1]}.csv"
+        heads[pixel] = file.read_text().splitlines()[0].split(",")
+    assert heads["8,8"] == [*heads["8,9"], "measured"]
+
+
 def test_a_place_has_mean_and_spread_of_what_the_views_measured_that_see_it(solid, tmp_path, monkeypatch):
     place = ["spectrum", "--view", 0, "--pixel", "8,8"]
     words = [*place, "--run", solid.run, "--output", tmp_path, "--overwrite"]

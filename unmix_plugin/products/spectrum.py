@@ -124,6 +124,9 @@ def _measured(
     if index is None:
         job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
         return None
+    if not scene.valid_mask(index)[pixel[1], pixel[0]]:
+        job.say(f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum")
+        return None
     return _read_pixel(job, scene, index, *pixel)
 
 

@@ -190,7 +190,7 @@ class ProbePanel:
             [
                 ("material", shown.name),
                 ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
-                ("measured in", shown.measured_in or "no training view at hand sees the point"),
+                ("measured in", shown.measured_in or "no training view at hand measured the point"),
                 *likeness_rows(self._session.services.library, shown.predicted, shown.materials),
             ]
         )
