@@ -276,7 +276,7 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         "world_position": None if position is None else position.tolist(),
         "opacity": probe.opacity,
         "measured_in_views": None if place.over_views is None else len(place.over_views),
-        "material": max(shares, key=lambda name: shares[name]) if is_something else None,
+        "material": materials.name_of(probe.spectra["predicted"], probe.abundances) if is_something else None,
         "abundances": shares,
         "library": [match_json(shown.match) for shown in place.matches],
     }

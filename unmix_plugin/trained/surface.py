@@ -25,7 +25,7 @@ from unmix_plugin.errors import ConfigError
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
-from unmix_plugin.spectral.segmentation import material_ids, material_scores
+from unmix_plugin.spectral.segmentation import material_ids
 from unmix_plugin.trained.measures import Scale, describe_scale
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -296,9 +296,7 @@ class SurfaceAppearance:
     @property
     def material_ids(self) -> UInt8[np.ndarray, " P"]:
         """Material of each point, chosen as in segmentations."""
-        by_angle = self.materials.segmentation == "probe"
-        endmembers = self.materials.endmembers.detach().cpu()
-        scores = material_scores(self.diffuse, endmembers) if by_angle else self.abundances
+        scores = self.materials.scores_of(self.diffuse, self.abundances)
         return material_ids(scores, torch.ones(len(scores))).numpy()
 
     @property

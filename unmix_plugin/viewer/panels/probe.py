@@ -56,8 +56,8 @@ class _ProbedPoint:
 
     @property
     def name(self) -> str:
-        """Of the endmember of the largest share."""
-        return self.materials.names[int(self.abundances.argmax())]
+        """Of its material, chosen as in segmentations."""
+        return self.materials.name_of(self.predicted, self.abundances)
 
 
 def _probe_through(
