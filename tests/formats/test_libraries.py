@@ -268,3 +268,15 @@ def test_a_folder_stands_for_the_libraries_in_it_whatever_the_suffix_of_their_nu
     infrared = written(tmp_path, "ir.csv", "wavelength,clay\n1000,1\n1500,3\n2500,4\n")
     with pytest.raises(SpectrumError, match=r"from 1000 to 2500 nm, can.t be compared: each covers"):
         library_of([infrared], Bands.of(np.linspace(400, 700, 31)))
+
+
+def test_a_library_is_refused_where_it_covers_too_little_of_what_is_lit(tmp_path):
+    red, bands = (
+        written(tmp_path, "red.csv", "wavelength,clay\n600,1\n700,3\n"),
+        Bands.of(range(400, 710, 10)),
+    )
+    lights = {start: (bands.centers_nm >= start) * 1.0 for start in (400, 550, 690)}
+    assert library_of([red], bands, lights[550]).names == ("clay",)
+    for light in (None, lights[400], lights[690]):  # 11 of 31 bands, and 2 of 2
+        with pytest.raises(SpectrumError, match=r"less than half of 31 bands, 400-700 nm, .* without light"):
+            library_of([red], bands, light)

@@ -89,7 +89,7 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
             "give a pixel with --view and --pixel, a point with --point, or a region with --region"
         )
     light, matches = job.scene.light_power, []
-    known = library_of(asked.library, job.materials.bands)
+    known = library_of(asked.library, job.materials.bands, light)
     if not job.materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
@@ -125,7 +125,9 @@ def _measured(
         job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
         return None
     if not scene.valid_mask(index)[pixel[1], pixel[0]]:
-        job.say(f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum")
+        job.say(
+            f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum"
+        )
         return None
     return _read_pixel(job, scene, index, *pixel)
 
