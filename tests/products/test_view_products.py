@@ -67,6 +67,11 @@ def test_every_format_of_abundances_holds_the_same_float32_shares_by_their_names
     channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
     for index, name in enumerate(("oak, old", "v1_2", "löss")):
         np.testing.assert_array_equal(channels[f"abundances.{name}"].pixels, expected[..., index])
+    alike = replace(MATERIALS, names=("v1.2", "v1_2", "V1.2"))
+    abundances._write_view(["exr"], tmp_path, NAME, VIEW, alike)
+    channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
+    for index, name in enumerate(("v1_2", "v1_2_1", "V1_2_2")):
+        np.testing.assert_array_equal(channels[f"abundances.{name}"].pixels, expected[..., index])
 
 
 def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):

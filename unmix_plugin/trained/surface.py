@@ -22,6 +22,7 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
@@ -325,13 +326,10 @@ class SurfaceAppearance:
 
 
 def property_names(names: tuple[str, ...]) -> list[str]:
-    """Names of abundances as formats without spaces take them, all different.
+    """Names of abundances as formats without spaces take them, all different even without capitals.
 
     >>> property_names(("red clay", "red-clay", "leaf"))
     ['abundance_red_clay', 'abundance_red_clay_1', 'abundance_leaf']
     """
-    plain: list[str] = []
-    for index, name in enumerate(names):
-        short = "abundance_" + (re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or str(index))
-        plain.append(f"{short}_{index}" if short in plain else short)
-    return plain
+    plain = [re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or str(index) for index, name in enumerate(names)]
+    return numbered_apart(f"abundance_{name}" for name in plain)
