@@ -177,7 +177,8 @@ def _materials(
 _CSV_HEAD = re.compile(
     r"(?:wave ?length|wl|lambda)s?[\s_]*[\[(]?\s*(?:in )?([^\])]*?)\s*[\])]?", re.IGNORECASE
 )
-_PERCENT = re.compile(r"[\s_]*[\[(](?:%|percent|per cent)[\])]\s*$", re.IGNORECASE)
+_PERCENT = re.compile(r"(?:[\s_]*[\[(](?:%|percent|per cent)[\])]|(?<![\d\s_])[\s_]*%)\s*$", re.IGNORECASE)
+"""`paint (%)`, `paint %`; `clay 20 %` is a name."""
 
 
 def _read_csv(path: Path) -> _Table:

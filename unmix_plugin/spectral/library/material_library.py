@@ -73,8 +73,23 @@ _FEWEST_BANDS = 3
 _LEAST_OVERLAP = 0.5
 """Part of a spectrum's bands with light that a material must cover to be compared with it."""
 
+_GREATEST_REFLECTANCE = 2.0
+"""Values above it are not reflectances; glossy and fluorescent surfaces exceed 1."""
+
 DARK_LIGHT = 1e-3
 """Light at a band, relative to its greatest, below which nothing is known of the reflectance there."""
+
+
+def require_reflectance(values: Float[np.ndarray, " B"], what: str) -> None:
+    """Refuse percent and the like where the unit counts.
+
+    Raises:
+        SpectrumError: a value exceeds all that reflectances have.
+    """
+    if values.max() > _GREATEST_REFLECTANCE:
+        raise SpectrumError(
+            f"{what} must be in reflectances, 1 for white; found {values.max():g} (divide percent by 100)"
+        )
 
 
 @dataclass(frozen=True)
