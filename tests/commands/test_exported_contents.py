@@ -20,6 +20,7 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measures import keep_region
@@ -226,6 +227,19 @@ def test_a_report_shows_the_regions_that_are_kept_and_says_which_it_cannot(solid
     assert (len(shares), sum(shares)) == (len(names), pytest.approx(1, abs=0.01))
     assert "Not shown: the region far away has nothing of the surface in it" in page
     assert "far away" not in section
+
+
+def test_libraries_of_regions_say_what_their_spectra_are(solid_copy):
+    keep_region(RunFolder(solid_copy), "all of it", Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
+    done(export, *words("regions", "--run", solid_copy))
+    done(export, "spectrum", "--region", "all of it", "--run", solid_copy, "--device", "cpu")
+    quantity = load_run(solid_copy, "cpu").materials_scene.materials.quantity
+    for file, about in (
+        ("regions/regions.hdr", "mean spectra of regions"),
+        ("spectrum/region_all of it.hdr", "mean spectrum"),
+    ):
+        header = read_header(solid_copy / "exports" / file)
+        assert header["description"].strip() == f"{about}: {quantity}, 1 = full scale"
 
 
 def test_a_report_quotes_the_figures_that_eval_found_and_links_to_the_page(solid_copy, tmp_path, monkeypatch):

@@ -101,7 +101,8 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
     written = _write_spectrum(job.folder, name, probed, job.scene)
     if spread is not None:
         mean = probe.spectra["predicted"][None].astype(np.float32)
-        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), "mean spectrum")
+        about = f"mean spectrum: {job.materials.quantity}, 1 = full scale"
+        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), about)
     return written
 
 
