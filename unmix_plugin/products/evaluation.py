@@ -168,8 +168,10 @@ def evaluate_scene(
         ids = {index: found for _, part in parts for index, found in part.items()}
     matching = evaluation.segmentation().matching
     for index in follow("drawing segmentations", list(ids)):
-        name = measured.frames[index].name
-        drawn = _draw_matched_segmentation(name, measured.labels(index), ids[index], look, matching)
+        name, labels = measured.frames[index].name, measured.labels(index)
+        if labels is not None:
+            labels = np.where(measured.valid_mask(index), labels, np.uint8(NOTHING_ID))
+        drawn = _draw_matched_segmentation(name, labels, ids[index], look, matching)
         write_file(folder / "segmentation" / f"{name}.png", drawn)
     more: dict[str, Any] = {"definitions": DEFINITIONS}
     per_sensor = {name: finite_or_none(found) for name, found in evaluation.per_sensor().items()}
@@ -227,11 +229,12 @@ def _draw_colour(view: ViewTruth, predicted: PredictedView, bands: Bands, psnr_d
     """True colour, predicted colour, and their difference; in false colours for sensors without all bands."""
     weights, spectra = view.colour_weights(bands), view.shown(predicted)
     error = np.abs(_srgb_on_black(spectra, weights) - _srgb_on_black(view.spectra, weights)).mean(axis=-1)
-    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage))
+    seen = np.maximum(as_numpy(view.opacity), as_numpy(predicted.coverage)) > 0.01
+    counted = (seen & view.valid.numpy()).astype(np.float64)
     panels = [
         TitledPicture(coloured_picture(view.spectra, view.opacity, weights), "true"),
         TitledPicture(coloured_picture(spectra, predicted.coverage, weights), "predicted"),
-        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), (seen > 0.01).astype(np.float64)), "error"),
+        TitledPicture(over_neutral(paint(error, _ERROR_SCALE), counted), "error"),
     ]
     colours = describe_colour(bands).split(":")[0] if view.sensor is None else f"seen by {view.sensor.name}"
     heading = f"{view.name}: {colours}, spectral PSNR {psnr_db:.1f} dB"
@@ -258,7 +261,7 @@ def _draw_matched_segmentation(
         true = TitledPicture(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
         panels = [true, *panels, TitledPicture(agreement, "disagreement")]
         seen |= set(np.unique(labels).tolist())
-        extra = [("right", RIGHT), ("wrong", WRONG), ("unlabelled", (NEUTRAL,) * 3)]
+        extra = [("right", RIGHT), ("wrong", WRONG), ("not counted", (NEUTRAL,) * 3)]
     true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
     surplus = [
         (name, colours[index])

@@ -217,6 +217,13 @@ class ViewTruth:
         opaque = self.opacity > _OPAQUE_ALPHA
         return self.valid & (opaque if self.labels is None else opaque | (self.labels != NOTHING_ID))
 
+    @property
+    def counted_labels(self) -> UInt8[Tensor, "H W"] | None:
+        """Labels, 255 also in pixels that don't count."""
+        if self.labels is None:
+            return None
+        return torch.where(self.valid, self.labels, torch.full_like(self.labels, NOTHING_ID))
+
     def in_light(self, factors: Float[np.ndarray, " B"] | None) -> ViewTruth:
         """The view as the same sensor would have measured it in another light; itself where `factors` are None."""
         if factors is None:
@@ -311,9 +318,8 @@ class Evaluation:
             else math.nan,
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
-        if self._tally is not None and view.labels is not None:
-            counted = torch.where(view.valid, view.labels, torch.full_like(view.labels, NOTHING_ID))
-            self._tally.add(predicted.segmentation, counted)
+        if self._tally is not None and (labels := view.counted_labels) is not None:
+            self._tally.add(predicted.segmentation, labels)
         self.per_view[view.name] = figures
         centers = torch.tensor(self.truth.bands.centers_nm)
         measured, error = (

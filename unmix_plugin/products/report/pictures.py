@@ -340,7 +340,7 @@ class ReportViews:
             self.shown.append(_ShownView(name, predicted, ids, shares=shares))
             return
         figures = self.evaluation.add(truth, view)
-        labels = None if truth.labels is None else truth.labels.numpy()
+        labels = None if truth.counted_labels is None else truth.counted_labels.numpy()
         measured = eight_bits(picture(truth.spectra, truth.opacity, self.materials.bands))
         error = self._count_error(view, truth)
         shown = _ShownView(name, predicted, ids, measured, error, labels, figures["psnr"], shares)
@@ -380,4 +380,4 @@ class ReportViews:
         self._pixels += int(matter.sum())
         painted = paint(np.sqrt((difference**2).mean(axis=-1)), ERROR_SCALE)
         seen = np.maximum(as_numpy(view.coverage), as_numpy(truth.opacity)) > 0.01
-        return eight_bits(over_neutral(painted, seen.astype(np.float64)))
+        return eight_bits(over_neutral(painted, (seen & truth.valid.numpy()).astype(np.float64)))
