@@ -48,7 +48,7 @@ def test_the_material_of_a_probe_is_that_of_the_segmentation(source, camera, met
         scene = replace(scene, materials=replace(scene.materials, segmentation=method))
         ids = scene.look(camera)["segmentation"]
         for row, column in (ids < 255).nonzero()[::300].tolist():
-            name = _probe_through(scene, camera, column, row, 1).name
+            name = _probe_through(scene, camera, column + 0.5, row + 0.5, 1).name
             assert name == scene.materials.names[int(ids[row, column])]
 
 
