@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
-    exposure_of,
     find_missing,
     refuse_outside,
     stated_values,

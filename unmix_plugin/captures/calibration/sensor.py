@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.exposures import Exposures, compare_exposures
 from unmix_plugin.captures.calibration.references import (
-    Exposures,
     Reference,
     References,
-    compare_exposures,
     find_missing,
     find_references,
     is_srgb,

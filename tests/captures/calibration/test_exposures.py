@@ -16,7 +16,7 @@ from tests.captures.capture_factory import (
     write_poses,
 )
 from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.references import compare_exposures, exposure_of
+from unmix_plugin.captures.calibration.exposures import compare_exposures, exposure_of
 from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.spectral_file import Linear
 
