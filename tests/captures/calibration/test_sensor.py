@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
+from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import _open_reference as open_reference
+from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
 from unmix_plugin.captures.calibration.sensor import (
     _BandChoice,
     _clipped_bands,
@@ -15,6 +17,7 @@ from unmix_plugin.captures.calibration.sensor import (
     _noise_shares,
     sampled_rows,
 )
+from unmix_plugin.captures.spectral_file import Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -119,3 +122,31 @@ def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
     white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
     assert not _clipped_bands(white, 65535.0).any()
+
+
+BLOWN = np.array([False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("facts", "top", "dtype", "saturation"),
+    [
+        ({}, 4095, np.uint16, 4095.0),
+        ({}, 4095, np.uint16, 65535.0),  # which no posed view tells
+        ({"linear": Linear(np.full(3, 1e-4), np.zeros(3), "a header")}, 4095, np.uint16, 4095.0),
+        ({"metadata": {"encoding": "sRGB"}}, 255, np.uint8, 255.0),
+        ({"metadata": {"xmp": MICASENSE, "exif": EXIF}}, 65520, np.uint16, 65520.0),
+    ],
+)
+def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, saturation):
+    """Whatever values are made of these, and whether it is a file of its own or a part of a view."""
+    noisy = GENERATOR.normal(0.8 * top, 0.03 * top, (40, 20, 3))
+    noisy[..., BLOWN] *= 1.8
+    counts = np.rint(noisy.clip(0, top)).astype(dtype)
+    view = np.full((60, 50, 3), top // 3, dtype)
+    view[7:47, 9:29] = counts
+    whites = [
+        open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts)),
+        panel_reference(file_of(view, **facts), (7, 9, 40, 20), "a view"),
+    ]
+    for white in whites:
+        np.testing.assert_array_equal(_clipped_bands(white, saturation), BLOWN)

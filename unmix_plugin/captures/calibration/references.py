@@ -125,16 +125,8 @@ class Reference:
     """Of a white panel at every band of the file, above 0."""
     dark: Reference | None = None
     """Of a white panel: the dark frame that was taken for it alone, in place of that of the views."""
-    is_view: bool = False
-    """Whether the file is a view that shows it."""
-
-    @property
-    def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
-        """The mean in numbers as the file stores them."""
-        linear = self.file.linear
-        if linear is None or is_srgb(self.file):
-            return self.mean.astype(np.float64)
-        return (self.mean - linear.offsets) / linear.gains
+    rectangle: tuple[int, int, int, int] | None = None
+    """First row and column, height and width of the part of a view that shows it; None for a file of its own."""
 
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
@@ -211,7 +203,7 @@ def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], v
         raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
     mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
-    return Reference(cube, "white reference", mean, False, how, is_view=True)
+    return Reference(cube, "white reference", mean, False, how, rectangle=rectangle)
 
 
 def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:

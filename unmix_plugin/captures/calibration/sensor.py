@@ -393,18 +393,29 @@ def _lit_bands(
 def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarray, " B"]:
     """Bands in which a white reference is at the end of the detector, where reflectances would come out too high.
 
-    A file of its own may reach that end where no view does, and then shows it by many values that are exactly there.
+    It may reach that end where no posed view does, and then shows it by many numbers that are exactly there. Columns
+    count by their means, too: software that averages lines leaves none exactly there.
     """
+    file, nowhere = white.file, np.zeros(white.file.shape[2], bool)
     if saturation is None:
-        return np.zeros(white.file.shape[2], bool)
-    is_clipped = (white.stored_mean >= _NEAR_TOP * saturation).mean(axis=(0, 1)) > _MOST_CLIPPED
-    if white.is_view or white.file.dtype.kind not in "iu":
-        return is_clipped
-    stored = np.concatenate([_stored_pixels(white.file, row) for row in sampled_rows(white.file.shape[0])])
-    if not len(stored):
-        return is_clipped
-    ends = [2**bits - 1 for bits in _DETECTOR_BITS if 2**bits - 1 == stored.max()]
-    return is_clipped | (np.isin(stored, ends).mean(axis=0) > _MOST_CLIPPED)
+        return nowhere
+    top, left, height, width = white.rectangle or (0, 0, *file.shape[:2])
+    columns, read, measured = slice(left, left + width), [], []
+    for row in sampled_rows(height):
+        line = slice(top + row, top + row + 1)
+        numbers = file.read(line)
+        read.append(numbers[:, columns])
+        measured.append(~find_missing(numbers, file, line)[:, columns])
+    known = np.concatenate(measured)
+    if not known.any():
+        return nowhere
+    lines = np.where(known[..., None], np.concatenate(read), 0)
+    stored, end = lines[known], saturation
+    if file.dtype.kind in "iu" and stored.max() in {2**bits - 1 for bits in _DETECTOR_BITS}:
+        end = min(end, float(stored.max()))
+    means = lines.sum(axis=0, dtype=np.float64) / np.maximum(known.sum(axis=0), 1)[:, None]
+    is_near = (means >= _NEAR_TOP * saturation).mean(axis=0) > _MOST_CLIPPED
+    return is_near | ((stored >= end).mean(axis=0) > _MOST_CLIPPED)
 
 
 _Sample: TypeAlias = tuple[Float32[np.ndarray, "N B"], Bool[np.ndarray, "N B"]]
