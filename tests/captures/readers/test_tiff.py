@@ -180,6 +180,14 @@ SAID = [
     ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
     ({"extratags": gdal(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
     ({"extratags": gdal(items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
+    (
+        {"extratags": gdal(items("gain", [4] * 6), '<Item name="exposure_ms">10</Item>')},
+        {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None},  # not of the camera, too
+    ),
+    (
+        {"extratags": gdal(GAIN, items("SCALE", [3] * 6, ' role="scale"'), '<Item name="tint">10</Item>')},
+        {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0},
+    ),
 ]
 
 
