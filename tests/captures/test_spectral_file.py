@@ -41,6 +41,22 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("second", "exposures"),
+    [
+        ({"exposure_s": 0.1, "gain": 1.0}, 0.1),
+        ({"exposure_s": 0.1, "gain": 4.0}, [0.1, 0.4]),  # though the times are equal
+        ({"exposure_s": 0.2}, [0.1, 0.2]),
+        ({"exposure_s": 0.1, "gain": [1.0, 4.0]}, None),
+        ({}, None),
+    ],
+)
+def test_a_stack_has_the_exposure_of_each_band_or_none(tmp_path, second, exposures):
+    parts = [part(tmp_path, 1, exposure_s=0.1, gain=1.0), part(tmp_path, 2, **second)]
+    found = stack_bands(parts, tmp_path).metadata
+    assert (found.get("exposure_s"), found.get("gain", 1.0)) == (exposures, 1.0)
+
+
+@pytest.mark.parametrize(
     ("error", "message"),
     [
         (RuntimeError("no luck\nat all"), r"a: can't be read \(RuntimeError: no luck at all\)"),

@@ -392,11 +392,11 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     if "header" not in same and len(headers) == len(parts):
         shared = set.intersection(*(set(header.items()) for header in headers))
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
-    exposed = [part.metadata.get("exposure_s") for part in parts]
-    if "exposure_s" not in same and all(isinstance(time, float) for time in exposed):
-        gains = [part.metadata.get("gain", 1.0) for part in parts]
-        same = {key: value for key, value in same.items() if key != "gain"}
-        same["exposure_s"] = [time * gain for time, gain in zip(exposed, gains, strict=True)]
+    exposed = [(part.metadata.get("exposure_s"), part.metadata.get("gain", 1.0)) for part in parts]
+    if len(set(map(repr, exposed))) > 1:
+        same = {key: value for key, value in same.items() if key not in ("exposure_s", "gain")}
+        if all(isinstance(number, float) for pair in exposed for number in pair):
+            same["exposure_s"] = [time * gain for time, gain in exposed]
     return replace(
         first,
         path=path,
