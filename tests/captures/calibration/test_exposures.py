@@ -53,6 +53,35 @@ def test_gains_are_factors_or_decibels_and_what_is_not_understood_is_said():
     assert not facts.keys() & {"exposure_s", "gain"}
 
 
+@pytest.mark.parametrize(
+    ("entries", "gain"),
+    [
+        ({"analog gain": "2", "digital gain": "4"}, 8.0),
+        ({"digital gain": "4", "analog gain": "2"}, 8.0),
+        ({"analog gain": "6.0206 dB", "digital gain": "{1, 2, 3}"}, [2.0, 4.0, 6.0]),
+        ({"digital gain": "4", "gain": "2", "analog gain": "8"}, 2.0),  # the whole
+        ({"analogue gain": "2"}, 2.0),
+        ({"analog gain": "{1, 2}", "digital gain": "{1, 2, 3}"}, None),
+    ],
+)
+def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_whole(entries, gain):
+    facts, warnings = exposure_facts(entries, "header field")
+    assert facts.get("gain") == (pytest.approx(gain, rel=1e-4) if gain else None)
+    assert len(warnings) == (gain is None)
+
+
+@pytest.mark.parametrize(
+    ("stated", "factor"), [("0.0", 1.0), ("6.0206", 2.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)]
+)
+def test_gains_of_resonon_are_decibels(stated, factor):
+    """Told by the names beside them, and of no other camera."""
+    facts, warnings = exposure_facts({"shutter": "20.0", "gain": stated, "framerate": "40.0"}, "header field")
+    assert (facts["exposure_s"], facts["gain"]) == (0.02, pytest.approx(factor, rel=1e-4))
+    assert not warnings
+    assert "no unit" not in facts["gain_evidence"]
+    assert exposure_facts({"shutter": "20.0", "gain": "6"}, "header field")[0]["gain"] == 6
+
+
 def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as milliseconds"):
     return file_of(
         np.ones((2, 2, 3), np.uint16),
