@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values, stack_bands
 from unmix_plugin.errors import CaptureError
 
@@ -54,6 +55,17 @@ def test_a_stack_has_the_exposure_of_each_band_or_none(tmp_path, second, exposur
     parts = [part(tmp_path, 1, exposure_s=0.1, gain=1.0), part(tmp_path, 2, **second)]
     found = stack_bands(parts, tmp_path).metadata
     assert (found.get("exposure_s"), found.get("gain", 1.0)) == (exposures, 1.0)
+
+
+def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
+    def exposure(*apertures):
+        facts = [{"exposure_s": 0.1} | ({"f_number": f} if f else {}) for f in apertures]
+        stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
+        return exposure_of(stack)
+
+    np.testing.assert_allclose(exposure(2.0, 4.0), [0.1 / 4, 0.1 / 16])
+    np.testing.assert_allclose(exposure(2.0, 2.0), [0.1 / 4])
+    assert exposure(2.0, None) is exposure(None, 2.0) is None
 
 
 @pytest.mark.parametrize(

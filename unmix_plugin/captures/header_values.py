@@ -479,11 +479,17 @@ def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
     return None if unit or not number >= 0 else (number or 1.0, False)
 
 
-def exif_exposure(time_s: Any, iso_speed: Any) -> dict[str, Any]:
-    """The same metadata by EXIF's exposure time and speed; none without a time above 0."""
+def exif_exposure(time_s: Any, iso_speed: Any, f_number: Any) -> dict[str, Any]:
+    """The same metadata, and `f_number`, by EXIF's exposure time, speed and f-number; none without a time above 0."""
     try:
-        time_s, speed = float(time_s or 0), float(iso_speed or 0)
+        time_s, speed, f_number = (float(value or 0) for value in (time_s, iso_speed, f_number))
     except (TypeError, ValueError, ZeroDivisionError):
         return {}
-    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"} if time_s > 0 else {}
-    return facts | ({"gain": speed / 100} if facts and speed > 0 else {})
+    if not time_s > 0:
+        return {}
+    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"}
+    return (
+        facts
+        | ({"gain": speed / 100} if speed > 0 else {})
+        | ({"f_number": f_number} if f_number > 0 else {})
+    )

@@ -118,6 +118,29 @@ def test_what_may_be_wrong_with_exposures_is_said():
     assert "have no unit in some files" in warnings(views, [other], [])
 
 
+def test_the_aperture_counts_for_light_and_not_for_dark_current():
+    def taken(time, f_number):
+        return replace(exposed(time), metadata={"exposure_s": time, "f_number": f_number})
+
+    views = [taken(0.01, 4.0), taken(0.02, 4.0 * 2**0.5), taken(0.04, 8.0)]  # the same light
+    found = compare_exposures(views, [], [], False)
+    np.testing.assert_allclose(found.common, [0.01 / 16])
+    same = exposure_of(views[0])
+    for view in views:
+        np.testing.assert_allclose(exposure_of(view), same)
+    brighter = compare_exposures([*views, taken(0.01, 2.0)], [], [(taken(0.01, 16.0), views[0])], False)
+    assert "s times gain over the square of the f-number: each is brought to" in brighter.notes[0]
+    assert brighter.warnings == ()
+    assert "dark frame was exposed 0.04" in " ".join(
+        compare_exposures(views[:1], [], [(taken(0.04, 8.0), views[0])], False).warnings
+    )
+    (warning,) = compare_exposures([*views, exposed(0.01)], [], [], False).warnings
+    assert (
+        "the f-number of the lens is known of some files and not of memory.npy: exposures are not" in warning
+    )
+    assert compare_exposures(views, [exposed(0.01)], [], False).common is None
+
+
 def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
     made = make_capture(tmp_path / "capture")
     name = "view_01"

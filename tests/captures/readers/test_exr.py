@@ -133,12 +133,12 @@ def test_damaged_numbers_are_reported_in_the_error_alone(tmp_path, capsys):
 
 def test_a_window_is_put_where_it_belongs_and_the_rest_is_missing(tmp_path):
     inside = (slice(2, 7), slice(3, 11))
-    header = head(window=(3, 2, 10, 6)) | {"expTime": 0.25, "isoSpeed": 200.0}
+    header = head(window=(3, 2, 10, 6)) | {"expTime": 0.25, "isoSpeed": 200.0, "aperture": 2.5}
     file = opened(tmp_path / "a.exr", header, channels(CUBE[inside]))
     expected = np.full(CUBE.shape, np.nan, np.float32)
     expected[inside] = CUBE[inside]
     rows_and_bands_of(file, expected)
-    check_file(file, exposure_s=0.25, gain=2.0)
+    check_file(file, exposure_s=0.25, gain=2.0, f_number=2.5)
 
 
 def test_what_is_rendered_beyond_the_picture_is_cut_off(tmp_path):

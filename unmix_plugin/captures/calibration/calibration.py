@@ -120,7 +120,7 @@ class Calibration:
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     exposure: Float64[np.ndarray, " b"] | None = None
-    """Exposure time times gain that values are brought to, one number or one a band of the file: that of the white
+    """Exposure (see `exposure_of`) that values are brought to, one number or one a band of the file: that of the white
     reference, otherwise of the first view; None where exposures are not compared."""
     own: Mapping[Path, References] = field(default_factory=dict)
     """Dark and white of single views, by the path of their cube; they go before the common ones."""

@@ -16,11 +16,18 @@ from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import counted, name_some
 
 
-def exposure_of(file: SpectralFile) -> Float64[np.ndarray, " b"] | None:
-    """Exposure time times gain, one number or one a band; None where the file does not say the time."""
+def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
+    """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
+    where the file does not say the time.
+
+    Args:
+        to_light: Whether the aperture counts, which lets in light but no dark current.
+    """
     time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
+    f_number = file.metadata.get("f_number", 1.0) if to_light else 1.0
     try:
-        exposure = np.atleast_1d(np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64))
+        exposure = np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64)
+        exposure = np.atleast_1d(exposure / f_number**2)
     except (TypeError, ValueError):
         return None
     is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
@@ -32,7 +39,7 @@ class Exposures:
     """What becomes of the exposures of views and references."""
 
     common: Float64[np.ndarray, " b"] | None = None
-    """Exposure time times gain that all are brought to, one number or one a band; None where they are not compared."""
+    """What all are brought to (see `exposure_of`), one number or one a band; None where exposures are not compared."""
     notes: tuple[str, ...] = ()
     """What was done."""
     warnings: tuple[str, ...] = ()
@@ -60,12 +67,15 @@ def compare_exposures(
         for files in (views, whites)
     )
     differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
+    apertures = {"f_number" in file.metadata for file in (*views, *whites) if exposure_of(file) is not None}
+    unit = "s times gain over the square of the f-number" if True in apertures else "s times gain"
+    taken = f"were exposed {_in_words(known)} {unit}" if known else ""
     finished = [finished_by(file, by_name=not whites) for file in views]
     if None not in finished and not is_bent:
         if not differs:
             return Exposures()
         kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
-        return Exposures(notes=(f"views were exposed {_in_words(known)} s times gain: {kept}",))
+        return Exposures(notes=(f"views {taken}: {kept}",))
     warnings, misfits = _missing_units([*views, *whites]), _misfits(views, whites)
     warnings += misfits
     if len(known) < len(views):
@@ -74,7 +84,12 @@ def compare_exposures(
         )
         is_partial = bool(known or of_whites) and not misfits
         return Exposures(warnings=(*warnings, missing) if is_partial else tuple(warnings))
-    taken = f"were exposed {_in_words(known)} s times gain"
+    if len(apertures) > 1:
+        lacking = [file.path.name for file in (*views, *whites) if "f_number" not in file.metadata]
+        unknown = f"the f-number of the lens is known of some files and not of {name_some(lacking)}"
+        return Exposures(
+            warnings=(*warnings, f"{unknown}: exposures are not compared; write it into all, or none")
+        )
     if is_bent:
         bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
         return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
@@ -88,7 +103,7 @@ def compare_exposures(
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
         )
-    pairs = [(exposure_of(dark), exposure_of(other)) for dark, other in darks]
+    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
     unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
     if unlike:
         of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))

@@ -455,9 +455,10 @@ def _exposure(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Time and gain out of EXIF or of items of GDAL that values are not multiplied by, and warnings."""
     applied = "" if linear is None else linear.evidence
-    exif = tags["exif"]
-    facts = exif_exposure(exif.get("ExposureTime"), exif.get("ISOSpeedRatings", exif.get("ISOSpeed")))
-    if facts:
+    exif = {item.name: item.value.strip("()") for item in items}  # GDAL copies them, numbers in brackets
+    exif |= {f"exif_{name.lower()}": value for name, value in tags["exif"].items()}
+    speed = exif.get("exif_isospeedratings", exif.get("exif_isospeed"))
+    if facts := exif_exposure(exif.get("exif_exposuretime"), speed, exif.get("exif_fnumber")):
         return facts, ()
     texts: dict[str, Any] = defaultdict(list)
     for item in (item for item in items if f"'{item.name}'" not in applied):
