@@ -14,7 +14,13 @@ from jaxtyping import Float32
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.references import is_srgb
-from unmix_plugin.captures.calibration.sensor import Sensor, choose_scale, prepare_sensor, sampled_rows
+from unmix_plugin.captures.calibration.sensor import (
+    Sensor,
+    choose_scale,
+    prepare_sensor,
+    sampled_rows,
+    with_one_exposure,
+)
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
@@ -107,6 +113,7 @@ def make_plan(
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
         sensors[name] = prepare_sensor(name, same, options, references, every)
+    sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = _choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
