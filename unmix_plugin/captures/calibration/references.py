@@ -368,8 +368,9 @@ def _panel_in_view(
 
 
 def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> SpectralFile | None:
-    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw."""
-    return beside or (None if finished_by(file) else file.dark)
+    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw: whole ones are,
+    whatever their name (reflectance_target), as dark lines of what was brought to reflectance are near 0."""
+    return beside or (None if finished_by(file, by_name=file.dtype.kind == "f") else file.dark)
 
 
 def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:
