@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,9 +17,12 @@ from unmix_plugin.captures.calibration.sensor import (
     _drop_found,
     _find_saturation,
     _noise_shares,
+    prepare_sensor,
     sampled_rows,
+    with_one_exposure,
 )
-from unmix_plugin.captures.spectral_file import Linear
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.spectral_file import CaptureView, Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -150,3 +155,30 @@ def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, satu
     ]
     for white in whites:
         np.testing.assert_array_equal(_clipped_bands(white, saturation), BLOWN)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale", "facts", "said"),
+    [
+        (np.uint16, 3000.0, {}, "each is brought to that of the first view, 0.01"),
+        (np.float32, 0.3, {}, "values are not divided by that, as they are at most about 1"),
+        (np.uint8, 90.0, {"encoding": "sRGB"}, "which can't be undone as cameras bend the brightness"),
+    ],
+)
+def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, scale, facts, said):
+    """Views of two sizes, the second taken at twice the time."""
+    light = GENERATOR.random((12, 10, 3)) + 0.2
+    files = {
+        name: file_of(
+            (scale * ratio * light).astype(dtype),
+            np.array([500.0, 600.0, 700.0]),
+            metadata=facts | {"exposure_s": 0.01 * ratio},
+        )
+        for name, ratio in (("10x12", 1), ("12x10", 2))
+    }
+    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
+    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
+    sensors = {name: prepare_sensor(name, own, options, (None, None), own) for name, own in each.items()}
+    upright, across = with_one_exposure(sensors, files).values()
+    assert said in " ".join([*upright.notes, *upright.warnings])
+    assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)

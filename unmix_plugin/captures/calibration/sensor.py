@@ -310,28 +310,31 @@ def _evidence(
 
 def with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]) -> dict[str, Sensor]:
     """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
-    each for its own band, or views of one camera in several sizes. The first one says what was done.
+    each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
 
     Args:
         first: File of the first view of each.
     """
-    raw = [name for name, sensor in sensors.items() if "white" not in sensor.evidence]
-    exposures = {name: sensors[name].calibration.exposure for name in raw}
+    bare = [name for name, sensor in sensors.items() if "white" not in sensor.evidence]
+    exposures = {name: sensors[name].calibration.exposure for name in bare}
     known = {name: exposure for name, exposure in exposures.items() if exposure is not None}
-    if len(raw) < 2 or not known:
+    rest = [name for name in bare if name not in known]
+    files = [first[name] for name in known or rest if radiometric_model(first[name]) is None]
+    if len(bare) < 2 or not files:
         return sensors
-    found = compare_exposures([first[name] for name in known], [], [], False)
-    warnings, brought = found.warnings, dict(sensors)
-    if lacking := [name for name in raw if name not in known]:
-        unlike = f"exposures of {name_some(lacking)} are not known or not compared, those of {name_some([*known])} are"
+    found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(_may_be_reflectance, files)))
+    notes, warnings = found.notes if known or found.common is None else (), found.warnings
+    if known and rest:
+        unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
         warnings += (f"{unlike}: values of these lenses or cameras may be off by a factor",)
+    brought = dict(sensors)
     if found.common is not None:
         for name, exposure in known.items():
             sensor, factor = sensors[name], (found.common / exposure).astype(np.float32)
             calibration = replace(sensor.calibration, exposure=found.common)
             brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
-    one = brought[raw[0]]
-    brought[raw[0]] = replace(one, notes=(*one.notes, *found.notes), warnings=(*one.warnings, *warnings))
+    one = brought[bare[0]]
+    brought[bare[0]] = replace(one, notes=(*one.notes, *notes), warnings=(*one.warnings, *warnings))
     return brought
 
 
