@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from numpy.testing import assert_allclose
 from PIL import Image
@@ -28,6 +29,7 @@ from unmix_plugin.errors import SceneError, UnmixError
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.neumatex.fit.data_manager import _PixelList
 from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 
@@ -103,6 +105,49 @@ def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
     assert found.notes[len(expected.notes) :] == (
         "mesh.ply has y as its upward axis, the poses have z: the mesh was turned",
     )
+
+
+def _write_pillar(folder: Path, has_alpha: bool = True) -> np.ndarray:
+    """A pillar at the world's origin in place of the ball, seen by cameras around it; its vertices."""
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) - _MOVE).tolist()
+    (folder / "transforms.json").write_text(json.dumps(content))
+    shutil.rmtree(folder / "relit")
+    pillar = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    pillar.apply_scale([0.8, 0.8, 1.0])
+    pillar.export(folder / "mesh.ply")
+    cameras = load_object(folder).pictures.cameras
+    shape = mesh_of(torch.tensor(pillar.vertices / RADIUS), torch.tensor(pillar.faces))
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        rays = cameras.image_rays(index)
+        seen = RayMesh(shape).closest(rays.origins, rays.directions).found.reshape(SIZE, SIZE)
+        alpha = seen.numpy().astype(np.float32)
+        write_exr(path, {**dict.fromkeys("RGB", 0.5 * alpha), **({"A": alpha} if has_alpha else {})}, {})
+    return np.array(pillar.vertices)
+
+
+_MOVE = np.column_stack([np.zeros((4, 3)), [*CENTRE, 0.0]])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_of_two_orientations_that_both_fit_somewhat_the_better_is_taken(folder, suffix):
+    vertices = _write_pillar(folder)
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    (folder / "mesh.ply").unlink()
+    for stored, is_turned in ((vertices, False), (vertices[:, [0, 2, 1]] * [1, 1, -1], True)):
+        mesh.vertices = stored
+        mesh.export(folder / f"mesh.{suffix}")
+        scene = load_object(folder)
+        assert_allclose(scene.frame.to_world(scene.mesh.vertices.double().numpy()), vertices, atol=1e-5)
+        assert any("the mesh was turned" in note for note in scene.notes) == is_turned
+
+
+def test_without_alpha_it_is_said_that_the_meshs_place_is_not_known_to_be_right(made, folder):
+    assert not any("could not be checked" in note for note in load_object(made).notes)
+    _write_pillar(folder, has_alpha=False)
+    notes = load_object(folder).notes
+    assert any("mesh.ply lies as they show the object, and which of its axes is upwards" in n for n in notes)
 
 
 def test_tone_turn_and_exposure_are_the_folders(tmp_path):

@@ -70,14 +70,18 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
     assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]))
 
 
-def test_our_own_gltf_in_metres_comes_back_in_units_of_the_world(tmp_path):
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.2, 0.1, 0.97), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize("extras", [{}, {"metres_per_unit": 0.05}, {"offset": [5.0, -3.0, 7.0]}])
+def test_our_own_gltf_comes_back_as_it_was_in_the_world(tmp_path, up, extras):
     box = trimesh.creation.box()
-    positions, normals = (np.array(a, dtype=np.float32) for a in (box.vertices + 2.0, box.vertex_normals))
-    colours, extras = np.ones_like(positions), {"metres_per_unit": 0.05}
-    up = np.array([0.0, 0.0, 1.0])
-    write_glb(tmp_path / "mesh.glb", positions, normals, colours, np.array(box.faces), {}, extras, up)
-    mesh = read_mesh(tmp_path / "mesh.glb").with_y_upwards()
-    assert_close(mesh.vertices, torch.from_numpy(positions))
+    world, normals = (np.array(a, dtype=np.float32) for a in (box.vertices + 2.0, box.vertex_normals))
+    stored = world - np.array(extras.get("offset", (0, 0, 0)), dtype=np.float32)
+    turned = np.array(up) / np.linalg.norm(up)
+    faces = np.array(box.faces)
+    write_glb(tmp_path / "mesh.glb", stored, normals, np.ones_like(world), faces, {}, extras, turned)
+    mesh = read_mesh(tmp_path / "mesh.glb")
+    assert_close(mesh.vertices, torch.from_numpy(world))
+    assert_close(mesh.normals, torch.from_numpy(normals))
 
 
 def test_normals_of_the_file_are_kept(tmp_path):

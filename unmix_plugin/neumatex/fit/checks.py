@@ -4,7 +4,7 @@ A mesh has to lie where the cameras and alpha say that the object is. Pictures a
 white surface sends back at most four times the mean radiance around it, which a single lamp straight before it does;
 dark ones in the shade send some thousandths.
 
-Notation: `N` cameras.
+Notation: `V` views that are compared.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
@@ -38,24 +38,17 @@ _MOST_VIEWS = 24
 _HALF_OPAQUE = 0.5
 
 
-def compare_outlines(
-    ray_mesh: RayMesh,
-    cameras: Cameras,
-    alphas: Sequence[Float[np.ndarray, "_ _"] | None],
-    frame: Normalisation,
-    where: str,
-) -> tuple[str | None, str | None]:
-    """How far off a mesh is from what pictures show of it.
+def outline_overlaps(
+    ray_mesh: RayMesh, cameras: Cameras, alphas: Sequence[Float[np.ndarray, "_ _"] | None]
+) -> Float64[np.ndarray, " V"]:
+    """How well a mesh covers what pictures show of it: in each view, the part that silhouette and alpha share.
 
     Args:
-        ray_mesh: The mesh in model space.
-        cameras: Of the pictures, model space.
+        ray_mesh: The mesh in the space of the cameras.
+        cameras: Of the pictures.
         alphas: Opacity of each picture, None where it has none: then the mesh has only to be in the view.
-        frame: To give places in the world.
-        where: What messages call the mesh.
     Returns:
-        What is wrong where most views do not see the mesh where their pictures show the object, and what is doubtful
-        where it is somewhat off; None otherwise.
+        Of the views that are compared, [0, 1].
     Raises:
         SceneError: no pixel of any picture is opaque.
     """
@@ -65,19 +58,41 @@ def compare_outlines(
             "that is 1 on the object, or pictures without alpha"
         )
     step = max(1, -(-len(cameras) // _MOST_VIEWS))
-    overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in range(0, len(cameras), step)]
-    median, wrong = float(np.median(overlaps)), sum(overlap < LEAST_OVERLAP for overlap in overlaps)
-    if 2 * wrong > len(overlaps):
-        edge = 2 / frame.scale
-        return (
-            f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less "
-            f"than half of what alpha shows, or is not in the view (median overlap {median:.0%}). Its box is "
-            f"{edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit "
-            "and axes. With y upwards it does not fit either"
-        ), None
+    views = range(0, len(cameras), step)
+    return np.array([_overlap(ray_mesh, cameras[view], alphas[view]) for view in views])
+
+
+def is_misplaced(overlaps: Float64[np.ndarray, " V"]) -> bool:
+    """Whether most views do not see the mesh where their pictures show the object."""
+    return 2 * int((overlaps < LEAST_OVERLAP).sum()) > len(overlaps)
+
+
+def misplacement(
+    overlaps: Float64[np.ndarray, " V"], cameras: Cameras, frame: Normalisation, where: str
+) -> str:
+    """How far off a misplaced mesh is.
+
+    Args:
+        overlaps: Of `outline_overlaps`.
+        cameras: Of the pictures, model space.
+        frame: To give places in the world.
+        where: What the message calls the mesh.
+    """
+    wrong, edge = int((overlaps < LEAST_OVERLAP).sum()), 2 / frame.scale
+    return (
+        f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less "
+        f"than half of what alpha shows, or is not in the view (median overlap {np.median(overlaps):.0%}). Its box "
+        f"is {edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit "
+        "and axes. With y upwards it does not fit either"
+    )
+
+
+def outline_doubt(overlaps: Float64[np.ndarray, " V"], where: str) -> str | None:
+    """What to say of a mesh that is somewhat off; None if it fits."""
+    median = float(np.median(overlaps))
     if median >= DOUBTFUL_OVERLAP:
-        return None, None
-    return None, (
+        return None
+    return (
         f"{where} and alpha show different outlines: their overlap is {median:.0%} (median of {len(overlaps)} views; "
         "90% and more is usual), which blurs materials. Check size and place of the mesh, lenses and alpha"
     )

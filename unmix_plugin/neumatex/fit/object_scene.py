@@ -19,7 +19,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.checks import compare_outlines, light_doubt
+from unmix_plugin.neumatex.fit.checks import (
+    is_misplaced,
+    light_doubt,
+    misplacement,
+    outline_doubt,
+    outline_overlaps,
+)
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -52,6 +58,8 @@ EVAL_INTERVAL = 8
 """Every so many frames one is for evaluation, where transforms.json does not say which."""
 MOST_STOPS = 20.0
 _NUM_COLOURS = 3
+_CLEARLY_BETTER = 0.01
+"""Of the mean overlap of outlines: pixels at their edges make that of equal shapes differ by less."""
 
 
 @dataclass(frozen=True)
@@ -315,25 +323,43 @@ def _content(root: Path) -> dict[str, Any]:
 def _placed(
     given: Mesh, name: str, folder: _Folder, notes: list[str]
 ) -> tuple[Normalisation, Mesh, PosedPictures]:
-    """The mesh and the pictures in model space; a mesh that fits only with its y axis upwards is turned.
+    """The mesh and the pictures in model space; a mesh that fits clearly better with its y axis upwards is turned.
 
     Raises:
         SceneError: it fits neither way; the message says how far off it is as it was given.
     """
-    found: list[str] = []
-    for placed in (given, given.with_y_upwards()):
-        scale, offset = placed.to_model_space()
-        frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
-        mesh, pictures = placed.transformed(scale, offset), folder.pictures(frame)
-        read = (pictures.read(index) for index in range(len(pictures)))
-        alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
-        misplaced, doubt = compare_outlines(RayMesh(mesh), pictures.cameras, alphas, frame, name)
-        if misplaced is None:
-            turned = f"{name} has y as its upward axis, the poses have z: the mesh was turned"
-            notes += ([] if doubt is None else [doubt]) + ([turned] if found else [])
-            return frame, mesh, pictures
-        found.append(misplaced)
-    raise SceneError(found[0])
+    frame, mesh, pictures = _in_model_space(given, folder)
+    read = (pictures.read(index) for index in range(len(pictures)))
+    alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
+    scale, offset = given.to_model_space()
+    turned = given.with_y_upwards()
+    as_given, upright = (
+        outline_overlaps(RayMesh(one.transformed(scale, offset)), pictures.cameras, alphas)
+        for one in (given, turned)
+    )
+    has_outlines = any(alpha is not None for alpha in alphas)
+    is_better = has_outlines and upright.mean() > as_given.mean() + _CLEARLY_BETTER
+    if (is_better or is_misplaced(as_given)) and not is_misplaced(upright):
+        notes.append(f"{name} has y as its upward axis, the poses have z: the mesh was turned")
+        as_given = upright
+        frame, mesh, pictures = _in_model_space(turned, folder)
+    if is_misplaced(as_given):
+        raise SceneError(misplacement(as_given, pictures.cameras, frame, name))
+    doubt = outline_doubt(as_given, name)
+    if not has_outlines:
+        doubt = (
+            f"the pictures have no alpha: whether {name} lies as they show the object, and which of its axes is "
+            "upwards, could not be checked"
+        )
+    notes += [] if doubt is None else [doubt]
+    return frame, mesh, pictures
+
+
+def _in_model_space(mesh: Mesh, folder: _Folder) -> tuple[Normalisation, Mesh, PosedPictures]:
+    """From the world to model space, and a mesh and the pictures there."""
+    scale, offset = mesh.to_model_space()
+    frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
+    return frame, mesh.transformed(scale, offset), folder.pictures(frame)
 
 
 def _from_poses(frame: Normalisation, placement: Placement) -> Normalisation:

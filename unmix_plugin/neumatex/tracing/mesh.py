@@ -1,8 +1,8 @@
 """A triangle mesh with shading normals, read from glTF, OBJ and PLY files and checked.
 
 Coordinates are taken as they are, as those of the cameras' world: a file whose axes were exchanged on export (many
-programs write glTF with +y up) has to be exported without that. Only metres of our own glTF are taken back to units of
-the world, whose length its extras say.
+programs write glTF with +y up) has to be exported without that. Only our own glTF is taken back to the world, since its
+extras say what was done to it: metres, +y up, another origin.
 
 Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
 """
@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.meshes import least_turns
 from unmix_plugin.limits import (
     MOST_TABLE_BYTES,
     MOST_TEXT_BYTES,
@@ -28,8 +29,8 @@ from unmix_plugin.limits import (
     read_bounded,
     refuse,
 )
-from unmix_plugin.scenes.placement import METRES_RANGE
-from unmix_plugin.scenes.reading.faults import find_named
+from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
+from unmix_plugin.scenes.reading.faults import find_named, read_number
 
 MAX_TRIANGLES = 5_000_000
 """More are refused: the tree over them and the memory of a training would not fit common machines."""
@@ -169,7 +170,7 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
     parts = [
-        (scene.geometry[name], _without_metres(np.asarray(transform), scene.geometry[name].metadata))
+        (scene.geometry[name], _to_world(np.asarray(transform), scene.geometry[name].metadata))
         for transform, name in placed
     ]
     parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
@@ -209,12 +210,26 @@ def _allow_triangles(path: Path, number: int) -> None:
         )
 
 
-def _without_metres(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
-    """A mesh's transform to the units of its world, where it says how many metres one has, as `write_glb` does."""
-    metres = extras.get("metres_per_unit")
-    if not isinstance(metres, int | float) or not METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
-        return transform
-    return np.diag([1 / metres] * 3 + [1.0]) @ transform
+def _to_world(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
+    """A mesh's transform to the world that it comes from, where it says how `write_glb` took it from there."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    back, metres = np.eye(4), read_number(extras.get(METRES_KEY))
+    up, offset = _vector(extras, "up"), _vector(extras, "offset")
+    if up is not None and abs(np.linalg.norm(up) - 1) < 1e-6:
+        back[:3, :3] = Rotation.from_quat(least_turns(up, np.eye(3)[1])).inv().as_matrix()
+        back[:3, 3] = 0 if offset is None else offset
+    if metres is not None and METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
+        back[:3, :3] /= metres
+    return back @ transform
+
+
+def _vector(extras: Mapping[str, Any], key: str) -> np.ndarray | None:
+    """Three numbers below `_FAR`; None where there are none."""
+    values = extras.get(key)
+    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
+    sound = [number for number in numbers if number is not None and abs(number) < _FAR]
+    return np.array(sound) if len(sound) == len(numbers) == 3 else None
 
 
 def _placed(path: Path, loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
