@@ -18,7 +18,7 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
@@ -138,9 +138,7 @@ def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None
         return None
     step = max(1, -(-len(pictures) // _MOST_VIEWS))
     read = [pictures.read(view) for view in range(0, len(pictures), step)]
-    shown = [
-        picture.numbers[opacity(picture) >= OPAQUE_ALPHA] for picture in read if picture.alpha is not None
-    ]
+    shown = [picture.numbers[opacity(picture) >= OPAQUE_ALPHA] for picture in read if has_alpha(picture)]
     found = np.concatenate(shown).mean(axis=1) if shown else np.zeros(0)
     mean = float(environment.mean_radiance().mean())
     if not (found.size and mean > 0):

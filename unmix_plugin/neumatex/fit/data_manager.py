@@ -30,7 +30,7 @@ from unmix_plugin.engine import (
 )
 from unmix_plugin.errors import SceneError, require
 from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
@@ -186,13 +186,21 @@ class ObjectDataManager(DataManager):
         """Read when training begins: evaluation needs none of it."""
         return _PixelList.of(self.object, self.options.max_pixels, self.seed)
 
+    @cached_property
+    def _ray_mesh(self) -> RayMesh:
+        """Says which pixels show the object where alpha does not."""
+        return RayMesh(self.object.mesh)
+
     def _image(
         self, pictures: PosedPictures, view: int, others: dict[str, Tensor]
     ) -> tuple[Cameras, dict[str, Tensor]]:
         picture = pictures.read(view)
+        shown = opacity(picture)
+        if not has_alpha(picture):
+            shown = shown * _sees_mesh(self._ray_mesh, pictures.cameras[view]).numpy()
         batch = {
             "numbers": self._tensor(picture.numbers),
-            "alpha": self._tensor(opacity(picture)),
+            "alpha": self._tensor(shown),
             "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
             "lights": torch.tensor(len(self.object.lights)),
         }
@@ -204,7 +212,7 @@ class ObjectDataManager(DataManager):
             colours = self.object.base_colour(view)
             return {} if colours is None else {"base_colour": self._tensor(colours)}
         materials = self.object.true_materials
-        abundances = None if materials is None else materials.abundances(view)
+        abundances = self.object.abundances(view)
         if materials is None or abundances is None:
             return {}
         endmembers = self._tensor(materials.endmembers.astype(np.float32))
