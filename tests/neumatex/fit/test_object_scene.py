@@ -147,6 +147,18 @@ def test_of_two_orientations_that_both_fit_somewhat_the_better_is_taken(folder, 
         assert any("the mesh was turned" in note for note in scene.notes) == is_turned
 
 
+@pytest.mark.parametrize("is_open", [False, True])
+def test_a_mesh_whose_triangles_face_inwards_is_turned_and_that_is_said(made, folder, is_open):
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    faces = np.array(mesh.faces)[int(is_open) :, ::-1]
+    trimesh.Trimesh(mesh.vertices, faces, process=False).export(folder / "mesh.ply", vertex_normal=False)
+    expected, found = load_object(made), load_object(folder)
+    assert_allclose(found.mesh.normals, expected.mesh.normals, atol=0.1)
+    count = len(faces)
+    assert f"mesh.ply: cameras saw {count} of {count} triangles from behind; they were turned" in found.notes
+    assert not any("behind" in note for note in expected.notes)
+
+
 def test_without_alpha_it_is_said_that_the_meshs_place_is_not_known_to_be_right(made, folder):
     assert not any("could not be checked" in note for note in load_object(made).notes)
     _write_pillar(folder, has_alpha=False)

@@ -4,7 +4,7 @@ A mesh has to lie where the cameras and alpha say that the object is. Pictures a
 white surface sends back at most four times the mean radiance around it, which a single lamp straight before it does;
 dark ones in the shade send some thousandths.
 
-Notation: `V` views that are compared.
+Notation: `V` views that are compared, `F` triangles.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from jaxtyping import Float, Float64
+from torch import Tensor
 
 from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
@@ -26,6 +27,8 @@ from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
 LONGEST_EDGE_PX = 64
 """Of the views whose outlines are compared."""
+_SIDES_EDGE_PX = 128
+"""Of the views that say which side of a triangle is its front."""
 LEAST_OVERLAP = 0.5
 """Of silhouette and alpha, shared part over both: below it a view disagrees. Right meshes have 0.9 and more."""
 DOUBTFUL_OVERLAP = 0.85
@@ -127,6 +130,19 @@ def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"]
     shown = torch.from_numpy(alpha[rows][:, columns] > _HALF_OPAQUE).flatten()
     union = int((seen | shown).sum())
     return float((seen & shown).sum()) / union if union else 1.0
+
+
+def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
+    """How much cameras see each triangle from its front, less how much from behind: sums of cosines over rays."""
+    mesh, seen = ray_mesh.mesh, torch.zeros(len(ray_mesh.mesh.faces))
+    a, b, c = mesh.corners().unbind(dim=1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    for view in range(0, len(cameras), max(1, -(-len(cameras) // _MOST_VIEWS))):
+        rays = cameras[view].shrunk(_SIDES_EDGE_PX**2).image_rays(0)
+        hits = ray_mesh.closest(rays.origins, rays.directions)
+        triangles = hits.triangles[hits.found]
+        seen.index_add_(0, triangles, -(rays.directions[hits.found] * normals[triangles]).sum(dim=-1))
+    return seen
 
 
 def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None:

@@ -25,6 +25,7 @@ from unmix_plugin.neumatex.fit.checks import (
     misplacement,
     outline_doubt,
     outline_overlaps,
+    sides_seen,
 )
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
@@ -35,7 +36,7 @@ from unmix_plugin.neumatex.tracing.light_files import (
     read_environment_of_bands,
     read_lamp,
 )
-from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh
+from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh, turned_to_viewers
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
@@ -383,6 +384,11 @@ def _placed(
             "upwards, could not be checked"
         )
     notes += [] if doubt is None else [doubt]
+    mesh, count = turned_to_viewers(mesh, sides_seen(RayMesh(mesh), pictures.cameras))
+    if count:
+        notes.append(
+            f"{name}: cameras saw {count} of {len(mesh.faces)} triangles from behind; they were turned"
+        )
     return frame, mesh, pictures
 
 

@@ -4,7 +4,8 @@ Coordinates are taken as they are, as those of the cameras' world: a file whose 
 programs write glTF with +y up) has to be exported without that. Only our own glTF is taken back to the world, since its
 extras say what was done to it: metres, +y up, another origin.
 
-Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
+Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside, which only who looks at a mesh
+can tell: in files they may be wound either way.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
@@ -105,15 +106,44 @@ def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
     return torch.where(lengths > 1e-30, sums / lengths.clamp(min=1e-30), upwards).float()
 
 
+def turned_to_viewers(mesh: Mesh, seen: Float[Tensor, " F"]) -> tuple[Mesh, int]:
+    """The mesh with each connected piece turned so that what is seen of it is its front.
+
+    Args:
+        mesh: Its triangles may face either way, those of one piece alike.
+        seen: How much each triangle is seen from its front, less how much it is from behind.
+    Returns:
+        The mesh, with normals on the front, and how many triangles were turned.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    corners = _places(mesh.vertices.numpy())[mesh.faces.numpy()]
+    starts, ends = corners[:, [0, 1]].reshape(-1), corners[:, [1, 2]].reshape(-1)
+    size = int(corners.max()) + 1
+    links = coo_matrix((np.ones(len(starts)), (starts, ends)), shape=(size, size))
+    count, of_places = connected_components(links, directed=False)
+    pieces = torch.from_numpy(of_places[corners[:, 0]]).long()
+
+    def is_negative(values: Float[Tensor, " F"]) -> Bool[Tensor, " F"]:
+        return (torch.zeros(count, dtype=torch.float64).index_add(0, pieces, values.double()) < 0)[pieces]
+
+    is_turned = is_negative(seen)
+    faces = torch.where(is_turned[:, None], mesh.faces.flip(1), mesh.faces)
+    a, b, c = mesh.vertices.double()[faces.long()].unbind(dim=1)
+    agreement = (torch.linalg.cross(b - a, c - a) * mesh.normals[faces.long()].sum(dim=1)).sum(dim=1)
+    signs = torch.ones(len(mesh.vertices), 1)
+    signs[faces[is_negative(agreement)].long()] = -1
+    return replace(mesh, faces=faces, normals=signs * mesh.normals), int(is_turned.sum())
+
+
 @np.errstate(all="ignore")  # what is not finite is refused by name
 def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     """The triangles of a file in units of the world, all objects of its scene graph in one mesh.
 
-    A closed mesh whose triangles face inwards is turned outwards.
-
     Args:
         path: A .glb, .gltf, .obj or .ply file.
-        notes: Gets a sentence for each thing that is unusual but usable: an open mesh, a mesh that was turned.
+        notes: Gets a sentence if the mesh is open, which is unusual but usable.
     Raises:
         SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
             are not finite, or too many triangles.
@@ -121,10 +151,7 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     vertices, faces, normals, uv = _joined([_placed(path, *part) for part in _parts(path)])
     _check(path, vertices, faces)
     faces = _with_area(path, vertices, faces)
-    notes = [] if notes is None else notes
-    if _is_closed(vertices, faces):
-        faces, normals = _outwards(path, vertices, faces, normals, notes)
-    else:
+    if notes is not None and not _is_closed(vertices, faces):
         notes.append(
             f"{path.name}: the mesh is open; light may pass through its holes, and its inside is black"
         )
@@ -302,27 +329,15 @@ def _file_normals(loaded: Any) -> np.ndarray | None:
     return normals if ((lengths > 1e-6) & (lengths < _FAR)).all() else None
 
 
+def _places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
+    """A number for the place of each vertex: files split them at seams of texture and normals, but what is joined is
+    said by positions alone."""
+    return np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+
+
 def _is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
     """Whether each edge is shared by two triangles that run along it in opposite directions."""
-    # Files split vertices at seams of texture and normals; positions alone say what is joined.
-    _, joined = np.unique(vertices, axis=0, return_inverse=True)
-    corners = joined.reshape(-1)[faces]
+    corners = _places(vertices)[faces]
     starts, ends = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
     forward, backward = starts * len(vertices) + ends, ends * len(vertices) + starts
     return bool(np.array_equal(np.sort(forward), np.sort(backward)))
-
-
-def _outwards(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Triangles and normals that point out of a closed mesh."""
-    a, b, c = (vertices[faces[:, corner]] - vertices.mean(axis=0) for corner in range(3))
-    crosses = np.cross(b, c)
-    if np.einsum("ij,ij->", a, crosses) < 0:
-        notes.append(f"{path.name}: the triangles faced inwards; they were turned outwards")
-        faces = faces[:, ::-1].copy()
-    if normals is not None:
-        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-        agreement = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[faces].mean(axis=1))
-        normals = -normals if agreement.sum() < 0 else normals
-    return faces, normals
