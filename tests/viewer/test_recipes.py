@@ -1,5 +1,7 @@
 """Recipes as a panel builds them: one change of a kind an endmember, all of it undoable."""
 
+from dataclasses import replace
+
 import pytest
 
 from unmix_plugin.editing import (
@@ -35,6 +37,22 @@ def test_the_last_change_of_a_kind_to_an_endmember_counts():
     assert recipe.operations == (Scale(1, 3.0), Retint(0, (0.1, 0.2, 0.3)), Scale(0, 5.0))
     assert change_of(recipe, Scale, 0) == Scale(0, 5.0)
     assert change_of(recipe, Gloss, 0) is None
+
+
+@pytest.mark.parametrize("first", [Retint(0, (0.1, 0.2, 0.3)), Scale(0, 2.0), Replace(0, "x/y")])
+def test_a_change_stays_with_the_look_that_a_swap_has_taken_elsewhere(first):
+    recipe = with_swap(with_change(Recipe(), first), Swap(0, 3))
+    assert change_of(recipe, type(first), 3) == first
+    assert change_of(recipe, type(first), 0) is None
+    assert with_change(recipe, first).operations == (first, Swap(0, 3), first)
+    moved = replace(first, endmember=3)
+    assert with_change(recipe, moved).operations == (Swap(0, 3), moved)
+
+
+def test_names_and_gloss_stay_where_they_are_when_looks_are_swapped():
+    recipe = with_swap(with_change(Recipe(), Gloss(0, 0.5)), Swap(0, 3))
+    assert change_of(recipe, Gloss, 0) == Gloss(0, 0.5)
+    assert with_change(recipe, Gloss(0, 2.0)).operations == (Swap(0, 3), Gloss(0, 2.0))
 
 
 def test_the_same_swap_twice_in_a_row_takes_it_back():

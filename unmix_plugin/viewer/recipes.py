@@ -1,7 +1,7 @@
 """Recipes as panels build them: each change is an edit of the recipe, and can be undone.
 
 Endmembers are given by their number, which no edit changes. A second change of the same kind to the same endmember
-replaces the first.
+replaces the first, wherever swaps have taken its look since.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from unmix_plugin.editing import (
     Swap,
 )
 
+_OF_LOOKS = (Replace, Retint, Scale)
+"""Changes of spectra, which a swap takes along; names and gloss stay where they are."""
 _MOST_UNDONE = 200
 _MOST_OPERATIONS = 500
 _ONE_EDIT_S = 2.0
@@ -70,8 +72,8 @@ class RecipeHistory:
 
 def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
     """The recipe with a change of one endmember, in place of an earlier one of the same kind."""
-    kind, endmember = type(change), change.endmember
-    others = [one for one in recipe.operations if not _is_change(one, kind, endmember)]
+    earlier = _changes_of(recipe, type(change), change.endmember)
+    others = [one for position, one in enumerate(recipe.operations) if position not in earlier]
     return _with_operations(recipe, [*others, change])
 
 
@@ -135,11 +137,18 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
 
 def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
     """The change of a kind that a recipe makes to an endmember by its number."""
-    return next((one for one in recipe.operations if _is_change(one, kind, endmember)), None)
+    return next((recipe.operations[position] for position in _changes_of(recipe, kind, endmember)), None)
 
 
-def _is_change(one: Operation, kind: type[Operation], endmember: str | int | None) -> bool:
-    return type(one) is kind and getattr(one, "endmember", None) == endmember
+def _changes_of(recipe: Recipe, kind: type[Operation], endmember: str | int | None) -> list[int]:
+    """Positions of the changes of a kind that an endmember shows at the end, the first first."""
+    positions, there = [], endmember
+    for position, one in reversed(list(enumerate(recipe.operations))):
+        if isinstance(one, Swap) and kind in _OF_LOOKS and there in (one.first, one.second):
+            there = one.second if there == one.first else one.first
+        elif type(one) is kind and getattr(one, "endmember", None) == there:
+            positions.append(position)
+    return positions[::-1]
 
 
 def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:

@@ -258,6 +258,17 @@ def test_without_alpha_pixels_beside_the_mesh_do_not_count_in_evaluation_either(
     assert len(manager._pixels.views) == pytest.approx(5 * int(alpha.sum()), rel=0.1)
 
 
+def test_pictures_under_held_out_lights_have_names_that_differ(folder):
+    for light, picture in (("a-b", "c"), ("a", "b-c")):
+        there = Path(shutil.copytree(folder / "relit" / "dim", folder / "relit" / light))
+        shutil.move(there / "images" / "000.exr", there / "images" / f"{picture}.exr")
+        frames = json.loads((there / "transforms.json").read_text())["frames"]
+        _change(there, frames=[{**frames[0], "file_path": f"images/{picture}.exr"}])
+    manager = ObjectDataManager(ObjectDataManagerConfig(), data=folder, device=torch.device("cpu"))
+    names = [manager.eval_name(index) for index in range(manager.num_eval_images)]
+    assert len(set(names)) == len(names) == 5
+
+
 def test_keys_that_nobody_knows_are_told_also_of_held_out_lights(folder):
     _change(folder, tone_mapping="linear", mesh_path="mesh.ply", environment_exposure_stops=0)
     assert not any("not known" in note for note in load_object(folder).notes)

@@ -35,6 +35,7 @@ from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
 from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.reading.loader import distinct_names
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -103,6 +104,9 @@ class ObjectDataManager(DataManager):
         self._num_rays = config.train_num_rays_per_batch
         lights = [(light, view) for light in self.object.lights for view in range(len(light.pictures))]
         self._images = [*split.evaluation, *lights]
+        named = [pictures.names[view] for view in split.evaluation]
+        named += [f"{light.name}-{light.pictures.names[view]}" for light, view in lights]
+        self._names = distinct_names([f"{name}.exr" for name in named])  # of which a stem is taken
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random object pixels of the training views; the draw depends on (seed, step) only."""
@@ -128,10 +132,7 @@ class ObjectDataManager(DataManager):
 
     def eval_name(self, index: int) -> str:
         """The picture's name, after its light's where that is held out."""
-        place = self._images[index]
-        if isinstance(place, int):
-            return self.object.pictures.names[place]
-        return f"{place[0].name}-{place[0].pictures.names[place[1]]}"
+        return self._names[index]
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the next training batch."""
