@@ -206,7 +206,7 @@ def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels
     seen = sample_seen(scene)
     index = int(seen.abundances.argmax(-1)[seen.accumulation >= 0.5].mode().values)
     earlier = [edit % index if "%" in edit else edit for edit in before]
-    result = edited(scene, *earlier, f"retint: {{endmember: {index}, colour: '#606858'}}", seen=seen)
+    result = edited(scene, *earlier, f"retint: {{endmember: {index}, colour: '#606858'}}")
     views = [result.look(CAMERAS[view], subpixels=1) for view in range(2)]
     shares = torch.cat([view["abundances"].flatten(0, 1) for view in views])
     opacity = torch.cat([view.opacity.flatten() for view in views])

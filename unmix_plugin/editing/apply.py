@@ -338,27 +338,27 @@ def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> Non
         )
 
 
-def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = None) -> TrainedScene:
+def edit_scene(
+    scene: TrainedScene, recipe: Recipe, see: Callable[[TrainedScene], Coefficients | None] = sample_seen
+) -> TrainedScene:
     """The edited scene. Edits are made in order, in the light that the scene was recorded in; then the recipe's light
     is lit. Endmembers keep their numbers.
 
     Args:
         scene: Stays as it is.
         recipe: What to change.
-        seen: What cameras see of `scene`, in any leading axes: retints that match the picture look at it, unless edits
-            before them took parts away or changed the gloss of some. None: what `sample_seen` finds, where needed.
+        see: What cameras see of a scene, in any leading axes, None where it is not known: retints that match the
+            picture look at the scene that the edits before them have made.
     Raises:
         ConfigError: the recipe does not fit the scene or contradicts itself; the message says where.
     """
     light = scene.light_power
-    if seen is None and recipe.wants_pictures:
-        seen = sample_seen(scene)
-    state = MaterialState.of(scene.materials, light, seen)
-    seen_as = state.visibility
+    state, seen_as = MaterialState.of(scene.materials, light), None
     for position, operation in enumerate(recipe.operations):
         where = recipe.where(position)
-        if replace(recipe, operations=(operation,)).wants_pictures and state.visibility != seen_as:
-            state.seen, seen_as = sample_seen(replace(scene, field=_field(scene, state))), state.visibility
+        looks = isinstance(operation, Retint) and operation.match == "picture"
+        if looks and state.visibility != seen_as:
+            state.seen, seen_as = see(replace(scene, field=_field(scene, state))), state.visibility
         try:
             _HANDLERS[type(operation)](state, operation, where)
         except UnmixError as error:

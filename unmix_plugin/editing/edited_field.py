@@ -149,7 +149,10 @@ class MaterialState:
 
     @classmethod
     def of(
-        cls, materials: Materials, light: Float64[np.ndarray, " B"] | None, seen: Coefficients | None
+        cls,
+        materials: Materials,
+        light: Float64[np.ndarray, " B"] | None,
+        seen: Coefficients | None = None,
     ) -> MaterialState:
         """The materials of a model as they are, in a light (None: unknown)."""
         spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy().copy()
@@ -253,6 +256,11 @@ class EditedField(CoefficientField):
         self.register_buffer("is_kept", is_kept.clone(), persistent=False)
         self.register_buffer("gloss", gloss.clone(), persistent=False)
         self._removes = not bool(is_kept.all())
+
+    @property
+    def change(self) -> tuple[bytes, bytes]:
+        """Equal where the same is removed, and the gloss is the same."""
+        return self.is_kept.cpu().numpy().tobytes(), self.gloss.cpu().numpy().tobytes()
 
     @property
     def moving_lamp(self) -> MovingLamp | None:

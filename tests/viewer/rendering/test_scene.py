@@ -58,14 +58,27 @@ def test_an_edited_scene_is_made_once_and_follows_a_training_but_not_every_step(
 def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
     asked = []
 
-    def see(unedited):
-        asked.append(unedited)
-        return sample_seen(unedited)
+    def see(scene):
+        asked.append(scene.field)
+        return sample_seen(scene)
 
     Edit(Recipe((Retint(0, (0.5, 0.4, 0.3), "spectrum"),))).apply(trained, 0, see)
     assert asked == []
     Edit(Recipe((Retint(0, (0.5, 0.4, 0.3)),))).apply(trained, 0, see)
-    assert asked == [trained]
+    assert asked == [trained.field]
+
+
+def test_what_cameras_see_is_sampled_once_while_colours_change_and_again_where_parts_go(
+    trained, source, monkeypatch
+):
+    sampled = []
+    monkeypatch.setattr(aids_module, "sample_seen", lambda scene: sampled.append(1) or sample_seen(scene))
+    aids = SceneAids(replace(source, take=lambda: trained), has_materials=True)
+    for removed, times in (((), 1), ((1,), 2), ((1, 2), 3)):
+        for colour in ((0.5, 0.4, 0.3), (0.3, 0.4, 0.5)):
+            before = (Remove(removed),) if removed else ()
+            Edit(Recipe((*before, Retint(0, colour)))).apply(trained, 0, aids.see)
+        assert len(sampled) == times
 
 
 @pytest.mark.parametrize(

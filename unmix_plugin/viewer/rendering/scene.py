@@ -175,9 +175,7 @@ class Edit:
             if self.light != LightChoice():
                 edited = relit(scene, self.light, "of this run")
             else:
-                scene = require_materials(scene, "of this run")
-                seen = see(scene) if self.recipe.wants_pictures else None
-                edited = edit_scene(scene, self.recipe, seen)
+                edited = edit_scene(require_materials(scene, "of this run"), self.recipe, see)
             self._kept[:] = [(edited, version, time.monotonic())]
             return edited
 
