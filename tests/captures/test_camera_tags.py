@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import present, write_band_file, xmp_packet
+from tests.captures.file_factory import file_of, present, write_band_file, xmp_packet
 from unmix_plugin.captures.camera_tags import (
     _RadiometricModel,
     band_of,
@@ -61,6 +61,17 @@ def test_a_band_has_its_centre_and_width_or_none_is_made_up(tags, centre, width)
         assert table.wavelengths_nm == [centre]
         assert (table.fwhm_nm is None) if width is None else (table.fwhm_nm == [width])
         assert next(iter(tags)).rpartition(":")[2] in table.evidence
+
+
+def test_numbers_of_10_bits_of_a_sequoia_are_as_bright_as_those_of_16():
+    """Whose black level is 2046 in both."""
+    numbers = np.random.default_rng(1).integers(40, 1000, (*SIZE, 1)).astype(np.uint16)
+    short = file_of(numbers, metadata={"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": 10}})
+    whole = file_of(numbers * 64, metadata={"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": 16}})
+    expected = model_of(whole).apply(whole.read().astype(np.float32), slice(0, SIZE[0]))
+    found = model_of(short).apply(short.read().astype(np.float32), slice(0, SIZE[0]))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert expected.mean() > 0
 
 
 def test_exif_rationals_become_numbers(tmp_path):

@@ -67,6 +67,18 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
         assert (source["sha256"], source["bytes"]) == (hashlib.sha256(data).hexdigest(), len(data))
 
 
+@pytest.mark.parametrize("suffix", ["hdr", "raw"])
+def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_named(tmp_path: Path, suffix):
+    capture = make_capture(tmp_path / "capture")
+    for path in capture.root.glob("white.*"):
+        path.rename(path.with_stem("spectralon"))
+    told: list[str] = []
+    process(
+        capture.root, tmp_path / "scene", "cubes", told.append, white=capture.root / f"spectralon.{suffix}"
+    )
+    assert told[0] == f"{capture.root}: 4 views of the layout cubes"
+
+
 BRIGHT_SQUARE = np.zeros((HEIGHT, WIDTH), bool)
 BRIGHT_SQUARE[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 4 : 3 * WIDTH // 4] = True
 
@@ -96,6 +108,16 @@ def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path):
     counts = np.fromfile(capture.root / "view_00.raw", "<u2").reshape(HEIGHT, len(WAVELENGTHS_NM), WIDTH)
     scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
     assert scene.cube(0)[0, 0, 0] == pytest.approx(counts[4:6, :3, 6:8].mean() / scale, abs=1e-4)
+
+
+def test_bands_on_both_sides_of_one_that_is_left_out_are_not_averaged(tmp_path: Path):
+    capture = make_capture(tmp_path / "capture")
+    scene, _ = made(tmp_path, capture, drop_bands="600", bin_bands=2, **references_of(capture))
+    np.testing.assert_allclose(scene.wavelengths_nm, [475, 675, 775])
+    expected = capture.reflectance["view_00"][..., [[0, 1], [4, 5], [6, 7]]].mean(axis=-1)
+    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
+    report = (tmp_path / "scene" / "report.txt").read_text()
+    assert "bands left out: 550 nm, 850 nm (too few up to a gap or the end for --bin-bands 2)" in report
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
@@ -210,6 +232,56 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
     np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"] * panel, atol=1.0 / 1000)
 
 
+@pytest.mark.parametrize(
+    ("name", "top", "dtype", "header", "unit", "is_known"),
+    [
+        (
+            "leaf_{}",
+            10000,
+            np.uint16,
+            {"reflectance scale factor": 10000},
+            "reflectance, as header field",
+            True,
+        ),
+        ("REFLECTANCE_{}", 1, np.float32, {}, "reflectance, as the name REFLECTANCE_0 says", True),
+        (
+            "REFLECTANCE_{}",
+            100,
+            np.float32,
+            {},
+            "reflectance, as the name REFLECTANCE_0 says",
+            False,
+        ),  # per cent
+        (
+            "REFLECTANCE_{}",
+            4000,
+            np.uint16,
+            {},
+            "relative reflectance, as the name REFLECTANCE_0 says",
+            False,
+        ),
+        ("leaf_{}", 1, np.float32, {"data gain values": 0.5}, "stored numbers divided", False),
+        ("leaf_{}", 1, np.float32, {}, "relative radiance", False),
+    ],
+)
+def test_reflectances_that_files_hold_are_seen_in_flat_light_if_a_white_is_1(
+    tmp_path: Path, name, top, dtype, header, unit, is_known
+):
+    capture = make_capture(tmp_path / "capture")
+    for path in capture.root.glob("*.*"):
+        path.unlink()
+    names = [name.format(index) for index in range(len(capture.reflectance))]
+    for view, values in zip(names, capture.reflectance.values(), strict=True):
+        write_cube(capture.root, view, (values * top).astype(dtype), header=header)
+    write_poses(capture.root / "transforms.json", names)
+    scene, _ = made(tmp_path, capture)
+    assert f"values are {unit}" in (tmp_path / "scene" / "report.txt").read_text().replace("\n  ", " ")
+    assert (scene.illuminant is not None) == is_known
+    if is_known:
+        np.testing.assert_array_equal(scene.illuminant, np.ones(len(WAVELENGTHS_NM)))
+        np.testing.assert_allclose(scene.cube(0), capture.reflectance["view_00"], atol=1e-3)
+
+
 def test_what_was_done_is_written_for_people(tmp_path: Path):
     _, findings = made(tmp_path, make_capture(tmp_path / "capture"), drop_bands="500-600")
     report = (tmp_path / "scene" / "report.txt").read_text()
@@ -304,6 +376,39 @@ def test_other_options_or_inputs_start_again(interrupted, writer, tmp_path: Path
         numbers.tofile(interrupted.root / "view_03.raw")
     process(interrupted.root, tmp_path / "scene", **options)
     assert len(writer.written) == 4
+
+
+@pytest.mark.parametrize("changed", ["panel", "wavelengths", "scale"])
+def test_numbers_that_are_mended_in_a_table_start_again(tmp_path: Path, monkeypatch, changed):
+    """Those beside the capture that options name, and those in its transforms.json."""
+    capture = make_capture(tmp_path / "capture", kind="npy")
+    panel, wavelengths, listed = tmp_path / "panel.csv", tmp_path / "nm.csv", capture.root / "transforms.json"
+    layout, options = "unmix-nerf" if changed == "scale" else "cubes", {"mask": "none"}
+    content = json.loads(listed.read_text()) | {"wavelengths": WAVELENGTHS_NM.tolist()}
+    for name, frame in zip(capture.reflectance, content["frames"], strict=True):
+        frame["hyperspectral_file_path"] = f"{name}.npy"
+    if changed != "scale":
+        named = {"white_reflectance": str(panel), "wavelengths": str(wavelengths)}
+        options |= references_of(capture, "npy") | named
+
+    def write(is_mended: bool) -> None:
+        wrong = {changed} if not is_mended else set()
+        listed.write_text(json.dumps(content | {"value_scale": 6000 if "scale" in wrong else 8000}))
+        panel.write_text(f"wavelength,panel\n400,{0.5 if 'panel' in wrong else 0.99}\n900,0.99")
+        centres = WAVELENGTHS_NM[:: -1 if "wavelengths" in wrong else 1]
+        wavelengths.write_text("\n".join(["wavelength", *map(str, centres)]))
+
+    write(is_mended=False)
+    monkeypatch.setattr(process_module, "write_view", _Writer(stop_at=2))
+    with pytest.raises(KeyboardInterrupt):
+        process(capture.root, tmp_path / "scene", layout, **options)
+    write(is_mended=True)
+    writer = _Writer()
+    monkeypatch.setattr(process_module, "write_view", writer)
+    process(capture.root, tmp_path / "scene", layout, **options)
+    assert len(writer.written) == 4
+    hashed = {Path(file["path"]) for file in record_of(tmp_path / "scene")["references"]}
+    assert {panel, wavelengths} <= hashed or changed == "scale"
 
 
 def test_a_scene_is_replaced_only_if_asked(tmp_path: Path):

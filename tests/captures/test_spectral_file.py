@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.captures.file_factory import file_of
+from tests.captures.file_factory import file_of, present
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values, stack_bands
 from unmix_plugin.errors import CaptureError
 
@@ -38,6 +39,33 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
     assert "only some of the files of one view state gains" in stack.warnings[0]
     mixed = stack_bands([*parts, replace(part(tmp_path, 3), bands=BandTable())], tmp_path).bands
     assert (mixed.wavelengths_nm, mixed.evidence) == (None, "only some of the files give wavelengths")
+
+
+@pytest.mark.parametrize(
+    ("second", "exposures"),
+    [
+        ({"exposure_s": 0.1, "gain": 1.0}, 0.1),
+        ({"exposure_s": 0.1, "gain": 4.0}, [0.1, 0.4]),  # though the times are equal
+        ({"exposure_s": 0.2}, [0.1, 0.2]),
+        ({"exposure_s": 0.1, "gain": [1.0, 4.0]}, None),
+        ({}, None),
+    ],
+)
+def test_a_stack_has_the_exposure_of_each_band_or_none(tmp_path, second, exposures):
+    parts = [part(tmp_path, 1, exposure_s=0.1, gain=1.0), part(tmp_path, 2, **second)]
+    found = stack_bands(parts, tmp_path).metadata
+    assert (found.get("exposure_s"), found.get("gain", 1.0)) == (exposures, 1.0)
+
+
+def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
+    def exposure(*apertures):
+        facts = [{"exposure_s": 0.1} | ({"f_number": f} if f else {}) for f in apertures]
+        stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
+        return exposure_of(stack)
+
+    np.testing.assert_allclose(present(exposure(2.0, 4.0)), [0.1 / 4, 0.1 / 16])
+    np.testing.assert_allclose(present(exposure(2.0, 2.0)), [0.1 / 4])
+    assert exposure(2.0, None) is exposure(None, 2.0) is None
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from tests.products.mesh_reading import loaded_mesh
 from tests.products.report.page_outline import assert_self_contained
 from unmix_plugin.commands.export import export
 from unmix_plugin.engine.runs.run_folder import RunFolder
+from unmix_plugin.formats.envi import read_header
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.trained.measures import keep_region
@@ -124,6 +125,20 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exp
     assert min(picture_size(base.with_suffix(".png"))) > 300
 
 
+def test_a_pixel_without_a_valid_value_has_no_measured_spectrum(solid, tmp_path, monkeypatch):
+    valid = np.ones((16, 16), bool)
+    valid[9, 8] = False
+    monkeypatch.setattr("unmix_plugin.scenes.scene.Scene.valid_mask", lambda *_: valid)
+    common = ["spectrum", "--view", "eval_002", "--run", solid.run, "--output", tmp_path]
+    heads = {}
+    for pixel, is_said in (("8,8", False), ("8,9", True)):
+        said = " ".join(done(export, *common, "--pixel", pixel).out.split())
+        assert ("no valid value in that pixel, or its mask leaves it out: no measured" in said) is is_said
+        file = tmp_path / f"eval_002_x8_y{pixel[-1]}.csv"
+        heads[pixel] = file.read_text().splitlines()[0].split(",")
+    assert heads["8,8"] == [*heads["8,9"], "measured"]
+
+
 def test_a_place_has_mean_and_spread_of_what_the_views_measured_that_see_it(solid, tmp_path, monkeypatch):
     place = ["spectrum", "--view", 0, "--pixel", "8,8"]
     words = [*place, "--run", solid.run, "--output", tmp_path, "--overwrite"]
@@ -212,6 +227,19 @@ def test_a_report_shows_the_regions_that_are_kept_and_says_which_it_cannot(solid
     assert (len(shares), sum(shares)) == (len(names), pytest.approx(1, abs=0.01))
     assert "Not shown: the region far away has nothing of the surface in it" in page
     assert "far away" not in section
+
+
+def test_libraries_of_regions_say_what_their_spectra_are(solid_copy):
+    keep_region(RunFolder(solid_copy), "all of it", Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
+    done(export, *words("regions", "--run", solid_copy))
+    done(export, "spectrum", "--region", "all of it", "--run", solid_copy, "--device", "cpu")
+    quantity = load_run(solid_copy, "cpu").materials_scene.materials.quantity
+    for file, about in (
+        ("regions/regions.hdr", "mean spectra of regions"),
+        ("spectrum/region_all of it.hdr", "mean spectrum"),
+    ):
+        header = read_header(solid_copy / "exports" / file)
+        assert header["description"].strip() == f"{about}: {quantity}, 1 = full scale"
 
 
 def test_a_report_quotes_the_figures_that_eval_found_and_links_to_the_page(solid_copy, tmp_path, monkeypatch):

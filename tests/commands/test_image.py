@@ -55,18 +55,21 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("field", "is_said"),
+    ("name", "field", "is_said"),
     [
-        ("reflectance scale factor = 2", True),
-        ("reflectance scale factor = 1", True),
-        ("data gain values = {2}", False),
+        ("field", "reflectance scale factor = 2", True),
+        ("field", "reflectance scale factor = 1", True),
+        ("field", "data gain values = {2}", False),
+        ("field_reflectance", "", True),
     ],
 )
-def test_angles_are_of_radiance_unless_the_file_says_that_it_is_reflectance(field, is_said, cube, tmp_path):
-    write_envi_cube(tmp_path / "field", cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
-    with (tmp_path / "field.hdr").open("a") as header:
+def test_angles_are_of_radiance_unless_the_file_says_that_it_is_reflectance(
+    name, field, is_said, cube, tmp_path
+):
+    write_envi_cube(tmp_path / name, cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
+    with (tmp_path / f"{name}.hdr").open("a") as header:
         header.write(f"{field}\n")
-    words = (tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
+    words = (tmp_path / f"{name}.hdr", "--endmembers", 3, "--output-dir", tmp_path / "out")
     assert (UNKNOWN_LIGHT not in done(image, *words, "--library", "+builtin").out) == is_said
     assert UNKNOWN_LIGHT not in done(image, *words, "--overwrite").out
 

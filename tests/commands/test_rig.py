@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from tests.commands.running import SMALL_METHOD, done
+from tests.commands.running import SMALL_METHOD, done, picture_size
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
+from unmix_plugin.trained.open_run import load_run
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +44,29 @@ def test_figures_are_given_by_sensor(rig_run):
 
 
 def test_every_band_is_rendered_and_exported_from_every_view(rig_run, tmp_path):
-    done(render, "--run", rig_run, "--outputs", "spectral", "--formats", "npy", "--output", tmp_path / "r")
+    words = ["--outputs", "spectral", "--formats", "npy", "--output", tmp_path / "r"]
+    said = " ".join(done(render, "--run", rig_run, *words).out.split())
+    assert "the scene's views have several sizes; pictures of a render have one" in said
     shapes = {np.load(path).shape for path in (tmp_path / "r").rglob("*.npy")}
     assert shapes == {(16, 20, 4)}
     for product in ("cubes", "report", "spectrum"):
         words = ["--view", "view_4", "--pixel", "5,4"] if product == "spectrum" else []
         done(export, product, "--run", rig_run, *words)
-    [cube] = Path(rig_run).glob("exports/cubes/view_4.hdr")
-    assert "samples = 20" in cube.read_text()
+
+
+def test_exported_views_have_their_own_pixels(rig_run, tmp_path):
+    """Rendered at the larger size of another view, they would show something else beside each measured pixel."""
+    for product in ("cubes", "abundances", "segmentation", "pca"):
+        formats = ["--formats", "npy"] if product in ("cubes", "abundances") else []
+        done(export, product, "--run", rig_run, "--output", tmp_path / product, *formats)
+    scene = load_run(rig_run, "cpu").scene
+    for view in (one for one in scene.views if one.split == "eval"):
+        expected = scene.render(view.camera, ["spectral", "abundances", "segmentation"])
+        cube, shares = (np.load(tmp_path / name / f"{view.name}.npy") for name in ("cubes", "abundances"))
+        np.testing.assert_array_equal(cube, expected["spectral"])
+        np.testing.assert_array_equal(shares, expected["abundances"])
+        ids = np.asarray(Image.open(tmp_path / "segmentation/labels" / f"{view.name}.png"))
+        np.testing.assert_array_equal(ids, expected["segmentation"])
+        assert picture_size(tmp_path / "pca" / f"{view.name}.png") == view.camera.size(0)
+    sizes = {view.camera.size(0) for view in scene.views if view.split == "eval"}
+    assert sizes == {(20, 16), (10, 8)}

@@ -38,7 +38,8 @@ def edited(
     scene: TrainedScene, *edits: str, seen: Coefficients | None = None, light: str = ""
 ) -> TrainedScene:
     """The scene after edits, each written as in a recipe."""
-    return edit_scene(scene, recipe(*edits, light=light), seen)
+    made = recipe(*edits, light=light)
+    return edit_scene(scene, made) if seen is None else edit_scene(scene, made, lambda _: seen)
 
 
 def recipe(*edits: str, light: str = "") -> Recipe:

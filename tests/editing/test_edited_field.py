@@ -190,11 +190,23 @@ def test_what_is_seen_is_sampled_from_coarse_pictures_of_several_views():
     assert_close(coarse.accumulation.mean(), seen.accumulation.mean(), rtol=0.05, atol=0)
 
 
-def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels():
+@pytest.mark.parametrize(
+    "before",
+    [
+        (),
+        ("gloss: {scale: 0}",),
+        ("gloss: {scale: 3, colour: '#c0a060'}",),
+        ("gloss: {endmember: %d, scale: 3}", "gloss: {scale: 0.4}"),
+        ("gloss: {endmember: %d, scale: 3, colour: '#c0a060'}",),
+        ("isolate: %d",),
+    ],
+)
+def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels(before):
     scene = lit_scene()
     seen = sample_seen(scene)
     index = int(seen.abundances.argmax(-1)[seen.accumulation >= 0.5].mode().values)
-    result = edited(scene, f"retint: {{endmember: {index}, colour: '#606858'}}", seen=seen)
+    earlier = [edit % index if "%" in edit else edit for edit in before]
+    result = edited(scene, *earlier, f"retint: {{endmember: {index}, colour: '#606858'}}")
     views = [result.look(CAMERAS[view], subpixels=1) for view in range(2)]
     shares = torch.cat([view["abundances"].flatten(0, 1) for view in views])
     opacity = torch.cat([view.opacity.flatten() for view in views])

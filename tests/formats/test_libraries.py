@@ -112,6 +112,18 @@ def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what
     np.testing.assert_allclose(ash.reflectance, [0.3, 0.1, NAN, NAN, 0.2])
 
 
+@pytest.mark.parametrize(
+    "head", ["leaf %", "leaf%", "leaf_%", "leaf (%)", "leaf [Percent]", "leaf (per cent) "]
+)
+def test_percent_are_divided_where_the_head_says_so(tmp_path, head):
+    table = written(tmp_path, "leaf.csv", f"wavelength,{head},clay 20 %\n400,5,0.5\n500,30,0.6\n")
+    (leaf, clay) = read_library(table)
+    assert (leaf.name, clay.name) == ("leaf", "clay 20 %")
+    np.testing.assert_allclose([leaf.reflectance, clay.reflectance], [[0.05, 0.3], [0.5, 0.6]])
+    [text] = read_library(written(tmp_path, "leaf.txt", f"Wavelength\t{head}\n400\t5\n500\t30\n"))
+    np.testing.assert_allclose(text.reflectance, [0.05, 0.3])
+
+
 @pytest.mark.parametrize("marker", ["-999", "-9999", "-1.23e34"])
 def test_marks_for_what_is_missing_count_as_they_are_stored(tmp_path, marker):
     text = f"wavelength,leaf (%)\n400,5\n500,{marker}\n600,30\n"
@@ -268,3 +280,15 @@ def test_a_folder_stands_for_the_libraries_in_it_whatever_the_suffix_of_their_nu
     infrared = written(tmp_path, "ir.csv", "wavelength,clay\n1000,1\n1500,3\n2500,4\n")
     with pytest.raises(SpectrumError, match=r"from 1000 to 2500 nm, can.t be compared: each covers"):
         library_of([infrared], Bands.of(np.linspace(400, 700, 31)))
+
+
+def test_a_library_is_refused_where_it_covers_too_little_of_what_is_lit(tmp_path):
+    red, bands = (
+        written(tmp_path, "red.csv", "wavelength,clay\n600,1\n700,3\n"),
+        Bands.of(range(400, 710, 10)),
+    )
+    lights = {start: (bands.centers_nm >= start) * 1.0 for start in (400, 550, 690)}
+    assert library_of([red], bands, lights[550]).names == ("clay",)
+    for light in (None, lights[400], lights[690]):  # 11 of 31 bands, and 2 of 2
+        with pytest.raises(SpectrumError, match=r"less than half of 31 bands, 400-700 nm, .* without light"):
+            library_of([red], bands, light)

@@ -129,7 +129,7 @@ def test_the_container_is_as_the_specification_has_it_and_another_reader_gets_it
     assert (binary_kind, binary_length % 4) == (b"BIN\0", 0)
     assert 28 + text_length + binary_length == len(data)
     assert content["asset"]["version"] == "2.0"
-    assert content["meshes"][0]["extras"] == {"materials": ["oak", "löss"]}
+    assert content["meshes"][0]["extras"] == {"materials": ["oak", "löss"], "up": [0, 1, 0]}
     attributes = content["meshes"][0]["primitives"][0]["attributes"]
     position, colour = (content["accessors"][attributes[name]] for name in ("POSITION", "COLOR_0"))
     assert (position["min"], position["max"]) == (

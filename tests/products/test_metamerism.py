@@ -146,6 +146,22 @@ def test_a_library_of_the_visible_range_serves_a_run_that_goes_far_beyond(tmp_pa
     assert job.say.call_args.args[0].startswith("0 pairs of 3 materials, seen in D65, A over 20 bands")
 
 
+def test_a_library_in_percent_is_refused_unless_it_says_so(tmp_path, monkeypatch):
+    monkeypatch.undo()
+    paints = tmp_path / "paints.csv"
+    rows = np.stack([BANDS.centers_nm, 100 * GREY, 100 * hidden(0.25)], axis=1)
+    for head in ("a,b", "a %,b (%)"):
+        np.savetxt(paints, rows, delimiter=",", header=f"wavelength,{head}", comments="")
+        asked = Metamerism(lights=BOTH, library=(paints,), surfaces="library")
+        if "%" in head:
+            assert pairs_of(_find_metamers(MATERIALS, asked)) == [{"a", "b"}]
+        else:
+            with pytest.raises(
+                SpectrumError, match=r"a .paints.csv. must be in reflectances, 1 for white; found 40"
+            ):
+                _find_metamers(MATERIALS, asked)
+
+
 def test_the_table_names_materials_lights_and_differences(tmp_path):
     exported(tmp_path / "new", MATERIALS, surfaces="run")
     [row] = csv.DictReader(io.StringIO((tmp_path / "new" / "metamerism.csv").read_text()))

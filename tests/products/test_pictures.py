@@ -19,6 +19,7 @@ from unmix_plugin.figures.pictures import (
     paint,
     premultiplied_over_neutral,
 )
+from unmix_plugin.products import evaluation as evaluation_module
 from unmix_plugin.products.abundances import colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import _write_endmembers
 from unmix_plugin.products.evaluation import (
@@ -150,6 +151,20 @@ def test_evaluation_figures_are_whole_with_more_as_many_and_fewer_materials(num_
     ids = view.segmentation.numpy()
     assert_has_white_margins(_draw_matched_segmentation("view", labels.numpy(), ids, look, matching))
     assert_has_white_margins(_draw_matched_segmentation("view", None, ids, look, matching))
+
+
+def test_an_error_is_drawn_only_where_pixels_count(monkeypatch):
+    given = materials(3)
+    view = rendered(given)
+    valid = torch.ones(12, 16, dtype=torch.bool)
+    valid[:, 8:] = False
+    measured = ViewTruth("view", view.spectra * valid[..., None] * 0.5, valid)  # invalid pixels read as 0
+    drawn = []
+    monkeypatch.setattr(evaluation_module, "draw_panels", lambda rows, *_: drawn.extend(rows[0]) or b"")
+    _draw_colour(measured, view, given.bands, 30.0)
+    error = next(panel.image for panel in drawn if panel.title == "error")
+    np.testing.assert_allclose(error[:, 8:], NEUTRAL)
+    assert np.ptp(error[:, 4:8]) > 0.1
 
 
 def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_its_own():

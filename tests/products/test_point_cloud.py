@@ -113,11 +113,12 @@ def test_a_target_is_judged_against_the_points_themselves(paint):
 def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
     formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
     unknown, known = make_model().materials, make_model(light=LIGHT).materials
-    assert formula.comment(known) == (
+    assert formula.comments(known) == [
         "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
-    )
-    assert formula.comment(unknown).endswith("; of radiance, since the scene's light is unknown")
-    assert named.comment(known).startswith("index_pri: index:pri, photochemical reflectance index")
+    ]
+    [said] = formula.comments(unknown)
+    assert said.endswith("; of radiance, since the scene's light is unknown")
+    assert named.comments(known)[0].startswith("index_pri: index:pri, photochemical reflectance index")
 
 
 @pytest.mark.parametrize("output", ["rgb", "band:650nm", "index", "index:", "target:", "ndvi", ""])
@@ -222,3 +223,15 @@ def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
     np.testing.assert_array_equal(found[pure, 2], material[pure] == 0)
     assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-3]
     assert ply.comments[-3].endswith("of radiance, since the scene's light is unknown")
+
+
+def test_a_file_says_which_spectrum_a_number_of_a_library_is(points, tmp_path):
+    spectra = SCENE.materials.endmembers.detach().double().numpy()
+    write_spectra_csv(tmp_path / "two.csv", SpectraTable(SCENE.bands, ("moss", "red clay"), spectra[[1, 0]]))
+    scores = _require_point_scores([f"library:{tmp_path / 'two.csv'}<0.1"], SCENE.bands)
+    _write_point_cloud(tmp_path / "points.ply", points, 300, SCENE, FRAME, scores)
+    ply = PlyData.read(tmp_path / "points.ply")
+    assert ply.comments[-2:] == ["library_1 0: moss", "library_1 1: red clay"]
+    numbers, material = np.asarray(ply["vertex"]["library_1"]), np.asarray(ply["vertex"]["material"])
+    pure = columns(ply, [f"abundance_endmember_{index}" for index in range(3)]).max(axis=1) > 0.999
+    np.testing.assert_array_equal(numbers[pure & (material < 2)], 1 - material[pure & (material < 2)])

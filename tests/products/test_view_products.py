@@ -15,6 +15,7 @@ from tests.method_factory import make_scene
 from tests.trained.camera_scenes import around
 from unmix_plugin.products import abundances, cubes, segmentation
 from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
+from unmix_plugin.products.spectrum import _facts, _ProbedPlace
 from unmix_plugin.trained.evaluation import render_view
 from unmix_plugin.trained.run_materials import endmember_colours
 
@@ -66,6 +67,11 @@ def test_every_format_of_abundances_holds_the_same_float32_shares_by_their_names
     channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
     for index, name in enumerate(("oak, old", "v1_2", "löss")):
         np.testing.assert_array_equal(channels[f"abundances.{name}"].pixels, expected[..., index])
+    alike = replace(MATERIALS, names=("v1.2", "v1_2", "V1.2"))
+    abundances._write_view(["exr"], tmp_path, NAME, VIEW, alike)
+    channels = OpenEXR.File(str(tmp_path / f"{NAME}.exr"), separate_channels=True).channels()
+    for index, name in enumerate(("v1_2", "v1_2_1", "V1_2_2")):
+        np.testing.assert_array_equal(channels[f"abundances.{name}"].pixels, expected[..., index])
 
 
 def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
@@ -75,6 +81,16 @@ def test_spectral_python_opens_the_endmembers_as_a_library(tmp_path):
     assert library.names == list(MATERIALS.names)
     np.testing.assert_array_equal(library.spectra, SCENE.materials.endmembers.numpy())
     np.testing.assert_array_equal(library.bands.centers, MATERIALS.bands.centers_nm)
+
+
+@pytest.mark.parametrize("method", ["abundances", "probe"])
+def test_the_material_of_a_pixel_is_that_of_its_label(method):
+    scene = replace(SCENE, materials=replace(MATERIALS, segmentation=method))
+    camera = around()[0]
+    ids = scene.look(camera)["segmentation"]
+    for row, column in (ids < 255).nonzero()[::40].tolist():
+        place = _ProbedPlace("", {}, scene.probe(camera, column, row), None, ())
+        assert _facts(place, scene.materials)["material"] == MATERIALS.names[int(ids[row, column])]
 
 
 def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):

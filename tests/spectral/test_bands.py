@@ -75,6 +75,17 @@ def test_bands_reach_as_far_into_a_gap_as_the_instrument_is_known_to_see():
     assert len(Bands(centers, np.full(len(centers), 200.0)).ranges_nm) == 1
 
 
+def test_a_lone_band_beyond_a_gap_reaches_no_farther_than_half_the_largest_other_step():
+    infrared = Bands.of([475, 560, 668, 717, 842, 1610])
+    np.testing.assert_array_equal(infrared.ranges_nm, [[432.5, 885.5], [1547.5, 1672.5]])
+    ultraviolet = Bands.of([200, 500, 510, 520, 530])
+    np.testing.assert_array_equal(ultraviolet.ranges_nm, [[195, 205], [495, 535]])
+    known = Bands(infrared.centers_nm, np.full(6, 200.0))
+    np.testing.assert_array_equal(known.ranges_nm, [[432.5, 942], [1510, 1710]])
+    ten = [444, 475, 531, 560, 650, 668, 705, 717, 740, 842]  # as uneven as multispectral cameras are
+    np.testing.assert_array_equal(Bands.of(ten).ranges_nm[-1], [791, 893])
+
+
 @pytest.mark.parametrize(
     "centers",
     [
@@ -82,6 +93,7 @@ def test_bands_reach_as_far_into_a_gap_as_the_instrument_is_known_to_see():
         [475, 560, 668, 717, 842],  # a multispectral camera
         [400, 400.3, 405, 405.4, 410, 410.5, 415],  # two cameras of 5 nm
         [400, 900],
+        [475, 842, 1610],
     ],
 )
 def test_uneven_steps_are_no_gaps(centers):

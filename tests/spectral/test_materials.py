@@ -115,6 +115,15 @@ def test_confidence_rates_the_material_that_the_segmentation_names():
     assert by_angle.confidence(seen).tolist() == [0]
 
 
+def test_the_material_of_a_place_is_that_of_the_segmentation():
+    bright_and_dark = torch.tensor([[0.9, 0.1, 0.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.0, 0.0]])
+    seen = shared([0.2, 0.8])
+    for method, name in (("abundances", "leaf"), ("probe", "clay")):
+        mixed = replace(materials(bright_and_dark, ("clay", "leaf")), segmentation=method)
+        place = mixed.spectra(seen)[0].double().numpy(), seen.abundances[0].double().numpy()
+        assert mixed.name_of(*place) == name == mixed.names[int(mixed.ids(seen))]
+
+
 def test_a_linear_map_of_spectra_needs_no_spectra():
     matrix = torch.rand(5, 2, generator=torch.Generator().manual_seed(1))
     mixed = Materials(BANDS, torch.rand(3, 5), torch.rand(1, 5))

@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
-from unmix_plugin.trained.surface import look_from_above
+from unmix_plugin.products.mesh import gltf_content
+from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above
+from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SCENE = ball_scene()
 
@@ -90,3 +94,15 @@ def test_from_straight_above_a_point_looks_as_its_surface():
     nothing, light = look_from_above(SCENE, torch.zeros(0, 3), torch.zeros(0, 3))
     assert (nothing.shape, light.shape) == ((0, 3), (0, 5))
     assert np.isfinite(diffuse.numpy()).all()
+
+
+@pytest.mark.parametrize(
+    "names", [("a", "a 2", "a!"), ("Leaf", "leaf", "LEAF"), ("a", "a_1", "A!"), ("粘", "土", "0")]
+)
+def test_abundances_of_names_that_are_alike_are_all_kept(names):
+    materials = replace(SCENE.materials, names=names)
+    looks = SurfaceAppearance(materials, torch.eye(3), torch.ones(3, len(materials.bands)))
+    mesh = TriangleMesh(np.eye(3), np.array([[0, 1, 2]]))
+    for numbers in (looks.properties(), gltf_content(mesh, looks, "three points")[1]):
+        columns = [column for name, column in numbers.items() if "abundance_" in name.lower()]
+        np.testing.assert_array_equal(columns, np.eye(3))

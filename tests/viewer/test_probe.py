@@ -40,7 +40,16 @@ def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
     np.testing.assert_allclose(taken.predicted, shown["spectral"], rtol=1e-5)
     np.testing.assert_allclose(taken.contributions.sum(axis=0), shown["diffuse"], rtol=1e-5)
     assert taken.abundances.sum() == pytest.approx(1)
-    assert taken.name == taken.materials.names[int(shown["abundances"].argmax())]
+
+
+@pytest.mark.parametrize("method", ["abundances", "probe"])
+def test_the_material_of_a_probe_is_that_of_the_segmentation(source, camera, method):
+    with source.borrowed() as scene:
+        scene = replace(scene, materials=replace(scene.materials, segmentation=method))
+        ids = scene.look(camera)["segmentation"]
+        for row, column in (ids < 255).nonzero()[::300].tolist():
+            name = _probe_through(scene, camera, column + 0.5, row + 0.5, 1).name
+            assert name == scene.materials.names[int(ids[row, column])]
 
 
 def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):

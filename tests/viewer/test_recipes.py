@@ -1,5 +1,6 @@
 """Recipes as a panel builds them: one change of a kind an endmember, all of it undoable."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -105,6 +106,22 @@ def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_
         assert change_of(recipe, type(change), change.endmember) == change
         others = [index for index in range(3) if index != change.endmember]
         torch.testing.assert_close(after[others], before[others])
+
+
+@pytest.mark.parametrize("first", [Retint(0, (0.1, 0.2, 0.3)), Scale(0, 2.0), Replace(0, "x/y")])
+def test_a_change_stays_with_the_look_that_a_swap_has_taken_elsewhere(first):
+    recipe = with_swap(with_change(Recipe(), first), Swap(0, 3))
+    assert change_of(recipe, type(first), 3) == first
+    assert change_of(recipe, type(first), 0) is None
+    assert with_change(recipe, first).operations == (first, Swap(0, 3), first)
+    moved = replace(first, endmember=3)
+    assert with_change(recipe, moved).operations == (Swap(0, 3), moved)
+
+
+def test_names_and_gloss_stay_where_they_are_when_looks_are_swapped():
+    recipe = with_swap(with_change(Recipe(), Gloss(0, 0.5)), Swap(0, 3))
+    assert change_of(recipe, Gloss, 0) == Gloss(0, 0.5)
+    assert with_change(recipe, Gloss(0, 2.0)).operations == (Swap(0, 3), Gloss(0, 2.0))
 
 
 def test_the_same_swap_twice_in_a_row_takes_it_back():

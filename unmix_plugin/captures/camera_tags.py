@@ -281,7 +281,12 @@ def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _Rad
     gain = f_number**2 / (a * exposure * iso + c)
     vignetting = _vignetting_2d(file, tags)
     saturated = _SATURATED_10_BITS if _stored_range(exif) == 2.0**10 else _SATURATED_10_BITS_OF_16
-    return _RadiometricModel("Parrot Sequoia", "relative", b, saturated, lambda y, x: gain / vignetting(y, x))
+    # A black level that no number of 10 bits reaches is of the 16 bits that cameras fill otherwise.
+    unit = 2.0**6 if saturated == _SATURATED_10_BITS < b else 1.0
+    black = b / unit
+    return _RadiometricModel(
+        "Parrot Sequoia", "relative", black, saturated, lambda y, x: unit * gain / vignetting(y, x)
+    )
 
 
 def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:

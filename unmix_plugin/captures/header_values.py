@@ -370,6 +370,9 @@ _TIMES = {
 }
 """Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
 _GAINS = ("gain", "analoggain", "analoguegain", "digitalgain")
+"""A plain gain is the whole one; the others multiply each other."""
+_OF_RESONON = {"shutter", "gain", "framerate"}
+"""Names in headers of Resonon, whose gains are in decibels without saying so. Source: massipipe, RadianceConverter."""
 _OWNERS = ("camera", "sensor", "detector", "imager")
 """Words before a name that change nothing."""
 _SECONDS = {
@@ -398,15 +401,17 @@ def exposure_facts(entries: Mapping[str, Any], where: str) -> tuple[dict[str, An
     >>> exposure_facts({"Exposure Time (us)": "500"}, "header field")[0]["exposure_s"]
     0.0005
     """
-    facts: dict[str, Any] = {}
+    found: dict[str, tuple[Any, str]] = {}
     warnings: list[str] = []
     named = {name: _split(name) for name in entries}
     units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
+    if {name for name, _ in named.values()} >= _OF_RESONON:
+        units.setdefault("gain", "dB")
     for key, (name, unit) in named.items():
         is_time = name in _TIMES
         if unit == "unit" or not (is_time or name in _GAINS):
             continue
-        what = "exposure_s" if is_time else "gain"
+        what = "exposure_s" if is_time else name.replace("analogue", "analog")
         stated: Any = entries[key]  # one, or one a band
         stated = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else stated
         if isinstance(stated, str):
@@ -418,13 +423,23 @@ def exposure_facts(entries: Mapping[str, Any], where: str) -> tuple[dict[str, An
             warnings.append(
                 f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood: exposures may differ"
             )
-        elif what not in facts:
+        elif what not in found:
             numbers = [value[0] for value in values if value is not None]
-            facts[what] = numbers[0] if len(set(numbers)) == 1 else numbers
             has_unit = all(value is not None and value[1] for value in values)
             assumed = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if is_time else "a factor"
             taken = "" if has_unit else f", no unit: taken as {assumed}"
-            facts[f"{what.removesuffix('_s')}_evidence"] = f"{where} '{key}'{taken}"
+            found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, f"{where} '{key}'{taken}"
+    facts: dict[str, Any] = {}
+    if "exposure_s" in found:
+        facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
+    parts = ["gain"] if "gain" in found else [name for name in ("analoggain", "digitalgain") if name in found]
+    if parts:
+        numbers, evidence = zip(*(found[name] for name in parts), strict=True)
+        if len({np.size(number) for number in numbers} - {1}) > 1:
+            warnings.append(f"{' and '.join(evidence)} are lists of different lengths: exposures may differ")
+        else:
+            facts["gain"] = np.multiply.reduce(np.broadcast_arrays(*numbers)).tolist()
+            facts["gain_evidence"] = " and ".join(evidence)
     return facts, tuple(warnings)
 
 
@@ -464,11 +479,17 @@ def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
     return None if unit or not number >= 0 else (number or 1.0, False)
 
 
-def exif_exposure(time_s: Any, iso_speed: Any) -> dict[str, Any]:
-    """The same metadata by EXIF's exposure time and speed; none without a time above 0."""
+def exif_exposure(time_s: Any, iso_speed: Any, f_number: Any) -> dict[str, Any]:
+    """The same metadata, and `f_number`, by EXIF's exposure time, speed and f-number; none without a time above 0."""
     try:
-        time_s, speed = float(time_s or 0), float(iso_speed or 0)
+        time_s, speed, f_number = (float(value or 0) for value in (time_s, iso_speed, f_number))
     except (TypeError, ValueError, ZeroDivisionError):
         return {}
-    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"} if time_s > 0 else {}
-    return facts | ({"gain": speed / 100} if facts and speed > 0 else {})
+    if not time_s > 0:
+        return {}
+    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"}
+    return (
+        facts
+        | ({"gain": speed / 100} if speed > 0 else {})
+        | ({"f_number": f_number} if f_number > 0 else {})
+    )

@@ -14,7 +14,13 @@ from jaxtyping import Float32
 
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.references import is_srgb
-from unmix_plugin.captures.calibration.sensor import Sensor, choose_scale, prepare_sensor, sampled_rows
+from unmix_plugin.captures.calibration.sensor import (
+    Sensor,
+    choose_scale,
+    prepare_sensor,
+    sampled_rows,
+    with_one_exposure,
+)
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
@@ -57,20 +63,29 @@ class Plan:
     """What a user should know, one sentence each."""
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each."""
-    reference_files: tuple[Path, ...] = ()
-    """Of dark frame and white reference."""
+    option_files: tuple[Path, ...] = ()
+    """What options name: dark frame, white reference, tables of its reflectance and of wavelengths."""
 
     def fingerprint(self, options: ProcessOptions) -> dict[str, Any]:
         """What must be the same for views to be gone on with: options, decisions and input files."""
         own = ["output_dir", "overwrite", "poses", "marker_size", "marker_family", "known_distance", "angles"]
         asked = {key: value for key, value in plain_options(options).items() if key not in own}
-        files = [path for view in self.views for path in input_files(view)] + list(self.reference_files)
+        files = [path for view in self.views for path in input_files(view)] + list(self.option_files)
         stamps = []  # path, size and time of change, which tell quickly whether a file is still the same
         for file in _files_of(files):
             with reading(file):
                 facts = file.stat()
             stamps.append([os.fspath(file.absolute()), facts.st_size, facts.st_mtime_ns])
-        return {"version": __version__, "options": asked, "decisions": self.decisions, "files": stamps}
+        # What transforms.json states may change while its poses, which views don't depend on, are mended.
+        stated = [view.cube.linear for view in self.views if view.cube.linear is not None]
+        return {
+            "version": __version__,
+            "options": asked,
+            "decisions": self.decisions,
+            "bands": {name: sensor.centers_nm.tolist() for name, sensor in self.sensors.items()},
+            "gains": sorted({repr((one.gains.tolist(), one.offsets.tolist())) for one in stated}),
+            "files": stamps,
+        }
 
 
 def make_plan(
@@ -98,6 +113,7 @@ def make_plan(
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
         sensors[name] = prepare_sensor(name, same, options, references, every)
+    sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     scale, why = choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = _choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
@@ -136,6 +152,8 @@ def make_plan(
     said += _notes_on_pictures([view.cube for view in views])
     said += dict.fromkeys(note for view in views for note in view.cube.notes)
     opened = [file for file in references if file is not None]
+    texts = (options.wavelengths or "", options.white_reflectance)  # numbers, or the name of a table
+    tables = filter(os.path.isfile, texts)
     warned = [warning for sensor in sensors.values() for warning in sensor.warnings]
     if scale != 1.0 and options.scale is None and all(sensor.is_stated for sensor in sensors.values()):
         units = ", ".join(dict.fromkeys(sensor.unit for sensor in sensors.values()))
@@ -155,7 +173,7 @@ def make_plan(
         decisions,
         (*capture.notes, *said),
         (*capture.warnings, *warned, *_warnings_of_files(each)),
-        tuple(path for file in opened for path in file.files),
+        (*(path for file in opened for path in file.files), *map(Path, tables)),
     )
 
 

@@ -65,7 +65,8 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     """
     _check(options)
     _refuse_output(options.output_dir, options.overwrite)
-    capture = _open_capture(options)
+    references = _open_references(options)
+    capture = _open_capture(options, references)
     say(f"{capture.root}: {len(capture.views)} views of the layout {capture.layout}")
     check_pose_options(options, capture)
     known = asked_distance(options, capture.views)
@@ -73,7 +74,7 @@ def process_capture(options: ProcessOptions, say: _Say, follow: _Follow) -> list
     if options.poses not in FROM_PICTURES:
         posed = pose_views(capture.views, given_poses(capture, options.poses), known)
     views = capture.views if posed is None else posed.views
-    plan = make_plan(capture, views, options, _open_references(options))
+    plan = make_plan(capture, views, options, references)
     for note in plan.notes:
         say(f"note: {note}")
     if options.poses == MARKERS:
@@ -154,10 +155,10 @@ def _check(options: ProcessOptions) -> None:
         raise ConfigError(f"--max-noise {options.max_noise:g}: expected a share above 0")
 
 
-def _open_capture(options: ProcessOptions) -> Capture:
+def _open_capture(options: ProcessOptions, references: Sequence[SpectralFile | None]) -> Capture:
     wavelengths = None if options.wavelengths is None else parse_wavelengths(options.wavelengths)
-    references = tuple(path for path in (options.dark, options.white) if path is not None)
-    asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=references)
+    named = tuple(path for file in references if file is not None for path in file.files)
+    asked = ReadOptions(options.dataset, wavelengths, options.axes, exclude=named)
     capture = _by_size(find_views(options.layout, options.data, asked))
     first: dict[str, SpectralFile] = {}
     for view in capture.views:

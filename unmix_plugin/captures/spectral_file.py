@@ -172,7 +172,7 @@ class SpectralFile:
     warnings: tuple[str, ...] = ()
     """What may make values, wavelengths or geometry wrong, one sentence each: reports begin with it."""
     metadata: dict[str, Any] = field(default_factory=dict)
-    """Other facts by name, as JSON-able values: exposure_s, gain, black_level, xmp, ..."""
+    """Other facts by name, as JSON-able values: exposure_s, gain, f_number, black_level, xmp, ..."""
     sources: tuple[Path, ...] = ()
     """Files that hold the numbers, where they are not `path` alone."""
     dark_lines: int = 0
@@ -392,11 +392,15 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     if "header" not in same and len(headers) == len(parts):
         shared = set.intersection(*(set(header.items()) for header in headers))
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
-    exposed = [part.metadata.get("exposure_s") for part in parts]
-    if "exposure_s" not in same and all(isinstance(time, float) for time in exposed):
-        gains = [part.metadata.get("gain", 1.0) for part in parts]
-        same = {key: value for key, value in same.items() if key != "gain"}
-        same["exposure_s"] = [time * gain for time, gain in zip(exposed, gains, strict=True)]
+    exposure: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
+    exposed = [[part.metadata.get(key, usual) for key, usual in exposure.items()] for part in parts]
+    if len(set(map(repr, exposed))) > 1:
+        same = {key: value for key, value in same.items() if key not in exposure}
+        is_alike = len({"f_number" in part.metadata for part in parts}) == 1
+        if is_alike and all(isinstance(number, float) for numbers in exposed for number in numbers):
+            of_first = exposed[0][2]  # so that the bands have one f-number again
+            same["exposure_s"] = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
+            same |= {"f_number": of_first} if "f_number" in first.metadata else {}
     return replace(
         first,
         path=path,

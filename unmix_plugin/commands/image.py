@@ -105,7 +105,7 @@ def image(argv: list[str]) -> None:
 
 def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, is_compared: bool) -> None:
     """Size, doubts and notes of a file, and what of it is left out."""
-    from unmix_plugin.captures.calibration.references import is_srgb
+    from unmix_plugin.captures.calibration.references import is_srgb, stated_reflectance
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
     print(
@@ -119,7 +119,7 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
         print(f"note: {note}")
     if is_srgb(opened):
         print("the picture is taken as sRGB and brought to linear light")
-    if is_compared and not _says_reflectance(opened):
+    if is_compared and stated_reflectance(opened) is None:
         print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
         print(
@@ -127,13 +127,6 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
         )
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
-
-
-def _says_reflectance(opened: SpectralFile) -> bool:
-    """Whether the calibration that the file states gives reflectance; a scale of 1 is one, too."""
-    evidence = "" if opened.linear is None else opened.linear.evidence.lower()
-    scale = opened.metadata.get("header", {}).get("reflectance scale factor", "")
-    return "reflectance" in evidence or "l2scale" in evidence or scale.strip() in ("1", "1.0")
 
 
 def _say(found: UnmixedImage, mask: np.ndarray, names: list[str]) -> None:

@@ -17,7 +17,7 @@ from unmix_plugin.errors import CaptureError, ConfigError, counted
 if TYPE_CHECKING:
     from rich.table import Table
 
-_SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evidence", "map")
+_SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evidence", "f_number", "map")
 """Metadata that have lines of their own."""
 
 
@@ -129,6 +129,8 @@ def _image_rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("exposure", f"{_range_text(found['exposure_s'])} s ({found['exposure_evidence']})"))
     if "gain" in found:
         rows.append(("gain", _range_text(found["gain"])))
+    if "f_number" in found:
+        rows.append(("f-number", f"{found['f_number']:g}"))
     rows += [(key, found["map"][key]) for key in ("map info",) if key in found.get("map", {})]
     return rows
 

@@ -123,6 +123,13 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
             cameras = choose_cameras(loaded.scene, request, loaded.scale)
         for line in loaded.scene.notes:
             say(console, line)
+        own = {view.name: view.camera.size(0) for view in loaded.scene.views}
+        if len({own[view.name] for view in cameras.views if view.name in own}) > 1:
+            say(
+                console,
+                "the scene's views have several sizes; pictures of a render have one, and each view keeps its vertical "
+                "field of view: products of unmix-export keep the size of each view",
+            )
         outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
         outputs = with_units(outputs, cameras.map_info)
     _render(options, loaded, cameras, outputs, console, processes)

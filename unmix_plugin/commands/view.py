@@ -88,7 +88,10 @@ def prepared(options: ViewOptions) -> Viewer:
     note = None if recipe is None else assumption_of_light(loaded.materials_scene, recipe)
     if note is not None:
         print(note, flush=True)
-    known = library_of(options.library, loaded.materials_scene.bands) if options.library else None
+    known = None
+    if options.library:
+        shown = loaded.materials_scene
+        known = library_of(options.library, shown.bands, shown.light_power)
     with working(console, "looking at the scene"):
         scene = partial(_scene_of, source, options.data)
         services = Services(source, scene, recipe, options.viewer.environments, known)

@@ -54,6 +54,7 @@ from unmix_plugin.editing.recipe import (
     Swap,
 )
 from unmix_plugin.errors import ConfigError, SpectrumError, UnmixError
+from unmix_plugin.field import CoefficientField
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
@@ -341,35 +342,37 @@ def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> Non
         )
 
 
-def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = None) -> TrainedScene:
+def edit_scene(
+    scene: TrainedScene, recipe: Recipe, see: Callable[[TrainedScene], Coefficients | None] = sample_seen
+) -> TrainedScene:
     """The edited scene. Edits are made in order, in the light that the scene was recorded in; then the recipe's light
     is lit. Endmembers keep their numbers.
 
     Args:
         scene: Stays as it is.
         recipe: What to change.
-        seen: What cameras see of `scene`, in any leading axes: retints that match the picture look at it. None: what
-            `sample_seen` finds, where it is needed.
+        see: What cameras see of a scene, in any leading axes, None where it is not known: retints that match the
+            picture look at the scene that the edits before them have made.
     Raises:
         ConfigError: the recipe does not fit the scene or contradicts itself; the message says where.
     """
     light = scene.light_power
-    if seen is None and recipe.wants_pictures:
-        seen = sample_seen(scene)
-    state = MaterialState.of(scene.materials, light, seen)
+    state, seen_as = MaterialState.of(scene.materials, light), None
     for position, operation in enumerate(recipe.operations):
         where = recipe.where(position)
+        looks = isinstance(operation, Retint) and operation.match == "picture"
+        if looks and state.visibility != seen_as:
+            state.seen, seen_as = see(replace(scene, field=_field(scene, state))), state.visibility
         try:
             _HANDLERS[type(operation)](state, operation, where)
         except UnmixError as error:
             raise ConfigError(f"{where}: {error}") from error
     factors, told = light_factors(scene, recipe)
-    specular_spectra, gloss = _specular(state)
     materials = replace(
         scene.materials,
         names=tuple(state.names),
         endmembers=_tensor(state.spectra * factors, scene),
-        specular_spectra=_tensor(specular_spectra * factors, scene),
+        specular_spectra=_tensor(state.mirrored()[0] * factors, scene),
     )
     if recipe.illuminant is not None:
         lit = factors if light is None else light * factors
@@ -378,14 +381,19 @@ def edit_scene(scene: TrainedScene, recipe: Recipe, seen: Coefficients | None = 
         name = asked.stem if isinstance(asked, Path) else asked
         lamp = _tensor(lit, scene)
         materials = replace(materials, light=lamp, is_light_assumed=is_assumed, light_name=name)
-    field = scene.field
-    if gloss is not None or not state.is_kept.all():
-        shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
-        edited = EditedField.over(field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float())
-        field = edited.to(scene.device)
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
-    return replace(scene, field=field, materials=materials, notes=tuple(notes))
+    return replace(scene, field=_field(scene, state), materials=materials, notes=tuple(notes))
+
+
+def _field(scene: TrainedScene, state: MaterialState) -> CoefficientField:
+    """That of the scene without what is removed, and with the gloss of each material."""
+    _, gloss = state.mirrored()
+    if gloss is None and state.is_kept.all():
+        return scene.field
+    shine = np.ones((1, len(state.gloss))) if gloss is None else gloss
+    edited = EditedField.over(scene.field, torch.from_numpy(state.is_kept), torch.from_numpy(shine).float())
+    return edited.to(scene.device)
 
 
 def changes_geometry(recipe: Recipe) -> bool:
@@ -417,27 +425,6 @@ def light_factors(scene: TrainedScene, recipe: Recipe) -> tuple[Float64[np.ndarr
         return relighting_factors(scene.bands, scene.light_power, recipe.illuminant)
     except SpectrumError as error:
         raise ConfigError(f"{recipe.source}: {error}") from error
-
-
-def _specular(
-    state: MaterialState,
-) -> tuple[Float64[np.ndarray, "GJ B"], Float64[np.ndarray, "G K"] | None]:
-    """Specular spectra mirrored in each colour, one after the other, and the gloss of each endmember in each of them;
-    None where all materials have the same gloss, which the spectra describe fully."""
-    colours = list(dict.fromkeys(state.mirrors))
-    gloss = np.array(
-        [
-            [
-                strength if mirror == colour else 0.0
-                for strength, mirror in zip(state.gloss, state.mirrors, strict=True)
-            ]
-            for colour in colours
-        ]
-    )
-    mirrored = [state.mirror_reflectances[colour] * state.specular_spectra for colour in colours]
-    if len(colours) == 1 and np.ptp(gloss) == 0:
-        return mirrored[0] * gloss[0, 0], None
-    return np.concatenate(mirrored), gloss
 
 
 def _tensor(values: Float64[np.ndarray, "*axes B"], scene: TrainedScene) -> Float[Tensor, "*axes B"]:

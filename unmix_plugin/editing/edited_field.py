@@ -102,7 +102,7 @@ def appearance_of(state: MaterialState, index: int) -> _Appearance | None:
         return None
     scaled, specular = (_rows(values, is_its) for values in (seen.scaled_abundances, seen.specular))
     others = np.where(np.arange(scaled.shape[1]) == index, 0.0, scaled)
-    spectra = others @ state.spectra + specular @ state.specular_spectra
+    spectra = others @ state.spectra + specular @ state.mirrored()[0]
     shares = _rows(seen.abundances[..., index] / seen.accumulation, is_its)
     return _Appearance(
         scaled[:, index],
@@ -141,7 +141,7 @@ class MaterialState:
     mirror_reflectances: dict[Colour | None, Float64[np.ndarray, " B"]]
     """The surface that each of these colours stands for."""
     seen: Coefficients | None
-    """What cameras see, rows of pixels (N, ...); None where that is not known."""
+    """What cameras see of materials and gloss as they are now, rows of pixels (N, ...); None where it is not known."""
     done: dict[tuple[str, int], str] = field(default_factory=dict)
     """Which edit did what to which endmember."""
     notes: list[str] = field(default_factory=list)
@@ -149,7 +149,10 @@ class MaterialState:
 
     @classmethod
     def of(
-        cls, materials: Materials, light: Float64[np.ndarray, " B"] | None, seen: Coefficients | None
+        cls,
+        materials: Materials,
+        light: Float64[np.ndarray, " B"] | None,
+        seen: Coefficients | None = None,
     ) -> MaterialState:
         """The materials of a model as they are, in a light (None: unknown)."""
         spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy().copy()
@@ -166,6 +169,30 @@ class MaterialState:
             {None: np.ones(len(materials.bands))},
             seen,
         )
+
+    def mirrored(self) -> tuple[Float64[np.ndarray, "GJ B"], Float64[np.ndarray, "G K"] | None]:
+        """Specular spectra mirrored in each colour, one after the other, and the gloss of each endmember in each of
+        them; None where all materials have the same gloss, which the spectra describe fully."""
+        colours = list(dict.fromkeys(self.mirrors))
+        gloss = np.array(
+            [
+                [
+                    strength if mirror == colour else 0.0
+                    for strength, mirror in zip(self.gloss, self.mirrors, strict=True)
+                ]
+                for colour in colours
+            ]
+        )
+        mirrored = [self.mirror_reflectances[colour] * self.specular_spectra for colour in colours]
+        if len(colours) == 1 and np.ptp(gloss) == 0:
+            return mirrored[0] * gloss[0, 0], None
+        return np.concatenate(mirrored), gloss
+
+    @property
+    def visibility(self) -> tuple[bytes, bytes | None]:
+        """What coefficients of pixels depend on: which materials are kept, and the gloss of each."""
+        _, gloss = self.mirrored()
+        return self.is_kept.tobytes(), None if gloss is None else gloss.tobytes()
 
     def index_of(self, endmember: Endmember) -> int:
         """The number of an endmember.
@@ -229,6 +256,11 @@ class EditedField(CoefficientField):
         self.register_buffer("is_kept", is_kept.clone(), persistent=False)
         self.register_buffer("gloss", gloss.clone(), persistent=False)
         self._removes = not bool(is_kept.all())
+
+    @property
+    def change(self) -> tuple[bytes, bytes]:
+        """Equal where the same is removed, and the gloss is the same."""
+        return self.is_kept.cpu().numpy().tobytes(), self.gloss.cpu().numpy().tobytes()
 
     @property
     def moving_lamp(self) -> MovingLamp | None:

@@ -221,11 +221,6 @@ class Recipe:
         return f"{self.source}, line {operation.line} ({operation.kind})"
 
     @property
-    def wants_pictures(self) -> bool:
-        """Whether the result depends on how cameras see the materials."""
-        return any(isinstance(one, Retint) and one.match == "picture" for one in self.operations)
-
-    @property
     def removes_parts(self) -> bool:
         """Whether anything becomes transparent."""
         return any(isinstance(one, Remove | Isolate) for one in self.operations)

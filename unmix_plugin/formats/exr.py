@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from unmix_plugin.engine.runs.atomic_files import cannot_write, whole_file
+from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.spectral.bands import Bands
 
 
@@ -41,8 +42,12 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], attributes: Mappin
 
 
 def layer_names(layer: str, channels: Sequence[str]) -> list[str]:
-    """Names of the channels of a layer; dots in them become `_`, since a dot parts layers."""
-    return [f"{layer}.{channel.replace('.', '_')}" for channel in channels]
+    """Names of the channels of a layer, all different; dots in them become `_`, since a dot parts layers.
+
+    >>> layer_names("abundances", ["v1.2", "v1_2"])
+    ['abundances.v1_2', 'abundances.v1_2_1']
+    """
+    return [f"{layer}.{name}" for name in numbered_apart(one.replace(".", "_") for one in channels)]
 
 
 def _channel_name(layer: str, wavelength_nm: float) -> str:

@@ -74,6 +74,22 @@ def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:
     return text.getvalue().encode()
 
 
+def numbered_apart(names: Iterable[str]) -> list[str]:
+    """Names that differ in more than capitals: one that is taken gets the least number that makes it free.
+
+    >>> numbered_apart(["red_clay", "leaf", "red_clay_1", "Leaf", "red_clay"])
+    ['red_clay', 'leaf', 'red_clay_1', 'Leaf_1', 'red_clay_2']
+    """
+    taken: dict[str, str] = {}
+    for name in names:
+        free, number = name, 0
+        while free.casefold() in taken:
+            number += 1
+            free = f"{name}_{number}"
+        taken[free.casefold()] = free
+    return list(taken.values())
+
+
 def eight_bits(values: np.ndarray) -> np.ndarray:
     """Values in [0, 1] as 8-bit numbers; others are cut."""
     return np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from unmix_plugin.errors import SpectrumError, name_some
 from unmix_plugin.formats.envi import data_beside, header_items, read_header, read_layout
@@ -47,7 +47,9 @@ _LARGEST_UM = 100.0
 _SMALLEST_SCALE = 1e-30
 
 
-def library_of(paths: Iterable[Path], bands: Bands | None = None) -> MaterialLibrary:
+def library_of(
+    paths: Iterable[Path], bands: Bands | None = None, light: Float[np.ndarray, " B"] | None = None
+) -> MaterialLibrary:
     """The spectra of a user's files alone, or the built-in ones where there are none or `+builtin` stands among them.
 
     Own spectra come first. One whose name another has is called `NAME (FILE)`.
@@ -55,6 +57,7 @@ def library_of(paths: Iterable[Path], bands: Bands | None = None) -> MaterialLib
     Args:
         paths: Files, folders of files, or `+builtin`.
         bands: What spectra will be compared at.
+        light: Its relative power there; None for flat light.
     Raises:
         SpectrumError: a file that can't be read; none of the user's spectra can be compared at the bands.
     """
@@ -66,12 +69,12 @@ def library_of(paths: Iterable[Path], bands: Bands | None = None) -> MaterialLib
         for file in (_libraries_in(path) if path.is_dir() else [path])
         for one in read_library(file)
     ]
-    if bands is not None and own and not MaterialLibrary(tuple(_named(own))).comparable(bands).any():
+    if bands is not None and own and not MaterialLibrary(tuple(_named(own))).comparable(bands, light).any():
         low = min(one.bands.centers_nm[0] for one in own)
         high = max(one.bands.centers_nm[-1] for one in own)
         raise SpectrumError(
             f"the library's spectra, from {low:g} to {high:g} nm, can't be compared: each covers less than half of "
-            f"{bands}"
+            f"{bands}, or less than three, not counting those without light"
         )
     built_in = measured_library().materials if not own or Path(BUILT_IN) in asked else ()
     return MaterialLibrary(tuple(_named([*own, *built_in])))
@@ -174,7 +177,8 @@ def _materials(
 _CSV_HEAD = re.compile(
     r"(?:wave ?length|wl|lambda)s?[\s_]*[\[(]?\s*(?:in )?([^\])]*?)\s*[\])]?", re.IGNORECASE
 )
-_PERCENT = re.compile(r"[\s_]*[\[(](?:%|percent|per cent)[\])]\s*$", re.IGNORECASE)
+_PERCENT = re.compile(r"(?:[\s_]*[\[(](?:%|percent|per cent)[\])]|(?<![\d\s_])[\s_]*%)\s*$", re.IGNORECASE)
+"""`paint (%)`, `paint %`; `clay 20 %` is a name."""
 
 
 def _read_csv(path: Path) -> _Table:

@@ -207,7 +207,7 @@ def write_glb(
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
         extras: What else the file says of the mesh, as JSON has it. Where its `metres_per_unit` is known, the node
             scales by it, since lengths of glTF are metres.
-        up: The unit vector that is up; its node turns it to +y, as glTF prescribes.
+        up: The unit vector that is up; its node turns it to +y, as glTF prescribes, and extras say it.
         uv: Texture coordinates: u to the right, v downwards.
         pictures: PNG by name; the first is shown in place of the colours, the others are variants, shown unlit.
     Source:
@@ -397,7 +397,7 @@ def _write_glb(
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node if metres is None else {**node, "scale": 3 * [metres]}],
-        "meshes": [{"primitives": [primitive], "extras": dict(extras)}],
+        "meshes": [{"primitives": [primitive], "extras": {**extras, "up": np.asarray(up).tolist()}}],
         **({"materials": list(materials)} if materials else {}),
         **({"extensionsUsed": list(used)} if used else {}),
         **({"extensions": said} if said else {}),

@@ -42,7 +42,8 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
         _write_endmembers(folder, materials)
         return paths
-    known, light = library_of(asked.library, materials.bands), job.scene.light_power
+    light = job.scene.light_power
+    known = library_of(asked.library, materials.bands, light)
     paths.append(folder / "angles.csv")
     job.claim(paths)
     if not materials.is_light_known:

@@ -7,7 +7,6 @@ bands play no part.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from unmix_plugin.spectral.colour.difference import (
     metameric_pairs,
     reflectance_to_lab,
 )
+from unmix_plugin.spectral.library.material_library import require_reflectance
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
@@ -81,9 +81,13 @@ def _find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
         rows += list((materials.endmembers.detach().double() / light).cpu().numpy()[:, kept])
     num_own, library = len(names), library_of(asked.library, bands)
     for material in library.materials if asked.surfaces != "run" else ():
-        with suppress(SpectrumError):  # of those that do not reach all bands
-            rows.append(library.reflectance(material.name, bands))
-            names.append(material.name)
+        try:
+            known = library.reflectance(material.name, bands)
+        except SpectrumError:  # of those that do not reach all bands
+            continue
+        require_reflectance(known, f"{material.name} ({material.source})")
+        rows.append(known)
+        names.append(material.name)
     reflectance = np.array(rows).reshape(len(names), len(bands))
     pairs = metameric_pairs(reflectance, powers, bands, asked.alike, asked.different)
     pairs.sort(key=lambda pair: pair.first >= num_own)  # stable

@@ -22,7 +22,6 @@ from unmix_plugin.products.scene_products import Pca
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.evaluation import PredictedView, as_numpy
-from unmix_plugin.trained.run_views import resized_views
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PcaOf = Literal["spectra", "abundances"]
@@ -36,7 +35,7 @@ _LEAST_EXPLAINED = 1e-6
 
 def export(job: Job, asked: Pca) -> list[Path]:
     """Find the components of all views, then paint each."""
-    views, table = resized_views(job.views(asked.views)), job.folder / "components.csv"
+    views, table = job.views(asked.views), job.folder / "components.csv"
     paths = [job.folder / f"{view.name}.png" for view in views]
     job.claim([*paths, table])
     seen = [_survey_view(job.scene, one.camera, asked.of) for one in job.follow("finding components", views)]

@@ -126,10 +126,14 @@ class _PointScore:
         reflectance = seen_reflectance(diffuse, opaque, light, 0.5)
         return self.map.fit(reflectance)(reflectance).numpy().astype(np.float32)
 
-    def comment(self, materials: Materials) -> str:
-        """What a file says of it."""
+    def comments(self, materials: Materials) -> list[str]:
+        """What a file says of it, and what its numbers stand for where they are ids."""
         caveat = "" if materials.is_light_known else "; of radiance, since the scene's light is unknown"
-        return f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
+        said = f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
+        return [
+            said,
+            *(f"{self.property} {index}: {name}" for index, (name, _) in enumerate(self.map.classes)),
+        ]
 
 
 def _require_point_scores(
@@ -223,6 +227,6 @@ def _write_point_cloud(
         **{score.property: score.values(diffuse, materials.light) for score in scores},
     }
     comments = looks.comments("surface points of an unmix-nerf run")
-    comments += [score.comment(materials) for score in scores]
+    comments += [comment for score in scores for comment in score.comments(materials)]
     write_ply(path, vertices, comments=comments)
     return len(chosen)

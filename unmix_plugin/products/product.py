@@ -154,16 +154,14 @@ class Job:
         paths: Callable[[Path, str], list[Path]],
         write: Callable[[Path, str, PredictedView, Materials], None],
     ) -> list[Path]:
-        """Render views, one after the other, and write each; several processes share them.
+        """Render views, one after the other, each at its own size, and write each; several processes share them.
 
         Args:
             choice: Of the run's views.
             paths: Files of a view, from the folder and its name.
             write: Writes them.
         """
-        from unmix_plugin.trained.run_views import resized_views
-
-        views, processes = resized_views(self.views(choice)), self.processes
+        views, processes = self.views(choice), self.processes
         files = [path for view in views for path in paths(self.folder, view.name)]
         with processes.together():
             self.claim(files)

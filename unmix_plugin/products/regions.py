@@ -68,13 +68,17 @@ def _measure_all(job: Job) -> list[Path]:
         for name, one in found.items()
         for what, values in (("mean", one.mean), ("standard deviation", one.spread))
     }
-    bands = job.materials.bands
+    bands, quantity = job.materials.bands, job.materials.quantity
     write_spectra_csv(
         spectra, SpectraTable(bands, tuple(columns), np.stack(list(columns.values())).clip(min=0))
     )
     means = np.stack([one.mean for one in found.values()]).astype(np.float32)
     written = write_envi_library(
-        job.folder / "regions", means, bands, tuple(found), "mean spectra of regions"
+        job.folder / "regions",
+        means,
+        bands,
+        tuple(found),
+        f"mean spectra of regions: {quantity}, 1 = full scale",
     )
     return [table, spectra, *written]
 

@@ -158,7 +158,7 @@ class Regions(Product):
     box: tuple[str, str] | None = None
     """Two opposite corners of a box, in the world ("0.1 0.2 0.5") or by pixels of views (VIEW:column,row)."""
     material: str | None = None
-    """Name or number of an endmember: where it has the largest share."""
+    """Name or number of an endmember: where segmentations show it."""
     view: str | None = None
     """View of --polygon or --mask: its name, or its number among the evaluation views."""
     polygon: str | None = None

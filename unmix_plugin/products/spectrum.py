@@ -89,7 +89,7 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
             "give a pixel with --view and --pixel, a point with --point, or a region with --region"
         )
     light, matches = job.scene.light_power, []
-    known = library_of(asked.library, job.materials.bands)
+    known = library_of(asked.library, job.materials.bands, light)
     if not job.materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
@@ -101,7 +101,8 @@ def export(job: Job, asked: Spectrum) -> list[Path]:
     written = _write_spectrum(job.folder, name, probed, job.scene)
     if spread is not None:
         mean = probe.spectra["predicted"][None].astype(np.float32)
-        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), "mean spectrum")
+        about = f"mean spectrum: {job.materials.quantity}, 1 = full scale"
+        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), about)
     return written
 
 
@@ -123,6 +124,11 @@ def _measured(
     index = _with_all_bands(scene).get(view.name)
     if index is None:
         job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
+        return None
+    if not scene.valid_mask(index)[pixel[1], pixel[0]]:
+        job.say(
+            f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum"
+        )
         return None
     return _read_pixel(job, scene, index, *pixel)
 
@@ -281,7 +287,7 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
         "world_position": None if position is None else position.tolist(),
         "opacity": probe.opacity,
         "measured_in_views": None if place.over_views is None else len(place.over_views),
-        "material": max(shares, key=lambda name: shares[name]) if is_something else None,
+        "material": materials.name_of(probe.spectra["predicted"], probe.abundances) if is_something else None,
         "abundances": shares,
         "library": [match_json(shown.match) for shown in place.matches],
     }

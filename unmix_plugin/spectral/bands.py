@@ -2,8 +2,8 @@
 
 Notation: `B` bands, index `i` rising with wavelength; wavelengths in nm. Each band stands for an interval of the
 spectrum: its edges lie halfway between neighbouring centres, and the outermost bands are symmetric about their centres.
-Where bands were left out there is a gap, into which those beside it reach no farther than half their spacing: what lies
-in there was not measured.
+Where bands were left out there is a gap, into which those beside it reach no farther than half their spacing (a lone
+one half of the largest step between the others): what lies in there was not measured.
 """
 
 from __future__ import annotations
@@ -114,6 +114,9 @@ class Bands:
         to_edge = np.stack([centers - edges[:-1], edges[1:] - centers], axis=1)
         own = np.fmax(spacing, np.reshape(fwhm, (-1, 1))) / 2
         reach = np.where(2 * to_edge > _LEAST_GAP * spacing, np.minimum(to_edge, own), to_edge)
+        for last, outwards in ((0, 0), (-1, 1)):  # the outermost are symmetric
+            if reach[last, 1 - outwards] < to_edge[last, 1 - outwards]:
+                reach[last, outwards] = reach[last, 1 - outwards]
         tiled = np.stack([edges[:-1], edges[1:]], axis=1)
         return np.where(reach < to_edge, centers[:, None] + reach * np.array([-1.0, 1.0]), tiled)
 
@@ -207,12 +210,14 @@ def are_band_numbers(values: np.ndarray, may_have_gaps: bool = False) -> bool:
 
 def _spacings_above(centers: Float64[np.ndarray, " B"]) -> Float64[np.ndarray, " B"]:
     """Mean of the next two steps above each centre, so that near duplicates don't count alone. Where only one is left
-    the median of all steps counts if it is larger, and where none is the spacing is infinite: nothing is known of it.
+    the median of all steps counts if it is larger; where none is, the largest of the steps but that below, or infinity
+    where these are fewer than two: nothing is known of it.
     """
     if len(centers) == 1:
         return np.array([np.inf])
     steps = np.diff(centers)
-    return np.concatenate([(steps[1:] + steps[:-1]) / 2, [max(steps[-1], np.median(steps)), np.inf]])
+    outermost = steps[:-1].max() if len(steps) > 2 else np.inf
+    return np.concatenate([(steps[1:] + steps[:-1]) / 2, [max(steps[-1], np.median(steps)), outermost]])
 
 
 def _require_one_axis(centers: np.ndarray) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
@@ -257,6 +258,19 @@ class Materials:
         if self.segmentation == "abundances":
             return coefficients.abundances
         return material_scores(self.spectra(coefficients), self.endmembers)
+
+    def scores_of(
+        self, spectra: Float[Tensor, "*rays B"], abundances: Float[Tensor, "*rays K"]
+    ) -> Float[Tensor, "*rays K"]:
+        """The same of spectra and abundances on any device."""
+        if self.segmentation == "abundances":
+            return abundances
+        return material_scores(spectra, self.endmembers.detach().to(spectra))
+
+    def name_of(self, spectrum: Float[np.ndarray, " B"], abundances: Float[np.ndarray, " K"]) -> str:
+        """Name of the material of one place, chosen as in segmentations."""
+        scores = self.scores_of(torch.from_numpy(spectrum).float(), torch.from_numpy(abundances))
+        return self.names[int(scores.argmax())]
 
     def ids(self, coefficients: Coefficients) -> UInt8[Tensor, "*rays"]:
         """Material of each ray, 255 where nothing is."""

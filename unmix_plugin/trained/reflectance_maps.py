@@ -115,7 +115,7 @@ def _library(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflec
     file, limit = match["file"], float(match["limit"] or _LARGEST_ANGLE_RAD)
     if not Path(file).exists() and not file.startswith("+"):
         raise ConfigError(f"there is no file or folder {file} with a library")
-    library, name = library_of([Path(file)], bands), Path(file).name
+    library, name = library_of([Path(file)], bands, lit.astype(np.float64)), Path(file).name
     if match["angle"]:
         if match["limit"]:
             raise ConfigError(

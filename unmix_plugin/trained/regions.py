@@ -40,7 +40,7 @@ class Box:
 
 @dataclass(frozen=True)
 class OfMaterial:
-    """Where a material has the largest share, as segmentations show it."""
+    """Where segmentations show a material."""
 
     material: int
     """Number of its endmember."""

@@ -22,10 +22,11 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
-from unmix_plugin.spectral.segmentation import material_ids, material_scores
+from unmix_plugin.spectral.segmentation import material_ids
 from unmix_plugin.trained.measures import Scale, describe_scale
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -296,9 +297,7 @@ class SurfaceAppearance:
     @property
     def material_ids(self) -> UInt8[np.ndarray, " P"]:
         """Material of each point, chosen as in segmentations."""
-        by_angle = self.materials.segmentation == "probe"
-        endmembers = self.materials.endmembers.detach().cpu()
-        scores = material_scores(self.diffuse, endmembers) if by_angle else self.abundances
+        scores = self.materials.scores_of(self.diffuse, self.abundances)
         return material_ids(scores, torch.ones(len(scores))).numpy()
 
     @property
@@ -327,13 +326,10 @@ class SurfaceAppearance:
 
 
 def property_names(names: tuple[str, ...]) -> list[str]:
-    """Names of abundances as formats without spaces take them, all different.
+    """Names of abundances as formats without spaces take them, all different even without capitals.
 
     >>> property_names(("red clay", "red-clay", "leaf"))
     ['abundance_red_clay', 'abundance_red_clay_1', 'abundance_leaf']
     """
-    plain: list[str] = []
-    for index, name in enumerate(names):
-        short = "abundance_" + (re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or str(index))
-        plain.append(f"{short}_{index}" if short in plain else short)
-    return plain
+    plain = [re.sub(r"[^0-9A-Za-z]+", "_", name).strip("_") or str(index) for index, name in enumerate(names)]
+    return numbered_apart(f"abundance_{name}" for name in plain)

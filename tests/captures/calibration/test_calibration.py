@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from tests.captures.file_factory import file_of
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
 from unmix_plugin.captures.calibration.references import _open_reference as open_reference
 from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
-from unmix_plugin.captures.calibration.references import find_missing
+from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import Linear
 from unmix_plugin.errors import CaptureError, ConfigError
@@ -101,7 +102,6 @@ def test_a_reference_has_gains_where_the_cubes_have_them():
     cube = file_of(stored, linear=Linear(gains, offsets, "its header"))
     found = open_reference(cube, "white reference", cube)
     np.testing.assert_allclose(found.mean[0, 0], stored[0, 0] * gains + offsets)
-    np.testing.assert_allclose(found.stored_mean[0, 0], stored[0, 0])
     for pair in ((cube, file_of(stored)), (file_of(stored), cube)):
         with pytest.raises(CaptureError, match=r"no gains or scale.*its header"):
             open_reference(pair[0], "white reference", pair[1])
@@ -170,6 +170,26 @@ def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: tupl
         panel_reference(file_of(counts, no_data=(65535.0,)), (2, 3, 2, 1), "a view")
     with pytest.raises(ConfigError, match="leaves the image of 12 rows and 8 columns"):
         panel_reference(file_of(counts), (10, 0, 4, 4), "a view")
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "facts", "has_dark"),
+    [
+        ("leaf", np.uint16, {}, True),
+        ("reflectance_target", np.uint16, {}, True),  # which is raw all the same
+        ("REFLECTANCE_212", np.float32, {}, False),
+        ("leaf", np.uint16, {"metadata": {"header": {"reflectance scale factor": "1"}}}, False),
+    ],
+)
+def test_dark_lines_of_raw_numbers_are_a_dark_frame_whatever_their_file_is_called(
+    name, dtype, facts, has_dark
+):
+    counts = np.full((6, 4, 2), 300, dtype)
+    counts[4:] = 90
+    file = replace(file_of(counts, **facts), path=Path(f"{name}.hdr"), shape=(4, 4, 2), dark_lines=2)
+    found = own_dark_mean(file)
+    assert (found is not None) == has_dark
+    assert found is None or (found == 90).all()
 
 
 @pytest.mark.parametrize(

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of
+from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import _open_reference as open_reference
+from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
 from unmix_plugin.captures.calibration.sensor import (
     _BandChoice,
     _clipped_bands,
     _drop_found,
     _find_saturation,
     _noise_shares,
+    prepare_sensor,
     sampled_rows,
+    with_one_exposure,
 )
+from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.spectral_file import CaptureView, Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
@@ -78,6 +86,23 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
 
 
 @pytest.mark.parametrize(
+    ("wavelengths_nm", "dropped", "expected"),
+    [
+        ([500, 510, 520, 530, 540], [], [505, 525]),
+        ([500, 510, 520, 530, 540, 550, 560], [3], [505, 545]),
+        ([1320, 1330, 1340, 1460, 1470, 1480, 1490], [], [1325, 1465, 1485]),  # cut out of the file
+        ([500, 510, 510, 520, 530], [2], [505, 525]),  # of two bands of one wavelength the other is there
+        ([450, 550, 610, 790], [], [500, 700]),
+        ([500, 900], [], [700]),
+    ],
+)
+def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
+    choice = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")).without_rests(2)
+    np.testing.assert_allclose(choice.centers_nm(2), expected)
+    assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
+
+
+@pytest.mark.parametrize(
     ("top", "facts", "part", "value", "expected"),
     [
         (4095, {}, np.s_[:0], 0, 4095.0),
@@ -102,3 +127,58 @@ def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
     white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
     assert not _clipped_bands(white, 65535.0).any()
+
+
+BLOWN = np.array([False, True, False])
+
+
+@pytest.mark.parametrize(
+    ("facts", "top", "dtype", "saturation"),
+    [
+        ({}, 4095, np.uint16, 4095.0),
+        ({}, 4095, np.uint16, 65535.0),  # which no posed view tells
+        ({"linear": Linear(np.full(3, 1e-4), np.zeros(3), "a header")}, 4095, np.uint16, 4095.0),
+        ({"metadata": {"encoding": "sRGB"}}, 255, np.uint8, 255.0),
+        ({"metadata": {"xmp": MICASENSE, "exif": EXIF}}, 65520, np.uint16, 65520.0),
+    ],
+)
+def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, saturation):
+    """Whatever values are made of these, and whether it is a file of its own or a part of a view."""
+    noisy = GENERATOR.normal(0.8 * top, 0.03 * top, (40, 20, 3))
+    noisy[..., BLOWN] *= 1.8
+    counts = np.rint(noisy.clip(0, top)).astype(dtype)
+    view = np.full((60, 50, 3), top // 3, dtype)
+    view[7:47, 9:29] = counts
+    whites = [
+        open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts)),
+        panel_reference(file_of(view, **facts), (7, 9, 40, 20), "a view"),
+    ]
+    for white in whites:
+        np.testing.assert_array_equal(_clipped_bands(white, saturation), BLOWN)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "scale", "facts", "said"),
+    [
+        (np.uint16, 3000.0, {}, "each is brought to that of the first view, 0.01"),
+        (np.float32, 0.3, {}, "values are not divided by that, as they are at most about 1"),
+        (np.uint8, 90.0, {"encoding": "sRGB"}, "which can't be undone as cameras bend the brightness"),
+    ],
+)
+def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, scale, facts, said):
+    """Views of two sizes, the second taken at twice the time."""
+    light = GENERATOR.random((12, 10, 3)) + 0.2
+    files = {
+        name: file_of(
+            (scale * ratio * light).astype(dtype),
+            np.array([500.0, 600.0, 700.0]),
+            metadata=facts | {"exposure_s": 0.01 * ratio},
+        )
+        for name, ratio in (("10x12", 1), ("12x10", 2))
+    }
+    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
+    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
+    sensors = {name: prepare_sensor(name, own, options, (None, None), own) for name, own in each.items()}
+    upright, across = with_one_exposure(sensors, files).values()
+    assert said in " ".join([*upright.notes, *upright.warnings])
+    assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)

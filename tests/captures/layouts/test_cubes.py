@@ -60,6 +60,31 @@ def test_each_view_of_a_tree_has_its_own_references(tmp_path, white, dark, folde
         assert stems(tmp_path / "flat") == expected
 
 
+def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_picture(
+    tmp_path,
+):
+    """Resonon writes x.bil and x.bil.hdr."""
+    made = make_capture(tmp_path / "flat", views=2)
+    write_tree(tmp_path / "tree")
+    for header in [*tmp_path.rglob("*.hdr")]:
+        header.rename(header.with_name(f"{header.stem}.raw.hdr"))
+    for name in ("view_00.png", "view_01.RAW.png"):
+        (made.root / name).touch()
+    flat, tree = find_cubes(made.root, PLAIN), find_cubes(tmp_path / "tree", PLAIN)
+    assert {view.name: view.picture and view.picture.name for view in flat.views} == {
+        "view_00": "view_00.png",
+        "view_01": "view_01.RAW.png",
+    }
+    assert flat.notes[0].startswith("left out, as named like references: dark.raw.hdr, white.raw.hdr")
+    assert [view.name for view in tree.views] == NAMES
+    assert [view.white and view.white.path.name for view in tree.views] == [
+        f"WHITEREF_{name}.raw.hdr" for name in NAMES
+    ]
+    (made.root / "view_00.hdr").write_bytes((made.root / "view_00.raw.hdr").read_bytes())
+    with pytest.raises(CaptureError, match=r"view_00\.hdr and .*view_00\.raw\.hdr would both be the view"):
+        find_cubes(made.root, PLAIN)
+
+
 def test_trees_of_several_days_may_have_the_same_names_and_references_above_them_are_named(tmp_path):
     for day in ("monday", "tuesday"):
         write_tree(tmp_path / day)

@@ -5,6 +5,7 @@ import math
 import shutil
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +15,26 @@ from tests.captures.capture_factory import process
 from tests.captures.file_factory import file_of, present, write_band_file
 from tests.captures.layouts.data_sets import PLAIN
 from tests.captures.layouts.rig_flight import (
+    HEIGHT,
     LENSES,
     PANEL_LIGHT,
+    PX_A_MM,
+    WIDTH,
     image,
     lens_pose,
     write_flight,
     write_panel,
     write_poses,
 )
+from tests.captures.layouts.rig_flight import (
+    tags as tags_of,
+)
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
 from unmix_plugin.errors import CaptureError
+from unmix_plugin.scenes.reading.loader import load_scene
 
 
 @pytest.fixture(scope="module")
@@ -133,10 +141,36 @@ def test_a_panel_before_the_flight_makes_reflectances(tmp_path):
     scene = _process(tmp_path / "flight", tmp_path / "scene", tmp_path / "poses.json", **options)
     one = json.loads((scene / "process.json").read_text())["stored"]["calibrated_value_of_1"]
     assert not list((scene / "cubes").glob("*_9999_*"))
+    np.testing.assert_array_equal(load_scene(scene).illuminant, np.ones(len(LENSES)))
     for lens in LENSES:
         found = np.load(next((scene / "cubes").glob(f"*_0001_{lens.ending}.npy")))[..., 0] / 65535 * one
         expected = np.minimum(0.5 * image(1, lens) / PANEL_LIGHT[lens.ending], one)
         np.testing.assert_allclose(found, expected, rtol=0.01)
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_lenses_without_a_calibration_of_their_own_are_brought_to_one_exposure(tmp_path, is_told):
+    """Or it is said that they are not."""
+    card = np.linspace(2000, 4000, WIDTH) + np.zeros((HEIGHT, 1))
+    for index, (lens, f_number) in product(range(3), zip(LENSES, (2.2, 4.4, 2.2, 2.2), strict=True)):
+        own = tags_of(index, lens)
+        del own["Camera:SensorModel"]
+        told = {"ExposureTime": lens.exposure_s, "FNumber": f_number}
+        counts = card * (lens.exposure_s / 0.004) * (2.2 / f_number) ** 2
+        name = f"IMG_170101_1010{index:02d}_{index:04d}_{lens.ending}.TIF"
+        exif = told if is_told or lens.ending != "RED" else {}
+        write_band_file(tmp_path / "flight" / name, counts, own, {"FocalPlaneXResolution": PX_A_MM} | exif)
+    write_poses(tmp_path / "poses.json", releases=3)
+    wrong = process(
+        tmp_path / "flight", tmp_path / "scene", "rig", poses=str(tmp_path / "poses.json"), mask="none"
+    )
+    means = [
+        np.load(next((tmp_path / "scene" / "cubes").glob(f"*_0001_{lens.ending}.npy"))).mean()
+        for lens in LENSES
+    ]
+    assert any("exposures of red are not known or not compared" in text for text in wrong) != is_told
+    compared = means if is_told else [means[0], *means[2:]]
+    np.testing.assert_allclose(compared, means[0], rtol=0.01)
 
 
 ID = "MicaSense:CaptureId"

@@ -161,6 +161,24 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 
+@pytest.mark.parametrize(
+    ("gain", "applied", "of_camera"),
+    [
+        ({"Gain": [0.1, 0.2, 0.3, 0.4, 0.5], "offset": 0.0}, [0.1, 0.2, 0.3, 0.4, 0.5], None),
+        ({"gain": 4.0}, None, 4.0),
+    ],
+)
+def test_a_gain_is_applied_or_part_of_the_exposure_and_never_both(tmp_path, gain, applied, of_camera):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs.update({"exposure_ms": 10.0, **gain})
+    file = open_spectral_file(tmp_path / "a.h5")
+    check_file(file, exposure_s=0.01, gain=of_camera)
+    assert (file.linear is None) == (applied is None)
+    if applied is not None:
+        check_file(file, calibrated=CUBE * np.array(applied))
+
+
 def test_marks_of_bands_may_be_booleans_and_booleans_are_no_wavelengths(tmp_path):
     good = np.array([True, False, True, True, True])
     with h5py.File(tmp_path / "a.h5", "w") as file:

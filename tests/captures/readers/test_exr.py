@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 
 from tests.captures.file_factory import check_file, rows_and_bands_of
+from unmix_plugin.captures.calibration.references import stated_reflectance
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
@@ -93,6 +94,8 @@ def test_one_of_several_layers_is_taken_or_named(tmp_path):
     check_file(open_spectral_file(tmp_path / "a.exr"), values=channels["S0.450,0nm"][..., None], warning=said)
     named = open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="T"))
     check_file(named, values=channels["T.450,0nm"][..., None])
+    assert stated_reflectance(named) == "the layer T"
+    assert stated_reflectance(open_spectral_file(tmp_path / "a.exr")) is None
     with pytest.raises(CaptureError, match="no layer, part or channel 'S3'"):
         open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="S3"))
 
@@ -130,12 +133,12 @@ def test_damaged_numbers_are_reported_in_the_error_alone(tmp_path, capsys):
 
 def test_a_window_is_put_where_it_belongs_and_the_rest_is_missing(tmp_path):
     inside = (slice(2, 7), slice(3, 11))
-    header = head(window=(3, 2, 10, 6)) | {"expTime": 0.25, "isoSpeed": 200.0}
+    header = head(window=(3, 2, 10, 6)) | {"expTime": 0.25, "isoSpeed": 200.0, "aperture": 2.5}
     file = opened(tmp_path / "a.exr", header, channels(CUBE[inside]))
     expected = np.full(CUBE.shape, np.nan, np.float32)
     expected[inside] = CUBE[inside]
     rows_and_bands_of(file, expected)
-    check_file(file, exposure_s=0.25, gain=2.0)
+    check_file(file, exposure_s=0.25, gain=2.0, f_number=2.5)
 
 
 def test_what_is_rendered_beyond_the_picture_is_cut_off(tmp_path):

@@ -150,8 +150,8 @@ def test_pictures_that_are_cut_short_are_refused(tmp_path, suffix):
 def test_the_exposure_of_a_picture_is_that_of_its_exif(tmp_path):
     picture = Image.new("L", (3, 2))
     exif = picture.getexif()
-    exif[0x8769] = {0x829A: 0.02, 0x8827: 200}
+    exif[0x8769] = {0x829A: 0.02, 0x8827: 200, 0x829D: 2.8}
     picture.save(tmp_path / "a.png", exif=exif)
-    check_file(open_spectral_file(tmp_path / "a.png"), exposure_s=0.02, gain=2.0)
+    check_file(open_spectral_file(tmp_path / "a.png"), exposure_s=0.02, gain=2.0, f_number=2.8)
     picture.save(tmp_path / "b.png")
     check_file(open_spectral_file(tmp_path / "b.png"), exposure_s=None)

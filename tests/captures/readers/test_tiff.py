@@ -101,7 +101,11 @@ PACKET = xmp_packet(
 )
 GAIN = '<Item name="gain">4</Item>'
 CAMERA_GAIN = gdal(GAIN, '<Item name="exposure_ms">10</Item>')
-EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True)]
+EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
+EXIF_OF_GDAL = "".join(
+    f'<Item name="EXIF_{name}">{value}</Item>'
+    for name, value in (("ExposureTime", "(0.25)"), ("ISOSpeedRatings", "200"), ("FNumber", "(2.8)"))
+)
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
 WHOLE = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
 SAID = [
@@ -176,10 +180,19 @@ SAID = [
         {"image": COLOURS, "photometric": "rgb", "extratags": gdal(items("wavelength", NM[:3]))},
         {"warnings": ()},
     ),
-    ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0}),
+    ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
+    ({"extratags": gdal(EXIF_OF_GDAL)}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
     ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
     ({"extratags": gdal(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
     ({"extratags": gdal(items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
+    (
+        {"extratags": gdal(items("gain", [4] * 6), '<Item name="exposure_ms">10</Item>')},
+        {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None},  # not of the camera, too
+    ),
+    (
+        {"extratags": gdal(GAIN, items("SCALE", [3] * 6, ' role="scale"'), '<Item name="tint">10</Item>')},
+        {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0},
+    ),
 ]
 
 

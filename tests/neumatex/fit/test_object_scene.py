@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from numpy.testing import assert_allclose
 from PIL import Image
@@ -23,13 +25,17 @@ from tests.neumatex.factory import (
     write_picture,
     write_spectral_object,
     write_table,
+    write_views,
 )
 from unmix_plugin.errors import SceneError, UnmixError
-from unmix_plugin.formats.exr import write_exr
-from unmix_plugin.neumatex.fit.data_manager import _PixelList
+from unmix_plugin.formats.exr import write_exr, write_spectral_exr
+from unmix_plugin.neumatex.fit.data_manager import ObjectDataManager, ObjectDataManagerConfig, _PixelList
 from unmix_plugin.neumatex.fit.object_scene import load_object
+from unmix_plugin.neumatex.fit.pictures import read_picture
+from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
+from unmix_plugin.spectral.bands import Bands
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +111,61 @@ def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
     )
 
 
+def _write_pillar(folder: Path, has_alpha: bool = True) -> np.ndarray:
+    """A pillar at the world's origin in place of the ball, seen by cameras around it; its vertices."""
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) - _MOVE).tolist()
+    (folder / "transforms.json").write_text(json.dumps(content))
+    shutil.rmtree(folder / "relit")
+    pillar = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    pillar.apply_scale([0.8, 0.8, 1.0])
+    pillar.export(folder / "mesh.ply")
+    cameras = load_object(folder).pictures.cameras
+    shape = mesh_of(torch.tensor(pillar.vertices / RADIUS), torch.tensor(pillar.faces))
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        rays = cameras.image_rays(index)
+        seen = RayMesh(shape).closest(rays.origins, rays.directions).found.reshape(SIZE, SIZE)
+        alpha = seen.numpy().astype(np.float32)
+        write_exr(path, {**dict.fromkeys("RGB", 0.5 * alpha), **({"A": alpha} if has_alpha else {})}, {})
+    return np.array(pillar.vertices)
+
+
+_MOVE = np.column_stack([np.zeros((4, 3)), [*CENTRE, 0.0]])
+
+
+@pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
+def test_of_two_orientations_that_both_fit_somewhat_the_better_is_taken(folder, suffix):
+    vertices = _write_pillar(folder)
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    (folder / "mesh.ply").unlink()
+    for stored, is_turned in ((vertices, False), (vertices[:, [0, 2, 1]] * [1, 1, -1], True)):
+        mesh.vertices = stored
+        mesh.export(folder / f"mesh.{suffix}")
+        scene = load_object(folder)
+        assert_allclose(scene.frame.to_world(scene.mesh.vertices.double().numpy()), vertices, atol=1e-5)
+        assert any("the mesh was turned" in note for note in scene.notes) == is_turned
+
+
+@pytest.mark.parametrize("is_open", [False, True])
+def test_a_mesh_whose_triangles_face_inwards_is_turned_and_that_is_said(made, folder, is_open):
+    mesh = trimesh.load_mesh(folder / "mesh.ply", process=False)
+    faces = np.array(mesh.faces)[int(is_open) :, ::-1]
+    trimesh.Trimesh(mesh.vertices, faces, process=False).export(folder / "mesh.ply", vertex_normal=False)
+    expected, found = load_object(made), load_object(folder)
+    assert_allclose(found.mesh.normals, expected.mesh.normals, atol=0.1)
+    count = len(faces)
+    assert f"mesh.ply: cameras saw {count} of {count} triangles from behind; they were turned" in found.notes
+    assert not any("behind" in note for note in expected.notes)
+
+
+def test_without_alpha_it_is_said_that_the_meshs_place_is_not_known_to_be_right(made, folder):
+    assert not any("could not be checked" in note for note in load_object(made).notes)
+    _write_pillar(folder, has_alpha=False)
+    notes = load_object(folder).notes
+    assert any("mesh.ply lies as they show the object, and which of its axes is upwards" in n for n in notes)
+
+
 def test_tone_turn_and_exposure_are_the_folders(tmp_path):
     folder = write_object(tmp_path / "ball", suffix=".png")
     assert load_object(folder).pictures.tone == "camera"
@@ -176,7 +237,81 @@ def test_integer_arrays_of_file_path_are_divided_by_the_value_scale(folder):
     assert load_object(folder).pictures.read(0).numbers.max() == 0.5
 
 
+def test_what_means_nothing_where_alpha_is_0_is_0(folder):
+    path = folder / "images" / "001.exr"
+    given = read_picture(path)
+    assert given.alpha is not None
+    hidden = given.alpha == 0
+    assert hidden.any()
+    channels = {name: np.where(hidden, np.nan, given.numbers[..., i]) for i, name in enumerate("RGB")}
+    write_exr(path, {**channels, "A": given.alpha}, {})
+    found = read_picture(path).numbers
+    assert (found[hidden] == 0).all()
+    assert_allclose(found[~hidden], given.numbers[~hidden])
+
+
+def test_without_alpha_pixels_beside_the_mesh_do_not_count_in_evaluation_either(folder):
+    _write_pillar(folder, has_alpha=False)
+    manager = ObjectDataManager(ObjectDataManagerConfig(), data=folder, device=torch.device("cpu"))
+    alpha = manager.eval_image(0)[1]["alpha"]
+    assert (alpha[0, 0], alpha[SIZE // 2, SIZE // 2]) == (0, 1)
+    assert len(manager._pixels.views) == pytest.approx(5 * int(alpha.sum()), rel=0.1)
+
+
+def test_pictures_under_held_out_lights_have_names_that_differ(folder):
+    for light, picture in (("a-b", "c"), ("a", "b-c")):
+        there = Path(shutil.copytree(folder / "relit" / "dim", folder / "relit" / light))
+        shutil.move(there / "images" / "000.exr", there / "images" / f"{picture}.exr")
+        frames = json.loads((there / "transforms.json").read_text())["frames"]
+        _change(there, frames=[{**frames[0], "file_path": f"images/{picture}.exr"}])
+    manager = ObjectDataManager(ObjectDataManagerConfig(), data=folder, device=torch.device("cpu"))
+    names = [manager.eval_name(index) for index in range(manager.num_eval_images)]
+    assert len(set(names)) == len(names) == 5
+
+
+def test_keys_that_nobody_knows_are_told_also_of_held_out_lights(folder):
+    _change(folder, tone_mapping="linear", mesh_path="mesh.ply", environment_exposure_stops=0)
+    assert not any("not known" in note for note in load_object(folder).notes)
+    _change(folder, environment_rotation=90)
+    _change(folder / "relit" / "dim", tonemapping="srgb")
+    notes = load_object(folder).notes
+    assert "transforms.json: keys that are not known and not used: environment_rotation" in notes
+    assert "relit/dim/transforms.json: keys that are not known and not used: tonemapping" in notes
+
+
+def _write_truth(folder: Path, shape: tuple[int, int], names: str) -> None:
+    write_exr(folder / "truth/base_colour/000.exr", dict.fromkeys(names, np.ones(shape, np.float32)), {})
+
+
+def _png_under_held_out_light(folder: Path) -> None:
+    write_views(folder / "relit" / "dim", ".png", (0.2, 0.1, 0.1), count=2)
+
+
+def _bands_under_held_out_light(folder: Path) -> None:
+    write_cubes(folder / "relit" / "dim", 2, 0.5, wavelengths=None)
+
+
+def _named_bands_as_colours(folder: Path) -> None:
+    for path in (folder / "images").iterdir():
+        channels = {f"S0.{nm},0nm": np.ones((SIZE, SIZE), np.float32) for nm in (450, 550, 650)}
+        write_exr(path, channels, {})
+
+
 FAULTS = {
+    "truth of another size": (
+        lambda folder: _write_truth(folder, (SIZE // 2, SIZE // 2), "RGB"),
+        r"000.exr: has shape \(12, 12, 3\); expected \(24, 24, 3\): rows and columns of the view 000, and 3 colours",
+    ),
+    "truth of five colours": (lambda folder: _write_truth(folder, (SIZE, SIZE), "RGBXY"), "24, 5.; expected"),
+    "response of held-out pictures": (
+        _png_under_held_out_light,
+        "is camera, a response that is learnt from .* but those are linear; expected linear, srgb or agx",
+    ),
+    "bands under a held-out light": (
+        _bands_under_held_out_light,
+        "dim: pictures of 5 bands; the object has 3 colours: give the same",
+    ),
+    "bands that are no colours": (_named_bands_as_colours, "light's spectrum is not known"),
     "mesh elsewhere": (
         lambda folder: _reshape(folder, 1.0, 2.0),
         r"is not where .* in 6 of 6 views .* is \(0.3, -0.2, 3.5\), the cameras look at \(0.3, -0.2, 1.5\), 2 away",
@@ -264,11 +399,12 @@ def test_a_held_out_light_may_have_its_own_lamp_and_an_option_replaces_the_objec
 
 
 def test_true_materials_are_read(made_spectral):
-    truth = load_object(made_spectral).true_materials
+    scene = load_object(made_spectral)
+    truth = scene.true_materials
     assert truth is not None
     assert truth.names == ("blue", "red")
     assert_allclose(truth.endmembers, ENDMEMBERS)
-    shares = truth.abundances(0)
+    shares = scene.abundances(0)
     assert shares is not None
     assert shares[3, 12].tolist() == [1, 0]
 
@@ -321,6 +457,55 @@ def test_another_cube_alpha_or_mask_makes_it_another_object(spectral_folder, kin
     assert load_object(spectral_folder).summary()["input_hashes"] != before
 
 
+def _bands_per_frame(*bands: int) -> Callable[[Path], None]:
+    """Cubes of some bands, and frames that say which."""
+
+    def change(folder: Path) -> None:
+        for path in (folder / "cubes").glob("*.npy"):
+            np.save(path, np.load(path)[..., list(bands)])
+        frames = json.loads((folder / "transforms.json").read_text())["frames"]
+        _change(folder, frames=[{**frame, "bands": list(bands)} for frame in frames])
+
+    return change
+
+
+def _own_responses(folder: Path) -> None:
+    write_table(folder / "responses.csv", ("a", "b", "c", "d", "e"), np.eye(5)[::-1])
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    _change(folder, frames=[{**frame, "responses_path": "responses.csv"} for frame in frames])
+
+
+def _exr_cubes(folder: Path, shift_nm: float) -> None:
+    """Cubes as spectral images whose channels name other wavelengths."""
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    bands = Bands.of([nm + shift_nm for nm in WAVELENGTHS])
+    for index, frame in enumerate(frames):
+        cube = np.load(folder / frame["hyperspectral_file_path"])
+        frame["hyperspectral_file_path"] = f"cubes/{index}.exr"
+        write_spectral_exr(folder / f"cubes/{index}.exr", cube, bands, None)
+    _change(folder, frames=frames)
+
+
+def test_wavelengths_of_spectral_images_count_as_those_of_transforms_json_do(made_spectral, spectral_folder):
+    expected = load_object(made_spectral)
+    _exr_cubes(spectral_folder, 0.0)
+    for wavelengths in (WAVELENGTHS, None):
+        _change(spectral_folder, wavelengths=wavelengths)
+        found = load_object(spectral_folder)
+        assert found.bands == expected.bands
+        assert_allclose(found.pictures.read(1).numbers, expected.pictures.read(1).numbers, rtol=1e-6)
+
+
+def test_bands_of_frames_that_are_all_in_order_change_nothing(spectral_folder):
+    _bands_per_frame(0, 1, 2, 3, 4)(spectral_folder)
+    assert load_object(spectral_folder).pictures.num_colours == 5
+
+
+def _fewer_shares(folder: Path) -> None:
+    for path in (folder / "abundances").glob("*.npy"):
+        np.save(path, np.load(path)[::2, ::2])
+
+
 def _fewer_bands(spectral_folder: Path) -> None:
     for path in (spectral_folder / "relit" / "dim" / "cubes").glob("*.npy"):
         np.save(path, np.load(path)[..., :4])
@@ -336,6 +521,18 @@ def _fewer_bands(spectral_folder: Path) -> None:
         ({"wavelengths": [450, 500, 550, 600, 900]}, "do not reach"),
         ({"tone_mapping": "srgb"}, "expected linear light"),
         ({"materials": ["blue"]}, "endmembers_path"),
+        (_bands_per_frame(4, 3, 2, 1, 0), "'bands' does not list all 5 bands of its picture in order"),
+        (_bands_per_frame(0, 1, 2), "5 'wavelengths' for pictures of 3 bands"),
+        (_own_responses, "has 'responses_path', which is not followed here"),
+        (
+            lambda folder: _exr_cubes(folder, 200.0),
+            "450-650 nm, but the files of the pictures say 5 bands, 650-",
+        ),
+        (_fewer_shares, r"has shape \(12, 12, 2\); expected \(24, 24, 2\): .* and 2 materials"),
+        (
+            lambda folder: _change(folder / "relit" / "dim", tone_mapping="srgb"),
+            "pictures of bands with 'tone_mapping' srgb; expected linear light",
+        ),
         (_store_integers, "holds uint16; expected floats, or 'value_scale'"),
         (_fewer_bands, "pictures of 4 bands, wavelengths of 5 bands"),
         (lambda folder: write_cubes(folder / "relit" / "dim", 2, 1.0, wavelengths=[1, 2]), "wavelengths"),

@@ -13,7 +13,7 @@ from tests.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.tracing import mesh as reading
-from unmix_plugin.neumatex.tracing.mesh import mesh_of, read_mesh
+from unmix_plugin.neumatex.tracing.mesh import mesh_of, read_mesh, turned_to_viewers
 from unmix_plugin.neumatex.tracing.rays import Hits, RayMesh
 
 
@@ -70,14 +70,18 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
     assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]))
 
 
-def test_our_own_gltf_in_metres_comes_back_in_units_of_the_world(tmp_path):
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.2, 0.1, 0.97), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize("extras", [{}, {"metres_per_unit": 0.05}, {"offset": [5.0, -3.0, 7.0]}])
+def test_our_own_gltf_comes_back_as_it_was_in_the_world(tmp_path, up, extras):
     box = trimesh.creation.box()
-    positions, normals = (np.array(a, dtype=np.float32) for a in (box.vertices + 2.0, box.vertex_normals))
-    colours, extras = np.ones_like(positions), {"metres_per_unit": 0.05}
-    up = np.array([0.0, 0.0, 1.0])
-    write_glb(tmp_path / "mesh.glb", positions, normals, colours, np.array(box.faces), {}, extras, up)
-    mesh = read_mesh(tmp_path / "mesh.glb").with_y_upwards()
-    assert_close(mesh.vertices, torch.from_numpy(positions))
+    world, normals = (np.array(a, dtype=np.float32) for a in (box.vertices + 2.0, box.vertex_normals))
+    stored = world - np.array(extras.get("offset", (0, 0, 0)), dtype=np.float32)
+    turned = np.array(up) / np.linalg.norm(up)
+    faces = np.array(box.faces)
+    write_glb(tmp_path / "mesh.glb", stored, normals, np.ones_like(world), faces, {}, extras, turned)
+    mesh = read_mesh(tmp_path / "mesh.glb")
+    assert_close(mesh.vertices, torch.from_numpy(world))
+    assert_close(mesh.normals, torch.from_numpy(normals))
 
 
 def test_normals_of_the_file_are_kept(tmp_path):
@@ -91,25 +95,35 @@ def test_normals_of_the_file_are_kept(tmp_path):
     assert_close(mesh.normals, torch.tensor(normals, dtype=torch.float32), atol=1e-5, rtol=0)
 
 
-def test_inward_triangles_are_turned_and_said(tmp_path):
-    sphere = trimesh.creation.icosphere(subdivisions=2)
-    sphere.invert()
-    sphere.export(tmp_path / "mesh.ply", vertex_normal=False)
-    notes = []
-    mesh = read_mesh(tmp_path / "mesh.ply", notes)
-    assert len(notes) == 1
-    assert "turned outwards" in notes[0]
-    assert_close(mesh.normals, mesh.vertices, atol=0.05, rtol=0)
+@pytest.mark.parametrize("has_normals", [False, True])
+def test_each_piece_is_turned_so_that_its_front_is_seen(tmp_path, has_normals):
+    inward, outward = (trimesh.creation.icosphere(subdivisions=2) for _ in range(2))
+    outside = np.concatenate([inward.vertices, inward.vertices])
+    inward.invert()
+    inward.update_faces(np.arange(len(inward.faces)) > 0)  # it may be open
+    outward.apply_translation((5, 0, 0))
+    both = trimesh.util.concatenate([inward, outward])
+    both.export(tmp_path / "mesh.ply", vertex_normal=has_normals)
+    read = read_mesh(tmp_path / "mesh.ply")
+    seen = torch.zeros(len(read.faces))
+    seen[10], seen[-10], seen[-11] = -1.0, -0.1, 0.3
+    mesh, count = turned_to_viewers(read, seen)
+    assert count == len(inward.faces)
+    normals = torch.from_numpy(outside).float()
+    assert_close(mesh.normals, normals, atol=0.05, rtol=0)
     a, b, c = mesh.corners().unbind(1)
-    assert bool(((torch.linalg.cross(b - a, c - a) * a).sum(-1) > 0).all())
+    assert bool(((torch.linalg.cross(b - a, c - a) * normals[mesh.faces[:, 0].long()]).sum(-1) > 0).all())
+    again, none = turned_to_viewers(mesh, torch.ones(len(mesh.faces)))
+    assert none == 0
+    assert torch.equal(again.normals, mesh.normals)
 
 
 def test_a_vertex_of_no_triangle_changes_nothing_however_far_it_is(tmp_path):
     box, notes = trimesh.creation.box(), []
     vertices = np.vstack([box.vertices, [[np.nan, 1e30, 0]]])
-    _ply(tmp_path / "box.ply", vertices, box.faces[:, ::-1])
+    _ply(tmp_path / "box.ply", vertices, box.faces)
     read = read_mesh(tmp_path / "box.ply", notes)
-    assert "turned outwards" in notes[0]
+    assert notes == []
     assert_close(read.vertices.amax(dim=0).double(), torch.full((3,), 0.5, dtype=torch.float64))
 
 

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tests.method_factory import make_scene
+from tests.method_factory import WAVELENGTHS_NM, make_scene
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.errors import UnmixError
 from unmix_plugin.products.render.files import choose_formats, file_name
@@ -95,3 +95,10 @@ BAD = [
 def test_what_cannot_be_written_is_refused(outputs, asked, said):
     with pytest.raises(UnmixError, match=said):
         formats(*outputs, asked=asked)
+
+
+def test_files_that_differ_in_capitals_alone_are_the_same_on_some_systems(tmp_path):
+    rows = "\n".join(f"{nm},0.2,0.{index + 1}" for index, nm in enumerate(WAVELENGTHS_NM))
+    (tmp_path / "foils.csv").write_text(f"wavelength,Gold,gold\n{rows}\n")
+    with pytest.raises(UnmixError, match=r"foils.csv#Gold and .*foils.csv#gold would have the same files"):
+        formats(f"target:{tmp_path}/foils.csv#Gold", f"target:{tmp_path}/foils.csv#gold")

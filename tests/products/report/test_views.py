@@ -92,6 +92,22 @@ def test_error_against_wavelength_and_proportions_are_over_pixels_that_show_matt
     assert "<clay>" in texts["segmentation"]
 
 
+def test_pixels_that_do_not_count_show_no_error_and_no_label():
+    view, truth = striped("view_0", 0.1)
+    truth.valid[5:] = False
+    counting = Evaluation(_SceneTruth(BANDS, 3, SPECTRA.double()), MATERIALS.endmembers, MATERIALS.names)
+    views = ReportViews(MATERIALS, counting, ())
+    views.add("view_0", view, truth)
+    [shown] = views.shown
+    assert shown.error is not None
+    assert shown.labels is not None
+    grey = shown.error[0, 0]  # where nothing is
+    assert (shown.error[5:] == grey).all()
+    assert (shown.error[1:5] != grey).any(axis=-1).all()
+    assert (shown.labels[5:] == 255).all()
+    assert (shown.labels[1:5] != 255).all()
+
+
 def test_worst_views_are_those_of_lowest_psnr():
     views = gathered([0.02, 0.1, 0.05, 0.01])
     assert [view.name for view in views.worst_first] == ["view_1", "view_2", "view_0", "view_3"]

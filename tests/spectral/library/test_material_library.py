@@ -81,6 +81,12 @@ def test_only_shared_lit_bands_are_compared_and_their_number_is_told():
     assert match.angle_rad == pytest.approx(0, abs=1e-7)
     dark = np.array([1.0, 1.0, 1.0, 1.0, 0.0, 1.0])
     assert small_library().nearest(spectrum[None], bands, dark)[0][0].num_bands == 3
+    many = Bands.of(np.linspace(400, 700, 13))  # of which most are dark
+    blue = np.where(many.centers_nm < 500, 1.0, 0.0)
+    red = np.interp(many.centers_nm, bands.centers_nm[1:5], [0.1, 0.1, 0.5, 0.9])
+    [match] = small_library().nearest((red * blue)[None], many, blue, count=1)[0]
+    assert (match.name, match.num_bands) == ("a/flat", 4)  # as red is flat there
+    assert small_library().comparable(many, np.where(many.centers_nm < 450, 1.0, 0.0)).tolist() == [False] * 3
     four = Bands.of([400, 500, 600, 700])
     for spectra, own in (  # that hardly overlap, or are black or not finite, resemble nothing
         (np.ones((1, 9)), Bands.of(np.arange(400, 1300, 100))),

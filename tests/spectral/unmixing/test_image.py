@@ -1,5 +1,7 @@
 """One image alone."""
 
+import inspect
+
 import numpy as np
 import pytest
 import torch
@@ -79,6 +81,42 @@ def test_pixels_outside_of_the_mask_take_no_part():
     np.testing.assert_array_equal(found.abundances[5:], unmix_image(cube, 3, mask=mask).abundances[5:])
 
 
+def test_what_an_array_masks_takes_no_part_though_its_numbers_are_finite():
+    stored = np.round(image_of(smooth_endmembers(3)) * 10_000).astype(np.uint16)
+    hole = np.zeros((40, 40), bool)
+    hole[:5] = True
+    stored[hole] = 65535  # no measurement, as a file marks it
+    some_bands = hole[..., None] & (np.arange(stored.shape[2]) < 2)
+    found = unmix_image(np.ma.masked_array(stored, some_bands), 3)
+    expected = unmix_image(stored, 3, mask=~hole)
+    assert not found.abundances[hole].any()
+    np.testing.assert_array_equal(found.abundances, expected.abundances)
+    np.testing.assert_array_equal(found.endmembers, expected.endmembers)
+    left = np.zeros((40, 40), bool)
+    left[3:10] = True
+    both = unmix_image(np.ma.masked_array(stored, some_bands), 3, mask=left)
+    assert ((both.abundances.sum(axis=2) > 0) <= (left & ~hole)).all()
+    with pytest.raises(SpectrumError, match="leaves no pixel to unmix"):
+        unmix_image(np.ma.masked_array(stored, True), 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"cube": [[[0.1, 0.2]]]}, "is a NumPy array; found list"),
+        ({"cube": torch.ones(4, 4, 3)}, "is a NumPy array; found Tensor"),
+        ({"shares": "areas"}, "shares must be auto, area, light; found 'areas'"),
+        ({"endmembers": "3"}, "endmembers must be a whole number or 'auto'; found '3'"),
+        ({"endmembers": 3.0}, "endmembers must be a whole number or 'auto'; found 3.0"),
+        ({"endmembers": None}, "endmembers must be a whole number or 'auto'; found None"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(words, message):
+    plain = inspect.unwrap(unmix_image)  # types may be checked before, as tests are run
+    with pytest.raises(SpectrumError, match=message):
+        plain(**{"cube": image_of(smooth_endmembers(3), 20), **words})
+
+
 @pytest.mark.parametrize(
     ("change", "count", "message"),
     [
@@ -114,6 +152,7 @@ def test_one_material_and_a_constant_image_are_unmixed():
     cube = np.full((6, 6, 5), 0.4, np.float32) * np.linspace(0.2, 1, 5, dtype=np.float32)
     found = unmix_image(cube, 1)
     assert np.allclose(found.abundances, 1)
+    assert np.allclose(found.confidence, 0.952, atol=1e-3)  # what all searches get wrong alike is left
     assert len(unmix_image(cube, "auto").endmembers) == 1
 
 

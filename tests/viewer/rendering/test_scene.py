@@ -1,5 +1,6 @@
 """Recipes on a scene that may be training, and what training views measured of it."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from unmix_plugin.editing import Gloss, Light, Recipe, Remove, Retint, Scale, Sw
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.reading.loader import load_scene
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.outputs import MaterialView
@@ -56,14 +58,27 @@ def test_an_edited_scene_is_made_once_and_follows_a_training_but_not_every_step(
 def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
     asked = []
 
-    def see(unedited):
-        asked.append(unedited)
-        return sample_seen(unedited)
+    def see(scene):
+        asked.append(scene.field)
+        return sample_seen(scene)
 
     Edit(Recipe((Retint(0, (0.5, 0.4, 0.3), "spectrum"),))).apply(trained, 0, see)
     assert asked == []
     Edit(Recipe((Retint(0, (0.5, 0.4, 0.3)),))).apply(trained, 0, see)
-    assert asked == [trained]
+    assert asked == [trained.field]
+
+
+def test_what_cameras_see_is_sampled_once_while_colours_change_and_again_where_parts_go(
+    trained, source, monkeypatch
+):
+    sampled = []
+    monkeypatch.setattr(aids_module, "sample_seen", lambda scene: sampled.append(1) or sample_seen(scene))
+    aids = SceneAids(replace(source, take=lambda: trained), has_materials=True)
+    for removed, times in (((), 1), ((1,), 2), ((1, 2), 3)):
+        for colour in ((0.5, 0.4, 0.3), (0.3, 0.4, 0.5)):
+            before = (Remove(removed),) if removed else ()
+            Edit(Recipe((*before, Retint(0, colour)))).apply(trained, 0, aids.see)
+        assert len(sampled) == times
 
 
 @pytest.mark.parametrize(
@@ -176,6 +191,26 @@ def test_a_point_is_measured_by_the_view_nearest_to_the_camera_and_one_inside_by
     column, row = (int(value) for value in coords[0])
     np.testing.assert_allclose(spectrum, scene.cube(index)[row, column])
     assert views.measurement(torch.zeros(3), camera, None, ball_of(camera).scene) is None
+
+
+def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_of, tmp_path):
+    shutil.copytree(scene.root, tmp_path / "holed")
+    index = scene.train_indices[1]
+    cube = np.load(scene.frames[index].cube_path)
+    cube[:, : cube.shape[1] // 2 + 2] = np.nan
+    np.save(tmp_path / "holed" / scene.frames[index].cube_path.relative_to(scene.root), cube)
+    holed = MeasuredViews(load_scene(tmp_path / "holed", SceneOptions(invalid_pixels="mask")), source)
+    camera = scene.cameras[index]
+    frame = ball_of(camera)
+    _, was_known, _ = views.error(frame)
+    _, is_known, _ = holed.error(frame)
+    assert torch.equal(is_known, was_known & torch.from_numpy(np.isfinite(cube).all(axis=-1)))
+    assert 0 < int(is_known.sum()) < int(was_known.sum())
+    point = BALL * camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
+    found = holed.measurement(point, camera, None, frame.scene)
+    assert found is not None  # by another view, which sees the point too
+    assert found[0] != scene.frames[index].name
+    assert float(found[1].min()) > 0
 
 
 def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene, ball_of):

@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
+from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
-    exposure_of,
     find_missing,
     refuse_outside,
     stated_values,
@@ -114,13 +114,13 @@ class Calibration:
     bands: np.ndarray
     """Indices of the kept bands in the file, in the order of the result."""
     bin_bands: int = 1
-    """Neighbouring kept bands that become one; what does not fill one at the end is left out."""
+    """Neighbouring kept bands that become one, of which there are whole multiples."""
     dark: Reference | None = None
     white: Reference | None = None
     saturation: float | None = None
     """Stored number of a saturated pixel; None where none is known."""
     exposure: Float64[np.ndarray, " b"] | None = None
-    """Exposure time times gain that values are brought to, one number or one a band of the file: that of the white
+    """Exposure (see `exposure_of`) that values are brought to, one number or one a band of the file: that of the white
     reference, otherwise of the first view; None where exposures are not compared."""
     own: Mapping[Path, References] = field(default_factory=dict)
     """Dark and white of single views, by the path of their cube; they go before the common ones."""
@@ -196,8 +196,7 @@ class Calibration:
 
     def _in_bins(self, values: np.ndarray) -> np.ndarray:
         """Kept bands by bins, (n, w, b) to (n, w, c, bands of a bin)."""
-        used = values[..., : self.num_bands * self.bin_bands]
-        return used.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
+        return values.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
 # Pictures brought from the lens of their file into that of the scene, while they are written.

@@ -1,5 +1,4 @@
-"""What stored numbers stand for, and the measured references that they are compared with: dark frames and white panels,
-and how long these and the views were exposed.
+"""What stored numbers stand for, and the measured references that they are compared with: dark frames and white panels.
 
 Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` bands are read.
 """
@@ -7,7 +6,7 @@ Notation: `H x W` pixels and `B` bands of a file, of which `h` rows and `b` band
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -36,8 +35,8 @@ _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
-_FINISHED = ("reflectance", "data gain", "data offset")
-"""In the evidence of gains that make reflectance or radiance of numbers."""
+_OF_REFLECTANCE, _OF_RADIANCE = ("reflectance", "l2scale"), ("data gain", "data offset")
+"""In the evidence of gains that make reflectance or radiance of numbers; l2scale is PRISMA's."""
 _REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
 """The word in names: REFLECTANCE_212, site/reflectance."""
 
@@ -47,22 +46,39 @@ def is_srgb(file: SpectralFile) -> bool:
     return file.metadata.get("encoding") == "sRGB"
 
 
+def stated_reflectance(file: SpectralFile, by_name: bool = True) -> str | None:
+    """Where a file says that its values are reflectances; None where it does not, or says what else they are.
+
+    Args:
+        by_name: Whether its name may say so.
+    Source: NV5, ENVI Header Files (`reflectance scale factor`); Fichet et al. 2021, spectral OpenEXR (layer `T`).
+    """
+    if is_srgb(file) or radiometric_model(file) is not None:
+        return None
+    evidence = "" if file.linear is None else file.linear.evidence
+    if any(word in evidence.lower() for word in _OF_REFLECTANCE):
+        return evidence
+    header = file.metadata.get("header")
+    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
+        return "header field 'reflectance scale factor'"
+    if file.reader == "exr" and (file.bands.names or ("",))[0].startswith("T."):
+        return "the layer T"
+    names = (file.path.stem, str(file.metadata.get("dataset", "")))
+    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
+    return None if named is None else f"the name {named}"
+
+
 def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
     """Where a file says that its values are reflectance or radiance, in which the exposure is accounted for; None where
     it does not. Software keeps the exposure time of the raw file in the header of such values.
 
     Args:
-        by_name: Whether its name may say so.
-    Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr), `reflectance scale factor`).
+        by_name: Whether its name may say that they are reflectance.
+    Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr)).
     """
-    if file.linear is not None and any(word in file.linear.evidence for word in _FINISHED):
-        return file.linear.evidence
-    header = file.metadata.get("header")
-    if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
-        return "header field 'reflectance scale factor'"
-    names = (file.path.stem, str(file.metadata.get("dataset", "")))
-    named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
-    return None if named is None else f"the name {named}"
+    evidence = "" if file.linear is None else file.linear.evidence
+    is_radiance = any(word in evidence for word in _OF_RADIANCE)
+    return evidence if is_radiance else stated_reflectance(file, by_name)
 
 
 def stated_values(
@@ -109,16 +125,8 @@ class Reference:
     """Of a white panel at every band of the file, above 0."""
     dark: Reference | None = None
     """Of a white panel: the dark frame that was taken for it alone, in place of that of the views."""
-    is_view: bool = False
-    """Whether the file is a view that shows it."""
-
-    @property
-    def stored_mean(self) -> Float64[np.ndarray, "1 columns B"]:
-        """The mean in numbers as the file stores them."""
-        linear = self.file.linear
-        if linear is None or is_srgb(self.file):
-            return self.mean.astype(np.float64)
-        return (self.mean - linear.offsets) / linear.gains
+    rectangle: tuple[int, int, int, int] | None = None
+    """First row and column, height and width of the part of a view that shows it; None for a file of its own."""
 
     def rows(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
         """Values at some rows and columns of the cubes; axes of length 1 where one value stands for all."""
@@ -195,7 +203,7 @@ def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], v
         raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
     mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
-    return Reference(cube, "white reference", mean, False, how, is_view=True)
+    return Reference(cube, "white reference", mean, False, how, rectangle=rectangle)
 
 
 def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:
@@ -360,8 +368,9 @@ def _panel_in_view(
 
 
 def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> SpectralFile | None:
-    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw."""
-    return beside or (None if finished_by(file) else file.dark)
+    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw: whole ones are,
+    whatever their name (reflectance_target), as dark lines of what was brought to reflectance are near 0."""
+    return beside or (None if finished_by(file, by_name=file.dtype.kind == "f") else file.dark)
 
 
 def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:
@@ -386,143 +395,3 @@ def _each_view(
         )
     only = next(iter(known.values()))
     return [only if file is None else file for file in files]
-
-
-# Exposures of views and references.
-
-
-def exposure_of(file: SpectralFile) -> Float64[np.ndarray, " b"] | None:
-    """Exposure time times gain, one number or one a band; None where the file does not say the time."""
-    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
-    try:
-        exposure = np.atleast_1d(np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64))
-    except (TypeError, ValueError):
-        return None
-    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
-    return exposure if is_usable else None
-
-
-@dataclass(frozen=True)
-class Exposures:
-    """What becomes of the exposures of views and references."""
-
-    common: Float64[np.ndarray, " b"] | None = None
-    """Exposure time times gain that all are brought to, one number or one a band; None where they are not compared."""
-    notes: tuple[str, ...] = ()
-    """What was done."""
-    warnings: tuple[str, ...] = ()
-    """What may be wrong."""
-
-
-def compare_exposures(
-    views: Sequence[SpectralFile],
-    whites: Sequence[SpectralFile],
-    darks: Sequence[tuple[SpectralFile, SpectralFile]],
-    is_bent: bool,
-    may_be_finished: bool = False,
-) -> Exposures:
-    """The exposure of the white reference, to which views are brought; without one, that of the first view.
-
-    Args:
-        views: At least one.
-        whites: References of all views, or one a view.
-        darks: Each dark frame with a view or a white that it is subtracted from.
-        is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
-        may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
-    """
-    known, of_whites = (
-        [exposure for file in files if (exposure := exposure_of(file)) is not None]
-        for files in (views, whites)
-    )
-    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
-    finished = [finished_by(file, by_name=not whites) for file in views]
-    if None not in finished and not is_bent:
-        if not differs:
-            return Exposures()
-        kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
-        return Exposures(notes=(f"views were exposed {_in_words(known)} s times gain: {kept}",))
-    warnings, misfits = _missing_units([*views, *whites]), _misfits(views, whites)
-    warnings += misfits
-    if len(known) < len(views):
-        missing = (
-            f"{counted(len(views) - len(known), 'view')} without exposure time: exposures are not compared"
-        )
-        is_partial = bool(known or of_whites) and not misfits
-        return Exposures(warnings=(*warnings, missing) if is_partial else tuple(warnings))
-    taken = f"were exposed {_in_words(known)} s times gain"
-    if is_bent:
-        bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
-        return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
-    if may_be_finished and differs and not (whites or darks):
-        kept = (
-            f"views {taken}: values are not divided by that, as they are at most about 1 and taken for reflectances. "
-            "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
-        )
-        return Exposures(warnings=(*warnings, kept))
-    if len(of_whites) < len(whites) and differs and not misfits:
-        warnings.append(
-            f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
-        )
-    pairs = [(exposure_of(dark), exposure_of(other)) for dark, other in darks]
-    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
-    if unlike:
-        of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
-        warnings.append(
-            f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}: dark current "
-            "grows with exposure, so take a dark frame at each"
-        )
-    common, of_whom = np.median(known[0], keepdims=True), "that of the first view"
-    if of_whites:
-        common, of_whom = (
-            of_whites[0],
-            "that of the white reference" if len(whites) == 1 else "that of its white reference",
-        )
-    is_same = len({tuple(exposure) for exposure in [*known, *of_whites, common]}) == 1
-    brought = f"views {taken}: each is brought to {of_whom}, {_in_words(of_whites or [common])}"
-    return Exposures(common, () if is_same else (brought,), tuple(warnings))
-
-
-def _in_words(exposures: Iterable[Float64[np.ndarray, " b"]]) -> str:
-    """The range of exposures.
-
-    >>> _in_words([np.array([0.01]), np.array([0.02])])
-    '0.01 to 0.02'
-    """
-    every = np.concatenate(list(exposures))
-    low, high = every.min(), every.max()
-    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
-
-
-def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> list[str]:
-    """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
-    stated = {
-        repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in (*views, *whites)
-    }
-    if whites and len(stated) == 1:
-        return []
-    num_bands, found = views[0].shape[2], []
-    for file in (*views, *whites):
-        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")} - {1, num_bands}
-        if sizes and "exposure_s" in file.metadata:
-            found.append((file.path.name, max(sizes)))
-    if not found:
-        return []
-    names, numbers = name_some([name for name, _ in found]), sorted({size for _, size in found})
-    what = f"{' or '.join(map(str, numbers))} exposure times or gains for {counted(num_bands, 'band')}"
-    said = f"{names}: {what}: exposures may differ and were not compared"
-    return [f"{said}. Give one number, or one a band, with points as decimal marks"]
-
-
-def _missing_units(files: Iterable[SpectralFile]) -> list[str]:
-    """Warnings where units are missing and matter."""
-    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
-    warnings = []
-    for what, kind in (("exposure", "exposure times"), ("gain", "gains")):
-        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
-        guessed = [text for text in evidence if "no unit" in text]
-        gains = {repr(own.get("gain", 1.0)) for own in metadata}
-        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
-            warnings.append(
-                f"{kind} have no unit in some files ({'; '.join(evidence)}): values may be off by a factor"
-            )
-    return warnings

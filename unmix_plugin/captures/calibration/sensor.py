@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.exposures import Exposures, compare_exposures
 from unmix_plugin.captures.calibration.references import (
-    Exposures,
     Reference,
     References,
-    compare_exposures,
     find_missing,
     find_references,
     is_srgb,
+    stated_reflectance,
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
@@ -52,6 +52,8 @@ _MOST_SATURATED_WHITE = 0.5
 _NEAR_TOP, _MOST_CLIPPED = 0.99, 0.05
 """Share of the detector's end that means of lines reach where some are above it; share of a white reference's values at
 that end from which a band is left out."""
+_GAP = 3.0
+"""Between neighbouring bands, as a multiple of the steps beside it, from which bands are missing in the file itself."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 _BRIGHT_PERCENTILE = 99.9
@@ -80,9 +82,7 @@ class _BandChoice:
 
     def centers_nm(self, binning: int) -> Float64[np.ndarray, " c"]:
         """Wavelengths of the scene: means over binned bands."""
-        kept = self.wavelengths_nm[self.kept]
-        count = len(kept) // binning
-        return kept[: count * binning].reshape(count, binning).mean(axis=1)
+        return self.wavelengths_nm[self.kept].reshape(-1, binning).mean(axis=1)
 
     def without(self, marks: Bool[np.ndarray, " B"], reason: str) -> _BandChoice:
         """The choice without some more bands."""
@@ -95,6 +95,20 @@ class _BandChoice:
         first = left[np.unique(self.wavelengths_nm[left], return_index=True)[1]]
         repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(left, first))
         return self.without(repeated, "an earlier band has the same wavelength")
+
+    def without_rests(self, binning: int) -> _BandChoice:
+        """The choice without bands that fill no bin up to the next gap: a bin across a gap would stand for light that
+        was not measured, such as that of bands in which air absorbs."""
+        kept = self.kept
+        own, others = self.wavelengths_nm[kept], self.wavelengths_nm[list(self.dropped)]
+        steps_nm, is_between = np.diff(own), (own[:-1, None] < others) & (others < own[1:, None])
+        around = np.pad(steps_nm, 1)
+        beside_nm = np.maximum(around[:-2], around[2:])
+        is_gap = is_between.any(axis=1) | ((steps_nm > _GAP * beside_nm) & (beside_nm > 0))
+        marks = np.zeros(len(self.wavelengths_nm), bool)
+        for run in np.split(kept, np.flatnonzero(is_gap) + 1):
+            marks[run[len(run) // binning * binning :]] = True
+        return self.without(marks, f"too few up to a gap or the end for --bin-bands {binning}")
 
     def require(self, binning: int, where: str) -> None:
         """Refuse to go on with fewer bands than are averaged into one. Raises CaptureError: so few are left."""
@@ -131,6 +145,8 @@ class Sensor:
 
     is_stated: bool = False
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
+    is_reflectance: bool = False
+    """Whether values are reflectances, of which 1 is a white: by a white reference, or as the files say."""
 
     @property
     def centers_nm(self) -> Float64[np.ndarray, " c"]:
@@ -193,6 +209,7 @@ def prepare_sensor(
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
+    choice = choice.without_rests(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
     if lamp is not None:
@@ -201,13 +218,16 @@ def prepare_sensor(
     # Floating-point numbers may have been brought to what stands for 1 already.
     has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
     linear = None if model is not None else first.linear
-    states_one = linear is not None and (linear.scale is not None or "reflectance" in linear.evidence)
+    states_one = linear is not None and linear.scale is not None
+    states_one |= has_one and stated_reflectance(first, by_name=False) is not None
+    said = [stated_reflectance(file) for file in files]
+    finished = said[0] if None not in said else None
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
     return Sensor(
         name,
         replace(calibration, bands=choice.kept, bin_bands=binning),
         choice,
-        "reflectance" if whites else _unit(first),
+        "reflectance" if whites else _unit(first, finished, has_one),
         bool(whites) or has_one,
         _binned(sample[0][:, still_kept], binning),
         evidence | _evidence(views, choice, (dark, white), own),
@@ -215,6 +235,7 @@ def prepare_sensor(
         (*exposures.notes, *noted),
         (*warnings, *exposures.warnings),
         bool(whites) or states_one,
+        bool(whites) or (has_one and finished is not None),
     )
 
 
@@ -249,9 +270,12 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
     return choice
 
 
-def _unit(file: SpectralFile) -> str:
+def _unit(file: SpectralFile, finished: str | None, has_one: bool) -> str:
+    """What values are without a white reference; `finished` is where all files say that they are reflectances."""
     if is_srgb(file):
         return "linear light of pictures in sRGB"
+    if finished is not None:
+        return f"{'' if has_one else 'relative '}reflectance, as {finished} says"
     model = radiometric_model(file)
     if model is not None:
         return model.description
@@ -282,6 +306,36 @@ def _evidence(
     models = [(view.name, radiometric_model(view.cube)) for view in views]
     light = {name: model.irradiance for name, model in models if model and model.irradiance is not None}
     return found | ({"irradiance": light} if light else {})
+
+
+def with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]) -> dict[str, Sensor]:
+    """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
+    each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
+
+    Args:
+        first: File of the first view of each.
+    """
+    bare = [name for name, sensor in sensors.items() if "white" not in sensor.evidence]
+    exposures = {name: sensors[name].calibration.exposure for name in bare}
+    known = {name: exposure for name, exposure in exposures.items() if exposure is not None}
+    rest = [name for name in bare if name not in known]
+    files = [first[name] for name in known or rest if radiometric_model(first[name]) is None]
+    if len(bare) < 2 or not files:
+        return sensors
+    found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(_may_be_reflectance, files)))
+    notes, warnings = found.notes if known or found.common is None else (), found.warnings
+    if known and rest:
+        unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
+        warnings += (f"{unlike}: values of these lenses or cameras may be off by a factor",)
+    brought = dict(sensors)
+    if found.common is not None:
+        for name, exposure in known.items():
+            sensor, factor = sensors[name], (found.common / exposure).astype(np.float32)
+            calibration = replace(sensor.calibration, exposure=found.common)
+            brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
+    one = brought[bare[0]]
+    brought[bare[0]] = replace(one, notes=(*one.notes, *notes), warnings=(*one.warnings, *warnings))
+    return brought
 
 
 def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
@@ -369,18 +423,29 @@ def _lit_bands(
 def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarray, " B"]:
     """Bands in which a white reference is at the end of the detector, where reflectances would come out too high.
 
-    A file of its own may reach that end where no view does, and then shows it by many values that are exactly there.
+    It may reach that end where no posed view does, and then shows it by many numbers that are exactly there. Columns
+    count by their means, too: software that averages lines leaves none exactly there.
     """
+    file, nowhere = white.file, np.zeros(white.file.shape[2], bool)
     if saturation is None:
-        return np.zeros(white.file.shape[2], bool)
-    is_clipped = (white.stored_mean >= _NEAR_TOP * saturation).mean(axis=(0, 1)) > _MOST_CLIPPED
-    if white.is_view or white.file.dtype.kind not in "iu":
-        return is_clipped
-    stored = np.concatenate([_stored_pixels(white.file, row) for row in sampled_rows(white.file.shape[0])])
-    if not len(stored):
-        return is_clipped
-    ends = [2**bits - 1 for bits in _DETECTOR_BITS if 2**bits - 1 == stored.max()]
-    return is_clipped | (np.isin(stored, ends).mean(axis=0) > _MOST_CLIPPED)
+        return nowhere
+    top, left, height, width = white.rectangle or (0, 0, *file.shape[:2])
+    columns, read, measured = slice(left, left + width), [], []
+    for row in sampled_rows(height):
+        line = slice(top + row, top + row + 1)
+        numbers = file.read(line)
+        read.append(numbers[:, columns])
+        measured.append(~find_missing(numbers, file, line)[:, columns])
+    known = np.concatenate(measured)
+    if not known.any():
+        return nowhere
+    lines = np.where(known[..., None], np.concatenate(read), 0)
+    stored, end = lines[known], saturation
+    if file.dtype.kind in "iu" and stored.max() in {2**bits - 1 for bits in _DETECTOR_BITS}:
+        end = min(end, float(stored.max()))
+    means = lines.sum(axis=0, dtype=np.float64) / np.maximum(known.sum(axis=0), 1)[:, None]
+    is_near = (means >= _NEAR_TOP * saturation).mean(axis=0) > _MOST_CLIPPED
+    return is_near | ((stored >= end).mean(axis=0) > _MOST_CLIPPED)
 
 
 _Sample: TypeAlias = tuple[Float32[np.ndarray, "N B"], Bool[np.ndarray, "N B"]]
@@ -453,5 +518,4 @@ def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B
 
 
 def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
-    count = values.shape[1] // binning
-    return values[:, : count * binning].reshape(len(values), count, binning).mean(axis=2)
+    return values.reshape(len(values), -1, binning).mean(axis=2)

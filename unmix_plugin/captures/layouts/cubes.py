@@ -65,7 +65,8 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     name, or the number of wavelengths given is not the number of bands."""
     excluded = {path.resolve() for path in options.exclude}
     files = [path for path in _visible_files(root) if path.resolve() not in excluded]
-    pictures = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
+    plain = {path.stem: path for path in files if path.suffix.lower() in _PICTURE_SUFFIXES}
+    pictures = {_stem(path): path for path in plain.values()}
     cubes = _cubes_among(files)
     if any(not _is_reference(path, ()) for path in cubes):
         return _capture_of_groups(root, {root: cubes}, pictures, options)
@@ -73,12 +74,12 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
         return _capture_of_plain(root, folders, pictures, options)
     if deeper := _cubes_below(root, excluded):  # among them references that lie in the folder itself
         return _capture_of_groups(root, deeper, {}, options)
-    if not pictures:
+    if not plain:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    shown = [path for path in pictures.values() if not _is_reference(path, ())]
+    shown = [path for path in plain.values() if not _is_reference(path, ())]
     return _capture_of_plain(root, shown, {}, options)
 
 
@@ -167,22 +168,22 @@ def _sort_into(
     groups: dict[tuple[Path, str], _Group], place: Path, cubes: list[Path], is_tree: bool
 ) -> list[Path]:
     """Cubes of one folder as views and their references; returns references of no view."""
-    stems = [path.stem for path in cubes]
+    stems = [_stem(path) for path in cubes]
     references = [path for path in cubes if _is_reference(path, stems)]
     others = [path for path in cubes if path not in references]
     own = []
     for path in others:
-        match = _RESULT.fullmatch(path.stem)
+        match = _RESULT.fullmatch(_stem(path))
         is_result = match is not None and (path.parent.name.lower() == _RESULTS or match["of"] in stems)
-        group = groups[place, match["of"] if is_result and match is not None else path.stem]
+        group = groups[place, match["of"] if is_result and match is not None else _stem(path)]
         kind = "result" if is_result else "cube"
         if (other := getattr(group, kind)) is not None:
             raise CaptureError(_same_name(other, path))
         setattr(group, kind, path)
-        own += [] if is_result else [path.stem]
+        own += [] if is_result else [_stem(path)]
     left_out = []
     for path in references:
-        match = _REFERENCE.fullmatch(path.stem)
+        match = _REFERENCE.fullmatch(_stem(path))
         assert match is not None
         word = (match["kind"] or match["kind2"]).lower()
         kind = "white" if word in ("white", "flat") else "dark" if word == "dark" else "white_dark"
@@ -198,7 +199,7 @@ def _sort_into(
 
 def _is_reference(path: Path, stems: Sequence[str]) -> bool:
     """Whether a name is that of a reference: with such a word, of a view that is there, or with a number or nothing."""
-    match = _REFERENCE.fullmatch(path.stem)
+    match = _REFERENCE.fullmatch(_stem(path))
     if match is None:
         return False
     of = match["of"] or match["of2"]
@@ -271,5 +272,13 @@ def _band_folders(root: Path, excluded: set[Path]) -> list[Path]:
 
 def _name(path: Path) -> str:
     """The stem, with only what is fit for any file system."""
-    stem = path.name if path.is_dir() else path.stem
-    return safe_name(stem, fallback="view")
+    return safe_name(_stem(path), fallback="view")
+
+
+def _stem(path: Path) -> str:
+    """What a view, its references and its picture share: x of x.hdr and x.png, and of x.bil.hdr and x.bil.png."""
+    if path.is_dir():
+        return path.name
+    inner = Path(path.stem)
+    is_beside = path.suffix.lower() in {".hdr", *_PICTURE_SUFFIXES} and inner.suffix.lower() in _NUMBERS
+    return inner.stem if is_beside else inner.name

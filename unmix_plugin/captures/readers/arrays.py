@@ -131,7 +131,7 @@ def image_of_arrays(
     of_image = image_shape(shape, axes)
     bands, band_warnings = check_bands(stated, of_image[2])
     linear = _linear(path, image, of_image[2])
-    exposure, exposure_warnings = _exposure(arrays, image)
+    exposure, exposure_warnings = _exposure(arrays, image, linear)
 
     dtype, no_data, valid = _measured_numbers(image, linear)
 
@@ -392,9 +392,13 @@ def _valid_range(image: FoundArray, linear: Linear | None) -> tuple[float, float
     return float(both[0]), float(both[1])
 
 
-def _exposure(arrays: Sequence[FoundArray], image: FoundArray) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Exposure among attributes, and single numbers or lists of one a band beside the image."""
-    entries: dict[str, Any] = dict(image._all_attributes)
+def _exposure(
+    arrays: Sequence[FoundArray], image: FoundArray, linear: Linear | None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Exposure among attributes that values are not multiplied by, and single numbers or lists of one a band beside the
+    image."""
+    applied = "" if linear is None else linear.evidence
+    entries = {key: value for key, value in image._all_attributes.items() if f"'{key}'" not in applied}
     for array in arrays:
         if array.is_vector() and prod(array.shape) in (1, *image.shape) and is_exposure(array._own_name):
             unit, numbers = _unit_of(array.attributes) or "", array.whole().reshape(-1).tolist()

@@ -120,9 +120,10 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
     exposure, exposure_warnings = exposure_facts(attributes, "attribute")
-    speed = header.get("isoSpeed")
-    if exposure and isinstance(speed, float) and speed > 0:
-        exposure["gain"] = speed / 100
+    for key, name, unit in (("isoSpeed", "gain", 100.0), ("aperture", "f_number", 1.0)):
+        number = header.get(key)
+        if exposure and isinstance(number, float) and number > 0:
+            exposure[name] = number / unit
     listed = [
         {
             "name": title,

@@ -86,7 +86,8 @@ def linear_of_items(path: Path, items: Sequence[GdalItem], num_bands: int) -> Li
     named = [gdal_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
     factor = named[0] if named and named[0] else 1.0
     gains, offsets = columns
-    linear = linear_values(path, num_bands, gains, offsets, "GDAL's scales and offsets")
+    names = " and ".join(f"'{name}'" for name in sorted({name for chosen in said for name, *_ in chosen}))
+    linear = linear_values(path, num_bands, gains, offsets, f"GDAL's {names}")
     if factor != 1 and linear is not None:
         raise CaptureError(
             f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; take one of them out, as "

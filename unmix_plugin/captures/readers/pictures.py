@@ -35,7 +35,7 @@ _DEPTH_AT, _KIND_AT = 24, 25
 _WITH_COLOURS = (2, 6)
 _ORIENTATION = 0x0112
 """EXIF's code; 1 to 8, where 1 is not turned."""
-_EXIF_DIRECTORY, _EXPOSURE_TIME, _ISO_SPEED = 0x8769, 0x829A, 0x8827
+_EXIF_DIRECTORY, _EXPOSURE_TIME, _ISO_SPEED, _F_NUMBER = 0x8769, 0x829A, 0x8827, 0x829D
 
 
 def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
@@ -67,7 +67,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         metadata["encoding"] = "sRGB"
     if orientation in range(2, 9):
         metadata["orientation"] = orientation
-    metadata |= exif_exposure(taken.get(_EXPOSURE_TIME), taken.get(_ISO_SPEED))
+    metadata |= exif_exposure(*(taken.get(tag) for tag in (_EXPOSURE_TIME, _ISO_SPEED, _F_NUMBER)))
     if alpha:
         metadata["has_alpha"] = True
     return SpectralFile(

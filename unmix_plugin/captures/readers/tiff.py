@@ -36,6 +36,7 @@ from unmix_plugin.captures.spectral_file import (
     Axes,
     BandIndex,
     BandTable,
+    Linear,
     ReadOptions,
     SpectralFile,
     choose_axes,
@@ -120,7 +121,8 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
     shape = image_shape(stack.shape, axes)
     bands, band_warnings = check_bands(stated, shape[2])
-    exposure, exposure_warnings = _exposure(tags, items)
+    linear = linear_of_items(path, items, shape[2])
+    exposure, exposure_warnings = _exposure(tags, items, linear)
     # A picture is as bright as its numbers to the eye only.
     is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
     may_be_picture = is_colour and first.dtype in (np.uint8, np.uint16)
@@ -132,7 +134,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         read_part=lambda rows, wanted: _read_part(path, stack, axes, rows, wanted),
         bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
-        linear=linear_of_items(path, items, shape[2]),
+        linear=linear,
         no_data=stack.no_data,
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
         warnings=stack.warnings
@@ -448,13 +450,17 @@ def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> 
     return replace(found, names=table.names, bad=table.bad) if is_fitting else table
 
 
-def _exposure(tags: dict[str, Any], items: list[GdalItem]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Time and gain out of EXIF or GDAL's metadata, and warnings."""
-    exif = tags["exif"]
-    facts = exif_exposure(exif.get("ExposureTime"), exif.get("ISOSpeedRatings", exif.get("ISOSpeed")))
-    if facts:
+def _exposure(
+    tags: dict[str, Any], items: list[GdalItem], linear: Linear | None
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Time and gain out of EXIF or of items of GDAL that values are not multiplied by, and warnings."""
+    applied = "" if linear is None else linear.evidence
+    exif = {item.name: item.value.strip("()") for item in items}  # GDAL copies them, numbers in brackets
+    exif |= {f"exif_{name.lower()}": value for name, value in tags["exif"].items()}
+    speed = exif.get("exif_isospeedratings", exif.get("exif_isospeed"))
+    if facts := exif_exposure(exif.get("exif_exposuretime"), speed, exif.get("exif_fnumber")):
         return facts, ()
     texts: dict[str, Any] = defaultdict(list)
-    for item in items:
+    for item in (item for item in items if f"'{item.name}'" not in applied):
         texts[item.name.removeprefix("exif_")].append(item.value)
     return exposure_facts({name: ",".join(values) for name, values in texts.items()}, "GDAL metadata")

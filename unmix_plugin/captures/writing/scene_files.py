@@ -88,7 +88,7 @@ def write_scene_files(
         "what_looks_wrong": findings,
         "measured": measured,
         "totals": {key: sum(view[key] for view in views) for key in totals},
-        "references": hashes(plan.reference_files),
+        "references": hashes(plan.option_files),
         "views": views,
     }
     _write_json(folder / RECORD_NAME, record)
@@ -129,11 +129,14 @@ def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
 
 def _write_light(folder: Path, plan: Plan) -> dict[str, str]:
     """The light on the white panel, for people, and the flat one in which reflectances are seen; keys of the scene."""
-    sensor = next(iter(plan.sensors.values()))
-    if sensor.lamp is None or not all(_has_bands_of(sensor, other) for other in plan.sensors.values()):
+    first, *others = sensors = list(plan.sensors.values())
+    # Where nobody says what 1 is, values that had to be divided may be per cent, or anything.
+    if not all(sensor.is_reflectance and (sensor.is_stated or plan.scale == 1.0) for sensor in sensors):
         return {}
-    bands = Bands(sensor.centers_nm)
-    write_spectra_csv(folder / _ILLUMINANT_NAME, SpectraTable(bands, ("power",), sensor.lamp[None]))
+    if first.lamp is not None and all(_has_bands_of(first, other) for other in others):
+        lamp = SpectraTable(Bands(first.centers_nm), ("power",), first.lamp[None])
+        write_spectra_csv(folder / _ILLUMINANT_NAME, lamp)
+    bands = Bands(np.unique(np.concatenate([sensor.centers_nm for sensor in sensors])))
     write_spectra_csv(folder / _FLAT_LIGHT_NAME, SpectraTable(bands, ("power",), np.ones((1, len(bands)))))
     return {"illuminant_path": _FLAT_LIGHT_NAME}
 

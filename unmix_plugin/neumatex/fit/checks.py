@@ -4,7 +4,7 @@ A mesh has to lie where the cameras and alpha say that the object is. Pictures a
 white surface sends back at most four times the mean radiance around it, which a single lamp straight before it does;
 dark ones in the shade send some thousandths.
 
-Notation: `N` cameras.
+Notation: `V` views that are compared, `F` triangles.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from torch import Tensor
 
 from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
@@ -26,6 +27,8 @@ from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
 
 LONGEST_EDGE_PX = 64
 """Of the views whose outlines are compared."""
+_SIDES_EDGE_PX = 128
+"""Of the views that say which side of a triangle is its front."""
 LEAST_OVERLAP = 0.5
 """Of silhouette and alpha, shared part over both: below it a view disagrees. Right meshes have 0.9 and more."""
 DOUBTFUL_OVERLAP = 0.85
@@ -38,24 +41,17 @@ _MOST_VIEWS = 24
 _HALF_OPAQUE = 0.5
 
 
-def compare_outlines(
-    ray_mesh: RayMesh,
-    cameras: Cameras,
-    alphas: Sequence[Float[np.ndarray, "_ _"] | None],
-    frame: Normalisation,
-    where: str,
-) -> tuple[str | None, str | None]:
-    """How far off a mesh is from what pictures show of it.
+def outline_overlaps(
+    ray_mesh: RayMesh, cameras: Cameras, alphas: Sequence[Float[np.ndarray, "_ _"] | None]
+) -> Float64[np.ndarray, " V"]:
+    """How well a mesh covers what pictures show of it: in each view, the part that silhouette and alpha share.
 
     Args:
-        ray_mesh: The mesh in model space.
-        cameras: Of the pictures, model space.
+        ray_mesh: The mesh in the space of the cameras.
+        cameras: Of the pictures.
         alphas: Opacity of each picture, None where it has none: then the mesh has only to be in the view.
-        frame: To give places in the world.
-        where: What messages call the mesh.
     Returns:
-        What is wrong where most views do not see the mesh where their pictures show the object, and what is doubtful
-        where it is somewhat off; None otherwise.
+        Of the views that are compared, [0, 1].
     Raises:
         SceneError: no pixel of any picture is opaque.
     """
@@ -65,19 +61,41 @@ def compare_outlines(
             "that is 1 on the object, or pictures without alpha"
         )
     step = max(1, -(-len(cameras) // _MOST_VIEWS))
-    overlaps = [_overlap(ray_mesh, cameras[view], alphas[view]) for view in range(0, len(cameras), step)]
-    median, wrong = float(np.median(overlaps)), sum(overlap < LEAST_OVERLAP for overlap in overlaps)
-    if 2 * wrong > len(overlaps):
-        edge = 2 / frame.scale
-        return (
-            f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less "
-            f"than half of what alpha shows, or is not in the view (median overlap {median:.0%}). Its box is "
-            f"{edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit "
-            "and axes. With y upwards it does not fit either"
-        ), None
+    views = range(0, len(cameras), step)
+    return np.array([_overlap(ray_mesh, cameras[view], alphas[view]) for view in views])
+
+
+def is_misplaced(overlaps: Float64[np.ndarray, " V"]) -> bool:
+    """Whether most views do not see the mesh where their pictures show the object."""
+    return 2 * int((overlaps < LEAST_OVERLAP).sum()) > len(overlaps)
+
+
+def misplacement(
+    overlaps: Float64[np.ndarray, " V"], cameras: Cameras, frame: Normalisation, where: str
+) -> str:
+    """How far off a misplaced mesh is.
+
+    Args:
+        overlaps: Of `outline_overlaps`.
+        cameras: Of the pictures, model space.
+        frame: To give places in the world.
+        where: What the message calls the mesh.
+    """
+    wrong, edge = int((overlaps < LEAST_OVERLAP).sum()), 2 / frame.scale
+    return (
+        f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less "
+        f"than half of what alpha shows, or is not in the view (median overlap {np.median(overlaps):.0%}). Its box "
+        f"is {edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit "
+        "and axes. With y upwards it does not fit either"
+    )
+
+
+def outline_doubt(overlaps: Float64[np.ndarray, " V"], where: str) -> str | None:
+    """What to say of a mesh that is somewhat off; None if it fits."""
+    median = float(np.median(overlaps))
     if median >= DOUBTFUL_OVERLAP:
-        return None, None
-    return None, (
+        return None
+    return (
         f"{where} and alpha show different outlines: their overlap is {median:.0%} (median of {len(overlaps)} views; "
         "90% and more is usual), which blurs materials. Check size and place of the mesh, lenses and alpha"
     )
@@ -114,6 +132,19 @@ def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"]
     return float((seen & shown).sum()) / union if union else 1.0
 
 
+def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
+    """How much cameras see each triangle from its front, less how much from behind: sums of cosines over rays."""
+    mesh, seen = ray_mesh.mesh, torch.zeros(len(ray_mesh.mesh.faces))
+    a, b, c = mesh.corners().unbind(dim=1)
+    normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    for view in range(0, len(cameras), max(1, -(-len(cameras) // _MOST_VIEWS))):
+        rays = cameras[view].shrunk(_SIDES_EDGE_PX**2).image_rays(0)
+        hits = ray_mesh.closest(rays.origins, rays.directions)
+        triangles = hits.triangles[hits.found]
+        seen.index_add_(0, triangles, -(rays.directions[hits.found] * normals[triangles]).sum(dim=-1))
+    return seen
+
+
 def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None:
     """What to say of pictures that are much too bright or too dark for their light; None if they are right.
 
@@ -123,9 +154,7 @@ def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None
         return None
     step = max(1, -(-len(pictures) // _MOST_VIEWS))
     read = [pictures.read(view) for view in range(0, len(pictures), step)]
-    shown = [
-        picture.numbers[opacity(picture) >= OPAQUE_ALPHA] for picture in read if picture.alpha is not None
-    ]
+    shown = [picture.numbers[opacity(picture) >= OPAQUE_ALPHA] for picture in read if has_alpha(picture)]
     found = np.concatenate(shown).mean(axis=1) if shown else np.zeros(0)
     mean = float(environment.mean_radiance().mean())
     if not (found.size and mean > 0):

@@ -30,11 +30,12 @@ from unmix_plugin.engine import (
 )
 from unmix_plugin.errors import SceneError, require
 from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, opacity
+from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
 from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.reading.loader import distinct_names
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -103,6 +104,9 @@ class ObjectDataManager(DataManager):
         self._num_rays = config.train_num_rays_per_batch
         lights = [(light, view) for light in self.object.lights for view in range(len(light.pictures))]
         self._images = [*split.evaluation, *lights]
+        named = [pictures.names[view] for view in split.evaluation]
+        named += [f"{light.name}-{light.pictures.names[view]}" for light, view in lights]
+        self._names = distinct_names([f"{name}.exr" for name in named])  # of which a stem is taken
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random object pixels of the training views; the draw depends on (seed, step) only."""
@@ -128,10 +132,7 @@ class ObjectDataManager(DataManager):
 
     def eval_name(self, index: int) -> str:
         """The picture's name, after its light's where that is held out."""
-        place = self._images[index]
-        if isinstance(place, int):
-            return self.object.pictures.names[place]
-        return f"{place[0].name}-{place[0].pictures.names[place[1]]}"
+        return self._names[index]
 
     def get_train_rays_per_batch(self) -> int:
         """Pixels of the next training batch."""
@@ -186,13 +187,21 @@ class ObjectDataManager(DataManager):
         """Read when training begins: evaluation needs none of it."""
         return _PixelList.of(self.object, self.options.max_pixels, self.seed)
 
+    @cached_property
+    def _ray_mesh(self) -> RayMesh:
+        """Says which pixels show the object where alpha does not."""
+        return RayMesh(self.object.mesh)
+
     def _image(
         self, pictures: PosedPictures, view: int, others: dict[str, Tensor]
     ) -> tuple[Cameras, dict[str, Tensor]]:
         picture = pictures.read(view)
+        shown = opacity(picture)
+        if not has_alpha(picture):
+            shown = shown * _sees_mesh(self._ray_mesh, pictures.cameras[view]).numpy()
         batch = {
             "numbers": self._tensor(picture.numbers),
-            "alpha": self._tensor(opacity(picture)),
+            "alpha": self._tensor(shown),
             "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
             "lights": torch.tensor(len(self.object.lights)),
         }
@@ -204,7 +213,7 @@ class ObjectDataManager(DataManager):
             colours = self.object.base_colour(view)
             return {} if colours is None else {"base_colour": self._tensor(colours)}
         materials = self.object.true_materials
-        abundances = None if materials is None else materials.abundances(view)
+        abundances = self.object.abundances(view)
         if materials is None or abundances is None:
             return {}
         endmembers = self._tensor(materials.endmembers.astype(np.float32))

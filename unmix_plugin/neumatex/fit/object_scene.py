@@ -16,10 +16,17 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.checks import compare_outlines, light_doubt
+from unmix_plugin.neumatex.fit.checks import (
+    is_misplaced,
+    light_doubt,
+    misplacement,
+    outline_doubt,
+    outline_overlaps,
+    sides_seen,
+)
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -29,7 +36,7 @@ from unmix_plugin.neumatex.tracing.light_files import (
     read_environment_of_bands,
     read_lamp,
 )
-from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh
+from unmix_plugin.neumatex.tracing.mesh import MESH_SUFFIXES, Mesh, read_mesh, turned_to_viewers
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array
@@ -52,6 +59,10 @@ EVAL_INTERVAL = 8
 """Every so many frames one is for evaluation, where transforms.json does not say which."""
 MOST_STOPS = 20.0
 _NUM_COLOURS = 3
+_SAME_BAND_NM = 0.5
+"""Wavelengths in names of files' channels are rounded."""
+_CLEARLY_BETTER = 0.01
+"""Of the mean overlap of outlines: pixels at their edges make that of equal shapes differ by less."""
 
 
 @dataclass(frozen=True)
@@ -73,25 +84,6 @@ class _TrueMaterials:
     """Reflectances."""
     abundance_files: tuple[Path | None, ...]
     """One a view."""
-
-    def abundances(self, view: int) -> Float32[np.ndarray, "H W M"] | None:
-        """True abundances of a view's pixels; None where they are unknown.
-
-        Raises:
-            SceneError: the file can't be read, or has another number of materials.
-        """
-        path = self.abundance_files[view]
-        if path is None:
-            return None
-        try:
-            found = np.array(map_array(path), dtype=np.float32)
-        except UnreadableArrayError as error:
-            raise SceneError(f"{path} {error}") from error
-        if found.ndim != 3 or found.shape[2] != len(self.names):
-            raise SceneError(
-                f"{path}: has shape {found.shape}; expected rows x columns x {len(self.names)} materials"
-            )
-        return found
 
 
 @dataclass(frozen=True)
@@ -128,13 +120,39 @@ class ObjectScene:
         """True base colour of a view, linear; None where it is unknown.
 
         Raises:
-            SceneError: its file is malformed.
+            SceneError: its file is malformed, or has another size than the view.
         """
         name = f"{self.pictures.files[index].name}.exr"
         if self.truth is None or not (self.truth / name).is_file():
             return None
-        found: Float[np.ndarray, "H W 3"] = read_picture(self.truth / name).numbers
+        found = read_picture(self.truth / name).numbers
+        self._require_shape(self.truth / name, found, index, _NUM_COLOURS, "colours")
         return found
+
+    def abundances(self, index: int) -> Float32[np.ndarray, "H W M"] | None:
+        """True abundances of a view's pixels; None where they are unknown.
+
+        Raises:
+            SceneError: the file can't be read, or has another size than the view, or another number of materials.
+        """
+        materials = self.true_materials
+        path = None if materials is None else materials.abundance_files[index]
+        if materials is None or path is None:
+            return None
+        try:
+            found = np.array(map_array(path), dtype=np.float32)
+        except UnreadableArrayError as error:
+            raise SceneError(f"{path} {error}") from error
+        self._require_shape(path, found, index, len(materials.names), "materials")
+        return found
+
+    def _require_shape(self, path: Path, found: np.ndarray, index: int, count: int, what: str) -> None:
+        width, height = self.pictures.cameras.size(index)
+        if found.shape != (height, width, count):
+            raise SceneError(
+                f"{path}: has shape {found.shape}; expected {(height, width, count)}: rows and columns of the view "
+                f"{self.pictures.names[index]}, and {count} {what}"
+            )
 
     def summary(self) -> dict[str, Any]:
         """What a run has to record of the object, as JSON-able values."""
@@ -160,8 +178,9 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         SceneError: the folder is not a sound object; the message says what is wrong with it.
     """
     root = root.resolve()
-    faults, notes = Faults(root), list[str]()
+    faults = Faults(root)
     entry = read_transforms(root, faults, needs_cubes=False)
+    notes = list(entry.warnings)
     split = split_frames(entry, "auto", EVAL_INTERVAL, faults)
     folder = _read_folder(root, entry, faults)
     mesh_path = _find_file(root, "mesh_path", "mesh", MESH_SUFFIXES, faults)
@@ -172,13 +191,15 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     environment = folder.environment(bands, own_lamp)
     doubt = light_doubt(pictures, environment)
     notes += [] if doubt is None else [doubt]
-    held_out = [_read_held_out(path, frame, bands, own_lamp) for path in _held_out_folders(root)]
+    held_out = [
+        _read_held_out(path, frame, pictures, bands, own_lamp, notes) for path in _held_out_folders(root)
+    ]
     if bands is not None and own_lamp is None:
         light_of_all = environment.mean_radiance().double().numpy()
         own_lamp = light_of_all / light_of_all.max()
     truth = root / "truth" / "base_colour"
     files = {path.name: sha256_of(path) for path in (mesh_path, folder.environment_path)}
-    return ObjectScene(
+    scene = ObjectScene(
         root=root,
         mesh=mesh,
         environment=environment,
@@ -193,6 +214,10 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         input_hashes={**files, **pictures.hashes},
         notes=tuple(notes),
     )
+    for view in split.evaluation:  # a malformed truth is told before training, not after it
+        scene.base_colour(view)
+        scene.abundances(view)
+    return scene
 
 
 @dataclass(frozen=True)
@@ -231,13 +256,13 @@ def _spectral_light(
 ) -> tuple[Bands | None, Float64[np.ndarray, " B"] | None]:
     """Bands of an object's pictures, None for pictures in colours, and their lamp's power, None where it is not
     given."""
-    root, found, count = folder.root, folder.entry.wavelengths_nm, pictures.num_colours
-    if count == _NUM_COLOURS and (found is None or len(found) != count):
+    root, bands, count = folder.root, _bands_of(folder, pictures), pictures.num_colours
+    if bands is None and count == _NUM_COLOURS:
         if lamp is not None:
             raise SceneError(f"{root}: a lamp is given, but its pictures have {count} colours; leave it out")
         return None, None
-    if found is None or len(found) != count:
-        given = "no 'wavelengths'" if found is None else f"{len(found)} 'wavelengths'"
+    if bands is None or len(bands) != count:
+        given = "no 'wavelengths'" if bands is None else f"{len(bands)} 'wavelengths'"
         raise SceneError(
             f"{root / FILE_NAME}: {given} for pictures of {count} bands; list the centre of each band in nm"
         )
@@ -245,8 +270,23 @@ def _spectral_light(
         raise SceneError(
             f"{root / FILE_NAME}: pictures of {count} bands with 'tone_mapping' {pictures.tone}; expected linear light"
         )
-    bands = Bands(found)
     return bands, folder.lamp(bands) if lamp is None else read_lamp(lamp, bands)
+
+
+def _bands_of(folder: _Folder, pictures: PosedPictures) -> Bands | None:
+    """What 'wavelengths' and the files of the pictures say; None where they say nothing."""
+    listed, in_files = folder.entry.wavelengths_nm, pictures.wavelengths_nm
+    if in_files is None:
+        return None if listed is None else Bands(listed)
+    bands = Bands.of(in_files)
+    if listed is None:
+        return bands
+    if len(listed) != len(bands) or np.abs(listed - bands.centers_nm).max() > _SAME_BAND_NM:
+        raise SceneError(
+            f"{folder.root / FILE_NAME}: 'wavelengths' of {Bands(listed)}, but the files of the pictures say {bands}; "
+            "give the same, in nm"
+        )
+    return Bands(listed)
 
 
 def _read_true_materials(root: Path, entry: SceneEntry, bands: Bands) -> _TrueMaterials | None:
@@ -315,25 +355,48 @@ def _content(root: Path) -> dict[str, Any]:
 def _placed(
     given: Mesh, name: str, folder: _Folder, notes: list[str]
 ) -> tuple[Normalisation, Mesh, PosedPictures]:
-    """The mesh and the pictures in model space; a mesh that fits only with its y axis upwards is turned.
+    """The mesh and the pictures in model space; a mesh that fits clearly better with its y axis upwards is turned.
 
     Raises:
         SceneError: it fits neither way; the message says how far off it is as it was given.
     """
-    found: list[str] = []
-    for placed in (given, given.with_y_upwards()):
-        scale, offset = placed.to_model_space()
-        frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
-        mesh, pictures = placed.transformed(scale, offset), folder.pictures(frame)
-        read = (pictures.read(index) for index in range(len(pictures)))
-        alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
-        misplaced, doubt = compare_outlines(RayMesh(mesh), pictures.cameras, alphas, frame, name)
-        if misplaced is None:
-            turned = f"{name} has y as its upward axis, the poses have z: the mesh was turned"
-            notes += ([] if doubt is None else [doubt]) + ([turned] if found else [])
-            return frame, mesh, pictures
-        found.append(misplaced)
-    raise SceneError(found[0])
+    frame, mesh, pictures = _in_model_space(given, folder)
+    read = (pictures.read(index) for index in range(len(pictures)))
+    alphas = [picture.alpha if has_alpha(picture) else None for picture in read]
+    scale, offset = given.to_model_space()
+    turned = given.with_y_upwards()
+    as_given, upright = (
+        outline_overlaps(RayMesh(one.transformed(scale, offset)), pictures.cameras, alphas)
+        for one in (given, turned)
+    )
+    has_outlines = any(alpha is not None for alpha in alphas)
+    is_better = has_outlines and upright.mean() > as_given.mean() + _CLEARLY_BETTER
+    if (is_better or is_misplaced(as_given)) and not is_misplaced(upright):
+        notes.append(f"{name} has y as its upward axis, the poses have z: the mesh was turned")
+        as_given = upright
+        frame, mesh, pictures = _in_model_space(turned, folder)
+    if is_misplaced(as_given):
+        raise SceneError(misplacement(as_given, pictures.cameras, frame, name))
+    doubt = outline_doubt(as_given, name)
+    if not has_outlines:
+        doubt = (
+            f"the pictures have no alpha: whether {name} lies as they show the object, and which of its axes is "
+            "upwards, could not be checked"
+        )
+    notes += [] if doubt is None else [doubt]
+    mesh, count = turned_to_viewers(mesh, sides_seen(RayMesh(mesh), pictures.cameras))
+    if count:
+        notes.append(
+            f"{name}: cameras saw {count} of {len(mesh.faces)} triangles from behind; they were turned"
+        )
+    return frame, mesh, pictures
+
+
+def _in_model_space(mesh: Mesh, folder: _Folder) -> tuple[Normalisation, Mesh, PosedPictures]:
+    """From the world to model space, and a mesh and the pictures there."""
+    scale, offset = mesh.to_model_space()
+    frame = Normalisation(np.eye(3), np.zeros(3), scale, -offset.double().numpy())
+    return frame, mesh.transformed(scale, offset), folder.pictures(frame)
 
 
 def _from_poses(frame: Normalisation, placement: Placement) -> Normalisation:
@@ -349,20 +412,37 @@ def _held_out_folders(root: Path) -> list[Path]:
 
 
 def _read_held_out(
-    root: Path, frame: Normalisation, bands: Bands | None, lamp: Float64[np.ndarray, " B"] | None
+    root: Path,
+    frame: Normalisation,
+    own: PosedPictures,
+    bands: Bands | None,
+    lamp: Float64[np.ndarray, " B"] | None,
+    notes: list[str],
 ) -> _HeldOutLight:
+    """A folder below relit/, given the object's pictures, bands and lamp."""
     faults = Faults(root)
     entry = read_transforms(root, faults, needs_cubes=False)
+    notes += [f"relit/{root.name}/{warning}" for warning in entry.warnings]
     folder = _read_folder(root, entry, faults)
     faults.raise_if_any()
     pictures = folder.pictures(frame)
+    if bands is not None and pictures.tone != "linear":
+        raise SceneError(
+            f"{root / FILE_NAME}: pictures of bands with 'tone_mapping' {pictures.tone}; expected linear light"
+        )
+    if pictures.tone == "camera" != own.tone:
+        raise SceneError(
+            f"{root / FILE_NAME}: 'tone_mapping' of its pictures is camera, a response that is learnt from the "
+            f"object's pictures, but those are {own.tone}; expected linear, srgb or agx"
+        )
+    found = _bands_of(folder, pictures)
+    if pictures.num_colours != own.num_colours or found not in (None, bands):
+        named = "" if found is None else f", wavelengths of {found}"
+        expected = f"{own.num_colours} colours" if bands is None else bands
+        raise SceneError(
+            f"{root}: pictures of {pictures.num_colours} bands{named}; the object has {expected}: give the same"
+        )
     if bands is not None:
-        own = entry.wavelengths_nm
-        if pictures.num_colours != len(bands) or (own is not None and Bands(own) != bands):
-            named = "" if own is None else f", wavelengths of {Bands(own)}"
-            raise SceneError(
-                f"{root}: pictures of {pictures.num_colours} bands{named}; the object has {bands}: give the same"
-            )
         own_lamp = folder.lamp(bands)
         lamp = lamp if own_lamp is None else own_lamp
     return _HeldOutLight(root.name, folder.environment(bands, lamp), pictures)

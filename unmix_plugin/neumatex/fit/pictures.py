@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError, counted
@@ -37,10 +37,12 @@ class Picture:
     """Opacity in [0, 1]; None where the file has none."""
     valid: Bool[np.ndarray, "H W"] | None = None
     """Pixels that count; None where no mask says."""
+    wavelengths_nm: Float64[np.ndarray, " C"] | None = None
+    """Of the bands, as the file says; None where it says none."""
 
 
 def read_picture(path: Path, value_scale: float | None = None) -> Picture:
-    """Read and check one picture.
+    """Read and check one picture; colours are 0 where alpha is, where they mean nothing.
 
     Args:
         path: Its file.
@@ -64,7 +66,9 @@ def read_picture(path: Path, value_scale: float | None = None) -> Picture:
             f"{path}: negative values, NaN or infinity in {counted(bad, 'pixel')}; expected light, 0 and up: "
             "repair the picture"
         )
-    return picture
+    if picture.alpha is None:
+        return picture
+    return replace(picture, numbers=np.where(picture.alpha[..., None] > 0, picture.numbers, np.float32(0)))
 
 
 def _read_display(path: Path) -> Picture:
@@ -78,13 +82,14 @@ def _read_exr(path: Path) -> Picture:
     from unmix_plugin.captures.spectral_file import ReadOptions
 
     channels = channel_names(path)  # refuses other files
-    numbers = open_spectral_file(path).read().astype(np.float32)
+    opened = open_spectral_file(path)
+    numbers, wavelengths = opened.read().astype(np.float32), opened.bands.wavelengths_nm
     if numbers.shape[2] < 3:
         raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
     if "A" not in channels:
-        return Picture(numbers, None)
+        return Picture(numbers, None, wavelengths_nm=wavelengths)
     alpha = open_spectral_file(path, ReadOptions(dataset="A")).read()
-    return Picture(numbers, alpha[..., 0].astype(np.float32).clip(0, 1))
+    return Picture(numbers, alpha[..., 0].astype(np.float32).clip(0, 1), wavelengths_nm=wavelengths)
 
 
 def _read_npy(path: Path, value_scale: float | None) -> Picture:
@@ -129,6 +134,8 @@ class PosedPictures:
     """What the numbers are of light."""
     num_colours: int
     """C."""
+    wavelengths_nm: tuple[float, ...] | None = None
+    """Of the bands, as the files say; None where they say none."""
 
     def __len__(self) -> int:
         return len(self.files)
@@ -186,7 +193,7 @@ def _read_files(files: _PictureFiles) -> Picture:
             f"{picture.numbers.shape[1]} x {picture.numbers.shape[0]}; give both one size"
         )
     numbers = picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None]
-    return Picture(numbers, alpha, picture.valid)
+    return replace(picture, numbers=numbers, alpha=alpha)
 
 
 def read_posed_pictures(
@@ -215,15 +222,32 @@ def read_posed_pictures(
     kinds = {files.colours.suffix.lower() in LIGHT_SUFFIXES for files in named}
     if len(kinds) > 1 or len(colours) > 1:
         faults.add(
-            "frames", f"mix pictures of light (.exr, .npy) and others, or of {colours} colours; give one kind"
+            "frames",
+            "mix pictures of light (.exr, .npy) and others, or of different numbers of colours or wavelengths; give "
+            "one kind",
         )
     faults.raise_if_any()
+    ((count, wavelengths),) = colours
+    for one in entry.frames:
+        if one.sensor.bands not in (None, tuple(range(count))):
+            faults.add(
+                one.where,
+                f"'bands' does not list all {count} bands of its picture in order; sort them as 'wavelengths' are, and "
+                "leave the key out",
+            )
+    faults.raise_if_any()
     usual: ToneMapping = "linear" if kinds == {True} else "camera"
-    return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, colours.pop())
+    return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, count, wavelengths)
 
 
 def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> _PictureFiles | None:
     """The files of a frame; None with noted faults where one is missing."""
+    if "responses_path" in frame.paths:
+        faults.add(
+            frame.where,
+            "has 'responses_path', which is not followed here: bands are taken to be narrow; give cubes of the bands "
+            "of 'wavelengths', and leave the key out",
+        )
     keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
     found = {key: resolve_path(root, frame.paths[key], None, frame.where, faults) for key in keys}
     mask = found.pop("mask_path", None)
@@ -233,17 +257,21 @@ def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Fa
     return _PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
 
 
-def _check(root: Path, named: list[_PictureFiles], faults: Faults) -> tuple[list[tuple[int, int]], set[int]]:
-    """Sizes of all pictures, and the numbers of colours that they have."""
+def _check(
+    root: Path, named: list[_PictureFiles], faults: Faults
+) -> tuple[list[tuple[int, int]], set[tuple[int, tuple[float, ...] | None]]]:
+    """Sizes of all pictures, and the numbers of colours and wavelengths that they have."""
     sizes, colours = [], set()
     for files in named:
         try:
-            shape = _read_files(files).numbers.shape
+            picture = _read_files(files)
         except SceneError as error:
             faults.add(str(root), str(error).replace(f"{root}/", ""))
             continue
-        sizes.append((shape[0], shape[1]))
-        colours.add(shape[2])
+        height, width, count = picture.numbers.shape
+        sizes.append((height, width))
+        found = picture.wavelengths_nm
+        colours.add((count, None if found is None else tuple(found.tolist())))
     return sizes, colours
 
 

@@ -1,10 +1,11 @@
 """A triangle mesh with shading normals, read from glTF, OBJ and PLY files and checked.
 
 Coordinates are taken as they are, as those of the cameras' world: a file whose axes were exchanged on export (many
-programs write glTF with +y up) has to be exported without that. Only metres of our own glTF are taken back to units of
-the world, whose length its extras say.
+programs write glTF with +y up) has to be exported without that. Only our own glTF is taken back to the world, since its
+extras say what was done to it: metres, +y up, another origin.
 
-Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside.
+Notation: `V` vertices, `F` triangles. Triangles are counter-clockwise seen from outside, which only who looks at a mesh
+can tell: in files they may be wound either way.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.errors import SceneError
+from unmix_plugin.formats.meshes import least_turns
 from unmix_plugin.limits import (
     MOST_TABLE_BYTES,
     MOST_TEXT_BYTES,
@@ -28,8 +30,8 @@ from unmix_plugin.limits import (
     read_bounded,
     refuse,
 )
-from unmix_plugin.scenes.placement import METRES_RANGE
-from unmix_plugin.scenes.reading.faults import find_named
+from unmix_plugin.scenes.placement import METRES_KEY, METRES_RANGE
+from unmix_plugin.scenes.reading.faults import find_named, read_number
 
 MAX_TRIANGLES = 5_000_000
 """More are refused: the tree over them and the memory of a training would not fit common machines."""
@@ -104,15 +106,44 @@ def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F
     return torch.where(lengths > 1e-30, sums / lengths.clamp(min=1e-30), upwards).float()
 
 
+def turned_to_viewers(mesh: Mesh, seen: Float[Tensor, " F"]) -> tuple[Mesh, int]:
+    """The mesh with each connected piece turned so that what is seen of it is its front.
+
+    Args:
+        mesh: Its triangles may face either way, those of one piece alike.
+        seen: How much each triangle is seen from its front, less how much it is from behind.
+    Returns:
+        The mesh, with normals on the front, and how many triangles were turned.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    corners = _places(mesh.vertices.numpy())[mesh.faces.numpy()]
+    starts, ends = corners[:, [0, 1]].reshape(-1), corners[:, [1, 2]].reshape(-1)
+    size = int(corners.max()) + 1
+    links = coo_matrix((np.ones(len(starts)), (starts, ends)), shape=(size, size))
+    count, of_places = connected_components(links, directed=False)
+    pieces = torch.from_numpy(of_places[corners[:, 0]]).long()
+
+    def is_negative(values: Float[Tensor, " F"]) -> Bool[Tensor, " F"]:
+        return (torch.zeros(count, dtype=torch.float64).index_add(0, pieces, values.double()) < 0)[pieces]
+
+    is_turned = is_negative(seen)
+    faces = torch.where(is_turned[:, None], mesh.faces.flip(1), mesh.faces)
+    a, b, c = mesh.vertices.double()[faces.long()].unbind(dim=1)
+    agreement = (torch.linalg.cross(b - a, c - a) * mesh.normals[faces.long()].sum(dim=1)).sum(dim=1)
+    signs = torch.ones(len(mesh.vertices), 1)
+    signs[faces[is_negative(agreement)].long()] = -1
+    return replace(mesh, faces=faces, normals=signs * mesh.normals), int(is_turned.sum())
+
+
 @np.errstate(all="ignore")  # what is not finite is refused by name
 def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     """The triangles of a file in units of the world, all objects of its scene graph in one mesh.
 
-    A closed mesh whose triangles face inwards is turned outwards.
-
     Args:
         path: A .glb, .gltf, .obj or .ply file.
-        notes: Gets a sentence for each thing that is unusual but usable: an open mesh, a mesh that was turned.
+        notes: Gets a sentence if the mesh is open, which is unusual but usable.
     Raises:
         SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
             are not finite, or too many triangles.
@@ -120,10 +151,7 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     vertices, faces, normals, uv = _joined([_placed(path, *part) for part in _parts(path)])
     _check(path, vertices, faces)
     faces = _with_area(path, vertices, faces)
-    notes = [] if notes is None else notes
-    if _is_closed(vertices, faces):
-        faces, normals = _outwards(path, vertices, faces, normals, notes)
-    else:
+    if notes is not None and not _is_closed(vertices, faces):
         notes.append(
             f"{path.name}: the mesh is open; light may pass through its holes, and its inside is black"
         )
@@ -169,7 +197,7 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
     parts = [
-        (scene.geometry[name], _without_metres(np.asarray(transform), scene.geometry[name].metadata))
+        (scene.geometry[name], _to_world(np.asarray(transform), scene.geometry[name].metadata))
         for transform, name in placed
     ]
     parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
@@ -209,12 +237,26 @@ def _allow_triangles(path: Path, number: int) -> None:
         )
 
 
-def _without_metres(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
-    """A mesh's transform to the units of its world, where it says how many metres one has, as `write_glb` does."""
-    metres = extras.get("metres_per_unit")
-    if not isinstance(metres, int | float) or not METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
-        return transform
-    return np.diag([1 / metres] * 3 + [1.0]) @ transform
+def _to_world(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
+    """A mesh's transform to the world that it comes from, where it says how `write_glb` took it from there."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    back, metres = np.eye(4), read_number(extras.get(METRES_KEY))
+    up, offset = _vector(extras, "up"), _vector(extras, "offset")
+    if up is not None and abs(np.linalg.norm(up) - 1) < 1e-6:
+        back[:3, :3] = Rotation.from_quat(least_turns(up, np.eye(3)[1])).inv().as_matrix()
+        back[:3, 3] = 0 if offset is None else offset
+    if metres is not None and METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
+        back[:3, :3] /= metres
+    return back @ transform
+
+
+def _vector(extras: Mapping[str, Any], key: str) -> np.ndarray | None:
+    """Three numbers below `_FAR`; None where there are none."""
+    values = extras.get(key)
+    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
+    sound = [number for number in numbers if number is not None and abs(number) < _FAR]
+    return np.array(sound) if len(sound) == len(numbers) == 3 else None
 
 
 def _placed(path: Path, loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
@@ -287,27 +329,15 @@ def _file_normals(loaded: Any) -> np.ndarray | None:
     return normals if ((lengths > 1e-6) & (lengths < _FAR)).all() else None
 
 
+def _places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
+    """A number for the place of each vertex: files split them at seams of texture and normals, but what is joined is
+    said by positions alone."""
+    return np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)
+
+
 def _is_closed(vertices: np.ndarray, faces: np.ndarray) -> bool:
     """Whether each edge is shared by two triangles that run along it in opposite directions."""
-    # Files split vertices at seams of texture and normals; positions alone say what is joined.
-    _, joined = np.unique(vertices, axis=0, return_inverse=True)
-    corners = joined.reshape(-1)[faces]
+    corners = _places(vertices)[faces]
     starts, ends = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
     forward, backward = starts * len(vertices) + ends, ends * len(vertices) + starts
     return bool(np.array_equal(np.sort(forward), np.sort(backward)))
-
-
-def _outwards(
-    path: Path, vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray | None, notes: list[str]
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Triangles and normals that point out of a closed mesh."""
-    a, b, c = (vertices[faces[:, corner]] - vertices.mean(axis=0) for corner in range(3))
-    crosses = np.cross(b, c)
-    if np.einsum("ij,ij->", a, crosses) < 0:
-        notes.append(f"{path.name}: the triangles faced inwards; they were turned outwards")
-        faces = faces[:, ::-1].copy()
-    if normals is not None:
-        a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-        agreement = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[faces].mean(axis=1))
-        normals = -normals if agreement.sum() < 0 else normals
-    return faces, normals

@@ -158,7 +158,8 @@ def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _Kno
         if library:
             raise ConfigError("the object is known in colours, not in bands: leave out --library")
         return _KnownSpectra([], np.zeros((0, 0), np.uint16))
-    known, light = library_of(library, materials.bands), _light_of(materials)
+    light = _light_of(materials)
+    known = library_of(library, materials.bands, light)
     chosen = known.comparable(materials.bands, light)
     if chosen.sum() > _MOST_KNOWN:
         raise ConfigError(

@@ -144,7 +144,7 @@ def choose_formats(
         _require_tifffile()
     owners: dict[str, str] = {}
     for output in chosen:
-        name = file_name(output)
+        name = file_name(output).casefold()
         if name in owners:
             raise ConfigError(
                 f"the outputs {owners[name]} and {output.name} would have the same files; ask for one of them"

@@ -59,7 +59,8 @@ def export(job: Job, asked: Report) -> list[Path]:
     if asked.max_views < 1:
         raise ConfigError(f"--max-views is {asked.max_views}; choose at least 1")
     job.claim([job.folder / "report.html"])
-    known, said = library_of(asked.library, job.materials.bands), _about(job.loaded.folder, asked)
+    known = library_of(asked.library, job.materials.bands, job.scene.light_power)
+    said = _about(job.loaded.folder, asked)
     chosen = evenly(job.views("eval"), asked.max_views)
     scene, notes = None, []
     if asked.edits is not None or asked.illuminant is not None:

@@ -55,6 +55,7 @@ _KNOWN = frozenset(
     value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path
     file_path name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
     seg_file_path mask_path abundance_file_path dino_file_path
+    mesh_path environment_path environment_rotation_deg environment_exposure_stops tone_mapping
     aabb aabb_scale scale render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
     enable_depth_loading enable_ray_loading sharpen sharpness_discard_threshold sharpness depth_path depth_file_path
     depth_unit_scale_factor driver_parameters envmap orientation_override colmap_im_id rotation time

@@ -71,10 +71,25 @@ _FEWEST_BANDS = 3
 """Bands that a comparison takes at least: two positive numbers are always nearly parallel."""
 
 _LEAST_OVERLAP = 0.5
-"""Part of a spectrum's bands that a material must cover to be compared with it."""
+"""Part of a spectrum's bands with light that a material must cover to be compared with it."""
+
+_GREATEST_REFLECTANCE = 2.0
+"""Values above it are not reflectances; glossy and fluorescent surfaces exceed 1."""
 
 DARK_LIGHT = 1e-3
 """Light at a band, relative to its greatest, below which nothing is known of the reflectance there."""
+
+
+def require_reflectance(values: Float[np.ndarray, " B"], what: str) -> None:
+    """Refuse percent and the like where the unit counts.
+
+    Raises:
+        SpectrumError: a value exceeds all that reflectances have.
+    """
+    if values.max() > _GREATEST_REFLECTANCE:
+        raise SpectrumError(
+            f"{what} must be in reflectances, 1 for white; found {values.max():g} (divide percent by 100)"
+        )
 
 
 @dataclass(frozen=True)
@@ -175,14 +190,14 @@ class MaterialLibrary:
     def comparable(
         self, bands: Bands, light: Float[np.ndarray, " B"] | None = None
     ) -> Bool[np.ndarray, " M"]:
-        """Which materials cover half of the bands or more, and three at least, not counting bands without light."""
+        """Which materials cover half of the bands with light or more, and three at least."""
         return np.asarray(self._compared_bands(bands, light).any(axis=1))
 
     def _compared_bands(self, bands: Bands, light: Float[np.ndarray, " B"] | None) -> Bool[np.ndarray, "M B"]:
         """Bands that each material is compared over; none of those that are passed over."""
         lit = np.ones(len(bands), bool) if light is None else light > DARK_LIGHT * np.max(light)
         shared = np.isfinite(self.resampled(bands)) & lit
-        enough = shared.sum(axis=1) >= max(_FEWEST_BANDS, _LEAST_OVERLAP * len(bands))
+        enough = shared.sum(axis=1) >= max(_FEWEST_BANDS, _LEAST_OVERLAP * lit.sum())
         return shared & enough[:, None]
 
     def angles(
@@ -194,8 +209,8 @@ class MaterialLibrary:
     ) -> tuple[Float64[np.ndarray, "N M"], Int64[np.ndarray, " M"]]:
         """Angle in radians between each spectrum and each material, and over how many bands a material is compared.
 
-        Materials that cover less than half of the bands, or less than three, are passed over: NaN and 0. So are bands
-        in which there is no light. Spectra that are not finite, or black, have no angles, NaN.
+        Bands in which there is no light are passed over. So are materials that cover less than half of the others, or
+        less than three: NaN and 0. Spectra that are not finite, or black, have no angles, NaN.
 
         Args:
             spectra: Radiance under `light`, or reflectance.

@@ -22,7 +22,11 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
+from unmix_plugin.spectral.library.material_library import (
+    LibraryMaterial,
+    MaterialLibrary,
+    require_reflectance,
+)
 from unmix_plugin.spectral.metrics import spectral_angle
 
 LOADING = 1e-3
@@ -30,8 +34,6 @@ LOADING = 1e-3
 3% of the background's standard deviation in each band. Rendered spectra are mixtures of a few and vary in no other
 direction, so that with much less, the smallest difference makes the target unlike everything in view; with much more,
 similar materials can no longer be told apart. Chosen on rendered views against true reflectances of seven materials."""
-_GREATEST_REFLECTANCE = 2.0
-"""A target of mf or ace with a value above it is not in reflectances; glossy and fluorescent surfaces exceed 1."""
 _LEAST_DISTANCE = 1e-4
 """From the background's mean to a target, in standard deviations: the rounding of float32 reaches a tenth of it."""
 _DetectionMethod = Literal["angle", "mf", "ace"]
@@ -268,11 +270,8 @@ def _chosen(name: str | None, names: Sequence[str], file: str) -> str:
 
 
 def _validate(reflectance: np.ndarray, method: _DetectionMethod, what: str) -> None:
-    if method != "angle" and reflectance.max() > _GREATEST_REFLECTANCE:
-        raise SpectrumError(
-            f"the target {what} must be in reflectances, 1 for white; found {reflectance.max():g} "
-            "(divide percent by 100)"
-        )
+    if method != "angle":
+        require_reflectance(reflectance, f"the target {what}")
     if method == "angle" and not reflectance.any():
         raise SpectrumError(
             f"the target {what} is zero in all bands: no angle to it is defined; choose mf or ace"

@@ -6,7 +6,7 @@ Notation: `H x W` pixels, `N` of them in use, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -74,12 +74,12 @@ def unmix_image(
     Args:
         cube: (H, W, B), radiance or reflectance in any unit, in whole numbers too; negative values count as 0.
         endmembers: How many materials to find; auto proposes a number.
-        mask: (H, W), pixels to use; None takes all.
+        mask: (H, W), pixels to use; None takes all. A pixel of which a NumPy masked array masks a band is left out.
         shares: What abundances are shares of.
         seed: Everything random follows from it.
     Raises:
-        SpectrumError: no cube, no light, NaN or infinite values in pixels to use, or more materials than bands, than
-            distinct pixels or than the pixels hold above their noise.
+        SpectrumError: no cube, an option that there is not, no light, NaN or infinite values in pixels to use, or more
+            materials than bands, than distinct pixels or than the pixels hold above their noise.
 
     >>> materials = np.array([[0.1, 0.2, 0.6, 0.7], [0.6, 0.5, 0.2, 0.1]])
     >>> share = np.linspace(0, 1, 400)[:, None]
@@ -87,7 +87,14 @@ def unmix_image(
     >>> unmix_image(cube, 2).abundances.shape
     (20, 20, 2)
     """
+    if not isinstance(cube, np.ndarray):
+        raise SpectrumError(f"an image to unmix is a NumPy array; found {type(cube).__name__}")
+    if not (isinstance(endmembers, int | np.integer) or endmembers == "auto"):
+        raise SpectrumError(f"endmembers must be a whole number or 'auto'; found {endmembers!r}")
+    if shares not in get_args(Shares):
+        raise SpectrumError(f"shares must be {', '.join(get_args(Shares))}; found {shares!r}")
     used = _used_pixels(cube, mask)
+    cube = np.ma.getdata(cube)
     spectra = torch.from_numpy(np.ascontiguousarray(cube[used], dtype=np.float32)).clamp(min=0)
     peaks = spectra.amax(dim=1)
     brightest = float(peaks.kthvalue(max(1, round(_LIT_QUANTILE * len(peaks)))).values)
@@ -134,9 +141,11 @@ def _used_pixels(cube: np.ndarray, mask: np.ndarray | None) -> Bool[np.ndarray, 
             f"the mask must be {cube.shape[0]} x {cube.shape[1]} of True and False; found {used.dtype} of shape "
             f"{used.shape}"
         )
+    if isinstance(cube, np.ma.MaskedArray):
+        used = used & ~np.ma.getmaskarray(cube).any(axis=-1)
     if not used.any():
         raise SpectrumError("the mask leaves no pixel to unmix")
-    broken = used & ~np.isfinite(cube).all(axis=-1)
+    broken = used & ~np.isfinite(np.ma.getdata(cube)).all(axis=-1)
     if broken.any():
         raise SpectrumError(
             f"{int(broken.sum())} of {int(used.sum())} pixels hold NaN or infinite values; leave them out with a mask"
@@ -184,8 +193,8 @@ def _confidence(
 ) -> Float[Tensor, "N"]:
     """Probability that the largest share is the largest in truth: of its margin, if the spread of the margin over the
     best sets of endmembers is the margin's error."""
-    if own.shape[1] == 1:
-        return torch.ones(len(own))
+    if own.shape[1] == 1:  # nothing is second, and no search can tell whether a material is missing
+        return torch.special.ndtr(torch.ones(len(own)) / _SHARED_MARGIN_ERROR)
     largest = own.topk(2, dim=1)
     margins = largest.values[:, 0] - largest.values[:, 1]
     squares = torch.zeros_like(margins)

@@ -56,8 +56,8 @@ class _ProbedPoint:
 
     @property
     def name(self) -> str:
-        """Of the endmember of the largest share."""
-        return self.materials.names[int(self.abundances.argmax())]
+        """Of its material, chosen as in segmentations."""
+        return self.materials.name_of(self.predicted, self.abundances)
 
 
 def _probe_through(
@@ -193,7 +193,7 @@ class ProbePanel:
             [
                 ("material", shown.name),
                 ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
-                ("measured in", shown.measured_in or "no training view at hand sees the point"),
+                ("measured in", shown.measured_in or "no training view at hand measured the point"),
                 *likeness_rows(self._session.services.library, shown.predicted, shown.materials),
             ]
         )

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from unmix_plugin.editing import sample_seen
+from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.spectral.materials import Coefficients, Materials
@@ -112,7 +113,7 @@ class SceneAids:
         self._why_not_measured = "the scene is still being read"
         self._source, self._has_materials = source, has_materials
         self._for_layers: tuple[int, LayerAids] | None = None
-        self._seen: tuple[int, Coefficients] | None = None
+        self._seen: dict[Any, tuple[int, Coefficients]] = {}
 
     def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
         """Note what was measured, or why that is unknown."""
@@ -134,8 +135,12 @@ class SceneAids:
         return replace(kept[1], error_of=error_of, why_no_error=self._why_not_measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
-        """What the training cameras see of the unedited scene, not long ago; called while it is lent."""
-        version = self._source.version
-        if self._seen is None or version - self._seen[0] >= STEPS_KEPT:
-            self._seen = (version, sample_seen(scene))
-        return self._seen[1]
+        """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while it is
+        lent."""
+        version, field = self._source.version, scene.field
+        change = field.change if isinstance(field, EditedField) else None
+        kept = self._seen.get(change)
+        if kept is None or version - kept[0] >= STEPS_KEPT:
+            kept = version, sample_seen(scene)
+            self._seen = dict([*self._seen.items()][-1:]) | {change: kept}
+        return kept[1]

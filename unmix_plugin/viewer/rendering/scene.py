@@ -175,9 +175,7 @@ class Edit:
             if self.light != LightChoice():
                 edited = relit(scene, self.light, "of this run")
             else:
-                scene = require_materials(scene, "of this run")
-                seen = see(scene) if self.recipe.wants_pictures else None
-                edited = edit_scene(scene, self.recipe, seen)
+                edited = edit_scene(require_materials(scene, "of this run"), self.recipe, see)
             self._kept[:] = [(edited, version, time.monotonic())]
             return edited
 
@@ -209,7 +207,7 @@ class MeasuredViews:
         self._lock = threading.Lock()
 
     def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
-        """Mean absolute error of the bands against the nearest training view, where that sees the same point.
+        """Mean absolute error of the bands against the nearest training view, where that measured the same point.
 
         Returns:
             Errors; where they are known; the name of the view.
@@ -240,8 +238,8 @@ class MeasuredViews:
         light: Float64[np.ndarray, " B"] | None,
         scene: TrainedScene,
     ) -> tuple[str, Float32[Tensor, "B"]] | None:
-        """Name of the training view nearest to a camera that sees a point, and the radiance measured there; None
-        where no view tried sees it.
+        """Name of the training view nearest to a camera that sees a point in a pixel that counts, and the radiance
+        measured there; None where no view tried does.
 
         Args:
             point: Model space.
@@ -289,7 +287,7 @@ class MeasuredViews:
     def _pixels_of(
         self, points: Float[Tensor, "P 3"], index: int, camera: Cameras, lent: TrainedScene | None = None
     ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
-        """Row and column of each point in a training view, and whether that view sees it."""
+        """Row and column of each point in a training view, and whether that view sees it in a pixel that counts."""
         camera = camera.to("cpu")
         coords, depths = camera.project(points.cpu(), 0)
         columns, rows = coords.nan_to_num(-1.0).clamp(-1, 1e6).floor().long().unbind(-1)
@@ -299,7 +297,10 @@ class MeasuredViews:
         places = camera.poses_at(torch.zeros_like(rows), coords[:, 1].nan_to_num(0.0))[:, :, 3]
         distance = (points.cpu() - places).norm(dim=-1)
         rendered = self._distance_of(index, camera, lent)[rows, columns]
-        return rows, columns, inside & ((distance - rendered).abs() < _TOLERANCE * distance)
+        sees = inside & ((distance - rendered).abs() < _TOLERANCE * distance)
+        if bool(sees.any()):
+            sees &= torch.from_numpy(self._scene.valid_mask(self._indices[index]))[rows, columns]
+        return rows, columns, sees
 
     def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""

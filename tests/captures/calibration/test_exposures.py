@@ -15,8 +15,8 @@ from tests.captures.capture_factory import (
     write_cube,
     write_poses,
 )
-from tests.captures.file_factory import file_of
-from unmix_plugin.captures.calibration.references import compare_exposures, exposure_of
+from tests.captures.file_factory import file_of, present
+from unmix_plugin.captures.calibration.exposures import compare_exposures, exposure_of
 from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.spectral_file import Linear
 
@@ -53,6 +53,35 @@ def test_gains_are_factors_or_decibels_and_what_is_not_understood_is_said():
     assert not facts.keys() & {"exposure_s", "gain"}
 
 
+@pytest.mark.parametrize(
+    ("entries", "gain"),
+    [
+        ({"analog gain": "2", "digital gain": "4"}, 8.0),
+        ({"digital gain": "4", "analog gain": "2"}, 8.0),
+        ({"analog gain": "6.0206 dB", "digital gain": "{1, 2, 3}"}, [2.0, 4.0, 6.0]),
+        ({"digital gain": "4", "gain": "2", "analog gain": "8"}, 2.0),  # the whole
+        ({"analogue gain": "2"}, 2.0),
+        ({"analog gain": "{1, 2}", "digital gain": "{1, 2, 3}"}, None),
+    ],
+)
+def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_whole(entries, gain):
+    facts, warnings = exposure_facts(entries, "header field")
+    assert facts.get("gain") == (pytest.approx(gain, rel=1e-4) if gain else None)
+    assert len(warnings) == (gain is None)
+
+
+@pytest.mark.parametrize(
+    ("stated", "factor"), [("0.0", 1.0), ("6.0206", 2.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)]
+)
+def test_gains_of_resonon_are_decibels(stated, factor):
+    """Told by the names beside them, and of no other camera."""
+    facts, warnings = exposure_facts({"shutter": "20.0", "gain": stated, "framerate": "40.0"}, "header field")
+    assert (facts["exposure_s"], facts["gain"]) == (0.02, pytest.approx(factor, rel=1e-4))
+    assert not warnings
+    assert "no unit" not in facts["gain_evidence"]
+    assert exposure_facts({"shutter": "20.0", "gain": "6"}, "header field")[0]["gain"] == 6
+
+
 def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as milliseconds"):
     return file_of(
         np.ones((2, 2, 3), np.uint16),
@@ -87,6 +116,27 @@ def test_what_may_be_wrong_with_exposures_is_said():
     assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
     other = exposed(0.005, evidence="header field 'exposure time'")
     assert "have no unit in some files" in warnings(views, [other], [])
+
+
+def test_the_aperture_counts_for_light_and_not_for_dark_current():
+    def taken(time, f_number):
+        return replace(exposed(time), metadata={"exposure_s": time, "f_number": f_number})
+
+    views = [taken(0.01, 4.0), taken(0.02, 4.0 * 2**0.5), taken(0.04, 8.0)]  # the same light
+    found = compare_exposures(views, [], [], False)
+    np.testing.assert_allclose([present(exposure_of(view)) for view in views], 0.01 / 16)
+    np.testing.assert_allclose(present(found.common), 0.01 / 16)
+    brighter = compare_exposures([*views, taken(0.01, 2.0)], [], [(taken(0.01, 16.0), views[0])], False)
+    assert "s times gain over the square of the f-number: each is brought to" in brighter.notes[0]
+    assert brighter.warnings == ()
+    assert "dark frame was exposed 0.04" in " ".join(
+        compare_exposures(views[:1], [], [(taken(0.04, 8.0), views[0])], False).warnings
+    )
+    (warning,) = compare_exposures([*views, exposed(0.01)], [], [], False).warnings
+    assert (
+        "the f-number of the lens is known of some files and not of memory.npy: exposures are not" in warning
+    )
+    assert compare_exposures(views, [exposed(0.01)], [], False).common is None
 
 
 def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
