@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from unmix_plugin.editing.recipe import Recipe
     from unmix_plugin.scenes.scene import Scene
     from unmix_plugin.spectral.bands import Bands
-    from unmix_plugin.spectral.materials import Coefficients
     from unmix_plugin.trained.open_run import LoadedRun
     from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.trained_scene import TrainedScene
@@ -41,7 +40,6 @@ class Subject:
     scene: Scene
     """What it was trained on."""
     views: list[View]
-    seen: Coefficients
     endmember: int
     """The one whose material is separated best."""
     material: int
@@ -52,7 +50,6 @@ class Subject:
         """Render all evaluation views, and find the endmember to edit."""
         import torch
 
-        from unmix_plugin.editing import sample_seen
         from unmix_plugin.scenes.reading.loader import load_scene
         from unmix_plugin.settings import SceneOptions
         from unmix_plugin.spectral.segmentation import SegmentationTally
@@ -70,14 +67,14 @@ class Subject:
             views.append(View(view, torch.tensor(alpha > OPAQUE, device=trained.device)))
         scores = tally.scores()
         endmember, material = max(scores.matching.items(), key=lambda pair: scores.iou[pair[1]])
-        return cls(trained, scene, views, sample_seen(trained), endmember, material, scores.iou[material])
+        return cls(trained, scene, views, endmember, material, scores.iou[material])
 
     def edited(self, recipe: Recipe) -> TrainedScene:
         """The scene after a recipe that leaves the geometry as it is."""
         from unmix_plugin.editing import changes_geometry, edit_scene
 
         assert not changes_geometry(recipe)
-        return edit_scene(self.trained, recipe, self.seen)
+        return edit_scene(self.trained, recipe)
 
     def pixels(self, edited: TrainedScene, output: str, least_share: float) -> Tensor:
         """What the opaque pixels show of which the endmember has at least a share: rows."""

@@ -103,6 +103,7 @@ def test_each_piece_is_turned_so_that_its_front_is_seen(tmp_path, has_normals):
     inward.update_faces(np.arange(len(inward.faces)) > 0)  # it may be open
     outward.apply_translation((5, 0, 0))
     both = trimesh.util.concatenate([inward, outward])
+    assert isinstance(both, trimesh.Trimesh)
     both.export(tmp_path / "mesh.ply", vertex_normal=has_normals)
     read = read_mesh(tmp_path / "mesh.ply")
     seen = torch.zeros(len(read.faces))
