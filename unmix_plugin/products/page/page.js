@@ -347,7 +347,7 @@
       paintedFlat();
       const present = new Set(materials);
       $("legend").replaceChildren(...names.map((_, k) => k).filter((k) => present.has(k)).map(swatch));
-      return "the material with the largest share at each place, and the area of the surface that it covers";
+      return "the material of each place, and the area of the surface that it covers";
     },
     confidence: () => { paintValues((v) => confidence[v], 0, 1); return "estimated probability that the material is right"; },
     index: () => {
