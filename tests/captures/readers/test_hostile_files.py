@@ -8,8 +8,9 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import h5py
@@ -213,3 +214,21 @@ def test_what_is_no_regular_file_is_not_opened(tmp_path):
     with pytest.raises(OSError, match="and 3 at most are read"):
         limits.read_bounded(tmp_path / "a", 3)
     assert limits.read_bounded(tmp_path / "a", 4) == b"long"
+
+
+def _damage_every_byte(folder: str) -> None:
+    path = Path(folder) / "cube.h5"
+    with h5py.File(path, "w") as file:
+        file["cube"] = CUBE
+    sound = path.read_bytes()
+    for position in range(len(sound)):
+        path.write_bytes(sound[:position] + b"\x91" + sound[position + 1 :])
+        with suppress(CaptureError):
+            open_spectral_file(path)
+
+
+def test_no_damaged_byte_of_hdf5_ends_the_process(tmp_path):
+    process = get_context("spawn").Process(target=_damage_every_byte, args=(str(tmp_path),))
+    process.start()
+    process.join()
+    assert process.exitcode == 0

@@ -265,8 +265,12 @@ def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[Fo
         scales = [scale.name for scale in dimension.values()] if len(dimension) else []
         names.append((scales[0] or "") if scales else dimension.label)
     dimensions, faster = tuple(names) if any(names) else None, take if is_cube else None
-    attributes, fill = _attributes(path, item), float(item.fillvalue) if item.dtype.kind in "iuf" else None
-    return [FoundArray(name, shape, item.dtype, whole, faster, attributes, {}, dimensions, fill)]
+    fill = None
+    if item.dtype.kind in "iuf":
+        # HDF5 ends the process where a damaged value is asked for; asked whether there is one, it raises an error.
+        item.id.get_create_plist().fill_value_defined()
+        fill = float(item.fillvalue)
+    return [FoundArray(name, shape, item.dtype, whole, faster, _attributes(path, item), {}, dimensions, fill)]
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:
