@@ -17,6 +17,7 @@ import warnings
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import _common
@@ -100,8 +101,24 @@ def run_chunk(chunk: tuple[str, int, int, int, float | None]) -> Outcome:
     if until is not None and time.time() > until:
         return Outcome()
     warnings.simplefilter("error")
+    # A library may end the process, and the harness with it: so each chunk has one of its own, on systems with `fork`.
+    receiver, sender = get_context("fork").Pipe(duplex=False)
     with tempfile.TemporaryDirectory(prefix="unmix-fuzz-") as folder:
-        return fuzz(name, Path(folder), seed, range(first, last))
+        child = get_context("fork").Process(target=_send, args=(sender, name, folder, seed, first, last))
+        child.start()
+        sender.close()
+        try:
+            return receiver.recv()
+        except EOFError:
+            child.join()
+            ended = f"the process ended with {child.exitcode} in one of the cases {first} to {last - 1}"
+            return Outcome(last - first, foreign=[(first, ended)])
+        finally:
+            child.join()
+
+
+def _send(sender: Connection, name: str, folder: str, seed: int, first: int, last: int) -> None:
+    sender.send(fuzz(name, Path(folder), seed, range(first, last)))
 
 
 def joined(a: Outcome, b: Outcome) -> Outcome:

@@ -227,6 +227,7 @@ def _damage_every_byte(folder: str) -> None:
             open_spectral_file(path)
 
 
+@pytest.mark.slow
 def test_no_damaged_byte_of_hdf5_ends_the_process(tmp_path):
     process = get_context("spawn").Process(target=_damage_every_byte, args=(str(tmp_path),))
     process.start()
