@@ -15,6 +15,7 @@ from tests.captures.poses.pose_factory import (
     assert_same_poses,
     lens_of,
     llff_table,
+    metashape_document,
     ring,
     transforms,
     write_json,
@@ -146,6 +147,32 @@ def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
     assert lenses[0] == lenses[1] != lenses[2]
     with pytest.raises(CaptureError, match="'is_fisheye' is true and camera_model \"PINHOLE\""):
         read(tmp_path, transforms(ring(), **terms, is_fisheye=True, camera_model="PINHOLE"))
+
+
+def test_a_fisheye_with_tangential_terms_is_the_one_that_metashape_writes(tmp_path):
+    content = transforms(
+        ring(),
+        camera_model="OPENCV_FISHEYE",
+        fl_x=500,
+        fl_y=500,
+        cx=323,
+        cy=236,
+        k1=0.1,
+        k2=0.02,
+        p1=0.02,
+        p2=-0.01,
+    )
+    terms = "<k1>0.1</k1><k2>0.02</k2><p1>-0.01</p1><p2>0.02</p2>"  # Metashape's order is the other one
+    (tmp_path / "cameras.xml").write_text(metashape_document(ring(), kind="fisheye", terms=terms))
+    x, y, squared = 0.3, 0.2, 0.13  # of the length of the angle from the axis
+    ideal = np.array([[x, y]]) * math.tan(squared**0.5) / squared**0.5
+    factor = 1 + 0.1 * squared + 0.02 * squared**2
+    bent_x = x * factor + 2 * 0.02 * x * y - 0.01 * (squared + 2 * x**2)
+    bent_y = y * factor + 0.02 * (squared + 2 * y**2) - 2 * 0.01 * x * y
+    for found in (read(tmp_path, content), read_poses(tmp_path / "cameras.xml")):
+        lens = lens_of(found)
+        seen = lens.resampled_from.project(ideal) if lens.resampled_from else lens.pixels_of(ideal)
+        np.testing.assert_allclose(seen, [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1)
 
 
 REFUSED = dict.fromkeys(("latlong", "equirectangular", "orthographic", "from_mitsuba"), True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeAlias
 
@@ -388,6 +389,7 @@ def _make_lens(
     elif bend is models.bend_equirectangular:
         focal = (width / (2 * math.pi), height / math.pi)
     elif bend is models.bend_fisheye:
+        bend = partial(models.bend_fisheye, tangential=given.distortion[2:])
         terms = (*given.distortion[:2], *given.higher_radial)
     if focal is None:
         return None, None
