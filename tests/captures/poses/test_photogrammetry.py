@@ -19,6 +19,7 @@ from tests.captures.poses.pose_factory import (
     assert_same_poses,
     lens_of,
     metashape_document,
+    pixels_in_file,
     reconstruction,
     ring,
     text_of,
@@ -91,6 +92,24 @@ def test_photoscans_old_form_counts_the_principal_point_from_the_corner(tmp_path
         assert (lens.focal_px, lens.center_px) == ((500, 510), center)
 
 
+@pytest.mark.parametrize(("more", "is_swapped"), [("", False), ("<p3>8</p3><p4>0</p4>", True)])
+def test_photoscans_old_form_has_p1_and_p2_in_opencvs_order_until_p3_came(tmp_path, more, is_swapped):
+    terms = f"<fx>500</fx><fy>500</fy><cx>323</cx><cy>236</cy><p1>0.003</p1><p2>-0.002</p2>{more}"
+    old = METASHAPE_CALIBRATION.replace("<f>500</f><cx>3</cx><cy>-4</cy>{terms}", terms)
+    found = read_metashape(tmp_path, ring(), calibration=old)
+    x, y, squared = 0.3, 0.2, 0.13
+    growth = 1 + 8 * squared if more else 1
+    p1, p2 = (-0.002, 0.003) if is_swapped else (0.003, -0.002)  # OpenCV's
+    bent_x = x + growth * (2 * p1 * x * y + p2 * (squared + 2 * x**2))
+    bent_y = y + growth * (2 * p2 * x * y + p1 * (squared + 2 * y**2))
+    seen = pixels_in_file(found, np.array([[x, y]]))
+    np.testing.assert_allclose(seen, [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1)
+    taken = "p1, p2 beside <fx>, <fy> are taken as OpenCV's " + ("p2, p1" if is_swapped else "p1, p2")
+    assert sum(taken in note for note in found.notes) == 1
+    plain = old.replace("0.003", "0").replace("-0.002", "0")
+    assert not any("p1, p2" in note for note in read_metashape(tmp_path, ring(), calibration=plain).notes)
+
+
 @pytest.mark.parametrize("kind", ["frame", "fisheye"])
 def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
     terms = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"
@@ -101,9 +120,9 @@ def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
     bent_y = y * (1 + 0.01 * squared) + growth * (-0.002 * (squared + 2 * y**2) + 2 * 0.003 * x * y)
     radius = squared**0.5
     ideal = np.array([[x, y]]) * (np.tan(radius) / radius if kind == "fisheye" else 1.0)
-    lens = lens_of(found)
-    seen = lens.resampled_from.project(ideal) if lens.resampled_from else lens.pixels_of(ideal)
-    np.testing.assert_allclose(seen, [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1)
+    np.testing.assert_allclose(
+        pixels_in_file(found, ideal), [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1
+    )
     said = "Metashape fisheye" if kind == "fisheye" else "Metashape with p3, p4"
     assert any(said in note for note in found.notes)
 

@@ -6,7 +6,8 @@ A camera's matrix leads from the camera (OpenCV axes) to its component; the comp
 to the world, often geocentric (metres from the middle of the Earth).
 
 A sensor's lens: u = w / 2 + cx + x' f + x' b1 + y' b2, v = h / 2 + cy + y' f, with x', y' bent by k1..k4 and by p1, p2,
-which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote u = cx + x' fx + y' skew, v = cy + y' fy.
+which are OpenCV's p2, p1. PhotoScan up to 1.3 wrote u = cx + x' fx + y' skew, v = cy + y' fy, with
+OpenCV's p1, p2 (manual of Agisoft Lens 0.4), unless p3, p4 are there, which the manual of 1.2 has with the other order.
 
 MicMac: Orientation-IMAGE.xml files, each with its calibration inside or in a file beside it.
 
@@ -183,10 +184,19 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
             f"{where} has the principal point {center_x:g}, {center_y:g}, outside its {width} x {height} pixels; check "
             "<cx>, <cy> and <resolution> in the file"
         )
-    center, tangential = (center_x, center_y), (values["p2"], values["p1"])
+    center, notes = (center_x, center_y), _unknown_terms(calibration, name)
+    is_opencv = is_old and calibration.find("p3") is None and calibration.find("p4") is None
+    tangential = (values["p1"], values["p2"]) if is_opencv else (values["p2"], values["p1"])
+    if is_old and any(tangential):
+        taken = (
+            "p1, p2 (PhotoScan up to 1.1)"
+            if is_opencv
+            else "p2, p1, as p3 or p4 is there (PhotoScan from 1.2)"
+        )
+        notes.append(f"sensor {name}: p1, p2 beside <fx>, <fy> are taken as OpenCV's {taken}")
     start, (k1, k2, k3, k4) = Lens(width, height, (f_x, f_y), center), [values[key] for key in _RADIAL]
     frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
-    growth, notes = (values["p3"], values["p4"]), _unknown_terms(calibration, name)
+    growth = values["p3"], values["p4"]
     has_growth = any(growth) and any(tangential)
     if kind == "frame" and not skew and not has_growth:
         return frame, notes
