@@ -110,6 +110,23 @@ def test_photoscans_old_form_has_p1_and_p2_in_opencvs_order_until_p3_came(tmp_pa
     assert not any("p1, p2" in note for note in read_metashape(tmp_path, ring(), calibration=plain).notes)
 
 
+@pytest.mark.parametrize("kind", ["fisheye", "spherical"])
+def test_a_sensor_without_calibration_keeps_its_type(tmp_path, kind):
+    found = read_metashape(tmp_path, ring(), kind=kind, calibration="")
+    x, y = 0.3, 0.2
+    ideal = np.array([[x, y]])
+    if kind == "spherical":
+        angles = np.array([[np.arctan(x), np.arctan2(y, np.hypot(x, 1))]])
+        expected = (320, 240) + angles * (640 / (2 * np.pi), 480 / np.pi)
+    else:
+        radius = np.hypot(x, y)
+        expected = (320, 240) + ideal * np.arctan(radius) / radius * (500, 400)  # 2 mm over those of pixels
+    np.testing.assert_allclose(pixels_in_file(found, ideal), expected, atol=0.1)
+    assert any(f"Metashape {kind}" in note for note in found.notes)
+    with pytest.raises(CaptureError, match="of the type equisolid_fisheye; expected frame"):
+        read_metashape(tmp_path, ring(), kind="equisolid_fisheye", calibration="")
+
+
 @pytest.mark.parametrize("kind", ["frame", "fisheye"])
 def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
     terms = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"

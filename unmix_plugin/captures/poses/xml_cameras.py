@@ -32,6 +32,7 @@ from unmix_plugin.captures.poses.lens import (
     Points,
     bend_agisoft,
     bend_equirectangular,
+    bend_fisheye,
     bent_lens,
     fit_lens,
 )
@@ -158,9 +159,7 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
     calibration, size = _calibration_metashape(sensor, where)
-    if calibration is None:
-        return _from_physical(sensor, size), [f"sensor {name} is not calibrated: nominal focal length"]
-    kind = calibration.get("type") or sensor.get("type", "frame")
+    kind = (None if calibration is None else calibration.get("type")) or sensor.get("type", "frame")
     if kind not in ("frame", "fisheye", "spherical"):
         raise CaptureError(f"{where} is of the type {kind}; expected frame, fisheye or spherical")
     width, height = size
@@ -168,6 +167,13 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
         around, said = bent_lens(bend_equirectangular, (), start, "Metashape spherical", where)
         return around, [f"sensor {name}: {said}"]
+    if calibration is None:
+        nominal = _from_physical(sensor, size)
+        notes = [f"sensor {name} is not calibrated: nominal focal length"]
+        if nominal is not None and kind == "fisheye":
+            nominal, said = bent_lens(bend_fisheye, (), nominal, "Metashape fisheye", where)
+            notes.append(f"sensor {name}: {said}")
+        return nominal, notes
     values = {tag: _number_of(calibration, tag, where) for tag in _TERMS}
     f_x = _number_of(calibration, "fx", where, values["f"] + values["b1"])
     f_y = _number_of(calibration, "fy", where, values["f"])
