@@ -127,6 +127,14 @@ def test_a_sensor_without_calibration_keeps_its_type(tmp_path, kind):
         read_metashape(tmp_path, ring(), kind="equisolid_fisheye", calibration="")
 
 
+@pytest.mark.parametrize("value", ["true", "1", "false"])
+def test_a_rolling_shutter_is_said_not_to_be_followed(tmp_path, value):
+    shutter = f'<property name="rolling_shutter" value="{value}"/>{METASHAPE_CALIBRATION}'
+    warnings = read_metashape(tmp_path, ring(), calibration=shutter).warnings
+    assert len(warnings) == (value != "false")
+    assert all("sensor lens: 'rolling_shutter' is set and not followed" in text for text in warnings)
+
+
 @pytest.mark.parametrize("kind", ["frame", "fisheye"])
 def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
     terms = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"

@@ -73,10 +73,16 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
     aligned = _of_one_world(_aligned(chunk, path, notes), worlds, notes)
     used = {camera.get("sensor_id") for camera in aligned}
     lenses: dict[str | None, Lens | None] = {}
+    warnings = []
     for sensor in chunk.iterfind("sensors/sensor"):
         if sensor.get("id") in used:
             lenses[sensor.get("id")], said = _lens_metashape(sensor, str(path))
             notes += said
+            if _properties(sensor).get("rolling_shutter", "").strip().lower() in ("true", "1"):
+                warnings.append(
+                    f"sensor {sensor.get('label', '?')}: 'rolling_shutter' is set and not followed: it stands for rows "
+                    "that were read one after the other: each picture gets one pose"
+                )
     raw = []
     for camera in aligned:
         world = worlds.get(camera.get("component_id"), worlds[None])
@@ -93,7 +99,9 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
     notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
     has_world = any(np.abs(world - np.eye(4)).max() > 0 for world in worlds.values())
     up = middle if is_geocentric else np.array([0.0, 0.0, 1.0]) if has_world else None
-    found = make_pose_set(raw, f"Metashape's {path.name}", str(path), None, up, dict.fromkeys(notes))
+    found = make_pose_set(
+        raw, f"Metashape's {path.name}", str(path), None, up, dict.fromkeys(notes), dict.fromkeys(warnings)
+    )
     return replace(found, metres_per_unit=1.0 if is_geocentric else None)
 
 
@@ -243,9 +251,13 @@ def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | Non
     raise CaptureError(f"{where} has no resolution; expected its width and height in pixels")
 
 
+def _properties(sensor: _Element) -> dict[str | None, str]:
+    return {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
+
+
 def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
     """A pinhole from focal length and pixel size in mm."""
-    texts = {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
+    texts = _properties(sensor)
     try:
         focal, *sides = (float(texts[name]) for name in ("focal_length", "pixel_width", "pixel_height"))
     except (KeyError, ValueError):
