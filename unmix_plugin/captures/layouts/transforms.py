@@ -57,7 +57,7 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
     stack_bands,
 )
-from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
 from unmix_plugin.scenes.reading.faults import Faults, read_number
 from unmix_plugin.scenes.reading.transforms_json import read_sensor_entry, read_value_scale, read_widths
 
@@ -140,16 +140,25 @@ def _read_frames(root: Path, key: str) -> _FrameList:
             raise CaptureError(f"{frame.where} has no '{key}', the path of its file: add it")
     notes = [f"{counted(n, 'frame')} of {name} listed before: left out" for name, n in repeated.items()]
     source = whole if whole in files else root
-    return _FrameList(source, _split_by_lists(tuple(frames.values()), top), top, tuple(notes))
+    return _FrameList(source, _split_by_lists(tuple(frames.values()), top, source), top, tuple(notes))
 
 
-def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any]) -> tuple[_Frame, ...]:
+def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], source: Path) -> tuple[_Frame, ...]:
     """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation, otherwise
-    what training leaves; without a list for training, it is what the others leave."""
-    train, val, test = (
-        {path_text(text) for text in top.get(f"{name}_filenames") or [] if isinstance(text, str)}
-        for name in ("train", "val", "test")
-    )
+    what training leaves; without a list for training, it is what the others leave. Raises CaptureError: a list names
+    what no frame does."""
+    known = {frame.text(key) for frame in frames for key in _NAME_KEYS} - {""}
+    lists: list[set[str]] = []
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        values = top.get(key) or []
+        listed = [path_text(str(value)) for value in (values if isinstance(values, list) else [values])]
+        if unknown := [name for name in listed if name not in known]:
+            raise CaptureError(
+                f"{source}: {len(unknown)} of {len(listed)} paths in '{key}' are those of no frame "
+                f"({name_some(unknown)}); expected them as frames have them, such as {frames[0].name}"
+            )
+        lists.append(set(listed))
+    train, val, test = lists
     evaluation = test or val
     if not (train or evaluation):
         return frames
