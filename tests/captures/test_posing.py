@@ -16,7 +16,7 @@ from tests.scenes.scene_factory import make_scene, ring_poses
 from unmix_plugin.captures.poses.lens import Lens, _FileLens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.captures.posing import _complete_rigs, _place_poses
+from unmix_plugin.captures.posing import _complete_rigs, _place_poses, pose_views
 from unmix_plugin.captures.process import _refuse_late
 from unmix_plugin.captures.spectral_file import CaptureView, SpectralFile
 from unmix_plugin.captures.writing.scene_files import _write_points
@@ -118,6 +118,28 @@ def test_a_scene_with_a_placement_has_the_sources_world(tmp_path, offset):
 SMALL_LENS = Lens(4, 3, (5.0, 5.0), (2.0, 1.5))
 FLIP = np.diag([1.0, -1.0, -1.0])
 ANGLES = {"a": "0,0,0", "b": "2,-3,1.5", "c": "-1,0.5,4"}
+
+
+@pytest.mark.parametrize(
+    ("size", "note", "finding"),
+    [
+        ((640, 480), "", ""),
+        ((320, 240), "lenses given for 640 x 480 pixels were scaled to 320 x 240", ""),
+        ((1280, 960), "lenses given for 640 x 480 pixels were scaled to 1280 x 960", ""),
+        (
+            (400, 300),
+            "",
+            "given for 640 x 480 pixels, its file has 400 x 300: taken as scaled. If it was cut",
+        ),
+    ],
+)
+def test_lenses_that_were_scaled_to_their_pictures_are_said(size, note, finding):
+    shape = (size[1], size[0], 1)
+    cube = SpectralFile(Path("x.tif"), "tiff", shape, np.dtype("u2"), lambda *_: np.zeros(0))
+    posed = pose_views([CaptureView(f"view_{index}", cube) for index in range(6)], ring_set())
+    assert [text for text in posed.notes if "scaled" in text] == [note] * bool(note)
+    assert len(posed.findings) == bool(finding)
+    assert all(finding in text for text in posed.findings)
 
 
 def rig_view(release: str, sensor: str, angles: str | None = None) -> CaptureView:

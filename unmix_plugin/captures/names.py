@@ -104,7 +104,7 @@ _IN_ORDER = "by their order, as the poses have no names"
 
 def match_poses(
     poses: PoseSet, views: Sequence[tuple[str, Sequence[str | Path]]]
-) -> tuple[dict[str, PosedCamera], list[str]]:
+) -> tuple[dict[str, PosedCamera], list[str], list[str]]:
     """Find the camera of each view.
 
     Names are compared whole, then as folder and name, file name, and name without suffix, each only where it is unique
@@ -114,7 +114,7 @@ def match_poses(
         views: Name and files of each view; the files as paths, of which the trailing parts count.
     Returns:
         Cameras by the name of the view, without views that have none; how they were matched and what is odd, one
-        sentence each.
+        sentence each; and warnings of views that may have the poses of others.
     Raises:
         CaptureError: no view has a pose.
     """
@@ -157,7 +157,14 @@ def match_poses(
         notes.append(f"{counted(len(unused), 'camera')} without view: {name_some(unused)}")
     if shared:
         notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
-    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes
+    of_views, of_cameras = _numbers(wanted), set() if how == _IN_ORDER else _numbers(owners)
+    warnings = [
+        f"the numbers in names of cameras are those of the views {apart:+d}: if one was counted from 0 and the other from "
+        "1, views have the poses of their neighbours; rename the files of one"
+        for apart in (1, -1)
+        if of_cameras and {number + apart for number in of_views} == of_cameras
+    ]
+    return {view: poses.cameras[found[view]] for view in wanted if view in found}, notes, warnings
 
 
 def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
@@ -188,6 +195,12 @@ def _cores(names: Iterable[str]) -> dict[str, str]:
         core = stem[first:last]
         cores[str(int(core)) if core.isdecimal() else core] = name
     return cores if len(cores) == len(stems) else {}
+
+
+def _numbers(names: Iterable[str]) -> set[int]:
+    """What differs among names, if these are numbers."""
+    cores = _cores(names)
+    return {int(core) for core in cores} if all(core.isdecimal() for core in cores) else set()
 
 
 def _owners_of(names: dict[str, list[str]], key: Callable[[str], str]) -> dict[str, set[str]]:

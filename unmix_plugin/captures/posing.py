@@ -104,7 +104,7 @@ def pose_views(
     Poses that don't tell metres get them from a distance that is known. Raises CaptureError: fewer than two views have
     a camera, or a lens does not fit its view. Raises ConfigError: the distance does not go with the poses."""
     files = [(view.name, [*view.cube.files, *filter(None, [view.picture])]) for view in views]
-    cameras, said = match_poses(poses, files)
+    cameras, said, doubts = match_poses(poses, files)
     cameras, completed = _complete_rigs(views, cameras)
     matched = [note for note in said if not (completed and "without pose" in note)]
     posed = tuple(view for view in views if view.name in cameras)
@@ -137,8 +137,9 @@ def pose_views(
         else:  # exports return to the scene's upright world, in metres
             keys = Placement(scale=1.0 / metres).to_json() | {METRES_KEY: 1.0}
         how = (*how, said)
-    notes = (*poses.notes, *matched, *completed, *resampled, *how)
-    findings = _other_sizes(posed, cameras)
+    cut, scaled = _other_sizes(posed, cameras)
+    notes = (*poses.notes, *matched, *completed, *resampled, *scaled, *how)
+    findings = [*doubts, *cut]
     missing = [view.name for view in views if view not in posed]
     if len(missing) > _MOST_UNPOSED * len(views):  # so many that the source itself is suspect
         left_out = (
@@ -150,20 +151,27 @@ def pose_views(
     return PosedViews(posed, placed, tuple(findings), keys, notes)
 
 
-def _other_sizes(posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]) -> list[str]:
-    """Lenses given for pictures of another size, which is no whole multiple: cut, perhaps, and not scaled."""
+def _other_sizes(
+    posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
+) -> tuple[list[str], list[str]]:
+    """Lenses given for pictures of another size: a finding where it is no whole multiple, so that they were cut,
+    perhaps, and not scaled; and notes of the others."""
+    findings, notes = [], []
     for view in posed:
         lens, (height, width, _) = cameras[view.name].lens or view.lens, view.cube.shape
-        if lens is None or (lens.width, lens.height) == (width, height):
+        if lens is None or lens.width == width:
             continue
         ratio = max(width / lens.width, lens.width / width)
-        if abs(ratio - round(ratio)) > _MOST_STRETCH * ratio:
-            finding = (
+        if abs(ratio - round(ratio)) <= _MOST_STRETCH * ratio:
+            notes.append(
+                f"lenses given for {lens.width} x {lens.height} pixels were scaled to {width} x {height}"
+            )
+        elif not findings:
+            findings.append(
                 f"the lens of view {view.name} is given for {lens.width} x {lens.height} pixels, its file has {width} "
                 f"x {height}: taken as scaled. If it was cut instead, give the lens of the cut picture"
             )
-            return [finding]
-    return []
+    return findings, list(dict.fromkeys(notes))
 
 
 def lens_of_view(lens: Lens | None, view: CaptureView) -> Lens:

@@ -16,7 +16,7 @@ def named(*names):
 def match(poses, *views):
     """The name of the camera that each view gets, and the notes."""
     names = {id(camera): name for name, camera in poses.cameras.items()}
-    cameras, notes = match_poses(poses, views)
+    cameras, notes, _ = match_poses(poses, views)
     return {view: names[id(camera)] for view, camera in cameras.items()}, notes
 
 
@@ -66,3 +66,26 @@ def test_poses_without_names_go_by_names_as_texts_which_is_said_where_numbers_go
     assert found == {"v1": "#0000", "v10": "#0001", "v2": "#0002"}
     assert "names were sorted as texts: v1, v10, v2" in notes[1]
     assert len(match(poses, ("v1", []), ("v2", []), ("v3", []))[1]) == 1
+
+
+@pytest.mark.parametrize(
+    ("cameras", "views", "is_doubtful"),
+    [
+        ([1, 2, 3], [0, 1, 2], True),
+        ([0, 1, 2], [1, 2, 3], True),
+        ([1, 2, 4, 5], [0, 1, 3, 4], True),
+        ([1, 2, 3], [1, 2, 3], False),
+        ([1, 2, 3], [0, 1, 2, 3], False),
+        ([2, 3, 4], [0, 1, 2], False),
+    ],
+)
+@pytest.mark.parametrize("name", ["frame_{:05d}.png", "cube_{}.png"])
+def test_numbers_counted_from_0_and_from_1_are_told(cameras, views, is_doubtful, name):
+    poses = named(*(name.format(number) for number in cameras))
+    found, _, warnings = match_poses(poses, [(f"cube_{number}", []) for number in views])
+    assert found
+    assert ["those of the views" in text for text in warnings] == [True] * is_doubtful
+
+
+def test_cameras_without_names_have_no_numbers_to_doubt():
+    assert match_poses(named("#0000", "#0001"), [("v1", []), ("v2", [])])[2] == []
