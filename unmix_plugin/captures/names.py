@@ -159,8 +159,8 @@ def match_poses(
         notes.append(f"several views or cameras share the name of {name_some(shared)}; rename them")
     of_views, of_cameras = _numbers(wanted), set() if how == _IN_ORDER else _numbers(owners)
     warnings = [
-        f"the numbers in names of cameras are those of the views {apart:+d}: if one was counted from 0 and the other from "
-        "1, views have the poses of their neighbours; rename the files of one"
+        f"the numbers in names of cameras are those of the views {apart:+d}: if one was counted from 0 and the other "
+        "from 1, views have the poses of their neighbours; rename the files of one"
         for apart in (1, -1)
         if of_cameras and {number + apart for number in of_views} == of_cameras
     ]
