@@ -89,7 +89,12 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     ("wavelengths_nm", "dropped", "expected"),
     [
         ([500, 510, 520, 530, 540], [], [505, 525]),
-        ([500, 510, 520, 530, 540, 550, 560], [3], [505, 545]),
+        ([500, 510, 520, 530, 540, 550, 560], [3], [505, 530, 555]),  # a single bad band
+        ([*range(500, 600, 10)], [3, 4, 5], [505, 565, 585]),
+        ([*range(500, 620, 10)], [2, 3, 4, 6, 7, 8], [505, 595]),  # one band between two gaps
+        ([*range(500, 560, 10)], [2, 3, 4], [505]),  # one behind the last
+        ([500, 505, 507.5, 510, 512.5, 515], [2, 4], [502.5, 512.5]),  # bad ones of a second detector
+        ([*range(500, 541, 10), *range(503, 537, 3)], [*range(5, 17)], [505, 525]),  # of a finer one
         ([1320, 1330, 1340, 1460, 1470, 1480, 1490], [], [1325, 1465, 1485]),  # cut out of the file
         ([500, 510, 510, 520, 530], [2], [505, 525]),  # of two bands of one wavelength the other is there
         ([450, 550, 610, 790], [], [500, 700]),
@@ -97,7 +102,7 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     ],
 )
 def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
-    choice = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")).without_rests(2)
+    choice = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")).without_incomplete_bins(2)
     np.testing.assert_allclose(choice.centers_nm(2), expected)
     assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
 

@@ -53,7 +53,7 @@ _NEAR_TOP, _MOST_CLIPPED = 0.99, 0.05
 """Share of the detector's end that means of lines reach where some are above it; share of a white reference's values at
 that end from which a band is left out."""
 _GAP = 3.0
-"""Between neighbouring bands, as a multiple of the steps beside it, from which bands are missing in the file itself."""
+"""Between neighbouring bands, as a multiple of the steps beside it, above which bands are missing."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 _BRIGHT_PERCENTILE = 99.9
@@ -96,17 +96,19 @@ class _BandChoice:
         repeated = np.isin(np.arange(len(self.wavelengths_nm)), np.setdiff1d(left, first))
         return self.without(repeated, "an earlier band has the same wavelength")
 
-    def without_rests(self, binning: int) -> _BandChoice:
+    def without_incomplete_bins(self, binning: int) -> _BandChoice:
         """The choice without bands that fill no bin up to the next gap: a bin across a gap would stand for light that
-        was not measured, such as that of bands in which air absorbs."""
+        was not measured, such as that of bands in which air absorbs. Single bad bands, or those of a second detector
+        between those of the first, leave no gap."""
         kept = self.kept
         own, others = self.wavelengths_nm[kept], self.wavelengths_nm[list(self.dropped)]
-        steps_nm, is_between = np.diff(own), (own[:-1, None] < others) & (others < own[1:, None])
-        around = np.pad(steps_nm, 1)
-        beside_nm = np.maximum(around[:-2], around[2:])
-        is_gap = is_between.any(axis=1) | ((steps_nm > _GAP * beside_nm) & (beside_nm > 0))
+        steps_nm = np.diff(own)
+        is_between = ((own[:-1, None] < others) & (others < own[1:, None])).any(axis=1)
+        around = np.pad(steps_nm, 1, constant_values=np.nan)
+        # Several ranges may be left out with few bands between them.
+        beside_nm = np.where(is_between, np.fmin(around[:-2], around[2:]), np.fmax(around[:-2], around[2:]))
         marks = np.zeros(len(self.wavelengths_nm), bool)
-        for run in np.split(kept, np.flatnonzero(is_gap) + 1):
+        for run in np.split(kept, np.flatnonzero(steps_nm > _GAP * beside_nm) + 1):
             marks[run[len(run) // binning * binning :]] = True
         return self.without(marks, f"too few up to a gap or the end for --bin-bands {binning}")
 
@@ -209,7 +211,7 @@ def prepare_sensor(
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
     choice, noted = _drop_found(choice, sample, options.max_noise)
-    choice = choice.without_rests(binning)
+    choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
     if lamp is not None:
