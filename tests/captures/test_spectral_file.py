@@ -53,8 +53,10 @@ def test_a_stack_keeps_what_its_parts_share_and_lists_the_rest(tmp_path):
 )
 def test_a_stack_has_the_exposure_of_each_band_or_none(tmp_path, second, exposures):
     parts = [part(tmp_path, 1, exposure_s=0.1, gain=1.0), part(tmp_path, 2, **second)]
-    found = stack_bands(parts, tmp_path).metadata
-    assert (found.get("exposure_s"), found.get("gain", 1.0)) == (exposures, 1.0)
+    stack = stack_bands(parts, tmp_path)
+    assert (stack.metadata.get("exposure_s"), stack.metadata.get("gain", 1.0)) == (exposures, 1.0)
+    said = ("one exposure time and gain is not known of every band: exposures are not compared",)
+    assert stack.warnings == (said if exposures is None else ())
 
 
 def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
@@ -65,7 +67,16 @@ def test_a_stack_has_one_f_number_and_exposures_that_fit_it(tmp_path):
 
     np.testing.assert_allclose(present(exposure(2.0, 4.0)), [0.1 / 4, 0.1 / 16])
     np.testing.assert_allclose(present(exposure(2.0, 2.0)), [0.1 / 4])
-    assert exposure(2.0, None) is exposure(None, 2.0) is None
+
+
+@pytest.mark.parametrize("gains", [(1.0, 1.0), (1.0, 4.0)])
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_a_stack_keeps_times_and_gains_without_f_numbers_that_only_some_parts_have(tmp_path, lacking, gains):
+    facts = [{"exposure_s": 0.1, "gain": gain, "f_number": 2.0} for gain in gains]
+    del facts[lacking]["f_number"]
+    stack = stack_bands([part(tmp_path, i, **own) for i, own in enumerate(facts)], tmp_path)
+    np.testing.assert_allclose(np.broadcast_to(present(exposure_of(stack)), 2), 0.1 * np.array(gains))
+    assert f"is known of some bands and not of {lacking}: exposures are compared" in stack.warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -480,16 +480,22 @@ def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
 
 
 def exif_exposure(time_s: Any, iso_speed: Any, f_number: Any) -> dict[str, Any]:
-    """The same metadata, and `f_number`, by EXIF's exposure time, speed and f-number; none without a time above 0."""
-    try:
-        time_s, speed, f_number = (float(value or 0) for value in (time_s, iso_speed, f_number))
-    except (TypeError, ValueError, ZeroDivisionError):
-        return {}
-    if not time_s > 0:
+    """The same metadata, and `f_number`, by EXIF's exposure time, speed and f-number, of those that are finite numbers
+    above 0; none without a time.
+
+    >>> exif_exposure("0.01", 200, "f/2.8")
+    {'exposure_s': 0.01, 'exposure_evidence': 'EXIF ExposureTime', 'gain': 2.0}
+    """
+    time_s, speed, f_number = map(_above_0, (time_s, iso_speed, f_number))
+    if time_s is None:
         return {}
     facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"}
-    return (
-        facts
-        | ({"gain": speed / 100} if speed > 0 else {})
-        | ({"f_number": f_number} if f_number > 0 else {})
-    )
+    return facts | ({"gain": speed / 100} if speed else {}) | ({"f_number": f_number} if f_number else {})
+
+
+def _above_0(value: Any) -> float | None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if 0 < number < np.inf else None

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.errors import CaptureError, install_hint
+from unmix_plugin.errors import CaptureError, install_hint, name_some
 
 Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 """What the axes of an array are, the slowest first: y rows, x columns, b bands."""
@@ -393,14 +393,21 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         shared = set.intersection(*(set(header.items()) for header in headers))
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
     exposure: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
+    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
     exposed = [[part.metadata.get(key, usual) for key, usual in exposure.items()] for part in parts]
+    unexposed, is_exposed = "", any("exposure_s" in part.metadata for part in parts)
+    if is_exposed and 0 < len(lacking) < len(parts):
+        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
+        unexposed = f"{unknown}: exposures are compared without it"
+        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
     if len(set(map(repr, exposed))) > 1:
         same = {key: value for key, value in same.items() if key not in exposure}
-        is_alike = len({"f_number" in part.metadata for part in parts}) == 1
-        if is_alike and all(isinstance(number, float) for numbers in exposed for number in numbers):
+        if all(isinstance(number, float) for numbers in exposed for number in numbers):
             of_first = exposed[0][2]  # so that the bands have one f-number again
             same["exposure_s"] = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
-            same |= {"f_number": of_first} if "f_number" in first.metadata else {}
+            same |= {} if lacking else {"f_number": of_first}
+        elif is_exposed:
+            unexposed = "one exposure time and gain is not known of every band: exposures are not compared"
     return replace(
         first,
         path=path,
@@ -416,6 +423,7 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         warnings=(
             *dict.fromkeys(warning for part in parts for warning in part.warnings),
             *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
+            *([unexposed] if unexposed else []),
         ),
         sources=tuple(source for part in parts for source in part.files),
         dark_lines=0,

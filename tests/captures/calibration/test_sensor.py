@@ -102,7 +102,9 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     ],
 )
 def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
-    choice = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")).without_incomplete_bins(2)
+    choice = _BandChoice(
+        np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")
+    ).without_incomplete_bins(2)
     np.testing.assert_allclose(choice.centers_nm(2), expected)
     assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
 

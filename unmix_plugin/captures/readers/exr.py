@@ -122,7 +122,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     exposure, exposure_warnings = exposure_facts(attributes, "attribute")
     for key, name, unit in (("isoSpeed", "gain", 100.0), ("aperture", "f_number", 1.0)):
         number = header.get(key)
-        if exposure and isinstance(number, float) and number > 0:
+        if exposure and isinstance(number, float) and 0 < number < np.inf:
             exposure[name] = number / unit
     listed = [
         {
