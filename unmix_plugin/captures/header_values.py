@@ -371,8 +371,6 @@ _TIMES = {
 """Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
 _GAINS = ("gain", "analoggain", "analoguegain", "digitalgain")
 """A plain gain is the whole one; the others multiply each other."""
-_OF_RESONON = {"shutter", "gain", "framerate"}
-"""Names in headers of Resonon, whose gains are in decibels without saying so. Source: massipipe, RadianceConverter."""
 _OWNERS = ("camera", "sensor", "detector", "imager")
 """Words before a name that change nothing."""
 _SECONDS = {
@@ -405,8 +403,6 @@ def exposure_facts(entries: Mapping[str, Any], where: str) -> tuple[dict[str, An
     warnings: list[str] = []
     named = {name: _split(name) for name in entries}
     units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
-    if {name for name, _ in named.values()} >= _OF_RESONON:
-        units.setdefault("gain", "dB")
     for key, (name, unit) in named.items():
         is_time = name in _TIMES
         if unit == "unit" or not (is_time or name in _GAINS):

@@ -392,22 +392,9 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
     if "header" not in same and len(headers) == len(parts):
         shared = set.intersection(*(set(header.items()) for header in headers))
         same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
-    exposure: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
-    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
-    exposed = [[part.metadata.get(key, usual) for key, usual in exposure.items()] for part in parts]
-    unexposed, is_exposed = "", any("exposure_s" in part.metadata for part in parts)
-    if is_exposed and 0 < len(lacking) < len(parts):
-        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
-        unexposed = f"{unknown}: exposures are compared without it"
-        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
-    if len(set(map(repr, exposed))) > 1:
-        same = {key: value for key, value in same.items() if key not in exposure}
-        if all(isinstance(number, float) for numbers in exposed for number in numbers):
-            of_first = exposed[0][2]  # so that the bands have one f-number again
-            same["exposure_s"] = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
-            same |= {} if lacking else {"f_number": of_first}
-        elif is_exposed:
-            unexposed = "one exposure time and gain is not known of every band: exposures are not compared"
+    exposure, exposure_warnings = _exposure_of_bands(parts)
+    if exposure is not None:
+        same = {key: value for key, value in same.items() if key not in _EXPOSURE} | exposure
     return replace(
         first,
         path=path,
@@ -423,12 +410,36 @@ def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
         warnings=(
             *dict.fromkeys(warning for part in parts for warning in part.warnings),
             *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
-            *([unexposed] if unexposed else []),
+            *exposure_warnings,
         ),
         sources=tuple(source for part in parts for source in part.files),
         dark_lines=0,
         missing_part=missing_part if has_own or any(part.missing_part for part in parts) else None,
     )
+
+
+_EXPOSURE: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
+"""Metadata of an exposure, and what counts where a file does not say it."""
+
+
+def _exposure_of_bands(parts: list[SpectralFile]) -> tuple[dict[str, Any] | None, list[str]]:
+    """Time times gain of each band, in s, and the f-number of all; nothing where they are not known, None where all
+    parts have the same. And warnings."""
+    exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
+    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
+    is_exposed, warnings = any(time is not None for time, *_ in exposed), []
+    if is_exposed and 0 < len(lacking) < len(parts):
+        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
+        warnings = [f"{unknown}: exposures are compared without it"]
+        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
+    if len(set(map(repr, exposed))) == 1:
+        return None, warnings
+    if not all(isinstance(number, float) for numbers in exposed for number in numbers):
+        unknown = "one exposure time and gain is not known of every band: exposures are not compared"
+        return {}, [unknown] if is_exposed else []
+    of_first = exposed[0][2]  # so that the bands have one f-number again
+    times_s = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
+    return {"exposure_s": times_s} | ({} if lacking else {"f_number": of_first}), warnings
 
 
 def choose_axes(

@@ -70,18 +70,6 @@ def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_w
     assert len(warnings) == (gain is None)
 
 
-@pytest.mark.parametrize(
-    ("stated", "factor"), [("0.0", 1.0), ("6.0206", 2.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)]
-)
-def test_gains_of_resonon_are_decibels(stated, factor):
-    """Told by the names beside them, and of no other camera."""
-    facts, warnings = exposure_facts({"shutter": "20.0", "gain": stated, "framerate": "40.0"}, "header field")
-    assert (facts["exposure_s"], facts["gain"]) == (0.02, pytest.approx(factor, rel=1e-4))
-    assert not warnings
-    assert "no unit" not in facts["gain_evidence"]
-    assert exposure_facts({"shutter": "20.0", "gain": "6"}, "header field")[0]["gain"] == 6
-
-
 def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as milliseconds"):
     return file_of(
         np.ones((2, 2, 3), np.uint16),
@@ -116,6 +104,12 @@ def test_what_may_be_wrong_with_exposures_is_said():
     assert "cameras bend the brightness" in warnings(views, [], [], is_bent=True)
     other = exposed(0.005, evidence="header field 'exposure time'")
     assert "have no unit in some files" in warnings(views, [other], [])
+
+
+def test_files_of_several_sizes_have_an_exposure_a_band_each_of_its_own():
+    lens, camera = exposed(0.01), exposed([0.01, 0.02])
+    camera = replace(camera, shape=(2, 2, 2))
+    assert compare_exposures([lens, camera], [], [], False).warnings == ()
 
 
 def test_the_aperture_counts_for_light_and_not_for_dark_current():
@@ -212,10 +206,14 @@ def test_values_are_finished_by_gains_or_names_that_say_so():
         files = [replace(exposed(time), **facts) for time in (0.01, 0.02)]
         return compare_exposures(files, whites, [], False).notes
 
-    for path in ("results/REFLECTANCE_212.dat", "leaf-reflectance.npy"):
-        assert "not divided by that" in notes(path=Path(path))[0]
-        assert "each is brought to" in notes([exposed(0.01)], path=Path(path))[0]
-    linear = Linear(np.full(3, 0.5), np.zeros(3), "header field 'data gain values'")
-    assert "not divided by that" in notes(linear=linear)[0]
-    assert "each is brought to" in notes(linear=replace(linear, evidence="attribute 'scale_factor'"))[0]
-    assert "each is brought to" in notes(path=Path("reflectances_of_lamps.npy"))[0]
+    values = np.dtype(np.float32)
+    linear = Linear(np.full(3, 0.5), np.zeros(3), "attribute 'scale_factor'")
+    for path in (Path("results/REFLECTANCE_212.dat"), Path("leaf-reflectance.npy")):
+        assert "not divided by that" in notes(path=path, dtype=values)[0]
+        assert "not divided by that" in notes(path=path, linear=linear)[0]
+        assert "each is brought to" in notes(path=path)[0]  # raw, as whole numbers are
+        assert "each is brought to" in notes([exposed(0.01)], path=path, dtype=values)[0]
+    for evidence in ("header field 'data gain values'", "GDAL's 'data_gain_values' and 'data_offset_values'"):
+        assert "not divided by that" in notes(linear=replace(linear, evidence=evidence))[0]
+    assert "each is brought to" in notes(linear=linear)[0]
+    assert "each is brought to" in notes(path=Path("reflectances_of_lamps.npy"), dtype=values)[0]

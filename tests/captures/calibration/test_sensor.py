@@ -189,3 +189,18 @@ def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, sc
     upright, across = with_one_exposure(sensors, files).values()
     assert said in " ".join([*upright.notes, *upright.warnings])
     assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)
+
+
+def test_what_is_wrong_with_exposures_of_one_sensor_is_said_once():
+    """One with times that can't be those of its bands, beside one without any."""
+    cube, bands = np.full((12, 10, 3), 1000, np.uint16), np.array([500.0, 600.0, 700.0])
+    files = {
+        name: file_of(cube + np.arange(10, dtype=np.uint16)[:, None], bands, metadata=facts)
+        for name, facts in (("a", {"exposure_s": [0.01, 0.02]}), ("b", {"exposure_s": [0.01, 0.04]}))
+    }
+    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
+    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
+    sensors = {name: prepare_sensor(name, own, options, (None, None), own) for name, own in each.items()}
+    for sensor in with_one_exposure(sensors, files).values():
+        (warning,) = sensor.warnings
+        assert "2 exposure times or gains for 3 bands" in warning

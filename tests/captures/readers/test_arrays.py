@@ -12,7 +12,7 @@ import scipy.sparse
 import torch
 
 from tests.captures.file_factory import check_file, present, rows_and_bands_of
-from unmix_plugin.captures.calibration.references import find_missing
+from unmix_plugin.captures.calibration.references import find_missing, finished_by, stated_reflectance
 from unmix_plugin.captures.readers import containers
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -305,12 +305,12 @@ def test_members_that_promise_too_much_are_refused(tmp_path):
         open_spectral_file(tmp_path / "a.npz")
 
 
-def prisma(path, zeros=(0, 1)):
+def prisma(path, zeros=(0, 1), level="L2D"):
     """Two cubes of rows, bands and columns, with wavelengths as attributes of the file."""
     nm = np.linspace(900, 500, 5).astype("f4")
     nm[list(zeros)] = 0
     with h5py.File(path, "w") as file:
-        group = file.create_group("HDFEOS/SWATHS/PRS_L2D_HCO/Data Fields")
+        group = file.create_group(f"HDFEOS/SWATHS/PRS_{level}_HCO/Data Fields")
         group["VNIR_Cube"] = CUBE.transpose(0, 2, 1)
         group["SWIR_Cube"] = CUBE[..., :4].transpose(0, 2, 1)
         group["VNIR_PIXEL_L2_ERR"] = np.zeros((8, 5, 9), np.uint8)
@@ -332,6 +332,21 @@ def test_a_prisma_cube_has_the_wavelengths_that_fit_it_and_zeros_are_unused_band
     check_file(other, nm=[2400, 1800, 1200, 1000], calibrated=CUBE[..., :4] / 100 - 2)
     with pytest.raises(CaptureError, match="2 data sets could be the image"):  # none of them their errors
         open_spectral_file(path)
+
+
+@pytest.mark.parametrize(
+    ("level", "name", "is_reflectance"),
+    [
+        ("L2B", "VNIR_Cube", False),
+        ("L2C", "VNIR_Cube", True),
+        ("L2D", "VNIR_Cube", True),
+        ("L1", "SWIR_Cube", False),
+    ],
+)
+def test_prisma_has_radiance_up_to_level_2b_and_then_reflectance(tmp_path, level, name, is_reflectance):
+    file = open_spectral_file(prisma(tmp_path / "a.he5", level=level), ReadOptions(dataset=name))
+    assert (stated_reflectance(file) is not None) == is_reflectance
+    assert f"of {'reflectance' if is_reflectance else 'radiance'}" in present(finished_by(file))
 
 
 @pytest.mark.parametrize(("unit", "nm"), [("um", [3000, 5000, 8000, 11_000, 12_000]), ("1", None)])

@@ -311,3 +311,19 @@ def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, ot
     check_file(open_spectral_file(header), values=CUBE)
     with pytest.raises(CaptureError, match="would both be the view 's'"):
         find_cubes(tmp_path, ReadOptions())
+
+
+@pytest.mark.parametrize(
+    ("gain", "factor"), [("0.0", 1.0), ("6.0206", 2.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)]
+)
+def test_gains_of_resonon_are_decibels_and_that_is_said(tmp_path, gain, factor):
+    """Told by the names beside them, and of no other camera."""
+    cube = np.ones((4, 5, 3), np.uint16)
+    file = open_spectral_file(
+        write_envi(tmp_path / "a.hdr", cube, "bil", f"shutter = 20.0\ngain = {gain}\nframerate = 40.0\n")
+    )
+    check_file(file, exposure_s=0.02, gain=pytest.approx(factor, rel=1e-4), warnings=())
+    evidence = file.metadata["gain_evidence"]
+    assert evidence == "header field 'gain', taken as decibels, as Resonon writes"
+    other = open_spectral_file(write_envi(tmp_path / "b.hdr", cube, "bil", "shutter = 20.0\ngain = 6\n"))
+    check_file(other, gain=6.0)

@@ -104,8 +104,9 @@ CAMERA_GAIN = gdal(GAIN, '<Item name="exposure_ms">10</Item>')
 EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
 EXIF_OF_GDAL = "".join(
     f'<Item name="EXIF_{name}">{value}</Item>'
-    for name, value in (("ExposureTime", "(0.25)"), ("ISOSpeedRatings", "200"), ("FNumber", "(2.8)"))
+    for name, value in (("ExposureTime", "(0.25)"), ("ISOSpeedRatings", "200"), ("FNumber", "(2.8) "))
 )
+TIMES = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06]
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
 WHOLE = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
 SAID = [
@@ -182,6 +183,7 @@ SAID = [
     ),
     ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
     ({"extratags": gdal(EXIF_OF_GDAL)}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
+    ({"extratags": gdal(items("EXIF_ExposureTime", TIMES))}, {"exposure_s": TIMES, "gain": None}),
     ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
     ({"extratags": gdal(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
     ({"extratags": gdal(items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),

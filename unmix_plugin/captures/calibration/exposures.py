@@ -140,15 +140,18 @@ def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> l
     }
     if whites and len(stated) == 1:
         return []
-    num_bands, found = views[0].shape[2], []
+    found = []
     for file in (*views, *whites):
-        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")} - {1, num_bands}
+        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")} - {
+            1,
+            file.shape[2],
+        }
         if sizes and "exposure_s" in file.metadata:
-            found.append((file.path.name, max(sizes)))
+            found.append((file.path.name, max(sizes), file.shape[2]))
     if not found:
         return []
-    names, numbers = name_some([name for name, _ in found]), sorted({size for _, size in found})
-    what = f"{' or '.join(map(str, numbers))} exposure times or gains for {counted(num_bands, 'band')}"
+    names, numbers = name_some([name for name, *_ in found]), sorted({size for _, size, _ in found})
+    what = f"{' or '.join(map(str, numbers))} exposure times or gains for {counted(found[0][2], 'band')}"
     said = f"{names}: {what}: exposures may differ and were not compared"
     return [f"{said}. Give one number, or one a band, with points as decimal marks"]
 

@@ -35,8 +35,8 @@ _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
 
 
-_OF_REFLECTANCE, _OF_RADIANCE = ("reflectance", "l2scale"), ("data gain", "data offset")
-"""In the evidence of gains that make reflectance or radiance of numbers; l2scale is PRISMA's."""
+_OF_RADIANCE = ("radiance", "data gain", "data offset")
+"""In the evidence of gains that make radiance of numbers."""
 _REFLECTANCE = re.compile(r"(?<![a-z])reflectance(?![a-z])", re.IGNORECASE)
 """The word in names: REFLECTANCE_212, site/reflectance."""
 
@@ -50,13 +50,14 @@ def stated_reflectance(file: SpectralFile, by_name: bool = True) -> str | None:
     """Where a file says that its values are reflectances; None where it does not, or says what else they are.
 
     Args:
-        by_name: Whether its name may say so.
+        by_name: Whether its name may say so, of numbers that are not raw: whole ones without a gain are, whatever their
+            name (reflectance_target).
     Source: NV5, ENVI Header Files (`reflectance scale factor`); Fichet et al. 2021, spectral OpenEXR (layer `T`).
     """
     if is_srgb(file) or radiometric_model(file) is not None:
         return None
     evidence = "" if file.linear is None else file.linear.evidence
-    if any(word in evidence.lower() for word in _OF_REFLECTANCE):
+    if "reflectance" in evidence.lower():
         return evidence
     header = file.metadata.get("header")
     if isinstance(header, dict) and "reflectance scale factor" in header:  # of 1, which changes nothing
@@ -64,6 +65,7 @@ def stated_reflectance(file: SpectralFile, by_name: bool = True) -> str | None:
     if file.reader == "exr" and (file.bands.names or ("",))[0].startswith("T."):
         return "the layer T"
     names = (file.path.stem, str(file.metadata.get("dataset", "")))
+    by_name &= file.dtype.kind == "f" or file.linear is not None
     named = next((name for name in names if by_name and _REFLECTANCE.search(name)), None)
     return None if named is None else f"the name {named}"
 
@@ -77,7 +79,7 @@ def finished_by(file: SpectralFile, by_name: bool = True) -> str | None:
     Source: NV5, ENVI Header Files (`data gain values` in W/(m2 um sr)).
     """
     evidence = "" if file.linear is None else file.linear.evidence
-    is_radiance = any(word in evidence for word in _OF_RADIANCE)
+    is_radiance = any(word in evidence.lower().replace("_", " ") for word in _OF_RADIANCE)
     return evidence if is_radiance else stated_reflectance(file, by_name)
 
 
@@ -368,9 +370,9 @@ def _panel_in_view(
 
 
 def _own_dark(file: SpectralFile, beside: SpectralFile | None = None) -> SpectralFile | None:
-    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw: whole ones are,
-    whatever their name (reflectance_target), as dark lines of what was brought to reflectance are near 0."""
-    return beside or (None if finished_by(file, by_name=file.dtype.kind == "f") else file.dark)
+    """The dark frame that lies beside a file, otherwise its own dark lines, if its numbers are raw: dark lines of what
+    was brought to reflectance are near 0."""
+    return beside or (None if finished_by(file) else file.dark)
 
 
 def own_dark_mean(file: SpectralFile) -> Float32[np.ndarray, "1 W B"] | None:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
-from unmix_plugin.captures.calibration.exposures import Exposures, compare_exposures
+from unmix_plugin.captures.calibration.exposures import Exposures, compare_exposures, exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -321,7 +321,13 @@ def with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]
     exposures = {name: sensors[name].calibration.exposure for name in bare}
     known = {name: exposure for name, exposure in exposures.items() if exposure is not None}
     rest = [name for name in bare if name not in known]
-    files = [first[name] for name in known or rest if radiometric_model(first[name]) is None]
+    files = [
+        first[name]
+        for name in known or rest
+        if radiometric_model(first[name]) is None
+        # What is wrong with those of one sensor was said of it.
+        and (exposure_of(first[name]) is not None or "exposure_s" not in first[name].metadata)
+    ]
     if len(bare) < 2 or not files:
         return sensors
     found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(_may_be_reflectance, files)))

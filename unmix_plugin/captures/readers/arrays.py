@@ -326,9 +326,10 @@ def _linear(path: Path, image: FoundArray, num_bands: int) -> Linear | None:
 
 
 def _prisma(image: FoundArray) -> tuple[float, float, str] | None:
-    """Gain, offset and where they stand in a PRISMA file: radiances of level 1, reflectances of level 2.
+    """Gain, offset and where they stand in a PRISMA file: radiances of levels 1 and 2B, reflectances of 2C and 2D.
 
-    Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`).
+    Source: ASI, PRISMA Products Specification, chapters 5 and 7 (`ScaleFactor_Vnir`, `L2ScaleVnirMin`); Busetto and
+    Ranghetti, prismaread (of level 2B).
     """
     for part in ("Vnir", "Swir"):
         if part.lower() not in image._own_name:
@@ -336,11 +337,12 @@ def _prisma(image: FoundArray) -> tuple[float, float, str] | None:
         ends = [f"l2scale{part.lower()}{end}" for end in ("min", "max")]
         low, high = (_first_number(image._all_attributes, (end,)) for end in ends)
         if low is not None and high is not None and high > low:
-            return (high - low) / 65535.0, low, f"'L2Scale{part}Min' and 'L2Scale{part}Max'"
+            what = "radiance" if "prs_l2b_" in image.name.lower() else "reflectance"
+            return (high - low) / 65535.0, low, f"'L2Scale{part}Min' and 'L2Scale{part}Max' of {what}"
         names = [f"{name}_{part.lower()}" for name in ("scalefactor", "offset")]
         factor, offset = (_first_number(image._all_attributes, (name,)) for name in names)
         if factor:
-            return 1.0 / factor, -(offset or 0.0), f"'ScaleFactor_{part}' and 'Offset_{part}'"
+            return 1.0 / factor, -(offset or 0.0), f"'ScaleFactor_{part}' and 'Offset_{part}' of radiance"
     return None
 
 

@@ -6,6 +6,7 @@ import math
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +45,9 @@ _DARK_LINES = (
     f"the lines from '{_DARK_START}' on were taken with the shutter closed: they are no part of the image, but the "
     "dark frame of raw numbers that have no other"
 )
+
+_OF_RESONON = {"shutter", "gain", "framerate"}
+"""In headers of Resonon, whose gains are in decibels without saying so."""
 
 
 def is_envi_header(path: Path) -> bool:
@@ -142,7 +146,7 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
     )
     bands, band_warnings = check_bands(stated, num_bands)
     linear, linear_warnings = _linear(header_path, header, num_bands)
-    exposure, exposure_warnings = exposure_facts(header, "header field")
+    exposure, exposure_warnings = _exposure(header)
     start, lines = _number(header, _DARK_START), file.shape[0]
     dark_lines = lines - int(start) if start is not None and 1 <= start < lines else 0
     if start is None and header.get(_DARK_START):
@@ -165,6 +169,15 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         warnings=file.warnings + band_warnings + linear_warnings + no_data_warnings + exposure_warnings,
         metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
     )
+
+
+def _exposure(header: dict[str, str]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Time and gain, and warnings. Source of Resonon's unit: massipipe, RadianceConverter."""
+    in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
+    facts, warnings = exposure_facts(header | ({"gain unit": "dB"} if in_db else {}), "header field")
+    if in_db and "gain_evidence" in facts:
+        facts["gain_evidence"] += ", taken as decibels, as Resonon writes"
+    return facts, warnings
 
 
 def _no_data(header: dict[str, str]) -> tuple[list[float], tuple[str, ...]]:

@@ -455,12 +455,13 @@ def _exposure(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Time and gain out of EXIF or of items of GDAL that values are not multiplied by, and warnings."""
     applied = "" if linear is None else linear.evidence
-    exif = {item.name: item.value.strip("()") for item in items}  # GDAL copies them, numbers in brackets
+    # GDAL copies them, numbers in brackets.
+    exif = {item.name: item.value.strip("() ") for item in items if item.sample is None}
     exif |= {f"exif_{name.lower()}": value for name, value in tags["exif"].items()}
     speed = exif.get("exif_isospeedratings", exif.get("exif_isospeed"))
     if facts := exif_exposure(exif.get("exif_exposuretime"), speed, exif.get("exif_fnumber")):
         return facts, ()
     texts: dict[str, Any] = defaultdict(list)
     for item in (item for item in items if f"'{item.name}'" not in applied):
-        texts[item.name.removeprefix("exif_")].append(item.value)
+        texts[item.name.replace("exif_exposuretime", "exposuretime_s")].append(item.value)
     return exposure_facts({name: ",".join(values) for name, values in texts.items()}, "GDAL metadata")
