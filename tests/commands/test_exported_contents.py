@@ -128,7 +128,7 @@ def test_a_pixel_has_what_was_measured_there_beside_what_is_predicted(solid, exp
 def test_a_pixel_without_a_valid_value_has_no_measured_spectrum(solid, tmp_path, monkeypatch):
     valid = np.ones((16, 16), bool)
     valid[9, 8] = False
-    monkeypatch.setattr("unmix_plugin.scenes.scene.Scene.valid_mask", lambda *_: valid)
+    monkeypatch.setattr("unmix_plugin.scenes.scene.Scene.valid_mask", lambda _, __, part: valid[part])
     common = ["spectrum", "--view", "eval_002", "--run", solid.run, "--output", tmp_path]
     heads = {}
     for pixel, is_said in (("8,8", False), ("8,9", True)):

@@ -125,12 +125,16 @@ def _measured(
     if index is None:
         job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
         return None
-    if not scene.valid_mask(index)[pixel[1], pixel[0]]:
+    if not _counts(scene, index, *pixel):
         job.say(
             f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum"
         )
         return None
     return _read_pixel(job, scene, index, *pixel)
+
+
+def _counts(scene: Scene, index: int, column: int, row: int) -> bool:
+    return bool(scene.valid_mask(index, (slice(row, row + 1), slice(column, column + 1))).all())
 
 
 def _read_pixel(job: Job, scene: Scene, index: int, column: int, row: int) -> Float[np.ndarray, " B"]:
@@ -168,7 +172,7 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray
         near = _SAME_PLACE_PX * float(depths[0] / camera.focal_px[0].min())
         if seen.position is None or seen.opacity < OCCUPIED_ACCUMULATION:
             continue
-        if np.linalg.norm(seen.position - probe.position) > near or not scene.valid_mask(index)[row, column]:
+        if np.linalg.norm(seen.position - probe.position) > near or not _counts(scene, index, column, row):
             continue
         alpha = scene.alpha(index)
         if alpha is None or alpha[row, column] >= _WHOLE:

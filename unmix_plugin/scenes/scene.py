@@ -163,13 +163,17 @@ class Scene:
         path = self.frames[index].label_path
         return None if path is None else read_labels(path, self._size(index))
 
-    def valid_mask(self, index: int) -> Bool[np.ndarray, "H W"]:
-        """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`)."""
+    def valid_mask(
+        self, index: int, part: tuple[slice | np.ndarray, ...] = ()
+    ) -> Bool[np.ndarray, "*pixels"]:
+        """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`); `part` as NumPy
+        indexes it, by default (H, W)."""
         path = self.frames[index].mask_path
         valid = np.ones(self._size(index), bool) if path is None else read_mask(path, self._size(index))
+        valid = valid[part]
         if self.options.invalid_pixels != "refuse":
             path, options = self.frames[index].cube_path, self.options
-            valid = valid & ~read_invalid(path, options.value_scale, options.invalid_pixels)
+            valid = valid & ~read_invalid(path, options.value_scale, options.invalid_pixels, part)
         return valid
 
     def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:

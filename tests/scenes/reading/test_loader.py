@@ -122,6 +122,8 @@ def test_few_highlights_above_one_are_clipped_and_invalid_pixels_masked_and_zero
         make_scene(tmp_path / "scene").edit_cube(2, spoil).root, SceneOptions(invalid_pixels="mask")
     )
     assert np.argwhere(~scene.valid_mask(2)).tolist() == [[2, 3], [4, 5], [6, 7]]
+    for part in ((slice(2, 7, 2), slice(3, 6)), (np.array([2, 3, 6]), np.array([3, 3, 7]))):
+        np.testing.assert_array_equal(scene.valid_mask(2, part), scene.valid_mask(2)[part])
     assert np.isfinite(scene.cube(2)).all()
     assert not scene.cube(2)[2, 3].any()
     assert scene.cube(2)[8, 10, 0] == 1.0

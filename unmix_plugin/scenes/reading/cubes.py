@@ -215,9 +215,14 @@ def read_cube(
 
 
 def read_invalid(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels
-) -> Bool[np.ndarray, "H W"]:
+    path: Path,
+    value_scale: float | None,
+    invalid_pixels: InvalidPixels,
+    part: tuple[slice | np.ndarray, ...] = (),
+) -> Bool[np.ndarray, "*pixels"]:
     """Pixels that `read_cube` sets to 0."""
+    if part:
+        return _find_invalid(_read_scaled(path, value_scale, part), invalid_pixels)
     height, width, bands = map_array(path).shape
     rows, invalid = max(1, _BLOCK_VALUES // max(1, width * bands)), np.empty((height, width), bool)
     for first in range(0, height, rows):

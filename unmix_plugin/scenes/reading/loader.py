@@ -194,10 +194,10 @@ def _assemble(
     )
 
 
-def _readable(name: str) -> str:
+def readable_name(name: str) -> str:
     """A name that shows what it is: no character that a terminal obeys, none that a table takes for a formula's.
 
-    >>> _readable("@SUM(A1)"), _readable("leaf\\u202e_1")
+    >>> readable_name("@SUM(A1)"), readable_name("leaf\\u202e_1")
     ('_SUM(A1)', 'leaf__1')
     """
     shown = safe_name(name, NOT_PORTABLE, "view")
@@ -217,10 +217,10 @@ def distinct_names(files: Sequence[str]) -> list[str]:
         ["_".join(part for part in path.parts if part not in ("..", "/")) for path in paths],
     )
     for candidate in candidates:
-        names = [_readable(name) for name in candidate]
+        names = [readable_name(name) for name in candidate]
         if len({name.casefold() for name in names}) == len(names):
             return names
-    return [_readable(f"{index}_{path.name}") for index, path in enumerate(paths)]
+    return [readable_name(f"{index}_{path.name}") for index, path in enumerate(paths)]
 
 
 def _name_frames(

@@ -221,11 +221,12 @@ class MeasuredViews:
             rays = frame.camera.to(device).image_rays(0)
             points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
             rows, columns, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
-            cube = self._scene.cube(self._indices[index])
-            cube = self._alike(index, cube, frame.scene, frame.scene.light_power)
+            pixels = (rows[sees].numpy(), columns[sees].numpy())
+            measured = self._scene.cube(self._indices[index], pixels)
+            measured = self._comparable(index, measured, frame.scene, frame.scene.light_power)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
             places = seen[sees].cpu()
-            errors[places] = (spectra - cube[rows[sees], columns[sees]]).abs().mean(dim=-1)
+            errors[places] = (spectra - measured).abs().mean(dim=-1)
             is_known[places] = True
         shape = (frame.camera.height, frame.camera.width)
         name = self._scene.frames[self._indices[index]].name
@@ -251,12 +252,12 @@ class MeasuredViews:
             own = self._camera(index, scene)
             rows, columns, sees = self._pixels_of(point[None], index, own, scene)
             if bool(sees[0]):
-                cube = self._scene.cube(self._indices[index])
-                spectrum = self._alike(index, cube[int(rows[0]), int(columns[0])].copy(), scene, light)
+                measured = self._scene.cube(self._indices[index], (rows.numpy(), columns.numpy()))
+                spectrum = self._comparable(index, measured[0], scene, light)
                 return self._scene.frames[self._indices[index]].name, spectrum
         return None
 
-    def _alike(
+    def _comparable(
         self,
         index: int,
         measured: Float32[np.ndarray, "*pixels B"],
@@ -299,7 +300,8 @@ class MeasuredViews:
         rendered = self._distance_of(index, camera, lent)[rows, columns]
         sees = inside & ((distance - rendered).abs() < _TOLERANCE * distance)
         if bool(sees.any()):
-            sees &= torch.from_numpy(self._scene.valid_mask(self._indices[index]))[rows, columns]
+            places = (rows[sees].numpy(), columns[sees].numpy())
+            sees[sees.clone()] = torch.from_numpy(self._scene.valid_mask(self._indices[index], places))
         return rows, columns, sees
 
     def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
