@@ -283,7 +283,7 @@ def test_doubtful_files_of_spectra_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); choose one"):
         edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
     path.write_text("wavelength,ochre\n440,60\n660,50\n")
-    with pytest.raises(ConfigError, match=r"ochre has reflectances of up to 59\.5"):
+    with pytest.raises(ConfigError, match=r"ochre must be in reflectances, 1 for white; found 59\.5"):
         edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
 
 

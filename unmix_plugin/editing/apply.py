@@ -65,7 +65,12 @@ from unmix_plugin.spectral.colour.conversion import (
     rgb_matrix,
 )
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
-from unmix_plugin.spectral.library.material_library import DARK_LIGHT, MaterialLibrary, measured_library
+from unmix_plugin.spectral.library.material_library import (
+    DARK_LIGHT,
+    MaterialLibrary,
+    measured_library,
+    require_reflectance,
+)
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.spectral.sensor import Sensor
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -188,9 +193,6 @@ def _through(spectra: Float[Tensor, "*n B"], matrix: Float64[np.ndarray, "B S"])
     return (spectra.detach().cpu().double() @ torch.from_numpy(matrix)).to(spectra)
 
 
-_GREATEST_REFLECTANCE = 2.0
-"""Of a table of reflectances; more is a sign of per cent. Fluorescent ones exceed 1."""
-
 _VISIBLE_DIFFERENCE = 2.5 / 255
 """Of sRGB channels, above which the user gets a note."""
 
@@ -221,10 +223,7 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
     if edit.extrapolate and is_unknown.any():
         unknown = _listed(state.bands, is_unknown)
         state.notes.append(f"{where}: {name} was not measured at {unknown}: the values beside are held there")
-    if reflectance.max() > _GREATEST_REFLECTANCE:
-        raise SpectrumError(
-            f"{name} has reflectances of up to {reflectance.max():g}; give values from 0 to 1, not per cent"
-        )
+    require_reflectance(reflectance, name)
     state.spectra[index] = reflectance * state.light
 
 

@@ -29,13 +29,14 @@ from unmix_plugin.engine import (
     step_generator,
 )
 from unmix_plugin.errors import SceneError, require
+from unmix_plugin.formats.files import numbered_apart
 from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
 from unmix_plugin.neumatex.tracing.rays import RayMesh
-from unmix_plugin.scenes.reading.loader import distinct_names
+from unmix_plugin.scenes.reading.loader import readable_name
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -106,7 +107,7 @@ class ObjectDataManager(DataManager):
         self._images = [*split.evaluation, *lights]
         named = [pictures.names[view] for view in split.evaluation]
         named += [f"{light.name}-{light.pictures.names[view]}" for light, view in lights]
-        self._names = distinct_names([f"{name}.exr" for name in named])  # of which a stem is taken
+        self._names = numbered_apart(map(readable_name, named))
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
         """Random object pixels of the training views; the draw depends on (seed, step) only."""
