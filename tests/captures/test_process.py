@@ -110,14 +110,14 @@ def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path):
     assert scene.cube(0)[0, 0, 0] == pytest.approx(counts[4:6, :3, 6:8].mean() / scale, abs=1e-4)
 
 
-def test_bands_on_both_sides_of_one_that_is_left_out_are_not_averaged(tmp_path: Path):
+def test_bands_on_both_sides_of_a_range_that_is_left_out_are_not_averaged(tmp_path: Path):
     capture = make_capture(tmp_path / "capture")
-    scene, _ = made(tmp_path, capture, drop_bands="600", bin_bands=2, **references_of(capture))
-    np.testing.assert_allclose(scene.wavelengths_nm, [475, 675, 775])
-    expected = capture.reflectance["view_00"][..., [[0, 1], [4, 5], [6, 7]]].mean(axis=-1)
+    scene, _ = made(tmp_path, capture, drop_bands="500-550", bin_bands=2, **references_of(capture))
+    np.testing.assert_allclose(scene.wavelengths_nm, [625, 725, 825])
+    expected = capture.reflectance["view_00"][..., [[3, 4], [5, 6], [7, 8]]].mean(axis=-1)
     np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
     report = (tmp_path / "scene" / "report.txt").read_text()
-    assert "bands left out: 550 nm, 850 nm (too few up to a gap or the end for --bin-bands 2)" in report
+    assert "bands left out: 450 nm (too few up to a gap or the end for --bin-bands 2)" in report
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
@@ -257,9 +257,9 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
             4000,
             np.uint16,
             {},
-            "relative reflectance, as the name REFLECTANCE_0 says",
+            "relative radiance",
             False,
-        ),
+        ),  # raw
         ("leaf_{}", 1, np.float32, {"data gain values": 0.5}, "stored numbers divided", False),
         ("leaf_{}", 1, np.float32, {}, "relative radiance", False),
     ],

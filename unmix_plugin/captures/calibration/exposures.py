@@ -122,7 +122,7 @@ def compare_exposures(
     return Exposures(common, () if is_same else (brought,), tuple(warnings))
 
 
-def _in_words(exposures: Iterable[Float64[np.ndarray, " b"]]) -> str:
+def _in_words(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
     """The range of exposures.
 
     >>> _in_words([np.array([0.01]), np.array([0.02])])

@@ -52,8 +52,9 @@ _MOST_SATURATED_WHITE = 0.5
 _NEAR_TOP, _MOST_CLIPPED = 0.99, 0.05
 """Share of the detector's end that means of lines reach where some are above it; share of a white reference's values at
 that end from which a band is left out."""
-_GAP = 3.0
-"""Between neighbouring bands, as a multiple of the steps beside it, above which bands are missing."""
+_GAP, _LEFT_OUT = 3.0, 2.5
+"""Between neighbouring bands, as a multiple of the steps beside it, above which bands are missing in the file itself,
+and above which a range was left out: one band that is left out makes two steps of one, two make three."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
 _BRIGHT_PERCENTILE = 99.9
@@ -106,9 +107,13 @@ class _BandChoice:
         is_between = ((own[:-1, None] < others) & (others < own[1:, None])).any(axis=1)
         around = np.pad(steps_nm, 1, constant_values=np.nan)
         # Several ranges may be left out with few bands between them.
-        beside_nm = np.where(is_between, np.fmin(around[:-2], around[2:]), np.fmax(around[:-2], around[2:]))
+        widest_nm = np.where(
+            is_between,
+            _LEFT_OUT * np.fmin(around[:-2], around[2:]),
+            _GAP * np.fmax(around[:-2], around[2:]),
+        )
         marks = np.zeros(len(self.wavelengths_nm), bool)
-        for run in np.split(kept, np.flatnonzero(steps_nm > _GAP * beside_nm) + 1):
+        for run in np.split(kept, np.flatnonzero(steps_nm > widest_nm) + 1):
             marks[run[len(run) // binning * binning :]] = True
         return self.without(marks, f"too few up to a gap or the end for --bin-bands {binning}")
 
