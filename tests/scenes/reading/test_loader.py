@@ -274,6 +274,32 @@ def test_keys_that_are_not_followed_or_not_known_are_said(tmp_path):
     assert unknown == "transforms.json: keys that are not known and not used: mask_file"
 
 
+@pytest.mark.parametrize("key", ["mask_path", "bands", "sensor", "capture", "transform_matrix"])
+def test_a_key_of_frames_that_stands_beside_them_is_said_not_to_be_followed(tmp_path, key):
+    folder = make_scene(tmp_path / "scene").edit(lambda c: c.update({key: [0, 1, 2, 3]}))
+    (said,) = load_scene(folder.root).warnings
+    assert (
+        said == f"transforms.json: {key}: not followed beside 'frames'; give it in each frame that it is for"
+    )
+
+
+def test_a_key_of_the_scene_that_stands_in_a_frame_is_said_not_to_be_followed(tmp_path):
+    folder = make_scene(tmp_path / "scene").edit(set_frame(2, applied_scale=2.0, materials=["leaf", "clay"]))
+    (said,) = load_scene(folder.root).warnings
+    assert said.startswith("transforms.json: applied_scale: not followed in frames; give it beside 'frames'")
+
+
+@pytest.mark.parametrize("key", ["value_scale", "wavelengths", "fwhm"])
+def test_units_and_bands_of_a_frame_that_are_not_the_scenes_are_refused(tmp_path, key):
+    folder = make_scene(tmp_path / "scene")
+    shared = {"value_scale": 1.0, "wavelengths": folder.content["wavelengths"], "fwhm": [5.0, 6.0, 7.0, 8.0]}
+    own = 2.0 if key == "value_scale" else shared[key][::-1]
+    folder.edit(lambda c: c.update(shared)).edit(set_frame(1, **{key: shared[key]}))
+    assert not load_scene(folder.root).warnings
+    message = fault_of(folder.edit(set_frame(1, **{key: own})))
+    assert f"frames[1]: has a '{key}' of its own; all cubes of a scene share one" in message
+
+
 def test_lens_keys_that_a_frame_has_otherwise_than_the_scene_are_said(tmp_path):
     folder = make_scene(tmp_path / "scene").edit(lambda c: c["frames"][1].update(fl_x=FOCAL, fl_y=None))
     assert not load_scene(folder.root).warnings

@@ -48,21 +48,34 @@ _SAID = {
 }
 _LENS_KEYS = "fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model".split()  # noqa: SIM905
 """Lens keys of frames, which nerfstudio does not look at where the scene has them."""
-_KNOWN = frozenset(
+_OF_SCENES = frozenset(
+    """
+    datadir applied_transform applied_scale offset ply_file_path wavelengths fwhm value_scale metres_per_unit
+    train_filenames val_filenames test_filenames materials illuminant_path endmembers_path mesh_path environment_path
+    environment_rotation_deg environment_exposure_stops tone_mapping
+    """.split()  # noqa: SIM905
+)
+"""What readers follow beside `frames`, and nowhere else."""
+_OF_FRAMES = frozenset(
+    """
+    transform_matrix row_poses key_poses sensor bands capture file_path hyperspectral_file_path seg_file_path mask_path
+    abundance_file_path responses_path
+    """.split()  # noqa: SIM905
+)
+"""What readers follow in a frame, and nowhere else."""
+_OF_ALL_CUBES = ("value_scale", "wavelengths", "fwhm")
+"""Of these, what makes values wrong where a frame has others than the scene."""
+_OF_EITHER = frozenset(
     """
     fl_x fl_y cx cy w h k1 k2 k3 k4 p1 p2 distortion_params camera_model camera_angle_x camera_angle_y x_fov y_fov
-    is_fisheye intrinsic_matrix frames datadir applied_transform applied_scale offset ply_file_path wavelengths fwhm
-    value_scale metres_per_unit train_filenames val_filenames test_filenames materials illuminant_path endmembers_path
-    file_path name transform_matrix row_poses key_poses sensor bands capture responses_path hyperspectral_file_path
-    seg_file_path mask_path abundance_file_path dino_file_path
-    mesh_path environment_path environment_rotation_deg environment_exposure_stops tone_mapping
+    is_fisheye intrinsic_matrix name frames dino_file_path
     aabb aabb_scale scale render_aabb up n_extra_learnable_dims importance_sampling integer_depth_scale
     enable_depth_loading enable_ray_loading sharpen sharpness_discard_threshold sharpness depth_path depth_file_path
     depth_unit_scale_factor driver_parameters envmap orientation_override colmap_im_id rotation time
     transform_matrix_start
     """.split()  # noqa: SIM905
 )
-"""What readers follow; and hints for rendering and training, from `aabb` on, which move no pose."""
+"""What readers follow in both; and hints for rendering and training, from `aabb` on, which move no pose."""
 
 
 def refused_keys(content: Mapping[str, Any], frame: Mapping[str, Any], is_scene: bool = False) -> list[str]:
@@ -74,10 +87,15 @@ def refused_keys(content: Mapping[str, Any], frame: Mapping[str, Any], is_scene:
     >>> refused_keys({"latlong": False, "k6": 0.01}, {})[0][:53]
     "'k6' is set, which stands for radial terms of higher "
     """
-    return [
+    refused = [
         f"'{key}' is set, which stands for {meaning}"
         for key, meaning in (_REFUSED | (_ONLY_IN_CAPTURES if is_scene else {})).items()
         if _is_set(frame.get(key, content.get(key)))
+    ]
+    return refused + [
+        f"has a '{key}' of its own; all cubes of a scene share one: give it beside 'frames', and change the cubes to it"
+        for key in _OF_ALL_CUBES
+        if frame.get(key) not in (None, content.get(key))
     ]
 
 
@@ -99,9 +117,21 @@ def keys_to_say(
         )
     if len({repr(own["time"]) for own in every[1:] if "time" in own}) > 1:
         warnings.append("frames have a 'time': what moves between views is taken to stand still")
-    unknown = sorted(
-        {key for own in every for key in own} - _KNOWN - set(_REFUSED) - set(_ONLY_IN_CAPTURES) - set(_SAID)
-    )
+    if misplaced := [key for key in content if key in _OF_FRAMES and _is_set(content[key])]:
+        warnings.append(
+            f"{', '.join(misplaced)}: not followed beside 'frames'; give it in each frame that it is for"
+        )
+    in_frames = [
+        key
+        for key in sorted(_OF_SCENES)
+        if any(own.get(key, content.get(key)) != content.get(key) for own in every[1:])
+    ]
+    if misplaced := [key for key in in_frames if key not in _OF_ALL_CUBES]:
+        warnings.append(
+            f"{', '.join(misplaced)}: not followed in frames; give it beside 'frames', for all of them"
+        )
+    known = _OF_SCENES | _OF_FRAMES | _OF_EITHER | set(_REFUSED) | set(_ONLY_IN_CAPTURES) | set(_SAID)
+    unknown = sorted({key for own in every for key in own} - known)
     notes = [f"keys that are not known and not used: {', '.join(unknown[:8])}"] if unknown else []
     return warnings, notes
 
