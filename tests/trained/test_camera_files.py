@@ -71,6 +71,44 @@ def test_frames_are_read_in_the_scenes_own_world(tmp_path):
     torch.testing.assert_close(camera.center_px, torch.tensor([[48.0, 30.0]]))
 
 
+@pytest.mark.parametrize(
+    ("common", "own", "name", "expected"),
+    [
+        ({}, {"camera_angle_x": 1.2}, "focal_px", [48 / math.tan(0.6)] * 2),
+        ({"distortion_params": [0.3, 0.1, 0, 0, 0, 0]}, {"k1": -0.1}, "distortion", [-0.1, 0.1, 0, 0]),
+        ({"k1": 0.2}, {"k1": None}, "distortion", [0.2, 0, 0, 0]),
+    ],
+)
+def test_the_lens_of_a_frame_goes_before_that_of_the_file(tmp_path, common, own, name, expected):
+    content = frames(**common)
+    content["frames"][1] |= own
+    camera = read_camera_file(written(tmp_path, content), FRAME).views[1].camera
+    torch.testing.assert_close(getattr(camera, name), torch.tensor([expected]))
+
+
+@pytest.mark.parametrize("size", [(9, 30), (24, 80)])
+def test_a_line_camera_of_any_size_is_written_as_one_whose_key_poses_reach_all_rows(tmp_path, size):
+    lines = line_camera().resized(*size)
+    path = tmp_path / "cameras.json"
+    path.write_bytes(camera_file_bytes([RunView("sweep", lines)], None, FRAME))
+    rays, expected = (c.image_rays(0) for c in (read_camera_file(path, FRAME).views[0].camera, lines))
+    torch.testing.assert_close(rays.origins, expected.origins, atol=1e-5, rtol=0)
+    torch.testing.assert_close(rays.directions, expected.directions, atol=1e-5, rtol=0)
+
+
+def test_the_one_pose_of_a_line_camera_is_halfway_through_its_image(tmp_path):
+    """Key poses may begin before the image."""
+    keys = []
+    for row in (-200, 59):
+        matrix = np.eye(4)
+        matrix[1, 3] = row
+        keys.append({"row": row, "transform_matrix": matrix.tolist()})
+    [view] = read_camera_file(
+        written(tmp_path, frames(space="model", frames=[{"key_poses": keys}])), FRAME
+    ).views
+    assert float(view.camera.camera_to_world[0, 1, 3]) == pytest.approx(29.5, abs=1e-4)
+
+
 def test_names_that_would_give_one_file_are_numbered(tmp_path):
     entries = [{"name": name, "transform_matrix": POSE.tolist()} for name in ("leaf a", "leaf  a", "stem")]
     found = read_camera_file(written(tmp_path, frames(frames=entries)), FRAME)
@@ -166,6 +204,14 @@ BAD = {
         r"frames\[0\]: 'transform_matrix' is a reflection",
     ),
     "projective": (frame_of([*POSE[:3], [0, 0, 1, 1]]), r"its last row is \(0, 0, 1, 1\)"),
+    "too few rows": (
+        frames(h=100, frames=[{"row_poses": [POSE.tolist()] * 10}]),
+        r"frames\[0\]: 'row_poses' has 10 poses, but the image has 100 rows",
+    ),
+    "key poses that end early": (
+        frames(frames=[{"key_poses": [{"row": row, "transform_matrix": POSE.tolist()} for row in (0, 50)]}]),
+        r"'key_poses' reach from row 0 to row 50, but the image has rows 0 to 59",
+    ),
     "no pose": (frames(frames=[{}]), "'transform_matrix' is absent"),
 }
 

@@ -146,7 +146,10 @@ def camera_entry(view: RunView, frame: Normalisation) -> dict[str, Any]:
     entry = {"name": view.name, **dict(zip(_LENS_KEYS, lens, strict=False))}
     if camera.key_poses is None:
         return {**entry, "transform_matrix": matrix(camera.camera_to_world[0])}
-    keys = zip(camera.key_poses.heights.tolist(), camera.key_poses.poses, strict=True)
+    heights = camera.key_poses.heights.clone()  # those of enlarged images end within their first and last row
+    heights[0], heights[-1] = heights[0].clamp(max=0.5), heights[-1].clamp(min=camera.height - 0.5)
+    poses = camera.key_poses.at(torch.zeros_like(heights, dtype=torch.int64), heights)
+    keys = zip(heights.tolist(), poses, strict=True)
     return {**entry, "key_poses": [{"row": y - 0.5, "transform_matrix": matrix(pose)} for y, pose in keys]}
 
 
@@ -202,7 +205,7 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> _
         lines = read_line_poses(entry, where, faults)
         has_rows = lines is not None or faults.noted > 0
         pose = None if has_rows else read_pose(entry.get("transform_matrix"), where, faults)
-        lens = read_intrinsics({}, {**content, **entry}, where, faults)
+        lens = read_intrinsics(content, entry, where, faults)
         faults.raise_if_any()
         assert lens is not None
         if lens.width is None or lens.height is None:
@@ -215,13 +218,15 @@ def _read_frames(path: Path, content: dict[str, Any], frame: Normalisation) -> _
         ]
         focal_px = lens.focal_at(width, height, lines is not None)
         assert focal_px is not None
-        one = lines.middle if lines is not None else pose
-        assert one is not None
         keys = None
         if lines is not None:
+            if (fault := lines.fault(height)) is not None:
+                raise ConfigError(f"{path}: {where}: {fault}")
+            pose = lines.middle(height)
             poses, heights = (torch.from_numpy(x).float() for x in (in_model(lines.poses), lines.rows + 0.5))
             keys = KeyPoses(poses, heights, (len(heights),))
-        camera = _camera(in_model(one[None])[0], focal_px, middle, lens.coefficients, (width, height), keys)
+        assert pose is not None
+        camera = _camera(in_model(pose[None])[0], focal_px, middle, lens.coefficients, (width, height), keys)
         views.append(RunView(name, camera))
     sizes = {(view.camera.width, view.camera.height) for view in views}
     if len(sizes) > 1:

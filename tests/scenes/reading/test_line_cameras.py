@@ -75,6 +75,18 @@ def test_a_scene_may_mix_frame_cameras_and_line_cameras(folder):
     )
 
 
+def test_the_one_pose_of_a_view_does_not_change_with_key_poses_beyond_the_image(folder):
+    before = load_scene(folder.root).cameras.camera_to_world
+
+    def begin_earlier(content):
+        keys = content["frames"][1]["key_poses"]
+        first, last = (np.array(key["transform_matrix"]) for key in keys)
+        keys[0] = {"row": 1 - HEIGHT, "transform_matrix": (2 * first - last).tolist()}  # it moves evenly
+
+    after = load_scene(folder.edit(begin_earlier).root).cameras.camera_to_world
+    torch.testing.assert_close(after, before, atol=1e-5, rtol=0)
+
+
 def turned(entries, row):
     """The poses with one turned by half a circle."""
     changed = copy.deepcopy(entries)
@@ -91,7 +103,7 @@ def test_poses_that_do_not_fit_the_rows_are_one_error(folder):
     early = [keys[0], {**keys[1], "row": HEIGHT - 5}]
     folder.edit(set_frame(2, row_poses=few)).edit(set_frame(3, key_poses=early))
     message = fault_of(folder)
-    assert f"frames[2]: 'row_poses' has {HEIGHT - 3} poses, but the cube has {HEIGHT} rows" in message
+    assert f"frames[2]: 'row_poses' has {HEIGHT - 3} poses, but the image has {HEIGHT} rows" in message
     assert f"frames[3]: 'key_poses' reach from row 0 to row {HEIGHT - 5}" in message
 
 

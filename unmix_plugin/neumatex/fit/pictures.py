@@ -20,7 +20,7 @@ from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, r
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import distinct_names, make_cameras
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, at_sizes
 from unmix_plugin.scenes.scene import Normalisation
 
 LIGHT_SUFFIXES = (".exr", ".npy")
@@ -235,6 +235,7 @@ def read_posed_pictures(
                 f"'bands' does not list all {count} bands of its picture in order; sort them as 'wavelengths' are, and "
                 "leave the key out",
             )
+    entry = at_sizes(entry, sizes, faults)
     faults.raise_if_any()
     usual: ToneMapping = "linear" if kinds == {True} else "camera"
     return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, count, wavelengths)

@@ -41,7 +41,7 @@ from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 from unmix_plugin.scenes.reading.images import check_colours, check_labels, check_masks
 from unmix_plugin.scenes.reading.sensors import check_coverage, group_by_sensor, read_operators
 from unmix_plugin.scenes.reading.splits import Split, split_frames
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size, read_transforms
+from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size, at_sizes, read_transforms
 from unmix_plugin.scenes.scene import Frame, Scene
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
@@ -86,10 +86,7 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     names = truth.material_names
     checked = _check_files(entry, located, None if names is None else len(names), options, faults)
     if checked is not None:
-        for frame, (height, _) in zip(entry.frames, checked.sizes, strict=True):
-            fault = None if frame.line_poses is None else frame.line_poses.fault(height)
-            if fault is not None:
-                faults.add(frame.where, fault)
+        entry = at_sizes(entry, checked.sizes, faults)
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     train, warnings = split.train, ()
     if checked is not None and split.train and entry.wavelengths_nm is not None:
@@ -393,7 +390,7 @@ def make_cameras(entry: SceneEntry, sizes: list[Size], normalisation: Normalisat
 
 
 def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
-    """One pose a frame, as transforms.json has it; of a line camera halfway through the image."""
+    """One pose a frame, as transforms.json has it."""
     poses = [frame.pose for frame in entry.frames if frame.pose is not None]
     assert len(poses) == len(entry.frames)
     return np.stack(poses)

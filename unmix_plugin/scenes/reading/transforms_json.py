@@ -7,7 +7,8 @@ a frame come before those of the whole scene.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +111,10 @@ class _LinePoses:
     is_by_row: bool
     """Whether they were given row by row."""
 
-    @property
-    def middle(self) -> Float64[np.ndarray, "3 4"]:
-        """The pose halfway through the image."""
+    def middle(self, num_rows: int) -> Float64[np.ndarray, "3 4"]:
+        """The pose halfway through an image of so many rows; key poses may reach beyond it."""
         keys = KeyPoses(torch.from_numpy(self.poses), torch.from_numpy(self.rows), (len(self.rows),))
-        y = torch.tensor([0.5 * (self.rows[0] + self.rows[-1])], dtype=torch.float64)
+        y = torch.tensor([0.5 * (num_rows - 1)], dtype=torch.float64)
         return keys.at(torch.zeros(1, dtype=torch.int64), y)[0].numpy()
 
     def fault(self, num_rows: int) -> str | None:
@@ -122,13 +122,13 @@ class _LinePoses:
         if self.is_by_row:
             if len(self.rows) == num_rows:
                 return None
-            found = f"'{_ROW_POSES}' has {len(self.rows)} poses, but the cube has {num_rows} rows"
+            found = f"'{_ROW_POSES}' has {len(self.rows)} poses, but the image has {num_rows} rows"
             return f"{found}; expected one pose a row"
         first, last = float(self.rows[0]), float(self.rows[-1])
         if first <= 0 and last >= num_rows - 1:
             return None
         return (
-            f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}, but the cube has rows 0 to {num_rows - 1}; "
+            f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}, but the image has rows 0 to {num_rows - 1}; "
             "expected the first key pose at row 0 or before it, and the last at the last row or after it"
         )
 
@@ -214,7 +214,7 @@ class FrameEntry:
     paths: dict[str, str]
     """The values of `_FILE_KEYS` that are there."""
     pose: Float64[np.ndarray, "3 4"] | None
-    """Camera to world, rotation orthonormal; of a line camera in the middle of its image."""
+    """Camera to world, rotation orthonormal; of a line camera halfway through its image, None before `at_sizes`."""
     intrinsics: Intrinsics | None
     """Lens of this frame."""
     sensor: SensorEntry = SensorEntry()
@@ -326,7 +326,23 @@ def _read_frame(
     lens, sensor = read_intrinsics(content, frame, where, faults), read_sensor_entry(frame, where, faults)
     named = {key: path for key, path in paths.items() if path is not None}
     shot = frame["capture"] if isinstance(frame.get("capture"), str) else None
-    return FrameEntry(where, named, pose if lines is None else lines.middle, lens, sensor, lines, shot)
+    return FrameEntry(where, named, pose, lens, sensor, lines, shot)
+
+
+def at_sizes(entry: SceneEntry, sizes: Sequence[Size], faults: Faults) -> SceneEntry:
+    """The entry with one pose for each line camera, too; notes a fault where poses of lines don't fit the image.
+
+    Args:
+        sizes: Of each frame's image.
+    """
+    frames = []
+    for frame, (num_rows, _) in zip(entry.frames, sizes, strict=True):
+        if frame.line_poses is not None:
+            if (fault := frame.line_poses.fault(num_rows)) is not None:
+                faults.add(frame.where, fault)
+            frame = replace(frame, pose=frame.line_poses.middle(num_rows))
+        frames.append(frame)
+    return replace(entry, frames=tuple(frames))
 
 
 def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) -> str | None:
