@@ -24,7 +24,7 @@ from tests.scenes.scene_factory import (
 )
 from unmix_plugin.scenes.reading import loader
 from unmix_plugin.scenes.reading.faults import find_named
-from unmix_plugin.scenes.reading.images import UnreadableImageError, read_mask
+from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 
@@ -208,6 +208,22 @@ def test_black_pixels_of_a_mask_do_not_count_and_opaque_pictures_are_no_alpha(tm
     np.testing.assert_array_equal(scene.valid_mask(1), mask > 0)
     assert not scene.has_alpha
     assert scene.alpha(1) is None
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "1", "RGBA"])
+def test_a_colour_that_stands_for_transparency_is_alpha(tmp_path, mode):
+    folder = make_scene(tmp_path / "scene")
+    for path in sorted((folder.root / "images").iterdir()):
+        pixels = np.asarray(Image.open(path))
+        is_seen = pixels[..., 3] > 127
+        grey = Image.fromarray(np.where(is_seen, np.uint8(255), np.uint8(0)))
+        if mode == "RGBA":
+            Image.fromarray(np.dstack([np.asarray(grey)] * 3 + [255 * is_seen.astype(np.uint8)])).save(path)
+        else:
+            clear = {"RGB": (0, 0, 0), "P": int(grey.convert("P").getpixel((0, 0)))}.get(mode, 0)
+            grey.convert(mode).save(path, transparency=clear)
+        assert_allclose(read_colour(path, None)[..., 3], np.where(is_seen, 255, 0))
+    assert load_scene(folder.root).has_alpha
 
 
 def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):

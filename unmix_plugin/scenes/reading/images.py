@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG", "TIFF")
 """Pillow reads more formats, some of which start other programs."""
-_COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "RGB"}
-"""How each pillow mode of 8 bits is brought to RGB or RGBA; palettes are looked at separately."""
+_COLOUR_MODES = {"RGB": "RGB", "RGBA": "RGBA", "L": "RGB", "LA": "RGBA", "1": "RGB", "P": "RGB"}
+"""How each pillow mode of 8 bits is brought to RGB or RGBA, where no colour stands for transparency."""
 
 UNLABELLED = 255
 """Label of a pixel whose material is unknown."""
@@ -39,11 +39,10 @@ def read_colour(path: Path, size: Size | None) -> UInt8[np.ndarray, "H W C"]:
     readable picture of this size with 8 bits a channel; SceneError: too large a one."""
 
     def convert(image: Image.Image) -> np.ndarray:
-        if image.mode == "P":
-            return np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
         if image.mode not in _COLOUR_MODES:
             raise UnreadableImageError(f"is a picture of mode {image.mode}; expected 8-bit RGB or RGBA")
-        return np.asarray(image.convert(_COLOUR_MODES[image.mode]))
+        has_clear_colour = "transparency" in image.info  # tRNS of a PNG: a colour, or entries of the palette
+        return np.asarray(image.convert("RGBA" if has_clear_colour else _COLOUR_MODES[image.mode]))
 
     return read_picture(path, size, convert)
 
