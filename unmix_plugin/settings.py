@@ -60,7 +60,7 @@ class SceneOptions:
     """Evaluation frames by the lists of transforms.json, by folder or file name, or every n-th; auto takes the first
     of these that the scene supports."""
     eval_interval: Annotated[int, short("eval-interval")] = 8
-    """With an interval split every n-th frame, from the first on, is for evaluation."""
+    """With an interval split every n-th frame from the first on, or of a rig every n-th shot, is for evaluation."""
     world: Annotated[Literal["bounded", "unbounded", "auto"], Common, short("world")] = "auto"
     """Whether all that pictures show lies in a box, or goes on behind it as far as the sky. Auto is bounded where
     pictures have alpha; otherwise it is unbounded if views agree on places outside of the box."""

@@ -1,5 +1,6 @@
 """Which frames train and which evaluate."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -55,6 +56,31 @@ def split_of(
 )
 def test_lists_go_before_names_of_folders_and_files_and_tests_before_validation(names, lists, expected):
     assert split_of(list(names), **lists) == expected
+
+
+def test_a_picture_that_several_frames_share_lists_all_of_them():
+    shared = [{"file_path": f"images/{i // 2}", "hyperspectral_file_path": f"cubes/{i}"} for i in range(6)]
+    entry = replace(
+        entry_of([]), frames=tuple(FrameEntry(str(i), p, None, None) for i, p in enumerate(shared))
+    )
+    for lists, expected in (
+        ({"test": ("images/1",)}, Split((0, 1, 4, 5), (2, 3))),
+        ({"train": ("images/0", "cubes/4"), "test": ("images/1",)}, Split((0, 1, 4), (2, 3))),
+    ):
+        faults = Faults(Path("scene"))
+        assert split_frames(replace(entry, split_lists=lists), "auto", 8, faults) == expected
+        faults.raise_if_any()
+
+
+@given(st.lists(st.sampled_from([None, "a", "b", "c", "d", "e"]), min_size=2), st.integers(2, 4))
+def test_frames_of_one_shot_are_on_one_side_of_a_split_by_interval(shots, interval):
+    entry = entry_of([str(i) for i in range(len(shots))])
+    frames = tuple(replace(frame, shot=shot) for frame, shot in zip(entry.frames, shots, strict=True))
+    split = split_frames(replace(entry, frames=frames), "interval", interval, Faults(Path("scene")))
+    assert sorted(split.train + split.evaluation) == list(range(len(shots)))
+    assert not {shots[i] for i in split.train} & {shots[i] for i in split.evaluation} - {None}
+    in_order = list(dict.fromkeys(i if shot is None else shot for i, shot in enumerate(shots)))
+    assert len({shots[i] or i for i in split.evaluation}) == len(in_order[::interval])
 
 
 def test_words_that_only_begin_like_a_split_are_no_split():

@@ -1,4 +1,4 @@
-"""Which frames train and which evaluate: by lists, by folder or file name, or every n-th.
+"""Which frames train and which evaluate: by lists, by folder or file name, or every n-th shot.
 
 Evaluation frames are those of the test split if there are any, otherwise those of the validation split.
 """
@@ -42,7 +42,7 @@ def split_frames(
     elif method == "filename" or (method == "auto" and _have_split_names(entry)):
         split = _by_name(entry, faults)
     else:
-        split = _by_interval(len(entry.frames), interval, faults)
+        split = _by_interval(entry, interval, faults)
     if entry.frames and not split.train:
         advice = "name some in 'train_filenames'"
         faults.add(FILE_NAME, f"no frame is left to train on ({_how(method)}); {advice}")
@@ -57,20 +57,18 @@ def _how(method: str) -> str:
 
 
 def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
-    index_of: dict[str, int] = {}
+    owners: dict[str, set[int]] = {}  # several frames may share a picture, such as those of a rig's cubes
     for index, frame in enumerate(entry.frames):
         for key in ("hyperspectral_file_path", "file_path"):
             if key in frame.paths:
-                index_of[_plain(frame.paths[key])] = index
+                owners.setdefault(_plain(frame.paths[key]), set()).add(index)
     chosen: dict[str, set[int]] = {}
     for name, paths in entry.split_lists.items():
         chosen[name] = set()
         for path in paths:
-            index = index_of.get(_plain(path))
-            if index is None:
+            if _plain(path) not in owners:
                 faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
-            else:
-                chosen[name].add(index)
+            chosen[name] |= owners.get(_plain(path), set())
     everything = set(range(len(entry.frames)))
     evaluation = chosen.get("test") or chosen.get("val")
     if evaluation is None:
@@ -120,8 +118,18 @@ def _by_name(entry: SceneEntry, faults: Faults) -> Split:
     return Split(tuple(members.get("train", [])), tuple(evaluation))
 
 
-def _by_interval(count: int, interval: int, faults: Faults) -> Split:
+def _by_interval(entry: SceneEntry, interval: int, faults: Faults) -> Split:
+    """Every n-th shot evaluates; the frames that a rig took together stay together, they show the same."""
     if interval < 2:
         faults.add("--eval-interval", f"is {interval}; expected 2 or more: frames are to be left to train on")
         return Split((), ())
-    return Split(tuple(i for i in range(count) if i % interval != 0), tuple(range(0, count, interval)))
+    numbers: dict[str | int, int] = {}
+    shots = [
+        numbers.setdefault(index if frame.shot is None else frame.shot, len(numbers))
+        for index, frame in enumerate(entry.frames)
+    ]
+    train, evaluation = (
+        tuple(index for index, shot in enumerate(shots) if (shot % interval == 0) == is_evaluation)
+        for is_evaluation in (False, True)
+    )
+    return Split(train, evaluation)
