@@ -84,6 +84,23 @@ def test_cubes_in_other_units_get_a_scale_proposed_that_then_works(folder, dtype
     assert load_scene(folder.root, SceneOptions(value_scale=float(scale))).cube(1).max() <= 1.0
 
 
+@pytest.mark.parametrize("scale_in", ["options", "transforms.json"])
+def test_a_scale_that_clips_more_than_highlights_is_said_with_one_that_does_not(folder, scale_in):
+    folder.edit_cubes(lambda cube: np.round(cube.astype(np.float64) * 10000).astype(np.uint16))
+
+    def read(scale):
+        folder.edit(lambda content: content.pop("value_scale", None))
+        if scale_in == "options":
+            return load_scene(folder.root, SceneOptions(value_scale=scale)).warnings
+        return load_scene(folder.edit(lambda content: content.update(value_scale=scale)).root).warnings
+
+    (said,) = read(6000.0)
+    share = max((np.load(path) > 6000).mean() for path in (folder.root / "cubes").iterdir())
+    assert f"up to {share:.0%} of the values are above 1 after division by the value scale 6000" in said
+    assert "(up to 7998 as stored); if they are no highlights, give --value-scale 10000" in said
+    assert not read(10000.0)
+
+
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
@@ -255,6 +272,19 @@ def test_files_beside_a_cube_that_do_not_fit_it_are_refused(folder, name, conten
 def test_a_mask_that_is_black_everywhere_is_refused(folder):
     Image.new("L", (WIDTH, HEIGHT)).save(folder.root / "mask.png")
     assert "the mask is black everywhere" in fault_of(folder.edit(set_frame(2, mask_path="mask.png")))
+
+
+def test_a_mask_that_leaves_nothing_but_invalid_pixels_is_refused(folder):
+    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+    mask[:, 5:] = 255
+    write(folder.root / "mask.png", mask)
+
+    def spoil(cube):
+        cube[:, 5:] = np.nan
+
+    folder.edit(set_frame(2, mask_path="mask.png")).edit_cube(2, spoil)
+    message = fault_of(folder, invalid_pixels="mask")
+    assert "frames[2] cubes/view_2.npy: the mask leaves only pixels with NaN" in message
 
 
 def test_a_small_file_that_decodes_to_gigabytes_is_refused_by_its_size(folder, monkeypatch):

@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from unmix_plugin.errors import name_some
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size
 
@@ -358,6 +359,25 @@ def check_cube_values(
     _note_invalid(scaled, invalid_pixels, faults)
     _note_scales(named, value_scale, faults)
     return measured
+
+
+def say_clipped(named: Sequence[tuple[str, _CubeValues]], value_scale: float | None) -> tuple[str, ...]:
+    """Warnings of a given scale that makes more than highlights brighter than 1.
+
+    Args:
+        named: What each cube holds, and how messages call it.
+    """
+    shares = {where: values.num_above_one / values.num_values for where, values in named}
+    clipped = {where: share for where, share in shares.items() if share > _EXCESS_SHARE}
+    if value_scale is None or not clipped:
+        return ()
+    stored = [values for where, values in named if where in clipped]
+    share, greatest = max(clipped.values()), max(values.greatest for values in stored)
+    proposal = _propose_scale(greatest, all(values.is_integer for values in stored))
+    found = f"up to {share:.0%} of the values are above 1 after division by the value scale {value_scale:g}"
+    stored_as = f"and count as 1 (up to {greatest:g} as stored)"
+    advice = f"if they are no highlights, give --value-scale {proposal:g}"
+    return (f"{name_some(list(clipped))}: {found} {stored_as}; {advice}",)
 
 
 def _read_header(path: Path, layout: str, where: str, faults: Faults) -> _ArrayHeader | None:

@@ -35,6 +35,7 @@ from unmix_plugin.scenes.reading.cubes import (
     check_cube_headers,
     check_cube_values,
     read_cube,
+    say_clipped,
 )
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
@@ -103,7 +104,7 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
         )
     faults.raise_if_any()
     assert checked is not None
-    warnings = (*entry.warnings, *warnings)
+    warnings = (*entry.warnings, *checked.warnings, *warnings)
     if entry.fwhm_nm is not None and (unknown := int(np.isnan(entry.fwhm_nm).sum())):
         said = f"'fwhm' has 0 or null for {unknown} of {len(entry.fwhm_nm)} bands: the widths of all count as unknown"
         entry, warnings = replace(entry, fwhm_nm=None), (*warnings, said)
@@ -258,6 +259,7 @@ class _CheckedFiles:
     """For each frame the pixels that are not valid or masked out; None without."""
     cube_hashes: dict[Path, str]
     """SHA-256 of each cube, in the order of the frames."""
+    warnings: tuple[str, ...]
 
 
 def _locate_files(
@@ -310,10 +312,17 @@ def _check_files(
     known_operators = [operator for operator in operators if operator is not None]
     if len(cubes) != len(values) or len(known_operators) != len(operators) or not cubes:
         return None
+    where = [frame.name_of("hyperspectral_file_path") for frame in entry.frames]
     unknown = tuple(
         cube.invalid if mask is None else ~mask if cube.invalid is None else cube.invalid | ~mask
         for cube, mask in zip(cubes, masks, strict=True)
     )
+    for name, missing, mask, cube in zip(where, unknown, masks, cubes, strict=True):
+        is_told = cube.num_invalid_pixels == cube.num_pixels or (mask is not None and not mask.any())
+        if missing is not None and missing.all() and not is_told:
+            faults.add(
+                name, "the mask leaves only pixels with NaN, infinite or negative values; drop the frame"
+            )
     foreground = None
     if seen is not None:
         foreground = tuple(
@@ -323,7 +332,8 @@ def _check_files(
     paths = [paths["hyperspectral_file_path"] for paths in located]
     sensors, indices = group_by_sensor(entries, known_operators, known_sizes, faults)
     hashes = {path: cube.sha256 for path, cube in zip(paths, cubes, strict=True)}
-    return _CheckedFiles(known_sizes, sensors, indices, foreground, unknown, hashes)
+    clipped = say_clipped(list(zip(where, cubes, strict=True)), options.value_scale)
+    return _CheckedFiles(known_sizes, sensors, indices, foreground, unknown, hashes, clipped)
 
 
 def _read_illuminant(
