@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
-from unmix_plugin.engine.configs import Common, DataManagerConfig, Hidden, ModelConfig, Target, short
+from unmix_plugin.engine.configs import AtStart, Common, DataManagerConfig, Hidden, ModelConfig, Target, short
 from unmix_plugin.errors import ConfigError, require
 from unmix_plugin.presets import AlphaPreset, Auto, choose
 
@@ -276,9 +276,9 @@ class UnmixModelConfig(ModelConfig):
     num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
     """K, the number of materials to unmix into; auto proposes it from the training pixels. None is 6, or the number of
     bands if that is smaller."""
-    endmember_init: Annotated[EndmemberInit, Common, short("endmember-init")] = "pairs"
+    endmember_init: Annotated[EndmemberInit, Common, AtStart, short("endmember-init")] = "pairs"
     """First guess of the endmembers from the pixels of all training views, or spectra from `endmember_file`."""
-    endmember_file: Annotated[Path | None, Common, short("endmember-file")] = None
+    endmember_file: Annotated[Path | None, Common, AtStart, short("endmember-file")] = None
     """CSV of reflectances (wavelength,name,...) for `endmember_init` file; multiplied by the scene's light if known,
     and by one factor for the scene's brightness."""
     specular: Literal["none", "dictionary", "full"] = "dictionary"
@@ -293,7 +293,7 @@ class UnmixModelConfig(ModelConfig):
     """Light that is fixed, that moves with the camera (objects turned before camera and lamp), or that differs from
     view to view (also exposure). Auto finds which it is; without alpha only whether
     exposures differ."""
-    lamp: tuple[float, ...] | Auto = "auto"
+    lamp: Annotated[tuple[float, ...] | Auto, AtStart] = "auto"
     """Where the lamp stands that moves with the camera, when training starts: 0 if it turns with the turntable or 1 if
     it also goes up and down with the camera, the turntable's middle and axis, and the way from the middle to the lamp
     (right, up, towards the camera), in model space; numbers need light `camera`. Auto finds it where light is `auto`

@@ -198,6 +198,21 @@ def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_tra
     assert ended.last_line == f"run: {run_copy}"
 
 
+@pytest.mark.parametrize(
+    ("flag", "value"),
+    [("endmember-init", "vca"), ("lamp", "0 0 0 0 0 0 1 0 0 1"), ("endmember-file", "a.csv")],
+)
+def test_what_acts_at_the_start_alone_is_refused_where_a_run_goes_on(run_copy, flag, value):
+    before = (run_copy / "config.json").read_bytes()
+    others = {"lamp": ["--light", "camera"], "endmember-file": ["--endmember-init", "file"]}.get(flag, [])
+    words = [f"--pipeline.model.{flag}", *value.split(), *others, "--max-num-iterations", 21]
+    said = refused(train, "unmix-nerf", "--load-run", run_copy, *words)
+    named = "endmember-init" if flag == "endmember-file" else flag
+    assert f"--pipeline.model.{named} is " in said
+    assert "it acts when a run is started alone; leave it out, or start a new run" in said
+    assert (run_copy / "config.json").read_bytes() == before
+
+
 def test_a_run_of_another_method_is_not_gone_on_with(run_copy):
     with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of neumatex"):
         parse(["neumatex", "--load-run", str(run_copy)])

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.configs import (
+        AtStart,
         Common,
         DataManagerConfig,
         InstantiateConfig,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     "configs": (
+        "AtStart",
         "Common",
         "DataManagerConfig",
         "InstantiateConfig",
@@ -71,6 +73,7 @@ _MODULES = {
 }
 
 __all__ = [
+    "AtStart",
     "Cameras",
     "Common",
     "DataManager",

@@ -32,6 +32,9 @@ Common = "common"
 Hidden = "hidden"
 """Annotation of a setting that works as a flag, but that no help lists: `Annotated[int, Hidden]`."""
 
+AtStart = "at start"
+"""Annotation of a setting that acts when a run is started, never again: going on with it refuses another value."""
+
 
 def short(name: str) -> Any:
     """Annotation that gives a setting the flag `--name` beside its long one."""

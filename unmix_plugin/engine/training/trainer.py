@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
-from unmix_plugin.engine.configs import OptimizerConfig, TrainerConfig
+from unmix_plugin.engine.configs import AtStart, OptimizerConfig, TrainerConfig
 from unmix_plugin.engine.machine import keep_freed_memory, resolve_device, seed_everything
 from unmix_plugin.engine.model import TrainingCallbackLocation, run_callbacks
 from unmix_plugin.engine.pipeline import Pipeline
@@ -30,7 +31,7 @@ from unmix_plugin.engine.runs.checkpoints import (
     save_checkpoint,
 )
 from unmix_plugin.engine.runs.config_json import config_to_json
-from unmix_plugin.engine.runs.load_run import require_checkpoint, require_data, write_config
+from unmix_plugin.engine.runs.load_run import load_config, require_checkpoint, require_data, write_config
 from unmix_plugin.engine.runs.run_folder import (
     RunFolder,
     RunLock,
@@ -208,6 +209,21 @@ def _prepare_steps(
     return replace(config, pipeline=pipeline.config), steps
 
 
+def _refuse_changes_at_start(before: Any, now: Any, flag: str = "--") -> None:
+    """Compare the settings of a run with those to go on with. Raises ConfigError: one differs that acted at the start
+    alone, and would be written down without having acted."""
+    hints = get_type_hints(type(now), include_extras=True)
+    for name in (entry.name for entry in fields(now)):
+        old, new, own = getattr(before, name, None), getattr(now, name), flag + name.replace("_", "-")
+        if is_dataclass(new):
+            _refuse_changes_at_start(old, new, f"{own}.")
+        elif AtStart in getattr(hints[name], "__metadata__", ()) and old != new:
+            raise ConfigError(
+                f"{own} is {new}, and the run to go on with was started with {old}: it acts when "
+                "a run is started alone; leave it out, or start a new run"
+            )
+
+
 @contextmanager
 def joined_training(config: TrainerConfig) -> Iterator[Processes]:
     """Context in which this process trains with the others that were started with it.
@@ -288,6 +304,8 @@ class Trainer:
         keep_freed_memory()
         with processes.together():
             resumed = None if config.load_run is None else open_run_folder(config.load_run)
+            if resumed is not None:
+                _refuse_changes_at_start(load_config(resumed.path), config)
             if config.data is not None and config.data.exists():  # found from any working directory then
                 config = replace(config, data=config.data.resolve())
             self.config, self.steps = _prepare_steps(config, processes)

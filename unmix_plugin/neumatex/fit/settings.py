@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import tyro
 
-from unmix_plugin.engine import Common, ModelConfig, Target, config_from_json, short
+from unmix_plugin.engine import AtStart, Common, ModelConfig, Target, config_from_json, short
 from unmix_plugin.errors import require
 from unmix_plugin.neumatex.fit.tone import LightCurve, ToneMapping
 from unmix_plugin.spectral.bands import Bands
@@ -116,9 +116,9 @@ class NeumatexModelConfig(ModelConfig):
     num_endmembers: Annotated[int | Auto | None, Common, short("endmembers")] = None
     """Of spectral materials: K, how many reflectances are mixed; auto proposes it from the training pixels. None is the
     number of --pipeline.model.from-run, otherwise 6, or the number of bands if that is smaller."""
-    endmember_init: EndmemberMethod = "pairs"
+    endmember_init: Annotated[EndmemberMethod, AtStart] = "pairs"
     """Of spectral materials: first guess of the endmembers, from the pixels divided by the light that reaches them."""
-    from_run: Annotated[Path | None, Common] = None
+    from_run: Annotated[Path | None, Common, AtStart] = None
     """Of spectral materials: run of unmix-nerf whose endmembers and abundances the fit starts from."""
     samples: Annotated[int, Common] = 16
     """Paths a pixel in training, in two independent halves; more is slower and less noisy. Few leave a bias, since tone
