@@ -51,6 +51,20 @@ def test_by_default_every_evaluation_view_is_written_in_what_suits_each_output(t
         assert str(tmp_path / name) in ended.out
 
 
+def test_a_map_without_coordinates_is_said_to_have_none(trained, tmp_path):
+    words = ["--run", trained.run, "--device", "cpu", "--outputs", "abundances", "--pixel-size", 0.2]
+    for direction, has_none in (("bottom", True), ("south", False)):
+        ended = done(render, *words, "--output", tmp_path / direction, "--cameras", f"map:{direction}")
+        header = (tmp_path / direction / "abundances" / f"map_{direction}.hdr").read_text()
+        assert ("files have no map coordinates" in " ".join(ended.out.split())) == has_none
+        assert ("map info" in header) != has_none
+
+
+def test_frames_a_second_without_a_video_are_refused(trained, tmp_path):
+    words = ["--run", trained.run, "--device", "cpu", "--output", tmp_path, "--fps", 30]
+    assert "--fps is for videos, and none is asked for" in refused(render, *words, "--outputs", "rgb")
+
+
 def test_renders_go_into_the_run_by_default_and_need_nothing_else(trained, run_copy, tmp_path):
     shutil.move(trained.scene, tmp_path / "elsewhere")
     try:

@@ -111,6 +111,7 @@ def render(argv: list[str]) -> None:
 def _render_run(options: _RenderOptions, request: CameraRequest, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, say, working
     from unmix_plugin.editing.edited_run import load_edited_run
+    from unmix_plugin.errors import ConfigError
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.files import choose_formats, with_units
 
@@ -132,6 +133,14 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
             )
         outputs = choose_formats(options.outputs, options.formats, loaded.scene, cameras.is_path)
         outputs = with_units(outputs, cameras.map_info)
+        formats = {one.format for one in outputs}
+        if options.fps is not None and not cameras.is_path and "mp4" not in formats:
+            raise ConfigError("--fps is for videos, and none is asked for; add mp4 to --formats, or leave it out")
+        if cameras.map_info is not None and not cameras.map_info.has_coordinates and formats & {"envi", "tif"}:
+            say(
+                console,
+                f"--cameras {options.cameras}: files have no map coordinates, which would mirror or misplace the map",
+            )
     _render(options, loaded, cameras, outputs, console, processes)
 
 

@@ -74,6 +74,24 @@ def test_an_envi_header_says_the_same(folder):
     assert (float(left), float(top)) == tie[3:5]
 
 
+@pytest.mark.parametrize("direction", ["top", "south", "east", "0,0,2"])
+def test_coordinates_of_a_map_are_those_of_the_world_where_its_axes_are(direction):
+    camera, info = map_camera(SCENE, SCALE, direction, 0.25)
+    axes = {"south": (0, 2), "east": (1, 2)}.get(direction, (0, 1))
+    rays = SCENE.frame.to_world(camera.image_rays(0).origins.double().numpy())
+    rays = rays.reshape(camera.height, camera.width, 3)[3, 2, list(axes)]
+    np.testing.assert_allclose(rays, [info.left + 2.5 * 0.25, info.top - 3.5 * 0.25], atol=0.05)
+    assert info.geotiff
+    assert "map info" in info.envi
+
+
+@pytest.mark.parametrize("direction", ["bottom", "north", "west", "1,2,3", "0,0,-1"])
+def test_a_map_along_no_axes_of_the_world_says_the_size_of_pixels_and_no_coordinates(direction):
+    _, info = map_camera(SCENE, SCALE, direction, 0.25)
+    assert info.envi == {"pixel size": [0.25, 0.25, "units=Meters"]}
+    assert not info.geotiff
+
+
 def test_units_and_a_coordinate_system_that_are_known_are_written():
     [utm, national] = (
         choose_cameras(SCENE, CameraRequest("map", pixel_size=1.0, epsg=code), SCALE).map_info

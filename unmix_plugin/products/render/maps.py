@@ -2,7 +2,8 @@
 
 Map coordinates are metres where the scene's scale is known, otherwise units of its world. From above, x is the world's
 x (east) and y its y (north); so maps of geo-referenced scenes have the coordinates of their frame. Seen from the side,
-up is the world's z and x goes to the right.
+up is the world's z. Where an axis of the image runs against one of the world (from below, north or west) or along none,
+files say the size of pixels but no coordinates: a GIS would put the map in mirror image, or where it is not.
 
 Source: GeoTIFF 1.1, OGC 19-008r4 (tags and keys); ENVI header format (map info).
 """
@@ -86,6 +87,8 @@ class MapInfo:
     """Of the world, where coordinates and lengths are metres; None: they are in units of the world."""
     epsg: int | None = None
     """EPSG code of the projected coordinate system; None where it is unknown."""
+    has_coordinates: bool = True
+    """Whether columns and rows run along axes of the world, so that `left` and `top` are coordinates of it."""
 
     @property
     def is_metric(self) -> bool:
@@ -96,6 +99,8 @@ class MapInfo:
     def envi(self) -> dict[str, Any]:
         """Entries of an ENVI header; pixels are counted from 1, whose corner (1, 1) is that of the first pixel."""
         units = f"units={'Meters' if self.is_metric else 'Unknown'}"
+        if not self.has_coordinates:
+            return {"pixel size": [self.pixel, self.pixel, units]}
         place = [1.0, 1.0, self.left, self.top, self.pixel, self.pixel]
         half, zone = divmod(self.epsg or 0, 100)
         if half in _UTM_HALVES and 1 <= zone <= 60:
@@ -104,7 +109,9 @@ class MapInfo:
 
     @property
     def geotiff(self) -> list[tuple[int, int, int, Any, bool]]:
-        """Tags of a GeoTIFF as tifffile takes them: pixel scale, tie point, keys."""
+        """Tags of a GeoTIFF as tifffile takes them: pixel scale, tie point, keys; none without coordinates."""
+        if not self.has_coordinates:
+            return []
         known = None if self.epsg is None else f"EPSG:{self.epsg}|"
         citation = known or (
             "unmix-nerf map, local metres|" if self.is_metric else "unmix-nerf map, units of the scene|"
@@ -153,7 +160,13 @@ def map_camera(
         raise ConfigError(f"--pixel-size is {pixel_size:g}; it must be greater than 0")
     width, height = (max(1, math.ceil(side / pixel_size - 1e-6)) for side in (high - low)[:2])
     check_size(width, height, f"--pixel-size {pixel_size:g}")
-    info = MapInfo(float(low[0]), float(high[1]), pixel_size, None if scale is None else metres)
+    info = MapInfo(
+        float(low[0]),
+        float(high[1]),
+        pixel_size,
+        None if scale is None else metres,
+        has_coordinates=bool((axes[:2].max(axis=1) > 1 - 1e-9).all()),  # unit vectors
+    )
     middle = np.array(
         [low[0] + width * pixel_size / 2, high[1] - height * pixel_size / 2, (low[2] + high[2]) / 2]
     )
