@@ -188,6 +188,7 @@ BAD = {
     "sizes that differ": (frames(frames=SIZES), r"sizes \[\(50, 60\), \(96, 60\)\]; expected one size"),
     "no size of frames": (frames(w=None), r"frames\[0\]: 'w' and 'h' are absent"),
     "no lens": (frames(fl_x=None), "'fl_x' is absent"),
+    "lens of the file": (frames(fl_x=-1), r"path\.json: 'fl_x' is -1; expected a focal length above 0"),
     "lens of no kind": (frames(camera_model="EQUIRECTANGULAR"), '"EQUIRECTANGULAR" is not supported'),
     "fov": (path_of(FLAT, 180), r"camera_path\[0\]: 'fov' is 180; expected degrees between 0 and 180"),
     "speed": (nerfstudio(fps=0), "'fps': 0.0 frames a second; expected a number above 0"),

@@ -135,8 +135,14 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
         outputs = with_units(outputs, cameras.map_info)
         formats = {one.format for one in outputs}
         if options.fps is not None and not cameras.is_path and "mp4" not in formats:
-            raise ConfigError("--fps is for videos, and none is asked for; add mp4 to --formats, or leave it out")
-        if cameras.map_info is not None and not cameras.map_info.has_coordinates and formats & {"envi", "tif"}:
+            raise ConfigError(
+                "--fps is for videos, and none is asked for; add mp4 to --formats, or leave it out"
+            )
+        if (
+            cameras.map_info is not None
+            and not cameras.map_info.has_coordinates
+            and formats & {"envi", "tif"}
+        ):
             say(
                 console,
                 f"--cameras {options.cameras}: files have no map coordinates, which would mirror or misplace the map",

@@ -298,6 +298,12 @@ def _named_bands_as_colours(folder: Path) -> None:
         write_exr(path, channels, {})
 
 
+def _too_few_rows(folder: Path) -> None:
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    frames[3]["row_poses"] = [frames[3].pop("transform_matrix")] * 5
+    _change(folder, frames=frames)
+
+
 FAULTS = {
     "truth of another size": (
         lambda folder: _write_truth(folder, (SIZE // 2, SIZE // 2), "RGB"),
@@ -328,6 +334,7 @@ FAULTS = {
     "no light": (lambda folder: (folder / "environment.exr").unlink(), "no environment; put environment.exr"),
     "broken light": (_bad_light, "environment.exr.*not finite"),
     "no pose": (_no_pose, r"frames\[3\]: 'transform_matrix' is absent"),
+    "too few rows": (_too_few_rows, rf"frames\[3\]: 'row_poses' has 5 poses, but the image has {SIZE} rows"),
     "no picture": (lambda folder: (folder / "images/004.exr").unlink(), "'images/004.exr' is missing"),
     "unknown tone": (lambda folder: _change(folder, tone_mapping="filmic"), "'tone_mapping' is \"filmic\""),
     "wrong turn": (

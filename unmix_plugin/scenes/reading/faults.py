@@ -17,6 +17,7 @@ from urllib.parse import unquote
 
 from unmix_plugin.errors import SceneError, name_some
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
+from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 
 MAX_LISTED = 20
 """Faults written out in one message; the rest is counted."""
@@ -30,6 +31,11 @@ class Faults:
         self._places: dict[str, list[str]] = {}
         self.noted = 0
         """How often a fault was noted so far, repetitions included."""
+
+    @property
+    def file(self) -> str:
+        """How messages call the file of cameras as a whole: transforms.json of a folder, or the root that is a file."""
+        return str(self._root) if self._root.suffix == ".json" else FILE_NAME
 
     def add(self, where: str, message: str) -> None:
         """Note a fault.

@@ -123,12 +123,12 @@ def keys_to_say(
         )
     in_frames = [
         key
-        for key in sorted(_OF_SCENES)
-        if any(own.get(key, content.get(key)) != content.get(key) for own in every[1:])
+        for key in sorted(_OF_SCENES.difference(_OF_ALL_CUBES))
+        if any(own.get(key) not in (None, content.get(key)) for own in every[1:])
     ]
-    if misplaced := [key for key in in_frames if key not in _OF_ALL_CUBES]:
+    if in_frames:
         warnings.append(
-            f"{', '.join(misplaced)}: not followed in frames; give it beside 'frames', for all of them"
+            f"{', '.join(in_frames)}: not followed in frames; give it beside 'frames', for all of them"
         )
     known = _OF_SCENES | _OF_FRAMES | _OF_EITHER | set(_REFUSED) | set(_ONLY_IN_CAPTURES) | set(_SAID)
     unknown = sorted({key for own in every for key in own} - known)

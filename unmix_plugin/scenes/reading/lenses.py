@@ -14,7 +14,7 @@ import numpy as np
 
 from unmix_plugin.limits import GREATEST_PX
 from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
-from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, refused_keys
+from unmix_plugin.scenes.reading.foreign_keys import refused_keys
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
 _SMALLEST_ANGLE = 1e-6
@@ -90,7 +90,7 @@ def read_lens(
     def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
         source = own if key in own else common
         value = source.get(key)
-        number, owner = read_number(value), FILE_NAME if source is common else where
+        number, owner = read_number(value), faults.file if source is common else where
         if value is not None and (number is None or abs(number) > GREATEST_PX):
             faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
         elif number is not None and (not low <= number <= high or (is_whole and number != int(number))):
@@ -192,7 +192,7 @@ def read_intrinsics(
     model = "OPENCV" if lens is None else lens.model
     if model not in _SUPPORTED_MODELS:
         faults.add(
-            where if frame.get("camera_model") is not None else FILE_NAME,
+            where if frame.get("camera_model") is not None else faults.file,
             f"camera_model {describe(model)} is not supported; expected one of {', '.join(_SUPPORTED_MODELS)}: "
             "unmix-process brings such pictures into an OPENCV lens",
         )
