@@ -233,3 +233,28 @@ def test_no_damaged_byte_of_hdf5_ends_the_process(tmp_path):
     process.start()
     process.join()
     assert process.exitcode == 0
+
+
+def test_names_of_hdf5_that_lead_back_to_themselves_end(tmp_path):
+    path = tmp_path / "cube.h5"
+    with h5py.File(path, "w") as file:
+        file["a/cube"] = CUBE
+        file["a/again"] = file["a"]
+        file["same"] = file["a/cube"]
+    np.testing.assert_array_equal(open_spectral_file(path).read(slice(None)), CUBE)
+    data = bytearray(path.read_bytes())
+    node = data.index(b"TREE")  # of version 1: its right sibling follows 16 bytes later
+    while node >= 0:
+        data[node + 16 : node + 24] = struct.pack("<Q", node)
+        node = data.find(b"TREE", node + 1)
+    path.write_bytes(data)
+    process = get_context("spawn").Process(target=_open, args=(path,))
+    process.start()
+    process.join(60)
+    process.kill()
+    assert process.exitcode == 0
+
+
+def _open(path: Path) -> None:
+    with suppress(CaptureError):
+        open_spectral_file(path)

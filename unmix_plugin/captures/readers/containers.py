@@ -191,15 +191,23 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     groups: dict[str, dict[str, Any]] = {}
     visited = count(1)
 
-    def visit(name: str, item: Any) -> None:
-        allow_parts(path, next(visited), "groups and data sets", CaptureError)
-        allow_depth(path, name.count("/") + 1, CaptureError)
-        arrays.extend(_found_in_hdf5(path, name, item, is_matlab))
-        if not hasattr(item, "shape"):
-            groups[name] = _attributes(path, item)
+    def visit(group: Any, seen: set[Any]) -> None:
+        # Not by `visititems`, which never ends where a damaged tree of names leads back to itself.
+        for link in group:
+            if not isinstance(group.get(link, getlink=True), h5py.HardLink) or (item := group[link]) in seen:
+                continue
+            name = item.name.removeprefix("/")
+            allow_parts(path, next(visited), "groups and data sets", CaptureError)
+            allow_depth(path, name.count("/") + 1, CaptureError)
+            seen.add(item)
+            arrays.extend(_found_in_hdf5(path, name, item, is_matlab))
+            if not hasattr(item, "shape"):
+                groups[name] = _attributes(path, item)
+            if isinstance(item, h5py.Group):
+                visit(item, seen)
 
     with h5py.File(path, "r") as file:
-        file.visititems(visit)
+        visit(file, {file["/"]})
         groups[""] = _attributes(path, file)
     for index, array in enumerate(
         arrays
