@@ -220,7 +220,7 @@ def test_a_colour_that_stands_for_transparency_is_alpha(tmp_path, mode):
         if mode == "RGBA":
             Image.fromarray(np.dstack([np.asarray(grey)] * 3 + [255 * is_seen.astype(np.uint8)])).save(path)
         else:
-            clear = {"RGB": (0, 0, 0), "P": int(grey.convert("P").getpixel((0, 0)))}.get(mode, 0)
+            clear = {"RGB": (0, 0, 0), "P": np.asarray(grey.convert("P")).item(0)}.get(mode, 0)
             grey.convert(mode).save(path, transparency=clear)
         assert_allclose(read_colour(path, None)[..., 3], np.where(is_seen, 255, 0))
     assert load_scene(folder.root).has_alpha
