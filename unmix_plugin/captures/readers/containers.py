@@ -190,13 +190,14 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     arrays: list[FoundArray] = []
     groups: dict[str, dict[str, Any]] = {}
     visited = count(1)
+    seen: set[Any] = set()
 
-    def visit(group: Any, seen: set[Any]) -> None:
+    def visit(group: Any, inside: str = "") -> None:
         # Not by `visititems`, which never ends where a damaged tree of names leads back to itself.
         for link in group:
             if not isinstance(group.get(link, getlink=True), h5py.HardLink) or (item := group[link]) in seen:
                 continue
-            name = item.name.removeprefix("/")
+            name = f"{inside}{link}"
             allow_parts(path, next(visited), "groups and data sets", CaptureError)
             allow_depth(path, name.count("/") + 1, CaptureError)
             seen.add(item)
@@ -204,10 +205,11 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
             if not hasattr(item, "shape"):
                 groups[name] = _attributes(path, item)
             if isinstance(item, h5py.Group):
-                visit(item, seen)
+                visit(item, f"{name}/")
 
     with h5py.File(path, "r") as file:
-        visit(file, {file["/"]})
+        seen.add(file["/"])
+        visit(file)
         groups[""] = _attributes(path, file)
     for index, array in enumerate(
         arrays
