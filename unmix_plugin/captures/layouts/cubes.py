@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from unmix_plugin.captures.names import natural_order, view_names
@@ -70,116 +70,99 @@ def find_cubes(root: Path, options: ReadOptions) -> Capture:
     cubes = _cubes_among(files)
     if any(not _is_reference(path, ()) for path in cubes):
         return _capture_of_groups(root, {root: cubes}, pictures, options)
-    if folders := _band_folders(root, excluded):
-        return _capture_of_plain(root, folders, pictures, options)
-    if deeper := _cubes_below(root, excluded):  # among them references that lie in the folder itself
+    folders = _band_folders(root, excluded)
+    if not folders and (deeper := _cubes_below(root, excluded)):  # references may lie in the folder itself
         return _capture_of_groups(root, deeper, {}, options)
-    if not plain:
+    shown = folders or [path for path in plain.values() if not _is_reference(path, ())]
+    if not shown:
         kinds = ", ".join(sorted(_CUBE_SUFFIXES | _PICTURE_SUFFIXES))
         raise CaptureError(
             f"{root} holds no cubes; expected one file a view ({kinds}), or one folder of band files a view"
         )
-    shown = [path for path in plain.values() if not _is_reference(path, ())]
-    return _capture_of_plain(root, shown, {}, options)
+    views = _open_views(_names(shown), shown, [{}] * len(shown), pictures if folders else {}, options)
+    return Capture("cubes", root, views)
 
 
-def _capture_of_plain(
-    root: Path, found: Sequence[Path], pictures: dict[str, Path], options: ReadOptions
-) -> Capture:
-    """Views that are pictures, or folders of bands."""
-    _refuse_same_names(found)
-    views = [
-        CaptureView(_name(path), _open(path, options), picture=pictures.get(_name(path)))
-        for path in sorted(found, key=lambda path: natural_order(_name(path)))
-    ]
-    return Capture("cubes", root, tuple(views))
-
-
-@dataclass
-class _Group:
-    """What belongs to one view; `result` is the reflectance that the camera wrote."""
-
-    cube: Path | None = None
-    result: Path | None = None
-    dark: Path | None = None
-    white: Path | None = None
-    white_dark: Path | None = None
+def _open_views(
+    names: Sequence[str],
+    paths: Sequence[Path],
+    references: Sequence[dict[str, Path]],
+    pictures: dict[str, Path],
+    options: ReadOptions,
+) -> tuple[CaptureView, ...]:
+    """Views in the order of their names, each with references of its own by their kind."""
+    views = []
+    for name, path, own in zip(names, paths, references, strict=True):
+        plain = replace(options, wavelengths_nm=None)
+        opened = {kind: open_spectral_file(reference, plain) for kind, reference in own.items()}
+        view = CaptureView(name, _open(path, options), picture=pictures.get(name))
+        views.append(replace(view, **opened))
+    return tuple(sorted(views, key=lambda view: natural_order(view.name)))
 
 
 def _capture_of_groups(
     root: Path, folders: dict[Path, list[Path]], pictures: dict[str, Path], options: ReadOptions
 ) -> Capture:
     """Views of one folder or of a tree, with the references that were taken for each."""
-    groups: dict[tuple[Path, str], _Group] = defaultdict(_Group)
+    groups: dict[tuple[Path, str], dict[str, Path]] = defaultdict(dict)
     left_out: list[Path] = []
     for folder, cubes in folders.items():
         left_out += _sort_into(groups, _place(folder, root), cubes, is_tree=folder != root)
-    complete = {key: group for key, group in groups.items() if group.cube or group.result}
-    take_results = all(group.result for group in complete.values()) and not all(
-        group.cube and group.white for group in complete.values()
-    )
-    paths = {key: (not take_results and group.cube) or group.result for key, group in complete.items()}
-    if not any(paths.values()):
+    complete = {key: group for key, group in groups.items() if "cube" in group or "result" in group}
+    if not complete:
         raise CaptureError(
             f"{root} holds references only ({name_some([path.name for path in left_out])}); expected one file a view"
         )
-    if len(folders) == 1 and root in folders:
-        _refuse_same_names([path for path in paths.values() if path is not None])
-        names = [_name(path) for path in paths.values() if path is not None]
+    take_results = all("result" in group for group in complete.values()) and not all(
+        "cube" in group and "white" in group for group in complete.values()
+    )
+    kinds = ["result" if take_results or "cube" not in group else "cube" for group in complete.values()]
+    paths = [group[kind] for group, kind in zip(complete.values(), kinds, strict=True)]
+    if list(folders) == [root]:
+        names = _names(paths)
     else:
-        names = view_names([str(place.relative_to(root) / f"{name}.x") for place, name in paths], str(root))
-    views: list[CaptureView] = []
-    references = dict.fromkeys(_OWN, 0)
-    for name, (key, path) in sorted(
-        zip(names, paths.items(), strict=True), key=lambda pair: natural_order(pair[0])
-    ):
-        assert path is not None
-        view = CaptureView(name, _open(path, options), picture=pictures.get(name))
-        for kind in references:
-            own = getattr(complete[key], kind)
-            if own is not None and path == complete[key].cube:
-                view = replace(view, **{kind: open_spectral_file(own, replace(options, wavelengths_nm=None))})
-                references[kind] += 1
-        views.append(view)
-    notes = _notes(references, len(views), left_out, take_results)
-    there = [path for folder in folders for path in _visible_files(folder)]
-    lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
-    warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
-    return Capture("cubes", root, tuple(views), notes=notes, warnings=warnings)
-
-
-def _notes(
-    references: dict[str, int], num_views: int, left_out: list[Path], take_results: bool
-) -> tuple[str, ...]:
+        names = view_names(
+            [str(place.relative_to(root) / f"{name}.x") for place, name in complete], str(root)
+        )
+    own = [
+        {reference: group[reference] for reference in _OWN if reference in group and kind == "cube"}
+        for group, kind in zip(complete.values(), kinds, strict=True)
+    ]
+    views = _open_views(names, paths, own, pictures, options)
+    counts = Counter(reference for references in own for reference in references)
     notes = [
-        f"{count} of {num_views} views have a {what}, which is used unless {flag} names another"
-        for count, (what, flag) in zip(references.values(), _OWN.values(), strict=True)
-        if count
+        f"{counts[kind]} of {len(views)} views have a {what}, which is used unless {flag} names another"
+        for kind, (what, flag) in _OWN.items()
+        if counts[kind]
     ]
     if take_results:
         notes.append("views are the reflectances that the camera wrote, as not all have a white reference")
     if left_out:
         named = name_some([path.name for path in left_out])
         notes.append(f"left out, as named like references: {named}; use one with --white or --dark")
-    return tuple(notes)
+    there = [path for folder in folders for path in _visible_files(folder)]
+    lost = [path.name for path in there if path.suffix.lower() in _NUMBERS and header_beside(path) is None]
+    warnings = (f"left out, as no header beside them says what they hold: {name_some(lost)}",) if lost else ()
+    return Capture("cubes", root, views, notes=tuple(notes), warnings=warnings)
 
 
 def _sort_into(
-    groups: dict[tuple[Path, str], _Group], place: Path, cubes: list[Path], is_tree: bool
+    groups: dict[tuple[Path, str], dict[str, Path]], place: Path, cubes: list[Path], is_tree: bool
 ) -> list[Path]:
-    """Cubes of one folder as views and their references; returns references of no view."""
+    """Cubes of one folder by view and by what they are of it: `cube`, `result` (the reflectance that the camera wrote),
+    or a kind of reference. Returns references of no view."""
     stems = [_stem(path) for path in cubes]
     references = [path for path in cubes if _is_reference(path, stems)]
-    others = [path for path in cubes if path not in references]
     own = []
-    for path in others:
+    for path in cubes:
+        if path in references:
+            continue
         match = _RESULT.fullmatch(_stem(path))
         is_result = match is not None and (path.parent.name.lower() == _RESULTS or match["of"] in stems)
         group = groups[place, match["of"] if is_result and match is not None else _stem(path)]
-        kind = "result" if is_result else "cube"
-        if (other := getattr(group, kind)) is not None:
+        other = group.setdefault("result" if is_result else "cube", path)
+        if other is not path:
             raise CaptureError(_same_name(other, path))
-        setattr(group, kind, path)
         own += [] if is_result else [_stem(path)]
     left_out = []
     for path in references:
@@ -192,7 +175,7 @@ def _sort_into(
         if not owners and is_tree and (len(own) == 1 or of is None):
             owners = own
         for stem in owners:
-            setattr(groups[place, stem], kind, path)
+            groups[place, stem][kind] = path
         left_out += [] if owners else [path]
     return left_out
 
@@ -233,12 +216,14 @@ def _cubes_below(root: Path, excluded: set[Path]) -> dict[Path, list[Path]]:
     return found
 
 
-def _refuse_same_names(found: Sequence[Path]) -> None:
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of views. Raises CaptureError: two have the same."""
     owners: dict[str, Path] = {}
-    for path in found:
+    for path in paths:
         other = owners.setdefault(_name(path).casefold(), path)
         if other is not path:
             raise CaptureError(_same_name(other, path))
+    return [_name(path) for path in paths]
 
 
 def _same_name(first: Path, second: Path) -> str:
