@@ -41,11 +41,10 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Float64
 
 from unmix_plugin.captures.names import FoundFiles, natural_order, path_text, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
-from unmix_plugin.captures.poses.reading import frames_of, read_poses
+from unmix_plugin.captures.poses.reading import frames_of, read_poses, read_transforms
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
@@ -100,8 +99,8 @@ class _Frame:
 class _FrameList:
     """All frames of a folder, and what is given for all of them."""
 
-    source: Path
-    """transforms.json, or the folder that holds one for each split."""
+    contents: dict[Path, Any]
+    """Of transforms.json, or of one for each split."""
     frames: tuple[_Frame, ...]
     top: dict[str, Any]
     notes: tuple[str, ...]
@@ -125,11 +124,12 @@ def _read_frames(root: Path, key: str) -> _FrameList:
             f"{root} holds no transforms.json and no transforms_train.json; give another folder with --data, or name "
             "another layout"
         )
+    contents = {path: load_json(path) for path in files}
     top: dict[str, Any] = {}
     frames: dict[str, _Frame] = {}
     repeated: dict[str, int] = defaultdict(int)
     for path, split in files.items():
-        own, listed = frames_of(path, load_json(path))
+        own, listed = frames_of(path, contents[path])
         top = {**own, **top}
         for index, values in enumerate(listed):
             frame = _Frame(f"{path.name}: frames[{index}]", values, split)
@@ -139,11 +139,10 @@ def _read_frames(root: Path, key: str) -> _FrameList:
         if not frame.text(key):
             raise CaptureError(f"{frame.where} has no '{key}', the path of its file: add it")
     notes = [f"{counted(n, 'frame')} of {name} listed before: left out" for name, n in repeated.items()]
-    source = whole if whole in files else root
-    return _FrameList(source, _split_by_lists(tuple(frames.values()), top, source), top, tuple(notes))
+    return _FrameList(contents, _split_by_lists(tuple(frames.values()), top, root), top, tuple(notes))
 
 
-def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], source: Path) -> tuple[_Frame, ...]:
+def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], root: Path) -> tuple[_Frame, ...]:
     """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation, otherwise
     what training leaves; without a list for training, it is what the others leave. Raises CaptureError: a list names
     what no frame does."""
@@ -154,7 +153,7 @@ def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], source: Pat
         listed = [path_text(str(value)) for value in (values if isinstance(values, list) else [values])]
         if unknown := [name for name in listed if name not in known]:
             raise CaptureError(
-                f"{source}: {len(unknown)} of {len(listed)} paths in '{key}' are those of no frame "
+                f"{root}: {len(unknown)} of {len(listed)} paths in '{key}' are those of no frame "
                 f"({name_some(unknown)}); expected them as frames have them, such as {frames[0].name}"
             )
         lists.append(set(listed))
@@ -190,7 +189,7 @@ def _make_capture(
     sizes = {name: (view.cube.shape[1], view.cube.shape[0]) for name, view in posed.items()}
     poses, said = None, [*listed.notes, *notes]
     try:
-        poses = read_poses(listed.source, sizes)
+        poses = read_transforms(listed.contents, sizes)
         cameras = {view.name: poses.cameras[name] for name, view in posed.items() if name in poses.cameras}
         poses = replace(poses, cameras=cameras)
     except CaptureError as error:
@@ -205,24 +204,21 @@ def find_nerfstudio(root: Path, options: ReadOptions) -> Capture:
     listed = _read_frames(root, "file_path")
     names = view_names([frame.name for frame in listed.frames], str(root))
     found, folder = FoundFiles(root), listed.top.get("datadir")
-    pictures: list[Path] = []
-    masks: list[Path | None] = []
-    for frame in listed.frames:
+    views = []
+    for frame, name in zip(listed.frames, names, strict=True):
         has_suffix = PurePosixPath(frame.name).suffix in _SUFFIXES
         others = [] if has_suffix else [f"{frame.name}{suffix}" for suffix in _SUFFIXES]
         others += [f"{folder}/{frame.name}"] if isinstance(folder, str) else []
-        path = found.find(frame.where, frame.name, *others)
-        pictures += [] if path is None else [path]
-        text = frame.text("mask_path")
-        masks.append(found.find(frame.where, text, least_parts=2) if text else None)
-    found.refuse_missing("copy them into the folder, or drop the frames")
-    views = []
-    for frame, name, path, mask in zip(listed.frames, names, pictures, masks, strict=True):
+        path, text = found.find(frame.where, frame.name, *others), frame.text("mask_path")
+        mask = found.find(frame.where, text, least_parts=2) if text else None
+        if path is None:
+            continue
         file = open_spectral_file(path, options)
         if file.bands.wavelengths_nm is None:
             file = replace(file, bands=replace(file.bands, evidence=_NO_WAVELENGTHS))
         picture = path if path.suffix in _SUFFIXES else None
         views.append(CaptureView(name, file, picture=picture, mask=mask, split=frame.split))
+    found.refuse_missing("copy them into the folder, or drop the frames")
     return _make_capture("nerfstudio", root, listed, views)
 
 
@@ -230,23 +226,19 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
     """The views of a scene whose frames name cubes."""
     listed = _read_frames(root, _CUBE_KEY)
     names = view_names([frame.text(_CUBE_KEY) for frame in listed.frames], str(root))
-    found, moved = FoundFiles(root), 0
-    cubes: list[Path] = []
-    for frame in listed.frames:
-        text = frame.text(_CUBE_KEY)
-        path = found.find(frame.where, text, _in_eval(text))
-        cubes += [] if path is None else [path]
-        moved += path is not None and "val" in PurePosixPath(text).parts and not (root / text).is_file()
-    found.refuse_missing(
-        "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"
-    )
     folders = [PurePosixPath(frame.name).parent.name for frame in listed.frames]
     by_folder: list[Split | None] = [_SPLIT_OF_FILE.get(folder) for folder in folders]
     if None in by_folder or len(set(by_folder)) != 2:
         by_folder = [None] * len(by_folder)
-    stated, warnings = _state_cubes(listed, options)
+    stated, warnings = _state_cubes(root, listed, options)
     views = []
-    for frame, name, cube, split, said in zip(listed.frames, names, cubes, by_folder, stated, strict=True):
+    found, moved = FoundFiles(root), 0
+    for frame, name, split, said in zip(listed.frames, names, by_folder, stated, strict=True):
+        text = frame.text(_CUBE_KEY)
+        cube = found.find(frame.where, text, _in_eval(text))
+        if cube is None:
+            continue
+        moved += "val" in PurePosixPath(text).parts and not (root / text).is_file()
         picture, mask, labels = (
             found.look(frame.where, frame.text(key), _in_eval(frame.text(key)), least_parts=least_parts)
             if frame.text(key)
@@ -256,6 +248,9 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         file, split, shot = _open_cube(cube, said, options), frame.split or split, frame.text("capture")
         view = CaptureView(name, file, said.sensor, picture, mask, labels, release=shot, split=split)
         views.append(view)
+    found.refuse_missing(
+        "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"
+    )
     notes = [f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed"] * (moved > 0)
     given = {*listed.top, *(key for frame in listed.frames for key in frame.values)}
     if left := [key for key in _TRUTH_KEYS if key in given]:
@@ -283,21 +278,19 @@ class _StatedCube:
     """What transforms.json says of a frame's cube; None where it says nothing."""
 
     sensor: str
-    wavelengths_nm: Float64[np.ndarray, " B"] | None
-    fwhm_nm: Float64[np.ndarray, " B"] | None
+    bands: BandTable | None
     value_scale: float | None
     """Stored number that stands for 1."""
     has_bands: bool
     """Whether the frame lists its bands, among those of the whole scene."""
 
 
-def _state_cubes(listed: _FrameList, options: ReadOptions) -> tuple[list[_StatedCube], list[str]]:
+def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[list[_StatedCube], list[str]]:
     """What is said of each frame's cube, and warnings.
 
     Raises CaptureError: a key of a scene folder is wrong, or can't be followed here.
     """
-    folder = listed.source if listed.source.is_dir() else listed.source.parent
-    values, faults, warnings = listed.top.get("wavelengths"), Faults(folder), []
+    values, faults, warnings = listed.top.get("wavelengths"), Faults(root), []
     numbers = [read_number(value) for value in values] if isinstance(values, list) else []
     is_known = bool(numbers) and None not in numbers and options.wavelengths_nm is None
     centres = np.array(numbers, dtype=np.float64) if is_known else None
@@ -320,9 +313,12 @@ def _state_cubes(listed: _FrameList, options: ReadOptions) -> tuple[list[_Stated
     stated = []
     for entry in entries:
         number = f"bands {unnamed.index(entry.bands) + 1}" if entry.name is None and len(unnamed) > 1 else ""
-        every = slice(None) if entry.bands is None else list(entry.bands)
-        own = [None if column is None or centres is None else column[every] for column in (centres, widths)]
-        stated.append(_StatedCube(entry.name or number, own[0], own[1], scale, entry.bands is not None))
+        own = slice(None) if entry.bands is None else list(entry.bands)
+        bands = None
+        if centres is not None:
+            own_widths = None if widths is None else widths[own]
+            bands = BandTable(centres[own], "'wavelengths' of transforms.json, nm", own_widths)
+        stated.append(_StatedCube(entry.name or number, bands, scale, entry.bands is not None))
     return stated, warnings
 
 
@@ -341,29 +337,29 @@ def _not_followed(frame: _Frame, bands: tuple[int, ...] | None, num_wavelengths:
 
 def _open_cube(path: Path, stated: _StatedCube, options: ReadOptions) -> SpectralFile:
     """A cube; numbers of 8 bits stand for fractions of 255, unless another number is said to stand for 1."""
-    file, wavelengths = open_spectral_file(path, options), stated.wavelengths_nm
-    if wavelengths is not None and len(wavelengths) == file.shape[2] and file.warnings:
+    file, bands = open_spectral_file(path, options), stated.bands
+    count = 0 if bands is None or bands.wavelengths_nm is None else len(bands.wavelengths_nm)
+    if count == file.shape[2] and file.warnings:
         # transforms.json settles which axis is that of bands, which the array alone leaves in doubt.
         sure = open_spectral_file(path, replace(options, axes="yxb"))
         file = sure if sure.shape == file.shape and options.axes is None else file
-    if stated.value_scale is not None and file.linear is not None:
+    scale, why = stated.value_scale, "'value_scale' of transforms.json"
+    if scale is not None and file.linear is not None:
         raise CaptureError(
             f"{path} has gains of its own ({file.linear.evidence}), transforms.json a 'value_scale'; take one of them "
             "out, as it is unclear which the numbers need"
         )
-    scale, why = stated.value_scale, "'value_scale' of transforms.json"
     if scale is None and file.dtype == np.uint8:
         scale, why = 255.0, "numbers of 8 bits"
     if scale is not None and file.linear is None:
         file = replace(file, linear=linear_values(path, file.shape[2], [1 / scale], [], why))
-    if file.bands.wavelengths_nm is not None or wavelengths is None:
+    if file.bands.wavelengths_nm is not None or bands is None:
         return file
-    if len(wavelengths) == file.shape[2]:
-        table = BandTable(wavelengths, "'wavelengths' of transforms.json, nm", stated.fwhm_nm)
-        return replace(file, bands=table)
+    if count == file.shape[2]:
+        return replace(file, bands=bands)
     if stated.has_bands:
         raise CaptureError(
-            f"{path} has {file.shape[2]} bands, 'bands' of its frame {len(wavelengths)} indices; expected one a band"
+            f"{path} has {file.shape[2]} bands, 'bands' of its frame {count} indices; expected one a band"
         )
     return file
 

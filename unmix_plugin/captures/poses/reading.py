@@ -17,8 +17,8 @@ from jaxtyping import Float64
 from unmix_plugin.captures.names import BY_ORDER, path_text
 from unmix_plugin.captures.poses import lens as models
 from unmix_plugin.captures.poses.colmap import find_models, is_model, read_colmap
-from unmix_plugin.captures.poses.lens import Lens, bent_lens, require_possible
-from unmix_plugin.captures.poses.opensfm import is_reconstruction, read_opensfm
+from unmix_plugin.captures.poses.lens import Lens, bent_lens
+from unmix_plugin.captures.poses.opensfm import read_opensfm
 from unmix_plugin.captures.poses.pose_set import (
     FLIP,
     PosedCamera,
@@ -63,12 +63,7 @@ def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> 
     """
     if not path.exists():
         raise CaptureError(f"{path} is not there; give a file or folder with poses: {_KNOWN}")
-    read = _read_folder if path.is_dir() else _read_file
-    poses = read(path, picture_sizes or {})
-    for lens in {camera.lens for camera in poses.cameras.values()}:
-        if lens is not None:
-            require_possible(lens, str(path))
-    return poses
+    return (_read_folder if path.is_dir() else _read_file)(path, picture_sizes or {})
 
 
 def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
@@ -87,14 +82,7 @@ def _read_file(path: Path, given: Mapping[str, _Size]) -> PoseSet:
 
 def _read_json(path: Path, given: Mapping[str, _Size]) -> PoseSet:
     content = load_json(path)
-    if _has_frames(content):
-        return _read_transforms({path: content}, given)
-    if is_reconstruction(content):
-        return read_opensfm(path, content)
-    raise CaptureError(
-        f"{path} holds {describe(content)} without poses; expected 'frames' with 'transform_matrix' "
-        "(transforms.json) or 'shots' (OpenSfM)"
-    )
+    return read_transforms({path: content}, given) if _has_frames(content) else read_opensfm(path, content)
 
 
 def _read_xml(path: Path) -> PoseSet:
@@ -116,7 +104,7 @@ def _read_folder(folder: Path, given: Mapping[str, _Size]) -> PoseSet:
     splits = [folder / name for name in _SPLIT_FILES if (folder / name).is_file()]
     if splits:
         names = ", ".join(path.name for path in splits)
-        found.append((names, lambda: _read_transforms({path: load_json(path) for path in splits}, given)))
+        found.append((names, lambda: read_transforms({path: load_json(path) for path in splits}, given)))
     if models := find_models(folder):
         found.append(("a COLMAP model", lambda: _greatest_model(models)))
     plain = [name for name in ("reconstruction.json", _LLFF_FILE) if (folder / name).is_file()]
@@ -159,14 +147,17 @@ def _read_llff(path: Path) -> PoseSet:
     Cameras have the names of the pictures beside it, where there are as many.
     """
     try:
-        with reading(path), np.errstate(invalid="ignore"):  # NaN is refused with all that is no pose
-            shape = read_array_header(path).shape
-            is_table = len(shape) == 2 and shape[0] > 0 and shape[1] in (15, 17)
-            table = np.array(map_array(path), dtype=np.float64) if is_table else None
+        with reading(path):
+            read_array_header(path)
+            mapped = map_array(path)
     except UnreadableArrayError as error:
         raise CaptureError(f"{path} {error}") from error
-    if table is None:
-        raise CaptureError(f"{path} has the shape {shape}; expected (views, 17) numbers, as LLFF writes them")
+    if mapped.ndim != 2 or not len(mapped) or mapped.shape[1] not in (15, 17):
+        raise CaptureError(
+            f"{path} has the shape {mapped.shape}; expected (views, 17) numbers, as LLFF writes them"
+        )
+    with np.errstate(invalid="ignore"):  # NaN is refused with all that is no pose
+        table = np.array(mapped, dtype=np.float64)
     names = [f"{BY_ORDER}{index:04d}" for index in range(len(table))]
     note = "poses have no names: they go by the order of views"
     for place in [path.parent / name for name in reversed(_LLFF_PICTURES) if (path.parent / name).is_dir()]:
@@ -197,8 +188,8 @@ _BENT_MODELS: dict[str, models.Bend] = {
     "OPENCV_FISHEYE": models.bend_fisheye,
     "FISHEYE624": models.bend_fisheye_624,
     "EQUIRECTANGULAR": models.bend_equirectangular,
+    "ftheta": models.bend_ftheta,
 }
-_NUM_TERMS_624 = 12
 
 
 def _has_frames(content: Any) -> bool:
@@ -223,8 +214,9 @@ def frames_of(path: Path, content: Any) -> tuple[dict[str, Any], list[dict[str, 
     return top, frames
 
 
-def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
-    """Poses of one transforms.json, or of one for each split."""
+def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -> PoseSet:
+    """Poses of what one transforms.json holds, or one for each split. Raises CaptureError: they are none, or can't be
+    represented."""
     cameras: list[tuple[str, PosedCamera]] = []
     notes: list[str] = []
     points: SparsePoints | None = None
@@ -234,27 +226,27 @@ def _read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) -
     for path, content in contents.items():
         top, frames = frames_of(path, content)
         warned, said = keys_to_say(top, frames)
-        warnings += [f"{path.name}: {text}" for text in warned]
-        notes += [f"{path.name}: {text}" for text in said]
         faults = Faults(path.parent if path.name == FILE_NAME else path)
         placement = read_placement(top, faults, path.name)
         metres.add(read_metres_per_unit(top, faults, path.name))
-        found = _read_frames(path, top, frames, sizes, faults, notes, warnings)
+        found = _read_frames(path, top, frames, sizes, faults, warned, said)
         try:
             faults.raise_if_any()
         except SceneError as error:
             raise CaptureError(str(error)) from error
         if not placement.is_identity:
-            notes.append(f"{path.name}: applied_transform and applied_scale are undone")
+            said.append("applied_transform and applied_scale are undone")
         for (name, *others), matrix, lens in found:
             position = placement.to_source(matrix[:, 3])
             matrix = np.column_stack([placement.rotation.T @ matrix[:, :3], position])
             cameras.append((name, PosedCamera(matrix, lens, tuple(others))))
-        points = points or _read_points(path, top, placement, notes)
+        points = points or _read_points(path, top, placement, said)
         up = placement.rotation.T @ np.array([0.0, 0.0, 1.0])
+        warnings += [f"{path.name}: {text}" for text in dict.fromkeys(warned)]
+        notes += [f"{path.name}: {text}" for text in dict.fromkeys(said)]
     where = ", ".join(str(path) for path in contents)
     source = " and ".join(path.name for path in contents)
-    made = make_pose_set(cameras, source, where, points, up, dict.fromkeys(notes), dict.fromkeys(warnings))
+    made = make_pose_set(cameras, source, where, points, up, notes, warnings)
     return replace(made, metres_per_unit=metres.pop() if len(metres) == 1 else None)
 
 
@@ -264,11 +256,11 @@ def _read_frames(
     frames: list[dict[str, Any]],
     sizes: Mapping[str, _Size],
     faults: Faults,
-    notes: list[str],
     warnings: list[str],
+    notes: list[str],
 ) -> list[tuple[list[str], Float64[np.ndarray, "3 4"], Lens | None]]:
     """Names, matrix and lens of each frame, in the file's own world."""
-    lenses: dict[str, tuple[Lens | None, str | None]] = {}
+    lenses: dict[str, Lens | None] = {}
     read, missing = [], []
     for index, frame in enumerate(frames):
         where = f"{path}: frames[{index}]"
@@ -279,11 +271,15 @@ def _read_frames(
         missing += [] if picture else [names[0]]
         matrix = _read_matrix(frame.get("transform_matrix"), where)
         if frame.get("from_na", top.get("from_na")):
-            notes.append(f"{path.name}: 'from_na' is set: cameras have OpenCV's axes, as NeuS2 writes them")
+            notes.append("'from_na' is set: cameras have OpenCV's axes, as NeuS2 writes them")
             matrix[:, :3] = matrix[:, :3] @ FLIP
-        model, terms, read_from = _other_model(top, frame, where)
-        given = read_lens(*read_from, f"frames[{index}]", faults)
-        lens = None
+        model, terms = _terms_of_other_models(top | frame, where)
+        common, own = top, frame
+        if terms:  # whose list is not that of the keys k1 to p2
+            common, own = (
+                {key: one[key] for key in one if key != "distortion_params"} for one in (top, frame)
+            )
+        given, lens = read_lens(common, own, f"frames[{index}]", faults), None
         if given is not None:
             if given.width is not None and given.height is not None:
                 size = (given.width, given.height)
@@ -291,23 +287,19 @@ def _read_frames(
                 size = _size_in(picture) or _size_of_view(given, names[0], sizes, where)
                 if size is not None and picture is None and given.focal_px != (None, None):
                     warnings.append(
-                        f"{path.name}: 'w' and 'h' are absent, and so are pictures that it names: focal lengths are "
-                        "taken in pixels of the views; add 'w' and 'h' if they are those of other pictures"
+                        "'w' and 'h' are absent, and so are pictures that it names: focal lengths are taken in pixels "
+                        "of the views; add 'w' and 'h' if they are those of other pictures"
                     )
             key = repr((given, size, terms))  # many frames share a lens, which takes long to fit
             if key not in lenses:
-                model = model or given.model
-                lenses[key] = (None, None) if size is None else _make_lens(given, model, terms, size, where)
-                notes += [note for note in lenses[key][1:] if note is not None]
-            lens = lenses[key][0]
+                lenses[key] = None if size is None else _make_lens(given, model, terms, size, where)
+            lens = lenses[key]
         read.append((names, matrix, lens))
     if missing:
-        notes.append(
-            f"{path.name}: {len(missing)} of {len(read)} frames name files that are not there ({name_some(missing)}); "
-            "their poses are kept"
-        )
+        named = f"{len(missing)} of {len(read)} frames name files that are not there ({name_some(missing)})"
+        notes.append(f"{named}; their poses are kept")
     if any(lens is None for _, _, lens in read):
-        notes.append(f"{path.name}: frames without a focal length or picture size have no lens")
+        notes.append("frames without a focal length or picture size have no lens")
     return read
 
 
@@ -343,58 +335,45 @@ def _size_of_view(lens: Intrinsics, name: str, given: Mapping[str, _Size], where
     return size
 
 
-def _other_model(
-    top: dict[str, Any], frame: dict[str, Any], where: str
-) -> tuple[str | None, tuple[float, ...], tuple[dict[str, Any], dict[str, Any]]]:
-    """Name and terms of a lens model that keys of its own describe, and the objects to read the rest of the lens from.
-
-    instant-ngp's `ftheta_p0` to `ftheta_p4`, nerfstudio's FISHEYE624 with twelve `distortion_params`.
-    """
-    values = {**top, **frame}
+def _terms_of_other_models(values: dict[str, Any], where: str) -> tuple[str | None, tuple[float, ...]]:
+    """Name and terms of a lens model that keys of its own describe: instant-ngp's ftheta, nerfstudio's FISHEYE624."""
     if values.get("ftheta_p0") is not None:
-        listed = [values.get(f"ftheta_p{power}", 0.0) for power in range(6)]
-        terms = _terms(listed, "'ftheta_p0' to 'ftheta_p5'", where)
-        if not terms[1] > 0:
-            raise CaptureError(f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian above 0")
-        return "ftheta", terms, (top, frame)
-    if str(values.get("camera_model")).upper() != "FISHEYE624":
-        return None, (), (top, frame)
-    listed = values.get("distortion_params")
-    terms = _terms(listed if isinstance(listed, list) else [], "'distortion_params' of FISHEYE624", where)
-    if len(terms) != _NUM_TERMS_624:
-        raise CaptureError(
-            f"{where}: 'distortion_params' has {len(terms)} numbers; FISHEYE624 has {_NUM_TERMS_624}"
-        )
-    top, frame = ({key: own[key] for key in own if key != "distortion_params"} for own in (top, frame))
-    return "FISHEYE624", terms, (top, frame)
-
-
-def _terms(listed: list[Any], what: str, where: str) -> tuple[float, ...]:
-    numbers = [read_number(value) for value in listed]
-    if None in numbers:
-        raise CaptureError(f"{where}: {what} are {describe(listed)}; expected numbers")
-    return tuple(number for number in numbers if number is not None)
+        model, what, count = "ftheta", "'ftheta_p0' to 'ftheta_p5'", 6
+        listed = [values.get(f"ftheta_p{power}", 0.0) for power in range(count)]
+    elif str(values.get("camera_model")).upper() == "FISHEYE624":
+        model, what, count = "FISHEYE624", "'distortion_params' of FISHEYE624", 12
+        listed = values.get("distortion_params")
+    else:
+        return None, ()
+    numbers = [read_number(value) for value in listed] if isinstance(listed, list) else []
+    terms = tuple(number for number in numbers if number is not None)
+    if len(numbers) != count or len(terms) != count:
+        raise CaptureError(f"{where}: {what} are {describe(listed)}; expected {count} numbers")
+    if model == "ftheta" and not terms[1] > 0:
+        raise CaptureError(f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian above 0")
+    return model, terms
 
 
 def _make_lens(
-    given: Intrinsics, model: Any, terms: tuple[float, ...], size: _Size, where: str
-) -> tuple[Lens | None, str | None]:
-    """The lens, None without a focal length, and a note if it is not exactly the one of the file."""
+    given: Intrinsics, other_model: str | None, terms: tuple[float, ...], size: _Size, where: str
+) -> Lens | None:
+    """The lens, or the one that stands for it; None without a focal length."""
     width, height = size
     x, y = given.center_px
     center, focal = (width / 2 if x is None else x, height / 2 if y is None else y), given.focal_at(*size)
+    model = other_model or given.model
     bend: models.Bend | None = _BENT_MODELS.get(model) if isinstance(model, str) else None
     if model == "ftheta":
-        bend, focal, terms = models.bend_ftheta, (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
+        focal, terms = (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
     elif bend is models.bend_equirectangular:
         focal = (width / (2 * math.pi), height / math.pi)
     elif bend is models.bend_fisheye:
         bend = partial(models.bend_fisheye, tangential=given.distortion[2:])
         terms = (*given.distortion[:2], *given.higher_radial)
     if focal is None:
-        return None, None
+        return None
     if model in _PLAIN_MODELS:
-        return Lens(*size, focal, center, given.distortion, given.higher_radial), None
+        return Lens(*size, focal, center, given.distortion, given.higher_radial)
     if bend is None:
         raise CaptureError(
             f"{where}: camera_model {describe(model)} is not known; expected one of "
@@ -430,6 +409,6 @@ def _read_points(
     try:
         positions, colours = read_ply_points(find_named(path.parent, name) or path.parent / name)
     except (OSError, ValueError) as error:
-        notes.append(f"{path.name}: the sparse points of {name} can't be read ({error}); left out")
+        notes.append(f"the sparse points of {name} can't be read ({error}); left out")
         return None
     return placement.to_source(positions), colours
