@@ -13,7 +13,7 @@ from tests.captures.poses.alignment import SIMILARITY, elsewhere, in_a_row
 from tests.captures.poses.pose_factory import ring_set, transforms, write_json
 from tests.scenes.geometry.ground_views import flight_poses
 from tests.scenes.scene_factory import make_scene, ring_poses
-from unmix_plugin.captures.poses.lens import Lens, _FileLens
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.posing import _complete_rigs, _place_poses, pose_views
@@ -201,7 +201,7 @@ def test_views_without_any_help_are_left_out_and_said_and_those_of_no_release_le
 
 
 def test_a_lens_that_pixels_would_be_brought_into_is_refused_once_they_are_written():
-    bent = replace(SMALL_LENS, resampled_from=_FileLens("fisheye", SMALL_LENS.pixels_of, ""))
+    bent = replace(SMALL_LENS, resampled_from=SMALL_LENS.pixels_of)
     _refuse_late({})
     with pytest.raises(CaptureError, match="the lens of a is not found in the pictures"):
         _refuse_late({"a": bent})

@@ -85,8 +85,8 @@ def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
     for sensor, lens in lenses.items():
         if lens.resampled_from is not None:
             raise CaptureError(
-                f"lens {sensor} is of the model {lens.resampled_from.model}, through which markers are not followed; "
-                "expected a lens of k1, k2, p1, p2: undistort the images first, or give poses with --poses FILE"
+                f"lens {sensor}: markers are not followed through it ({lens.said}); expected a lens of k1, k2, p1, p2: "
+                "undistort the images first, or give poses with --poses FILE"
             )
     found = poses_from_markers(
         sightings,

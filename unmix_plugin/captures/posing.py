@@ -18,6 +18,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -61,8 +62,6 @@ _Seen: TypeAlias = dict[str, tuple[float, float]]
 KnownDistance: TypeAlias = tuple[_Seen, _Seen, float]
 """Two points, each in two views, and the metres between them."""
 _Pose: TypeAlias = Float64[np.ndarray, "4 4"]
-_Offsets: TypeAlias = dict[tuple[str, str], _Pose]
-"""From the camera space of the second lens to that of the first, by the names of both, OpenGL axes."""
 
 
 @dataclass(frozen=True)
@@ -119,26 +118,20 @@ def pose_views(
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
     own = {view.sensor: view.lens for view in posed if cameras[view.name].lens in (None, view.lens)}
-    resampled = [
-        f"lens {sensor}: {lens.resampled_from.said}"
-        for sensor, lens in own.items()
-        if lens and lens.resampled_from
-    ]
+    of_views = [f"lens {sensor}: {lens.said}" for sensor, lens in own.items() if lens and lens.said]
     placed, way, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
-    keys = way.to_json() if poses.has_world else {}
-    if poses.has_world and poses.metres_per_unit is not None:
-        keys[METRES_KEY] = poses.metres_per_unit
+    metres, keys = poses.metres_per_unit, way.to_json() if poses.has_world else {}
     if known is not None:
-        if poses.metres_per_unit is not None:
+        if metres is not None:
             raise ConfigError(f"--known-distance: {poses.source} gives metres already; leave it out")
-        metres, said = _metres_per_unit(known, fitted if poses.has_world else placed.cameras)
-        if poses.has_world:
-            keys[METRES_KEY] = metres
-        else:  # exports return to the scene's upright world, in metres
-            keys = Placement(scale=1.0 / metres).to_json() | {METRES_KEY: 1.0}
-        how = (*how, said)
+        metres, scaled_by = _metres_per_unit(known, fitted if poses.has_world else placed.cameras)
+        how = (*how, scaled_by)
+        if not poses.has_world:  # exports return to the scene's upright world, in metres
+            keys, metres = Placement(scale=1.0 / metres).to_json(), 1.0
+    if metres is not None and keys:
+        keys[METRES_KEY] = metres
     cut, scaled = _other_sizes(posed, cameras)
-    notes = (*poses.notes, *matched, *completed, *resampled, *scaled, *how)
+    notes = (*poses.notes, *matched, *completed, *of_views, *scaled, *how)
     findings = [*doubts, *cut]
     missing = [view.name for view in views if view not in posed]
     if len(missing) > _MOST_UNPOSED * len(views):  # so many that the source itself is suspect
@@ -161,15 +154,13 @@ def _other_sizes(
         lens, (height, width, _) = cameras[view.name].lens or view.lens, view.cube.shape
         if lens is None or lens.width == width:
             continue
-        ratio = max(width / lens.width, lens.width / width)
+        given, ratio = f"{lens.width} x {lens.height} pixels", max(width / lens.width, lens.width / width)
         if abs(ratio - round(ratio)) <= _MOST_STRETCH * ratio:
-            notes.append(
-                f"lenses given for {lens.width} x {lens.height} pixels were scaled to {width} x {height}"
-            )
+            notes.append(f"lenses given for {given} were scaled to {width} x {height}")
         elif not findings:
             findings.append(
-                f"the lens of view {view.name} is given for {lens.width} x {lens.height} pixels, its file has {width} "
-                f"x {height}: taken as scaled. If it was cut instead, give the lens of the cut picture"
+                f"the lens of view {view.name} is given for {given}, its file has {width} x {height}: taken as "
+                "scaled. If it was cut instead, give the lens of the cut picture"
             )
     return findings, list(dict.fromkeys(notes))
 
@@ -204,22 +195,24 @@ def _complete_rigs(
     for view in views:
         if view.release:
             releases[view.release].append(view)
-    offsets = _measured_offsets(releases, cameras)
-    found = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
+    measured = _measured_offsets(releases, cameras)
+    lenses = {view.sensor: cameras[view.name].lens for view in views if view.name in cameras}
     completed, how = dict(cameras), Counter[tuple[str, str]]()
     for members in releases.values():
         posed = [view for view in members if view.name in cameras]
         for view in members:
             if view.name in cameras:
                 continue
-            base, offset = _offset_to(view, posed, offsets)
-            if base is None or offset is None:
-                kind = "unknown" if posed else "unposed"
-            else:
+            pairs = [(base, (base.sensor, view.sensor)) for base in posed]
+            by_poses = [(base, measured[pair]) for base, pair in pairs if pair in measured]
+            stated = [(base, _stated_offset(base, view)) for base in posed]
+            by_files = [(base, offset) for base, offset in stated if offset is not None]
+            if by_poses or by_files:
+                base, offset = (by_poses or by_files)[0]
                 pose = _square(cameras[base.name].camera_to_world) @ offset
-                completed[view.name] = PosedCamera(pose[:3], found.get(view.sensor) or view.lens)
-                kind = "poses" if (base.sensor, view.sensor) in offsets else "files"
-            how[view.sensor, kind] += 1
+                completed[view.name] = PosedCamera(pose[:3], lenses.get(view.sensor) or view.lens)
+            kind = "unknown" if posed else "unposed"
+            how[view.sensor, "poses" if by_poses else "files" if by_files else kind] += 1
     said = {
         "unposed": "left out: no lens of their release has a pose",
         "unknown": "left out: there is no pose, and nothing says where the lens is on the rig",
@@ -232,51 +225,36 @@ def _complete_rigs(
 
 def _measured_offsets(
     releases: Mapping[str, Sequence[CaptureView]], cameras: Mapping[str, PosedCamera]
-) -> _Offsets:
-    """Offsets between lenses with poses in one release: mean rotation, median place."""
+) -> dict[tuple[str, str], _Pose]:
+    """From the camera space of a second lens to that of a first, by the names of both, where both have poses in one
+    release: mean rotation, median place."""
+    from scipy.spatial.transform import Rotation
+
     found: dict[tuple[str, str], list[_Pose]] = defaultdict(list)
     for members in releases.values():
         posed = [view for view in members if view.name in cameras]
         poses = {view.sensor: _square(cameras[view.name].camera_to_world) for view in posed}
-        for first, base in poses.items():
-            for second, other in poses.items():
-                if first != second:
-                    found[first, second].append(np.linalg.inv(base) @ other)
+        for first, second in permutations(poses, 2):
+            found[first, second].append(np.linalg.inv(poses[first]) @ poses[second])
     offsets = {}
     for pair, those in found.items():
-        stacked, mean = np.stack(those), np.eye(4)
-        left, _, right = np.linalg.svd(stacked[:, :3, :3].mean(axis=0))
-        mean[:3, :3] = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-        mean[:3, 3] = np.median(stacked[:, :3, 3], axis=0)
-        offsets[pair] = mean
+        stacked, offsets[pair] = np.stack(those), np.eye(4)
+        offsets[pair][:3, :3] = Rotation.from_matrix(stacked[:, :3, :3]).mean().as_matrix()
+        offsets[pair][:3, 3] = np.median(stacked[:, :3, 3], axis=0)
     return offsets
 
 
-def _offset_to(
-    view: CaptureView, posed: Sequence[CaptureView], offsets: _Offsets
-) -> tuple[CaptureView | None, _Pose | None]:
-    """A posed view of the release and the offset from it, measured ones first."""
-    for base in posed:
-        if (base.sensor, view.sensor) in offsets:
-            return base, offsets[base.sensor, view.sensor]
-    rotation = _rig_rotation(view)
-    for base in posed:
-        other = _rig_rotation(base)
-        if rotation is not None and other is not None:
-            offset = np.eye(4)
-            offset[:3, :3] = FLIP @ other.T @ rotation @ FLIP
-            return base, offset
-    return None, None
-
-
-def _rig_rotation(view: CaptureView) -> Float64[np.ndarray, "3 3"] | None:
-    """From the axes of the lens to those of the reference lens, as the file says; None where it doesn't."""
+def _stated_offset(base: CaptureView, view: CaptureView) -> _Pose | None:
+    """The same by the rotations of both lenses to the reference lens that their files say; None where one doesn't."""
     from scipy.spatial.transform import Rotation
 
-    angles = tag_numbers(view.cube.metadata.get("xmp") or {}, "RigRelatives")
-    if angles is None or len(angles) != 3 or not np.isfinite(angles).all():
+    angles = [tag_numbers(one.cube.metadata.get("xmp") or {}, "RigRelatives") for one in (base, view)]
+    if any(three is None or len(three) != 3 or not np.isfinite(three).all() for three in angles):
         return None
-    return Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()
+    first, second = (Rotation.from_euler("XYZ", three, degrees=True).as_matrix() for three in angles)
+    offset = np.eye(4)
+    offset[:3, :3] = FLIP @ first.T @ second @ FLIP
+    return offset
 
 
 def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:

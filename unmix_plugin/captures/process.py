@@ -121,7 +121,7 @@ def _resampled_lenses(plan: Plan, posed: PosedViews) -> dict[str, tuple[Lens, li
         if lens is not None and lens.resampled_from is not None:
             lens = plan.recipes[view.sensor].calibration.raster.lens(lens)
             assert lens.resampled_from is not None
-            seen = lens.resampled_from.project(probe).ravel().tolist()
+            seen = lens.resampled_from(probe).ravel().tolist()
             numbers = [*lens.focal_px, *lens.center_px, *lens.distortion, *lens.higher_radial, *seen]
             found[view.name] = lens, numbers
     return found

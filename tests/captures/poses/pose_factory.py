@@ -62,7 +62,7 @@ def lens_of(found: PoseSet) -> Any:
 def pixels_in_file(found: PoseSet, ideal: np.ndarray) -> np.ndarray:
     """Where the lens of the first camera's file shows ideal points, whether or not pixels are brought into another."""
     lens = lens_of(found)
-    return lens.resampled_from.project(ideal) if lens.resampled_from else lens.pixels_of(ideal)
+    return lens.resampled_from(ideal) if lens.resampled_from else lens.pixels_of(ideal)
 
 
 def llff_table(poses, hwf=(480.0, 640.0, 500.0)):

@@ -163,7 +163,7 @@ def test_pixels_are_interpolated_where_skew_is_large(tmp_path):
     sheared = read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
     assert any("pixels are interpolated" in note for note in sheared.notes)
     x, y = 0.3, 0.2
-    seen = lens_of(sheared).resampled_from.project(np.array([[x, y]]))
+    seen = lens_of(sheared).resampled_from(np.array([[x, y]]))
     plain = lens_of(read_metashape(tmp_path, ring())).pixels_of(np.array([[x, y]]))
     np.testing.assert_allclose(seen - plain, [[80 * y, 0.0]], atol=0.5)
 

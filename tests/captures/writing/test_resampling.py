@@ -41,7 +41,7 @@ REACH = dict.fromkeys(LENSES, (1.0, 0.8)) | {"fisheye of 120 degrees": (2.4, 1.5
 """Ideal coordinates over which points are drawn, over those of a lens of 90 degrees."""
 
 
-def fitted(name: str) -> tuple[Lens, str]:
+def fitted(name: str) -> Lens:
     project, focal, center = LENSES[name]
     return fit_lens(project, Lens(WIDTH, HEIGHT, (focal, focal), center), name, "a file")
 
@@ -59,10 +59,10 @@ def whole(values: np.ndarray, missing: np.ndarray | None = None, saturated: np.n
 
 @pytest.mark.parametrize("name", LENSES)
 def test_points_are_seen_where_the_scenes_lens_says(name: str):
-    lens, note = fitted(name)
-    assert lens.resampled_from is not None, note
-    assert "interpolated" in note
-    assert "170" not in name or "% of the picture lies outside and is left out" in note
+    lens = fitted(name)
+    assert lens.resampled_from is not None, lens.said
+    assert "interpolated" in lens.said
+    assert "170" not in name or "% of the picture lies outside and is left out" in lens.said
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     places = np.stack([columns, rows], axis=-1).astype(np.float32)  # each pixel tells where it is in the file
     resampling = Resampling.into(lens)
@@ -92,7 +92,7 @@ def looked_up(picture: np.ndarray, missing: np.ndarray, pixels: np.ndarray) -> t
 
 
 def test_missing_pixels_and_those_outside_take_no_part():
-    lens, _ = fitted("radial about a centre of its own")
+    lens = fitted("radial about a centre of its own")
     values = np.full((HEIGHT, WIDTH, 2), 0.5, np.float32)
     missing = np.zeros((HEIGHT, WIDTH), bool)
     missing[40:44, 50:60] = True
@@ -105,7 +105,7 @@ def test_missing_pixels_and_those_outside_take_no_part():
 
 
 def test_saturation_stays_with_its_pixels_and_labels_keep_their_numbers():
-    lens, _ = fitted("fisheye of 120 degrees")
+    lens = fitted("fisheye of 120 degrees")
     saturated = np.zeros((HEIGHT, WIDTH, 1), bool)
     saturated[30:50, 40:60] = True
     resampling = Resampling.into(lens)
@@ -151,11 +151,11 @@ def test_a_scene_of_an_ftheta_lens_shows_its_views_in_a_lens_that_trains(tmp_pat
 
 
 def test_views_of_one_lens_share_their_resampling_and_a_lens_that_ours_stands_for_needs_none():
-    lens, _ = fitted("fisheye of 120 degrees")
+    lens = fitted("fisheye of 120 degrees")
     first, second = (lens.seen_as(64, 48, (0.0, 0.0), (0.5, 0.5)) for _ in range(2))
     assert Resampling.into(first) is Resampling.into(second)
     assert Resampling.into(first) is not Resampling.into(lens.seen_as(64, 48, (4.0, 0.0), (0.5, 0.5)))
     project, focal = fisheye(60.0)
-    lens, note = fit_lens(project, Lens(WIDTH, HEIGHT, (focal, focal), (64.0, 48.0)), "fisheye", "a file")
+    lens = fit_lens(project, Lens(WIDTH, HEIGHT, (focal, focal), (64.0, 48.0)), "fisheye", "a file")
     assert lens.resampled_from is None
-    assert "off by at most" in note
+    assert "off by at most" in lens.said

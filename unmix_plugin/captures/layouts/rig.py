@@ -57,37 +57,55 @@ def find_rig(root: Path, options: ReadOptions) -> Capture:
     excluded = {path.resolve() for path in options.exclude}
     paths = [path for path in sorted(root.rglob("*")) if path.is_file() and path.resolve() not in excluded]
     paths = [path for path in paths if not any(part.startswith(".") for part in path.relative_to(root).parts)]
-    opened = [_open_band_file(path, root) for path in paths if path.suffix.lower() in _TIFF_SUFFIXES]
-    bands = [item for item in opened if item.file.shape[2] == 1 and not _is_thermal(item.file)]
-    if options.wavelengths_nm is None:
-        bands = [item for item in bands if not item.file.bands.is_broad.any()]
+    kinds: dict[str, list[_BandFile]] = defaultdict(list)
+    for path in paths:
+        if path.suffix.lower() in _TIFF_SUFFIXES:
+            item = _open_band_file(path, root)
+            kinds[_kind_of(item.file, options)].append(item)
+    bands = kinds["band"]
     if not bands:
         raise CaptureError(
             f"{root} holds no TIFF files of single bands, such as IMG_0000_1.tif, IMG_..._GRE.TIF or DJI_..._MS_G.TIF: "
             "give the folder of the flight, or use the layout 'cubes'"
         )
-    sensors = _sensor_names(bands)
-    releases = _release_names(bands, str(root))
+    sensors, releases = _sensor_names(bands), _release_names(bands, str(root))
     splits = _splits_of(releases)
     names = view_names([str(item.file.path.relative_to(root)) for item in bands], str(root))
-    notes = _notes(opened, bands, paths, releases)
+    notes = []
+    if kinds["thermal"]:
+        notes.append(f"{counted(len(kinds['thermal']), 'thermal image')} left out")
+    if kinds["broad"]:
+        broad = sorted({tag_text(item.tags, "BandName") or item.ending for item in kinds["broad"]})
+        images = f"{counted(len(kinds['broad']), 'image')} of bands too broad for one wavelength left out"
+        notes.append(f"{images}: {', '.join(broad)}")
+    if colour := len(kinds["colour"]) + sum(path.suffix.lower() in _COLOUR_SUFFIXES for path in paths):
+        pictures = f"{counted(colour, 'colour picture')} left out"
+        notes.append(f"{pictures}: nothing says what their channels measure")
+    counts = Counter(releases)
+    if incomplete := [release for release, count in counts.items() if count < max(counts.values())]:
+        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
     views: list[CaptureView] = []
-    lens_notes: Counter[tuple[str, str]] = Counter()
+    missing: Counter[tuple[str, str]] = Counter()
     for item, name, sensor, release in zip(bands, names, sensors, releases, strict=True):
-        lens, said = lens_of(item.file)
-        lens_notes.update((sensor, note) for note in said)
+        lens, why_not = lens_of(item.file)
+        missing.update([(sensor, why_not)] if lens is None else [])
         views.append(CaptureView(name, item.file, sensor, lens=lens, release=release, split=splits[release]))
     _check_lenses(views)
-    notes += [f"lens {sensor}: {note} ({counted(n, 'file')})" for (sensor, note), n in lens_notes.items()]
+    notes += [f"lens {sensor}: {why} ({counted(n, 'file')})" for (sensor, why), n in missing.items()]
     views = _with_given_bands(views, options)
     ordered = sorted(views, key=lambda view: natural_order(view.name))
     return Capture("rig", root, tuple(ordered), notes=tuple(notes))
 
 
-def _is_thermal(file: SpectralFile) -> bool:
+def _kind_of(file: SpectralFile, options: ReadOptions) -> str:
+    """`band`, or why a file is no view: `colour`, `thermal`, or `broad` where no user gives wavelengths."""
     wavelengths = file.bands.wavelengths_nm
     name = tag_text(file.metadata.get("xmp") or {}, "BandName") or ""
-    return name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > _THERMAL_NM)
+    if file.shape[2] > 1:
+        return "colour"
+    if name.upper() == "LWIR" or (wavelengths is not None and float(wavelengths.min()) > _THERMAL_NM):
+        return "thermal"
+    return "broad" if options.wavelengths_nm is None and file.bands.is_broad.any() else "band"
 
 
 def _check_lenses(views: Sequence[CaptureView]) -> None:
@@ -122,31 +140,6 @@ def _with_given_bands(views: list[CaptureView], options: ReadOptions) -> list[Ca
     evidence = "given with --wavelengths"
     tables = {sensor: BandTable(np.array([nm]), evidence) for sensor, nm in zip(sensors, given, strict=True)}
     return [replace(view, cube=replace(view.cube, bands=tables[view.sensor])) for view in views]
-
-
-def _notes(
-    opened: Sequence[_BandFile], bands: Sequence[_BandFile], paths: Iterable[Path], releases: Sequence[str]
-) -> list[str]:
-    """What was left out, and what is incomplete."""
-    notes = []
-    thermal = sum(item.file.shape[2] == 1 and _is_thermal(item.file) for item in opened)
-    colour = sum(item.file.shape[2] > 1 for item in opened)
-    colour += sum(path.suffix.lower() in _COLOUR_SUFFIXES for path in paths)
-    counts = Counter(releases)
-    incomplete = [release for release, count in counts.items() if count < max(counts.values())]
-    if thermal:
-        notes.append(f"{counted(thermal, 'thermal image')} left out")
-    broad = [item for item in opened if item.file.shape[2] == 1 and item.file.bands.is_broad.any()]
-    if broad and len(bands) < len(opened) - thermal - colour:
-        names = sorted({tag_text(item.tags, "BandName") or item.ending for item in broad})
-        too_broad = f"{counted(len(broad), 'image')} of bands too broad for one wavelength left out"
-        notes.append(f"{too_broad}: {', '.join(names)}")
-    if colour:
-        pictures = f"{counted(colour, 'colour picture')} left out"
-        notes.append(f"{pictures}: nothing says what their channels measure")
-    if incomplete:
-        notes.append(f"{len(incomplete)} of {len(counts)} releases lack a band: {name_some(incomplete)}")
-    return notes
 
 
 @dataclass(frozen=True)
@@ -217,27 +210,29 @@ def _splits_of(releases: Iterable[str]) -> dict[str, Split]:
     return {release: "eval" if release in evaluated else "train" for release in names}
 
 
-def lens_of(file: SpectralFile) -> tuple[Lens | None, tuple[str, ...]]:
-    """The lens of a file, and what there is to say of it; no lens where its tags don't tell one. Raises CaptureError:
-    its model differs from every OPENCV lens by too much, or folds the image over."""
+def lens_of(file: SpectralFile) -> tuple[Lens | None, str]:
+    """The lens of a file; None where its tags don't tell one, and why. Raises CaptureError: its model differs from
+    every OPENCV lens by too much, or folds the image over."""
     tags = file.metadata.get("xmp") or {}
     try:
         if tag_numbers(tags, "DewarpData") is not None:
-            lens, notes = _dji_lens(file, tags)
+            lens = _dji_lens(file, tags)
         else:
-            lens, notes = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
+            lens = _pix4d_lens(file, tags, file.metadata.get("exif") or {})
         if not lens.is_possible:
             raise _NoLensError("its numbers make no sense")
     except _NoLensError as why:
-        return None, (f"no lens in the file's tags: {why}",)
-    return lens, notes
+        return None, f"no lens in the file's tags: {why}"
+    require_possible(lens, f"{file.path}, {_TAGS}")
+    return lens, ""
 
 
 class _NoLensError(Exception):
     """Tags tell no lens; the text says why."""
 
 
-def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tuple[Lens, tuple[str, ...]]:
+def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Lens:
+    height, width = file.shape[:2]
     unit = _MM_OF_UNIT.get(exif_number(exif, "FocalPlaneResolutionUnit") or 4.0, 1.0)
     across = (exif_number(exif, "FocalPlaneXResolution") or 0.0) / unit  # pixels a millimetre
     down = (exif_number(exif, "FocalPlaneYResolution") or 0.0) / unit or across
@@ -250,13 +245,10 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
         matrix = tag_numbers(tags, "FisheyeAffineMatrix")
         if matrix is None or len(matrix) != 4:
             raise _NoLensError("FisheyeAffineMatrix is absent")
-        height, width = file.shape[:2]
         try:
-            lens, note = _fit_fisheye((width, height), tuple(fisheye), tuple(matrix), centre)
+            return _fit_fisheye((width, height), tuple(fisheye), tuple(matrix), centre)
         except CaptureError as error:
             raise CaptureError(f"{file.path}, {error}") from error
-        # A resampling is said where it is used, as poses may bring another lens.
-        return lens, (() if lens.resampled_from else (note,))
     focal = tag_numbers(tags, "PerspectiveFocalLength")
     if focal is None or focal[0] <= 0.0:
         raise _NoLensError("PerspectiveFocalLength is absent")
@@ -264,41 +256,26 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> tupl
     focal_px = (focal[0] * across, focal[0] * down) if unit == "mm" else (focal[0], focal[0])
     distortion = tag_numbers(tags, "PerspectiveDistortion") or []
     k1, k2, k3, p1, p2 = distortion if len(distortion) == 5 else [0.0] * 5
-    return _lens(file, focal_px, centre, (k1, k2, k3), (p1, p2)), ()
+    return Lens(width, height, focal_px, centre, (k1, k2, p1, p2), (k3, 0.0))
 
 
-def _dji_lens(file: SpectralFile, tags: XmpTags) -> tuple[Lens, tuple[str, ...]]:
+def _dji_lens(file: SpectralFile, tags: XmpTags) -> Lens:
     """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre.
 
     Where `DewarpFlag` is not 0, the camera has taken the distortion out of its picture already.
     """
+    height, width = file.shape[:2]
     text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
     numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
     middle = [(tag_numbers(tags, f"CalibratedOpticalCenter{axis}") or [math.nan])[0] for axis in "XY"]
     if len(numbers) != 9 or not np.isfinite(middle).all():
         raise _NoLensError("DewarpData or CalibratedOpticalCenter is incomplete")
-    notes: tuple[str, ...] = ()
-    flag = (tag_numbers(tags, "DewarpFlag") or [0.0])[0]
-    if flag:
-        numbers[4:] = [0.0] * 5
-        notes = (f"the camera took out the distortion (DewarpFlag {flag:g}), so the lens has none",)
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = numbers
-    center = (middle[0] + cx + 0.5, middle[1] + cy + 0.5)
-    return _lens(file, (fx, fy), center, (k1, k2, k3), (p1, p2)), notes
-
-
-def _lens(
-    file: SpectralFile,
-    focal_px: tuple[float, float],
-    centre: tuple[float, float],
-    radial: tuple[float, float, float],
-    tangential: tuple[float, float],
-) -> Lens:
-    height, width = file.shape[:2]
-    lens = Lens(width, height, focal_px, centre, (*radial[:2], *tangential), (radial[2], 0.0))
-    if lens.higher_radial[0]:
-        require_possible(lens, f"{file.path}, {_TAGS}")
-    return lens
+    plain = Lens(width, height, (fx, fy), (middle[0] + cx + 0.5, middle[1] + cy + 0.5))
+    if flag := (tag_numbers(tags, "DewarpFlag") or [0.0])[0]:
+        said = f"the camera took out the distortion (DewarpFlag {flag:g}), so the lens has none"
+        return replace(plain, said=said)
+    return replace(plain, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
 
 
 @lru_cache
@@ -307,7 +284,7 @@ def _fit_fisheye(
     polynomial: tuple[float, ...],
     matrix: tuple[float, ...],
     centre: tuple[float, float],
-) -> tuple[Lens, str]:
+) -> Lens:
     """Radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F.
 
     Remembered, as all files of a lens have the same.

@@ -7,12 +7,11 @@ are little-endian; every count is checked before it is used.
 
 from __future__ import annotations
 
-import os
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,17 +24,16 @@ from unmix_plugin.captures.poses.pose_set import (
     PoseSet,
     SparsePoints,
     make_pose_set,
-    reading,
+    read_table,
 )
 from unmix_plugin.errors import CaptureError
-from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 
 _Record = TypeVar("_Record")
 
-_PLACES = ("sparse", "colmap", "colmap/sparse", "sparse/*", "colmap/sparse/*", "colmap/*")
-"""Where under a folder a model is looked for first."""
-_DEEPEST = 6
-"""Folders below the one that is given in which a model is looked for: hloc writes colmap/sparse/0/models/1."""
+_PLACES = ("", "sparse/", "colmap/", "colmap/sparse/", "sparse/*/", "colmap/sparse/*/", "colmap/*/")
+_PLACES += tuple("*/" * depth for depth in range(1, 7))
+"""Where under a folder a model is looked for, those first where COLMAP's programs put one; hloc writes
+colmap/sparse/0/models/1."""
 _MODELS: dict[str, tuple[int, models.Bend | None]] = {
     "SIMPLE_PINHOLE": (3, None),
     "PINHOLE": (4, None),
@@ -63,36 +61,16 @@ _CAMERA, _IMAGE, _POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct
 _OBSERVATION_BYTES, _TRACK_BYTES = 24, 8
 _LONGEST_NAME = 4096
 
-
-@dataclass(frozen=True)
-class _Camera:
-    model: str
-    width: int
-    height: int
-    parameters: tuple[float, ...]
-    """As the model orders them."""
-
-
-@dataclass(frozen=True)
-class _Image:
-    name: str
-    camera: int
-    quaternion: tuple[float, ...]
-    """w, x, y, z of the rotation from world to camera."""
-    translation: tuple[float, ...]
-    """From world to camera."""
+_Camera: TypeAlias = tuple[str, int, int, tuple[float, ...]]
+"""Model, width, height, and parameters as the model orders them."""
+_Image: TypeAlias = tuple[str, int, tuple[float, ...]]
+"""Name, number of the camera; from world to camera a quaternion w, x, y, z and a translation."""
 
 
 def find_models(folder: Path) -> list[Path]:
     """Folders with a COLMAP model: where its programs put one first, then those that lie deeper."""
-    places = [folder] + [place for pattern in _PLACES for place in sorted(folder.glob(pattern))]
-    for parent, folders, _ in os.walk(folder):
-        folders.sort()
-        here = Path(parent)
-        places.append(here)
-        if len(here.relative_to(folder).parts) == _DEEPEST:
-            folders.clear()
-    return [place for place in dict.fromkeys(places) if is_model(place)]
+    found = [path.parent for place in _PLACES for path in sorted(folder.glob(f"{place}images.*"))]
+    return [place for place in dict.fromkeys(found) if is_model(place)]
 
 
 def is_model(folder: Path) -> bool:
@@ -108,27 +86,28 @@ def read_colmap(folder: Path) -> PoseSet:
         raise CaptureError(
             f"{folder} has no COLMAP model; expected cameras and images as .bin or .txt: give the folder that has both"
         )
-    paths = [folder / f"{name}.{suffix}" for name in ("cameras", "images", "points3D")]
-    cameras_path, images_path, points_path = paths
+    cameras_path, images_path, points_path = (
+        folder / f"{name}.{suffix}" for name in ("cameras", "images", "points3D")
+    )
     readers = (_binary_cameras, _binary_images, _binary_points)
     if suffix == "txt":
         readers = (_text_cameras, _text_images, _text_points)
     read_cameras, read_images, read_points = readers
-    cameras, images, notes = read_cameras(cameras_path), read_images(images_path), []
+    cameras, images = read_cameras(cameras_path), read_images(images_path)
     points = read_points(points_path) if points_path.is_file() else None
-    if points is None:
-        notes.append(f"{points_path.name} is not there: no sparse points")
     lenses = {}
-    for number in sorted({image.camera for image in images}):
+    for number in sorted({number for _, number, _ in images}):
         if number not in cameras:
             raise CaptureError(
                 f"{cameras_path} has no camera {number}, which images name; the files do not belong together"
             )
-        lenses[number], note = _lens(cameras[number], f"{cameras_path}: camera {number}")
-        notes += [] if note is None else [note]
-    where = str(images_path)
-    posed = [(image.name, PosedCamera(_matrix(image, where), lenses[image.camera])) for image in images]
-    return make_pose_set(posed, f"COLMAP model in {folder}", where, points, None, notes)
+        lenses[number] = _lens(*cameras[number], f"{cameras_path}: camera {number}")
+    posed = [
+        (name, PosedCamera(_matrix(numbers, f"{images_path}: {name}"), lenses[number]))
+        for name, number, numbers in images
+    ]
+    notes = [f"{points_path.name} is not there: no sparse points"] if points is None else []
+    return make_pose_set(posed, f"COLMAP model in {folder}", str(images_path), points, None, notes)
 
 
 def _suffix(folder: Path) -> str | None:
@@ -140,21 +119,19 @@ def _suffix(folder: Path) -> str | None:
 
 
 @np.errstate(all="ignore")  # what is not finite is refused where all poses are looked at
-def _matrix(image: _Image, where: str) -> Float64[np.ndarray, "3 4"]:
+def _matrix(numbers: Sequence[float], where: str) -> Float64[np.ndarray, "3 4"]:
     """Camera to world, OpenGL axes."""
     from scipy.spatial.transform import Rotation
 
-    length = float(np.linalg.norm(image.quaternion))
-    if not 1e-6 < length < 1e6:
-        raise CaptureError(f"{where}: {image.name} has the quaternion {image.quaternion}; expected length 1")
-    w, x, y, z = image.quaternion
+    w, x, y, z, *translation = numbers
+    if not 1e-6 < np.linalg.norm(numbers[:4]) < 1e6:
+        raise CaptureError(f"{where} has the quaternion {(w, x, y, z)}; expected length 1")
     to_world = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    return np.column_stack([to_world @ FLIP, -to_world @ np.array(image.translation)])
+    return np.column_stack([to_world @ FLIP, -to_world @ np.array(translation)])
 
 
-def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
-    """Exactly the camera's lens where it is of our kind, otherwise the nearest one and a note."""
-    model, width, height, parameters = camera.model, camera.width, camera.height, camera.parameters
+def _lens(model: str, width: int, height: int, parameters: tuple[float, ...], where: str) -> Lens:
+    """Exactly the camera's lens where it is of our kind, otherwise the one that stands for it."""
     if not np.isfinite(parameters).all() or not (0 < width < 1e6 and 0 < height < 1e6):
         raise CaptureError(f"{where} is {width} x {height} with {parameters}; expected numbers above 0")
     if model == "EQUIRECTANGULAR":
@@ -166,7 +143,7 @@ def _lens(camera: _Camera, where: str) -> tuple[Lens, str | None]:
     start, bend = Lens(width, height, (fx, fy), (cx, cy)), _MODELS[model][1]
     if bend is None or (bend is models.bend_opencv and not any(terms[5:])):
         k1, k2, p1, p2, k3 = (*terms, *[0.0] * 5)[:5]
-        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0)), None
+        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
     return bent_lens(bend, terms, start, model, where)
 
 
@@ -179,7 +156,7 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
             known = f"0 to {len(_MODELS) - 1}"
             raise CaptureError(f"{path}: a camera has the model number {model}; COLMAP's are {known}")
         name, (length, _) = list(_MODELS.items())[model]
-        cameras[number] = _Camera(name, width, height, reader.take(struct.Struct(f"<{length}d")))
+        cameras[number] = name, width, height, reader.take(struct.Struct(f"<{length}d"))
     return cameras
 
 
@@ -191,7 +168,7 @@ def _binary_images(path: Path) -> list[_Image]:
         _, *numbers, camera = reader.take(_IMAGE)
         name = reader.text()
         reader.skip(reader.count(_OBSERVATION_BYTES, f"observations in {name}") * _OBSERVATION_BYTES)
-        images.append(_Image(name, camera, tuple(numbers[:4]), tuple(numbers[4:])))
+        images.append((name, camera, tuple(numbers)))
     return images
 
 
@@ -210,7 +187,7 @@ class _Reader:
     """Bytes of a file from front to back."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._at, self._data = path, 0, _bytes_of(path)
+        self._path, self._at, self._data = path, 0, read_table(path)
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         start = self._at
@@ -218,16 +195,14 @@ class _Reader:
         return layout.unpack_from(self._data, start)
 
     def skip(self, count: int) -> None:
-        left = len(self._data) - self._at
-        if count > left:
+        if count > (left := len(self._data) - self._at):
             raise CaptureError(f"{self._path} ends early: {left} of {count} bytes are left; copy it again")
         self._at += count
 
     def count(self, least_bytes: int, what: str) -> int:
         """A number of records, each of at least so many bytes."""
         (count,) = self.take(struct.Struct("<Q"))
-        left = len(self._data) - self._at
-        if count * least_bytes > left:
+        if count * least_bytes > (left := len(self._data) - self._at):
             raise CaptureError(f"{self._path} promises {count} {what}, {left} bytes follow; copy it again")
         return count
 
@@ -246,7 +221,7 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
         number, model, width, height, *parameters = line.split()
         if len(parameters) != _MODELS[model][0]:
             raise ValueError
-        return int(number), _Camera(model, int(width), int(height), tuple(map(float, parameters)))
+        return int(number), (model, int(width), int(height), tuple(map(float, parameters)))
 
     return dict(_parsed(path, parse, "number, model, width, height and the parameters of the model"))
 
@@ -261,8 +236,7 @@ def _text_images(path: Path) -> list[_Image]:
         if _is_observations(line):
             return None
         _, *numbers = line.split(maxsplit=9)
-        qw, qx, qy, qz, x, y, z = (float(value) for value in numbers[:7])
-        return _Image(numbers[8].strip(), int(numbers[7]), (qw, qx, qy, qz), (x, y, z))
+        return numbers[8].strip(), int(numbers[7]), tuple(map(float, numbers[:7]))
 
     found = _parsed(path, parse, "number, quaternion, translation, camera and name")
     return [image for image in found if image is not None]
@@ -285,9 +259,7 @@ def _is_observations(line: str) -> bool:
 def _text_points(path: Path) -> SparsePoints:
     def parse(line: str) -> tuple[list[float], list[int]]:
         _, x, y, z, red, green, blue, *_ = line.split()
-        colours = [int(red), int(green), int(blue)]
-        if not all(0 <= value <= 255 for value in colours):
-            raise ValueError
+        colours = list(bytes([int(red), int(green), int(blue)]))  # ValueError beyond 255
         return [float(x), float(y), float(z)], colours
 
     found = _parsed(path, parse, "number, x, y, z, red, green, blue")
@@ -298,7 +270,7 @@ def _text_points(path: Path) -> SparsePoints:
 def _parsed(path: Path, parse: Callable[[str], _Record], expected: str) -> list[_Record]:
     """Records of a text file, one a line; comments and blank lines between them are nothing."""
     records = []
-    for number, line in enumerate(_bytes_of(path).decode("utf-8", "replace").splitlines(), start=1):
+    for number, line in enumerate(read_table(path).decode("utf-8", "replace").splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
@@ -307,8 +279,3 @@ def _parsed(path: Path, parse: Callable[[str], _Record], expected: str) -> list[
             found = line.strip()[:80]
             raise CaptureError(f"{path}, line {number}: found {found!r}; expected {expected}") from error
     return records
-
-
-def _bytes_of(path: Path) -> bytes:
-    with reading(path):
-        return read_bounded(path, MOST_TABLE_BYTES)

@@ -8,8 +8,8 @@ is one focal length; focal length and centre bring bent points to pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TypeAlias
 
@@ -24,17 +24,6 @@ Project: TypeAlias = Callable[[Points], Points]
 """From ideal coordinates to pixels."""
 Bend: TypeAlias = Callable[..., Points]
 """From ideal coordinates, and the numbers of a model, to bent ones."""
-
-
-@dataclass(frozen=True)
-class _FileLens:
-    """The lens that the pixels of a file were taken through, of a model that scenes do not have."""
-
-    model: str
-    project: Project
-    """From ideal coordinates to pixels of the picture that the `Lens` beside it has."""
-    said: str
-    """What becomes of the picture, for people."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +52,11 @@ class Lens:
     """k1, k2, p1, p2 of the OPENCV model; zeros are a pinhole."""
     higher_radial: tuple[float, float] = (0.0, 0.0)
     """k3, k4: radial terms of the sixth and eighth power."""
-    resampled_from: _FileLens | None = None
-    """Where the file has another one: its pixels are to be brought into this lens."""
+    resampled_from: Project | None = None
+    """Where the pixels of the file were taken through a model that scenes do not have, and are to be brought into this
+    lens: from ideal coordinates to the file's pixels."""
+    said: str = field(default="", compare=False)
+    """What stands for what, where the file has a lens of another model."""
 
     @property
     def radial(self) -> tuple[float, float, float, float]:
@@ -79,7 +71,7 @@ class Lens:
 
     def pixels_of(self, ideal: Points) -> Points:
         """Where ideal points are seen."""
-        return _brown(ideal, self.radial, self.distortion[2:]) * self.focal_px + self.center_px
+        return bend_brown(ideal, self.radial, self.distortion[2:]) * self.focal_px + self.center_px
 
     def ideal_of(self, pixels: Points) -> Points | None:
         """The inverse of `pixels_of`; None where the distortion folds."""
@@ -89,7 +81,7 @@ class Lens:
         """Pixels of the file in the picture that this lens has; None where the file's lens folds."""
         if self.resampled_from is None:
             return pixels
-        ideal = _invert(self.resampled_from.project, pixels, self)
+        ideal = _invert(self.resampled_from, pixels, self)
         return None if ideal is None else self.pixels_of(ideal)
 
     def file_pixels(self) -> Float64[np.ndarray, "H W 2"]:
@@ -99,7 +91,7 @@ class Lens:
         if self.resampled_from is not None:
             ideal = self.ideal_of(pixels)
             assert ideal is not None  # it was chosen so
-            pixels = self.resampled_from.project(ideal)
+            pixels = self.resampled_from(ideal)
         return pixels.reshape(self.height, self.width, 2)
 
     def seen_as(
@@ -112,13 +104,11 @@ class Lens:
             corner: Where its upper left corner lies in this picture, x and y.
             scale: Its pixels over those of this picture, along x and y.
         """
-        from_file = self.resampled_from
-        if from_file is not None:
-            from_file = replace(from_file, project=_Cut(from_file.project, corner, scale))
+        in_file = None if self.resampled_from is None else _Cut(self.resampled_from, corner, scale)
         (fx, fy), (cx, cy), (across, down) = self.focal_px, self.center_px, scale
         focal, center = (fx * across, fy * down), ((cx - corner[0]) * across, (cy - corner[1]) * down)
         return replace(
-            self, width=width, height=height, focal_px=focal, center_px=center, resampled_from=from_file
+            self, width=width, height=height, focal_px=focal, center_px=center, resampled_from=in_file
         )
 
 
@@ -138,8 +128,8 @@ _CALIBRATE = "calibrate the camera again, or undistort the images and give poses
 
 
 @np.errstate(all="ignore")  # whatever comes of it is judged by where pixels fall
-def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Lens, str]:
-    """The OPENCV lens that stands for one of another model.
+def fit_lens(project: Project, start: Lens, model: str, where: str) -> Lens:
+    """The OPENCV lens that stands for one of another model, and says so.
 
     Args:
         project: The other model.
@@ -148,7 +138,7 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         where: The file, for messages.
     Returns:
         The nearest lens; if it is not near enough, pixels are to be resampled into it. Of a lens too wide for it, a
-        pinhole that shows its middle. And a sentence that says what was done.
+        pinhole that shows its middle.
     Raises:
         CaptureError: the model is not to be followed even in the middle of the image, or its numbers are impossible.
     """
@@ -158,12 +148,12 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
     if ideal is not None and np.linalg.norm(ideal, axis=1).max() < np.tan(np.radians(_WIDEST_DEG)):
         lens, worst = _nearest_opencv(pixels, ideal, start)
         if worst <= _LARGEST_ERROR_PX:
-            note = f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
-            return lens, note
+            said = f"lens model {model} replaced by the nearest OPENCV lens; off by at most {worst:.2g} px"
+            return replace(lens, said=said)
         if not _folds(lens):
             nearest = f"no OPENCV lens comes nearer than {worst:.2g} px"
-            note = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
-            return replace(lens, resampled_from=_FileLens(model, project, note)), note
+            said = f"lens model {model}: {nearest}, so pixels are interpolated into that one"
+            return replace(lens, resampled_from=project, said=said)
     found = _widest_pinhole(project, start)
     if found is None:
         raise CaptureError(
@@ -171,15 +161,15 @@ def fit_lens(project: Project, start: Lens, model: str, where: str) -> tuple[Len
         )
     pinhole, outside = found
     corner = np.hypot(pinhole.width, pinhole.height) / 2 / pinhole.focal_px[0]
-    note = (
+    said = (
         f"lens model {model} sees too much for an OPENCV lens, so pixels are interpolated into a pinhole that reaches "
         f"{np.degrees(np.arctan(corner)):.0f} degrees from the axis to its corners; {outside:.0%} of the picture lies "
         "outside and is left out"
     )
-    return replace(pinhole, resampled_from=_FileLens(model, project, note)), note
+    return replace(pinhole, resampled_from=project, said=said)
 
 
-def bent_lens(bend: Bend, terms: Sequence[float], start: Lens, model: str, where: str) -> tuple[Lens, str]:
+def bent_lens(bend: Bend, terms: Sequence[float], start: Lens, model: str, where: str) -> Lens:
     """The same as `fit_lens` of a model that bends ideal points, with focal length and centre of the start."""
     return fit_lens(lambda ideal: bend(ideal, *terms) * start.focal_px + start.center_px, start, model, where)
 
@@ -210,7 +200,8 @@ def _widest_pinhole(project: Project, start: Lens) -> tuple[Lens, float] | None:
         pinhole = Lens(start.width, start.height, (focal, focal), middle)
         ideal = (_pixel_grid(start.width, start.height) - middle) / focal
         # The way from the axis to each point must not fold, or two directions would share a pixel.
-        if not all(_is_sound(project, ideal * part).all() for part in np.linspace(0.1, 1.0, 10)):
+        parts = np.linspace(0.1, 1.0, 10)
+        if not all(_is_upright(_jacobian(project, ideal * part)).all() for part in parts):
             continue
         seen = project(ideal)
         inside = ((seen >= 0) & (seen <= (start.width, start.height))).all(axis=1)
@@ -258,28 +249,32 @@ def _invert(project: Project, pixels: Points, start: Lens) -> Points | None:
                 return None
             if np.abs(missing).max() < 1e-9:
                 break
-            jacobian = np.stack(list(_slopes(project, ideal)), axis=-1)
-            determinant = np.linalg.det(jacobian)
-            if not np.isfinite(determinant).all() or (determinant <= 0).any():
+            jacobian = _jacobian(project, ideal)
+            if not _is_upright(jacobian).all():
                 return None
             ideal = ideal + np.linalg.solve(jacobian, missing[..., None])[..., 0]
         return ideal if np.abs(pixels - project(ideal)).max() < 1e-3 else None
 
 
-def _slopes(project: Project, ideal: Points) -> Iterator[Points]:
-    """Pixels that a step along x and along y moves each point by, over the step."""
-    for step in _STEP * np.eye(2):
-        yield (project(ideal + step) - project(ideal - step)) / (2 * _STEP)
+def _jacobian(project: Project, ideal: Points) -> Float64[np.ndarray, "P 2 2"]:
+    """Of pixels by ideal points, by differences."""
+    steps = _STEP * np.eye(2)
+    slopes = [(project(ideal + step) - project(ideal - step)) / (2 * _STEP) for step in steps]
+    return np.stack(slopes, axis=-1)
 
 
-def _is_sound(project: Project, ideal: Points) -> Bool[np.ndarray, " P"]:
-    """Whether the model is finite at points and keeps their surroundings the right way round."""
-    with np.errstate(all="ignore"):
-        determinant = np.linalg.det(np.stack(list(_slopes(project, ideal)), axis=-1))
-        return np.isfinite(determinant) & (determinant > 0)
+def _is_upright(jacobian: Float64[np.ndarray, "P 2 2"]) -> Bool[np.ndarray, " P"]:
+    """Where a model is finite and keeps what is around a point the right way round."""
+    determinant = np.linalg.det(jacobian)
+    return np.isfinite(determinant) & (determinant > 0)
 
 
 # Models of other programs: what each does to ideal points.
+
+
+def bend_brown(points: Points, radial: Sequence[float], tangential: Sequence[float] = (0.0, 0.0)) -> Points:
+    """Radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
+    return points * _series((points**2).sum(axis=1), radial)[:, None] + _tangential(points, tangential)
 
 
 def bend_opencv(
@@ -300,7 +295,7 @@ def _equidistant(ideal: Points) -> Points:
 def bend_fisheye(ideal: Points, *radial: float, tangential: Sequence[float] = (0.0, 0.0)) -> Points:
     """An equidistant lens bent as OpenCV bends a perspective one: with terms of theta^2, theta^4, ... (OPENCV_FISHEYE),
     and with tangential ones."""
-    return _brown(_equidistant(ideal), radial, tangential)
+    return bend_brown(_equidistant(ideal), radial, tangential)
 
 
 def bend_agisoft(
@@ -318,7 +313,7 @@ def bend_agisoft(
     """
     points = _equidistant(ideal) if is_fisheye else ideal
     grown = _series((points**2).sum(axis=1), growth)[:, None]
-    return _brown(points, radial) + _tangential(points, tangential) * grown
+    return bend_brown(points, radial) + _tangential(points, tangential) * grown
 
 
 def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *more: float) -> Points:
@@ -366,7 +361,7 @@ def bend_eucm(ideal: Points, alpha: float, beta: float) -> Points:
 
 def bend_dual(ideal: Points, transition: float, *radial: float) -> Points:
     """OpenSfM's dual: between a perspective lens (1) and an equidistant one (0)."""
-    return _brown(transition * ideal + (1.0 - transition) * _equidistant(ideal), radial)
+    return bend_brown(transition * ideal + (1.0 - transition) * _equidistant(ideal), radial)
 
 
 def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
@@ -391,11 +386,6 @@ def bend_equirectangular(ideal: Points) -> Points:
     """A picture of all directions, the axis in its middle: longitude across, latitude down, radians."""
     x, y = ideal.T
     return np.column_stack([np.arctan(x), np.arctan2(y, np.hypot(x, 1.0))])
-
-
-def _brown(points: Points, radial: Sequence[float], tangential: Sequence[float] = (0.0, 0.0)) -> Points:
-    """Points with radial terms of r^2, r^4, ... and OpenCV's p1, p2."""
-    return points * _series((points**2).sum(axis=1), radial)[:, None] + _tangential(points, tangential)
 
 
 def _series(squared: Float64[np.ndarray, " P"], terms: Sequence[float]) -> Float64[np.ndarray, " P"]:

@@ -18,35 +18,34 @@ from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.scenes.reading.faults import describe, read_number
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
-_SPHERICAL = (lens.bend_equirectangular, "")
-_FISHEYE = (lens.bend_fisheye, "k1 k2 k3 k4")
-_SIX_TERMS = (lens.bend_opensfm_624, "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3")
+_SIX_TERMS = "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3"
 _BENT: dict[str, tuple[lens.Bend, str]] = {
-    **dict.fromkeys(("fisheye", "fisheye_opencv"), _FISHEYE),
-    **dict.fromkeys(("fisheye62", "fisheye624"), _SIX_TERMS),
+    "fisheye": (lens.bend_fisheye, "k1 k2 k3 k4"),
+    "fisheye_opencv": (lens.bend_fisheye, "k1 k2 k3 k4"),
+    "fisheye62": (lens.bend_opensfm_624, _SIX_TERMS),
+    "fisheye624": (lens.bend_opensfm_624, _SIX_TERMS),
     "dual": (lens.bend_dual, "transition k1 k2"),
-    **dict.fromkeys(("spherical", "equirectangular"), _SPHERICAL),
+    "spherical": (lens.bend_equirectangular, ""),
+    "equirectangular": (lens.bend_equirectangular, ""),
 }
 """Types of projection that are not ours: what bends ideal points, and its numbers."""
 
 
-def is_reconstruction(content: Any) -> bool:
-    """Whether JSON looks like a reconstruction.json: a list of objects with shots, or one."""
-    parts = content if isinstance(content, list) else [content]
-    return any(isinstance(part, dict) and "shots" in part for part in parts)
-
-
 def read_opensfm(path: Path, content: Any) -> PoseSet:
-    """Poses, lenses and points of the reconstruction with the most shots. Raises CaptureError: a shot without a sound
-    pose or camera, or a lens that can't be represented."""
-    parts = [part for part in (content if isinstance(content, list) else [content]) if isinstance(part, dict)]
-    parts = [part for part in parts if isinstance(part.get("shots"), dict)]
-    best = max(parts, key=lambda part: len(part["shots"]), default={})
+    """Poses, lenses and points of the reconstruction with the most shots, of a list of them or the only one. Raises
+    CaptureError: there is none, a shot has no sound pose or camera, or a lens can't be represented."""
+    listed = content if isinstance(content, list) else [content]
+    parts = [part for part in listed if isinstance(part, dict) and isinstance(part.get("shots"), dict)]
+    if not parts:
+        raise CaptureError(
+            f"{path} holds {describe(content)} without poses; expected 'frames' with 'transform_matrix' "
+            "(transforms.json) or 'shots' (OpenSfM)"
+        )
+    best = max(parts, key=lambda part: len(part["shots"]))
     notes = [f"{len(parts)} reconstructions; the one with the most shots was read"] if len(parts) > 1 else []
-    shots: dict[str, Any] = best.get("shots", {})
     lenses: dict[str, lens.Lens] = {}
     raw, loose = [], []
-    for name, shot in shots.items():
+    for name, shot in best["shots"].items():
         where = f"{path}: shot {name}"
         pose = _world_to_camera(best, name, shot, where)
         if pose is None:
@@ -56,16 +55,17 @@ def read_opensfm(path: Path, content: Any) -> PoseSet:
         if not isinstance(camera, str) or camera not in _object(best, "cameras"):
             raise CaptureError(f"{where} names the camera {describe(camera)}; expected one of 'cameras'")
         if camera not in lenses:
-            lenses[camera], note = _lens_opensfm(best["cameras"][camera], f"{path}: camera {camera}")
-            notes += [] if note is None else [note]
+            lenses[camera] = _lens_opensfm(_object(best["cameras"], camera), f"{path}: camera {camera}")
         rotation = pose[:, :3].T
         matrix = np.column_stack([rotation @ FLIP, -rotation @ pose[:, 3]])
         raw.append((name, PosedCamera(matrix, lenses[camera])))
     notes += [f"{len(loose)} shots have no pose: {name_some(loose)}"] if loose else []
     up = np.array([0.0, 0.0, 1.0])
     found = make_pose_set(raw, f"OpenSfM's {path.name}", str(path), _points(best, str(path)), up, notes)
-    origin = best.get("reference_lla")  # of metres to the east, north and up; 0 where pictures had no place
-    has_place = isinstance(origin, dict) and any(origin.get(key) for key in ("latitude", "longitude"))
+    origin = _object(
+        best, "reference_lla"
+    )  # of metres to the east, north and up; 0 where pictures had no place
+    has_place = any(origin.get(key) for key in ("latitude", "longitude"))
     return replace(found, metres_per_unit=1.0 if has_place else None)
 
 
@@ -77,30 +77,28 @@ def _world_to_camera(
         raise CaptureError(f"{where} is {describe(shot)}; expected an object")
     if "rotation" in shot:
         return _pose(shot, where)
-    for instance in _object(content, "rig_instances").values():
-        members = instance.get("rig_camera_ids") if isinstance(instance, dict) else None
-        if not isinstance(members, dict) or name not in members:
-            continue
-        lens = _object(content, "rig_cameras").get(members[name])
-        if not isinstance(lens, dict):
-            raise CaptureError(f"{where} names {describe(members[name])}, not in 'rig_cameras'")
-        outer, inner = _pose(instance, where), _pose(lens, where)
-        return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
+    rigs = _object(content, "rig_instances")
+    for rig in rigs:
+        lens_of = _object(_object(rigs, rig), "rig_camera_ids")
+        if name in lens_of:
+            outer = _pose(rigs[rig], where)
+            inner = _pose(_object(_object(content, "rig_cameras"), lens_of[name]), where)
+            return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
     return None
 
 
 def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
     from scipy.spatial.transform import Rotation
 
-    vectors = [_vector(values.get(key)) for key in ("rotation", "translation")]
-    if vectors[0] is None or vectors[1] is None:
-        raise CaptureError(f"{where}: 'rotation' and 'translation' have to be 3 finite numbers each")
-    return np.column_stack([Rotation.from_rotvec(vectors[0]).as_matrix(), vectors[1]])
+    turn, shift = _vector(values.get("rotation")), _vector(values.get("translation"))
+    if turn is None or shift is None:
+        raise CaptureError(
+            f"{where}: 'rotation' and 'translation', its own or its rig's, have to be 3 finite numbers each"
+        )
+    return np.column_stack([Rotation.from_rotvec(turn).as_matrix(), shift])
 
 
-def _lens_opensfm(camera: Any, where: str) -> tuple[lens.Lens, str | None]:
-    values = camera if isinstance(camera, dict) else {}
-
+def _lens_opensfm(values: dict[str, Any], where: str) -> lens.Lens:
     def number(key: str, default: float = 0.0) -> float:
         value = read_number(values.get(key, default))
         if value is None:
@@ -122,7 +120,7 @@ def _lens_opensfm(camera: Any, where: str) -> tuple[lens.Lens, str | None]:
     start = lens.Lens(width, height, (side * focal[0], side * focal[1]), center)
     if bend is None:
         k1, k2, k3, p1, p2 = map(number, ("k1", "k2", "k3", "p1", "p2"))
-        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0)), None
+        return replace(start, distortion=(k1, k2, p1, p2), higher_radial=(k3, 0.0))
     terms = [number(key, 1.0 if key == "transition" else 0.0) for key in keys.split()]
     return lens.bent_lens(bend, terms, start, kind, where)
 
@@ -139,8 +137,9 @@ def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
     return np.array(positions), np.array(known).round().astype(np.uint8)
 
 
-def _object(content: dict[str, Any], key: str) -> dict[str, Any]:
-    value = content.get(key)
+def _object(content: dict[str, Any], key: Any) -> dict[str, Any]:
+    """The object below a key; an empty one without it."""
+    value = content.get(key) if isinstance(key, str) else None
     return value if isinstance(value, dict) else {}
 
 

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.lens import Lens, require_possible
 from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_xml, read_bounded
 from unmix_plugin.scenes.placement import Placement
@@ -139,13 +139,22 @@ def make_pose_set(
         where: The file, for messages.
         up: Against gravity, in the source's coordinates.
     Raises:
-        CaptureError: a name twice with different poses, or a matrix is not a pose.
+        CaptureError: a name twice with different poses, or a matrix is not a pose, or a lens is none.
     """
     unique, repeated = _unique(cameras, where)
-    rigid, made_rigid = _make_rigid({name: camera.camera_to_world for name, camera in unique.items()}, where)
-    offset = find_offset(np.stack([pose[:, 3] for pose in rigid.values()]))
-    moved = np.column_stack([np.zeros((3, 3)), offset])
-    said = [*notes, *made_rigid]
+    rigid, scales = _rigid(unique, where)
+    offset = find_offset(rigid[:, :, 3])
+    rigid[:, :, 3] -= offset
+    lenses = dict.fromkeys(camera.lens for camera in unique.values() if camera.lens is not None)
+    for lens in lenses:
+        require_possible(lens, where)
+    said = [*notes, *(lens.said for lens in lenses if lens.said)]
+    scaled = scales[np.abs(scales - 1.0) > _SCALE_TOLERANCE]
+    if len(scaled):
+        low, high = scaled.min(), scaled.max()
+        factor = f"{low:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
+        which = f"the rotations of {len(scaled)} of {len(scales)} cameras"
+        said.append(f"{which} were scaled by {factor}; made rigid, positions kept")
     if repeated:
         listed = counted(len(repeated), "camera")
         said.append(f"{listed} listed twice with the same pose: {name_some(repeated)}")
@@ -160,7 +169,10 @@ def make_pose_set(
             )
         positions, colours = positions[good] - offset, None if colours is None else colours[good]
     return PoseSet(
-        {name: replace(camera, camera_to_world=rigid[name] - moved) for name, camera in unique.items()},
+        {
+            name: replace(camera, camera_to_world=pose)
+            for (name, camera), pose in zip(unique.items(), rigid, strict=True)
+        },
         source,
         positions,
         colours,
@@ -195,37 +207,28 @@ def _unique(
     return unique, repeated
 
 
-def _make_rigid(
-    matrices: Mapping[str, Float64[np.ndarray, "3 4"]], where: str
-) -> tuple[dict[str, Float64[np.ndarray, "3 4"]], list[str]]:
-    """The poses with orthonormal rotations of determinant 1, positions kept; and what was changed."""
-    if not matrices:
+def _rigid(
+    cameras: Mapping[str, PosedCamera], where: str
+) -> tuple[Float64[np.ndarray, "N 3 4"], Float64[np.ndarray, " N"]]:
+    """The poses with orthonormal rotations of determinant 1, positions kept; and by what the rotations were scaled."""
+    if not cameras:
         raise CaptureError(f"{where} has no camera; expected one for each view, export it again")
     faulty: dict[str, list[str]] = {}
-    for name, matrix in matrices.items():
-        if (fault := _fault(matrix)) is not None:
+    for name, camera in cameras.items():
+        if (fault := _fault(camera.camera_to_world)) is not None:
             faulty.setdefault(fault, []).append(name)
     if faulty:
         listed = "; ".join(f"{name_some(names)}: {fault}" for fault, names in faulty.items())
         raise CaptureError(
-            f"{where} has {sum(map(len, faulty.values()))} of {len(matrices)} camera matrices that are not poses: "
+            f"{where} has {sum(map(len, faulty.values()))} of {len(cameras)} camera matrices that are not poses: "
             f"{listed}; expected camera to world, a rotation (or a scaled one) and a position"
         )
-    rigid, scaled = {}, []
-    for name, matrix in matrices.items():
-        u, _, vt = np.linalg.svd(matrix[:, :3])
-        rigid[name] = np.column_stack([u @ vt, matrix[:, 3]])
-        scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
-        scaled += [scale] if abs(scale - 1.0) > _SCALE_TOLERANCE else []
-    first = next(iter(rigid.values()))
-    if len(rigid) > 1 and all(np.array_equal(first, pose) for pose in rigid.values()):
+    stacked = np.stack([camera.camera_to_world for camera in cameras.values()])
+    u, _, vt = np.linalg.svd(stacked[:, :, :3])
+    rigid = np.concatenate([u @ vt, stacked[:, :, 3:]], axis=2)
+    if len(rigid) > 1 and (rigid == rigid[0]).all():
         raise CaptureError(f"{where}: all {len(rigid)} cameras have the same pose; estimate them again")
-    if not scaled:
-        return rigid, []
-    low, high = min(scaled), max(scaled)
-    factor = f"{low:.4g}" if high - low <= 1e-3 * high else f"{low:.4g} to {high:.4g}"
-    note = f"the rotations of {len(scaled)} of {len(rigid)} cameras were scaled by {factor}; made rigid, positions kept"
-    return rigid, [note]
+    return rigid, np.cbrt(np.linalg.det(stacked[:, :, :3]))
 
 
 def _fault(matrix: Float64[np.ndarray, "3 4"]) -> str | None:
@@ -259,6 +262,12 @@ def reading(path: Path) -> Iterator[None]:
         raise CaptureError(f"{path} can't be read ({error.strerror or error})") from error
 
 
+def read_table(path: Path) -> bytes:
+    """All of a file; CaptureError where it can't be read, or is too large."""
+    with reading(path):
+        return read_bounded(path, MOST_TABLE_BYTES)
+
+
 def load_json(path: Path) -> Any:
     """What a file holds; CaptureError where it can't be read, or is no JSON."""
     try:
@@ -271,7 +280,6 @@ def load_json(path: Path) -> Any:
 def load_xml(path: Path) -> ElementTree.Element:
     """The root of an XML file; CaptureError where it can't be read, is no XML, or declares entities."""
     try:
-        with reading(path):
-            return parse_xml(read_bounded(path, MOST_TABLE_BYTES))
+        return parse_xml(read_table(path))
     except ValueError as error:
         raise CaptureError(f"{path} is not valid XML ({error}); was it cut short?") from error

@@ -31,8 +31,8 @@ from unmix_plugin.captures.poses.lens import (
     Lens,
     Points,
     bend_agisoft,
+    bend_brown,
     bend_equirectangular,
-    bend_fisheye,
     bent_lens,
     fit_lens,
 )
@@ -65,19 +65,18 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
     chunk = max(chunks, key=lambda one: len(list(one.iter("camera"))))
     notes = [f"{len(chunks)} chunks; the one with the most cameras was read"] if len(chunks) > 1 else []
     # Similarities to the world by component; None is the chunk's own, the identity without one.
-    owners = [(None, chunk), *((part.get("id"), part) for part in chunk.iterfind("components/component"))]
     worlds: dict[str | None, Float64[np.ndarray, "4 4"]] = {None: np.eye(4)}
+    owners = [(None, chunk), *((part.get("id"), part) for part in chunk.iterfind("components/component"))]
     for component, owner in owners:
         if (own := owner.find("transform")) is not None:
-            worlds[component] = _similarity(own, path)
+            worlds[component] = _similarity(own, str(path))
     aligned = _of_one_world(_aligned(chunk, path, notes), worlds, notes)
     used = {camera.get("sensor_id") for camera in aligned}
     lenses: dict[str | None, Lens | None] = {}
     warnings = []
     for sensor in chunk.iterfind("sensors/sensor"):
         if sensor.get("id") in used:
-            lenses[sensor.get("id")], said = _lens_metashape(sensor, str(path))
-            notes += said
+            lenses[sensor.get("id")] = _lens_metashape(sensor, str(path), notes)
             if _properties(sensor).get("rolling_shutter", "").strip().lower() in ("true", "1"):
                 warnings.append(
                     f"sensor {sensor.get('label', '?')}: 'rolling_shutter' is set and not followed: it stands for rows "
@@ -116,22 +115,20 @@ def _aligned(chunk: _Element, path: Path, notes: list[str]) -> list[_Element]:
     if len(enabled) < len(cameras):
         notes.append(f"{counted(len(cameras) - len(enabled), 'disabled camera')} left out")
     aligned = [camera for camera in enabled if camera.find("transform") is not None]
-    missing = [camera.get("label", "?") for camera in enabled if camera.find("transform") is None]
     if not aligned:
         raise CaptureError(
             f"{path}: none of {len(cameras)} cameras is enabled and has a transform; align photos first"
         )
-    if missing:
-        why = ""
-        if any(camera.get("master_id") for camera in enabled if camera.find("transform") is None):
-            why = ", some of them lenses of a rig, whose places beside the first lens are not read"
-        notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {name_some(missing)}")
+    if missing := [camera for camera in enabled if camera.find("transform") is None]:
+        of_rig = any(camera.get("master_id") for camera in missing)
+        why = ", some of them lenses of a rig, whose places beside the first lens are not read" * of_rig
+        named = name_some([camera.get("label", "?") for camera in missing])
+        notes.append(f"{counted(len(missing), 'camera')} without transform{why}: {named}")
     return aligned
 
 
-def _similarity(element: _Element, path: Path) -> Float64[np.ndarray, "4 4"]:
+def _similarity(element: _Element, where: str) -> Float64[np.ndarray, "4 4"]:
     """rotation, translation and scale of an element, or its 16 numbers."""
-    where = str(path)
     if len(element) == 0:
         values = _numbers_of(element, 16, where)
         return np.eye(4) if values is None else values.reshape(4, 4)
@@ -162,26 +159,22 @@ def _of_one_world(
     return kept
 
 
-def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str]]:
-    """The lens of a sensor, None without any focal length; and what is not exactly as in the file."""
+def _lens_metashape(sensor: _Element, where: str, notes: list[str]) -> Lens | None:
+    """The lens of a sensor, None without any focal length; what is odd is noted."""
     name = sensor.get("label", "?")
     where = f"{where}: sensor {name}"
-    calibration, size = _calibration_metashape(sensor, where)
+    calibration, (width, height) = _calibration_metashape(sensor, where)
     kind = (None if calibration is None else calibration.get("type")) or sensor.get("type", "frame")
     if kind not in ("frame", "fisheye", "spherical"):
         raise CaptureError(f"{where} is of the type {kind}; expected frame, fisheye or spherical")
-    width, height = size
     if kind == "spherical":
         start = Lens(width, height, (width / (2 * np.pi), height / np.pi), (width / 2, height / 2))
-        around, said = bent_lens(bend_equirectangular, (), start, "Metashape spherical", where)
-        return around, [f"sensor {name}: {said}"]
+        return bent_lens(bend_equirectangular, (), start, f"Metashape spherical of sensor {name}", where)
     if calibration is None:
-        nominal = _from_physical(sensor, size)
-        notes = [f"sensor {name} is not calibrated: nominal focal length"]
-        if nominal is not None and kind == "fisheye":
-            nominal, said = bent_lens(bend_fisheye, (), nominal, "Metashape fisheye", where)
-            notes.append(f"sensor {name}: {said}")
-        return nominal, notes
+        notes.append(f"sensor {name} is not calibrated: nominal focal length")
+        calibration = _nominal_calibration(sensor)
+    if calibration is None:
+        return None
     values = {tag: _number_of(calibration, tag, where) for tag in _TERMS}
     f_x = _number_of(calibration, "fx", where, values["f"] + values["b1"])
     f_y = _number_of(calibration, "fy", where, values["f"])
@@ -198,31 +191,27 @@ def _lens_metashape(sensor: _Element, where: str) -> tuple[Lens | None, list[str
             f"{where} has the principal point {center_x:g}, {center_y:g}, outside its {width} x {height} pixels; check "
             "<cx>, <cy> and <resolution> in the file"
         )
-    center, notes = (center_x, center_y), _unknown_terms(calibration, name)
+    notes += _unknown_terms(calibration, name)
     is_opencv = is_old and calibration.find("p3") is None and calibration.find("p4") is None
     tangential = (values["p1"], values["p2"]) if is_opencv else (values["p2"], values["p1"])
     if is_old and any(tangential):
-        taken = (
-            "p1, p2 (PhotoScan up to 1.1)"
-            if is_opencv
-            else "p2, p1, as p3 or p4 is there (PhotoScan from 1.2)"
-        )
+        later = "p2, p1, as p3 or p4 is there (PhotoScan from 1.2)"
+        taken = "p1, p2 (PhotoScan up to 1.1)" if is_opencv else later
         notes.append(f"sensor {name}: p1, p2 beside <fx>, <fy> are taken as OpenCV's {taken}")
-    start, (k1, k2, k3, k4) = Lens(width, height, (f_x, f_y), center), [values[key] for key in _RADIAL]
+    start, growth = Lens(width, height, (f_x, f_y), (center_x, center_y)), (values["p3"], values["p4"])
+    k1, k2, k3, k4 = (values[key] for key in _RADIAL)
     frame = replace(start, distortion=(k1, k2, *tangential), higher_radial=(k3, k4))
-    growth = values["p3"], values["p4"]
-    has_growth = any(growth) and any(tangential)
-    if kind == "frame" and not skew and not has_growth:
-        return frame, notes
+    more = {"b2": bool(skew), "p3, p4": any(growth) and any(tangential)}
+    if kind == "frame" and not any(more.values()):
+        return frame
 
     def bent_and_skewed(ideal: Points) -> Points:
         bent = bend_agisoft(ideal, frame.radial, tangential, growth, is_fisheye=kind == "fisheye")
-        return bent * (f_x, f_y) + center + np.column_stack([skew * bent[:, 1], np.zeros(len(bent))])
+        return bent @ np.array([[f_x, 0.0], [skew, f_y]]) + start.center_px
 
-    terms = " and ".join(term for term, is_there in (("b2", skew), ("p3, p4", has_growth)) if is_there)
-    model = "Metashape fisheye" if kind == "fisheye" else f"Metashape with {terms}"
-    fitted, note = fit_lens(bent_and_skewed, start, model, where)
-    return fitted, [*notes, f"sensor {name}: {note}"]
+    terms = " and ".join(term for term, is_there in more.items() if is_there)
+    model = "fisheye" if kind == "fisheye" else f"with {terms}"
+    return fit_lens(bent_and_skewed, start, f"Metashape {model} of sensor {name}", where)
 
 
 def _unknown_terms(calibration: _Element, name: str) -> list[str]:
@@ -232,9 +221,8 @@ def _unknown_terms(calibration: _Element, name: str) -> list[str]:
         with suppress(ValueError):
             if child.tag not in (*_TERMS, "fx", "fy", "skew") and float(child.text or ""):
                 unknown.append(child.tag)
-    return (
-        [f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}"] if unknown else []
-    )
+    note = f"sensor {name}: numbers that are not known and not used: {name_some(unknown)}"
+    return [note] if unknown else []
 
 
 def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | None, tuple[int, int]]:
@@ -255,8 +243,8 @@ def _properties(sensor: _Element) -> dict[str | None, str]:
     return {element.get("name"): element.get("value", "") for element in sensor.findall("property")}
 
 
-def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
-    """A pinhole from focal length and pixel size in mm."""
+def _nominal_calibration(sensor: _Element) -> _Element | None:
+    """By focal length and size of a pixel in mm; None where they are not given."""
     texts = _properties(sensor)
     try:
         focal, *sides = (float(texts[name]) for name in ("focal_length", "pixel_width", "pixel_height"))
@@ -264,8 +252,10 @@ def _from_physical(sensor: _Element, size: tuple[int, int]) -> Lens | None:
         return None
     if not 0 < min(focal, *sides) <= max(focal, *sides) < np.inf:
         return None
-    x, y = (focal / side for side in sides)
-    return Lens(*size, (x, y), (size[0] / 2, size[1] / 2))
+    calibration = ElementTree.Element("calibration")
+    for tag, side in zip(("fx", "fy"), sides, strict=True):
+        ElementTree.SubElement(calibration, tag).text = repr(focal / side)
+    return calibration
 
 
 # MicMac.
@@ -294,20 +284,25 @@ def read_micmac(paths: list[Path]) -> PoseSet:
     """Poses of orientation files. Raises CaptureError: a file is damaged, of another convention, or its calibration is
     missing or can't be represented."""
     lenses: dict[tuple[str, _Shift], Lens] = {}
-    notes: list[str] = []
     raw = []
     for path in paths:
-        root = load_xml(path)
-        orientation = root if root.tag == "OrientationConique" else root.find("OrientationConique")
-        if orientation is None:
-            raise CaptureError(f"{path} holds no <OrientationConique> of MicMac")
-        lens = _lens_micmac(orientation, path, lenses, notes)
+        orientation = _element_micmac(path, "OrientationConique")
+        lens = _lens_micmac(orientation, path, lenses)
         name = path.name.removeprefix(_PREFIX).removesuffix(".xml")
         raw.append((name, PosedCamera(_pose_micmac(orientation, str(path)), lens)))
     is_far = find_offset(np.stack([camera.camera_to_world[:, 3] for _, camera in raw])).any()
     up = np.array([0.0, 0.0, 1.0]) if is_far else None
     folder = paths[0].parent
-    return make_pose_set(raw, f"MicMac's {folder.name}", str(folder), None, up, dict.fromkeys(notes))
+    return make_pose_set(raw, f"MicMac's {folder.name}", str(folder), None, up)
+
+
+def _element_micmac(path: Path, tag: str) -> _Element:
+    """The element of a file that has it as its root, or below."""
+    root = load_xml(path)
+    found = root if root.tag == tag else root.find(tag)
+    if found is None:
+        raise CaptureError(f"{path} holds no <{tag}> of MicMac")
+    return found
 
 
 def _pose_micmac(orientation: _Element, where: str) -> Float64[np.ndarray, "3 4"]:
@@ -329,28 +324,20 @@ def _require_known(what: str, found: str | None, expected: str, where: str) -> N
         raise CaptureError(f"{where} has the {what} {name}; expected {expected}")
 
 
-def _lens_micmac(
-    orientation: _Element, path: Path, lenses: dict[tuple[str, _Shift], Lens], notes: list[str]
-) -> Lens:
+def _lens_micmac(orientation: _Element, path: Path, lenses: dict[tuple[str, _Shift], Lens]) -> Lens:
     inner = orientation.find("Interne")
     name = (orientation.findtext("FileInterne") or "").strip()
     shift = _shift_micmac(orientation.find("OrIntImaM2C"), str(path))
     key = (name if inner is None else str(path), shift)
     if key not in lenses:
-        where = str(path)
-        if inner is None:
-            file = find_named(
-                path.parent, name.replace("\\", "/").rpartition("/")[2]
-            )  # whatever folder it was in
+        file: Path | None = path
+        if inner is None:  # in a file, whatever folder that was in
+            file = find_named(path.parent, name.replace("\\", "/").rpartition("/")[2])
             if file is None:
                 raise CaptureError(f"{path} names the calibration {name!r}; copy it into {path.parent}")
-            where, root = str(file), load_xml(file)
-            inner = root if root.tag == "CalibrationInternConique" else root.find("CalibrationInternConique")
-        if inner is None:
-            raise CaptureError(f"{where} holds no <CalibrationInternConique> of MicMac")
-        lens, said = _calibration_micmac(inner, where)
-        notes += said
-        lenses[key] = _cut_micmac(lens, inner, shift, where) if any(shift) else lens
+            inner = _element_micmac(file, "CalibrationInternConique")
+        lens = _calibration_micmac(inner, str(file))
+        lenses[key] = _cut_micmac(lens, inner, shift, str(file)) if any(shift) else lens
     return lenses[key]
 
 
@@ -380,7 +367,7 @@ def _cut_micmac(lens: Lens, inner: _Element, shift: _Shift, where: str) -> Lens:
     return lens.seen_as(int(size[0]), int(size[1]), (-shift[0], -shift[1]), (1.0, 1.0))
 
 
-def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
+def _calibration_micmac(inner: _Element, where: str) -> Lens:
     _require_known("convention", inner.findtext("KnownConv"), _CONVENTION, where)
     if any(_shift_micmac(inner.find("OrIntGlob/Affinite"), where)):
         raise CaptureError(
@@ -400,7 +387,7 @@ def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
             f"{where}: the distortion {unknown[0]} is not supported; calibrate with RadialStd or Fraser, or use Drunk"
         )
     if not bends:
-        return start, []
+        return start
 
     def project(ideal: Points) -> Points:
         pixels = focal * ideal + center
@@ -408,8 +395,7 @@ def _calibration_micmac(inner: _Element, where: str) -> tuple[Lens, list[str]]:
             pixels = _bend(pixels, model, where)
         return pixels + 0.5
 
-    lens, note = fit_lens(project, start, " and ".join(model.tag for model in bends), where)
-    return lens, [note]
+    return fit_lens(project, start, " and ".join(model.tag for model in bends), where)
 
 
 def _bend(pixels: Points, model: _Element, where: str) -> Points:
@@ -418,17 +404,11 @@ def _bend(pixels: Points, model: _Element, where: str) -> Points:
     middle = None if radial is None else _numbers_of(radial.find("CDist"), 2, where)
     if radial is None or middle is None:
         raise CaptureError(f"{where}: <{model.tag}> has no centre <CDist>; the file is damaged")
-    terms = [_numbers_of(element, 1, where) for element in radial.findall("CoeffDist")]
-    away = pixels - middle
-    squared = (away**2).sum(axis=1)
-    factor = 1.0 + sum(
-        term[0] * squared ** (power + 1) for power, term in enumerate(terms) if term is not None
-    )
-    x, y = away.T
+    found = [_numbers_of(element, 1, where) for element in radial.findall("CoeffDist")]
+    terms = [0.0 if term is None else float(term[0]) for term in found]
     p1, p2, b1, b2 = (_number_of(model, tag, where) for tag in ("P1", "P2", "b1", "b2"))
-    bent_x = x * factor + p1 * (squared + 2 * x**2) + 2 * p2 * x * y + b1 * x + b2 * y
-    bent_y = y * factor + p2 * (squared + 2 * y**2) + 2 * p1 * x * y
-    return np.column_stack([bent_x, bent_y]) + middle
+    away = pixels - middle
+    return bend_brown(away, terms, (p2, p1)) + away @ np.array([[b1, 0.0], [b2, 0.0]]) + middle
 
 
 # Numbers in XML.
