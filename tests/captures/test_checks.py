@@ -45,9 +45,10 @@ def sound(tmp_path_factory: pytest.TempPathFactory):
 
 
 def test_nothing_is_wrong_with_a_good_capture(sound):
-    checked = check_views(sound, ball_points())
-    assert checked[0] == []
-    text = report_text("a title", checked, ["something"])
+    findings: list[str] = []
+    measured = check_views(sound, ball_points(), findings)
+    assert findings == []
+    text = report_text("a title", findings, measured, ["something"])
     assert "none of the checks found a fault" in text
     assert max(map(len, text.splitlines())) <= 110
 
@@ -60,7 +61,7 @@ FAULTS = {
     ),
     "a jump of exposure": (
         lambda folder: _views(folder, ring_of(20), gains={4: 0.7}),
-        "exposure jumps in 1 view, judged by sparse points: view_4 (0.7",
+        "1 view with a jump of exposure, judged by sparse points: view_4 (0.7",
     ),
     "a narrow ring": (lambda folder: _views(folder, ring_of(12, 250.0, (10.0, 14.0))), "a narrow ring"),
     "a gap": (
@@ -69,7 +70,7 @@ FAULTS = {
     ),
     "a view far from the others": (
         lambda folder: _views(folder, [*ring_of(6, 60.0), FAR_AWAY]),
-        "1 view with hardly any overlap with another one (view_6)",
+        "1 view with hardly any overlap with another one, take views in smaller steps: view_6",
     ),
     "few views": (lambda folder: _views(folder, ring_of(6)), "only 6 views"),
     "blur": (
@@ -91,7 +92,8 @@ def recorded(folder, **facts: dict[str, float]):
 @pytest.mark.parametrize("kind", FAULTS)
 def test_what_looks_wrong_is_found_once_with_the_views_it_is_in(tmp_path: Path, kind: str):
     make, said = FAULTS[kind]
-    findings, _ = check_views(make(tmp_path), ball_points())
+    findings: list[str] = []
+    check_views(make(tmp_path), ball_points(), findings)
     assert sum(said in finding for finding in findings) == 1, findings
     if len(make(tmp_path)) >= 15:
         assert len(findings) == 1
@@ -99,10 +101,12 @@ def test_what_looks_wrong_is_found_once_with_the_views_it_is_in(tmp_path: Path, 
 
 def test_what_can_not_be_judged_is_not_found_wrong(tmp_path: Path):
     flashed = _views(tmp_path, ring_of(32), light=None, gains={4: 0.7})
-    assert check_views(flashed, None)[0] == []  # without points
-    assert not any("light" in finding for finding in check_views(flashed[::7], ball_points())[0])
-    on_one_side = check_views(_views(tmp_path, ring_of(16, 60.0, (10.0, 14.0))), None)
-    assert on_one_side[0] == []
+    findings: list[str] = []
+    check_views(flashed, None, findings)  # without points
+    check_views(_views(tmp_path, ring_of(16, 60.0, (10.0, 14.0))), None, findings)  # on one side
+    assert findings == []
+    check_views(flashed[::7], ball_points(), findings)
+    assert not any("light" in finding for finding in findings)
 
 
 def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
@@ -112,10 +116,11 @@ def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
         replace(looking_down, camera=replace(looking_down.camera, camera_to_world=pose + shift))
         for shift in (np.eye(3, 4, 3) * x for x in (0.0, 0.5, 1.0, 9.0))
     ]
-    assert _overlap(views, None)[0] == []
-    findings, said = _overlap(views, ball_points())
-    assert "1 view with hardly any overlap with another one (a)" in findings[0]
-    assert "least 0%" in said
+    findings: list[str] = []
+    _overlap(views, None, findings)
+    assert findings == []
+    assert "least 0%" in _overlap(views, ball_points(), findings)
+    assert "steps: a (at most 0% seen by a neighbour" in findings[0]
 
 
 def test_detail_falls_when_a_picture_is_blurred():

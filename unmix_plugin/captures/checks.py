@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -120,30 +119,27 @@ class SeenView:
             return np.log(found)
 
 
-_Checked: TypeAlias = tuple[list[str], list[str]]
-"""What looks wrong, and what was looked at with its numbers, one sentence each."""
+def check_views(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> list[str]:
+    """All checks of the views of one sensor, in order, with the sparse points, if there are any.
 
-
-def check_views(views: Sequence[SeenView], points: _Points | None) -> _Checked:
-    """All checks of the views of one sensor, in order, with the sparse points, if there are any."""
-    findings, measured = [], []
+    Args:
+        findings: What looks wrong is appended, one sentence each.
+    Returns:
+        What was looked at with its numbers, one sentence each.
+    """
     if len(views) < _FEW_VIEWS:
         findings.append(
             f"only {len(views)} views: expect holes and fog; {_FEW_VIEWS} or more all around serve better"
         )
-    findings += _pixels(views)
-    for check in (_ring, _overlap, _blur, _exposure, _moving_light):
-        found, said = check(views, points)
-        findings += found
-        measured.append(said)
-    return findings, measured
+    _pixels(views, findings)
+    return [check(views, points, findings) for check in (_ring, _overlap, _blur, _exposure, _moving_light)]
 
 
-def report_text(title: str, checked: _Checked, done: Sequence[str]) -> str:
+def report_text(title: str, findings: Sequence[str], measured: Sequence[str], done: Sequence[str]) -> str:
     """One page of text: what looks wrong, what was measured, what was done."""
-    wrong, parts = checked[0] or ["none of the checks found a fault"], [title, ""]
+    wrong, parts = findings or ["none of the checks found a fault"], [title, ""]
     headings = ("What looks wrong", "What was measured", "What was done")
-    for heading, lines in zip(headings, (wrong, checked[1], done), strict=True):
+    for heading, lines in zip(headings, (wrong, measured, done), strict=True):
         parts.append(heading)
         parts += [
             textwrap.fill(line, _WIDTH, initial_indent="- ", subsequent_indent="  ", break_long_words=False)
@@ -159,31 +155,30 @@ def angles_between(views: Sequence[SeenView]) -> Float64[np.ndarray, "N N"]:
     return np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
 
 
-def _pixels(views: Sequence[SeenView]) -> list[str]:
+def _pixels(views: Sequence[SeenView], findings: list[str]) -> None:
     """Views with many saturated or missing pixels, or without matter."""
-    findings = []
     for what, limit in (("saturated", _SATURATED_SHARE), ("missing", _MISSING_SHARE)):
-        records = [view.record for view in views]
-        shares = {one.name: getattr(one, f"{what}_pixels") / one.num_pixels for one in records}
+        shares = {
+            view.name: getattr(view.record, f"{what}_pixels") / view.record.num_pixels for view in views
+        }
         many = [f"{name} ({part:.0%})" for name, part in shares.items() if part > limit]
-        if many:
-            findings.append(
-                f"{counted(len(many), 'view')} with more than {limit:.0%} {what} pixels: {name_some(many, 5)}"
-            )
+        _note(findings, many, f"with more than {limit:.0%} {what} pixels")
     empty = [view.name for view in views if view.record.matter_share == 0.0]
-    if empty:
-        findings.append(
-            f"{counted(len(empty), 'view')} without any matter, by the mask: {name_some(empty, 5)}"
-        )
-    return findings
+    _note(findings, empty, "without any matter, by the mask")
 
 
-def _ring(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str], str]:
+def _note(findings: list[str], names: Sequence[str], what: str) -> None:
+    """A finding that names the views that it is in, if there are any."""
+    if names:
+        findings.append(f"{counted(len(names), 'view')} {what}: {name_some(names, 5)}")
+
+
+def _ring(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
     """From which sides the cameras look, and what is missing."""
     poses = np.stack([view.camera.camera_to_world for view in views])
     focus = meeting_point(poses)
     if focus is None:
-        return [], "the cameras look at no one place: sides are not judged"
+        return "the cameras look at no one place: sides are not judged"
     directions = poses[:, :, 3] - focus
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
@@ -194,7 +189,6 @@ def _ring(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str
         f"cameras span {around:.0f} degrees around the middle, at elevations of {elevation.min():.0f} to "
         f"{elevation.max():.0f} degrees"
     )
-    findings = []
     if height < _NARROW_DEG and around > _WIDE_RING_DEG:
         findings.append(
             f"a narrow ring: all cameras are within {height:.0f} degrees of elevation, so that what is seen from "
@@ -202,10 +196,10 @@ def _ring(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str
         )
     if around > _WIDE_RING_DEG and gap > _GAP_DEG:
         findings.append(f"no camera looks from {gap:.0f} degrees of the circle around the object")
-    return findings, said
+    return said
 
 
-def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
+def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
     """Whether each view shows something that another view shows from a similar side.
 
     A grid of rays of each view is followed to the depth of the middle of the scene: where the cameras look, or that of
@@ -217,7 +211,7 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
     if focus is None and points is not None and len(points):
         focus = np.median(points, axis=0)
     if focus is None or len(views) < 2:
-        return [], "overlap is not judged: the cameras look at no one place, and there are no sparse points"
+        return "overlap is not judged: the cameras look at no one place, and there are no sparse points"
     between = angles_between(views)
     shares = np.zeros(len(views))
     nearest = np.zeros(len(views))
@@ -234,16 +228,13 @@ def _overlap(views: Sequence[SeenView], points: _Points | None) -> tuple[list[st
         f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "
         f"looks from {np.median(nearest):.0f} degrees away (median; most {nearest.max():.0f})"
     )
-    if not alone:
-        return [], said
-    worst = min(alone, key=lambda index: shares[index])
-    names = name_some([views[index].name for index in alone], 5)
-    finding = (
-        f"{counted(len(alone), 'view')} with hardly any overlap with another one ({names}): of {views[worst].name} at "
-        f"most {shares[worst]:.0%} is seen by a neighbour, the nearest looks from {nearest[worst]:.0f} degrees away; "
-        "take views in smaller steps"
-    )
-    return [finding], said
+    names = [
+        f"{views[index].name} (at most {shares[index]:.0%} seen by a neighbour, {nearest[index]:.0f} degrees away)"
+        for index in alone
+    ]
+    what = "with hardly any overlap with another one, take views in smaller steps"
+    _note(findings, names, what)
+    return said
 
 
 def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
@@ -259,27 +250,26 @@ def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
     return view.position + depth * rays
 
 
-def _blur(views: Sequence[SeenView], _: _Points | None = None) -> tuple[list[str], str]:
+def _blur(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
     """Views with less fine detail than the others."""
     details = np.array([view.record.detail for view in views])
     middle = float(np.median(details))
     if len(views) < _LEAST_VIEWS or middle <= 0:
-        return [], "blur is not judged"
+        return "blur is not judged"
     blurred = [
         f"{view.name} ({detail / middle:.0%} of the usual detail)"
         for view, detail in zip(views, details, strict=True)
         if detail < _BLURRED * middle
     ]
     said = f"finest structures have {middle:.2f} times the contrast of those twice as large (median of views)"
-    if not blurred:
-        return [], said
-    return [f"{counted(len(blurred), 'view')} less sharp than the others: {name_some(blurred, 5)}"], said
+    _note(findings, blurred, "less sharp than the others")
+    return said
 
 
-def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
+def _exposure(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
     """Views whose sparse points are brighter or darker than the same points in the views nearest to them."""
     if points is None or len(points) < _LEAST_SHARED_POINTS or len(views) < _LEAST_VIEWS:
-        return [], "exposure is not compared: it takes sparse points, as of estimated poses and COLMAP"
+        return "exposure is not compared: it takes sparse points, as of estimated poses and COLMAP"
     angles = angles_between(views) + 360.0 * np.eye(len(views))
     before = [view._has_before_it(points) for view in views]
     gains = np.full(len(views), np.nan)  # logarithms, against the views around
@@ -294,7 +284,7 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[s
         if len(ratios) >= 2:
             gains[index] = np.median(ratios)
     if np.isnan(gains).any():
-        return [], "exposure is not compared: too few sparse points are seen in every view"
+        return "exposure is not compared: too few sparse points are seen in every view"
     usual = 1.4826 * float(np.median(np.abs(gains - np.median(gains))))
     said = f"sparse points vary by {np.expm1(usual):.0%} in brightness from view to view (robust deviation)"
     jumps = [
@@ -302,27 +292,24 @@ def _exposure(views: Sequence[SeenView], points: _Points | None) -> tuple[list[s
         for view, gain in zip(views, gains, strict=True)
         if abs(gain) > max(_JUMP, _JUMP_DEVIATIONS * usual)
     ]
-    if not jumps:
-        return [], said
-    return [
-        f"exposure jumps in {counted(len(jumps), 'view')}, judged by sparse points: {name_some(jumps, 5)}"
-    ], said
+    _note(findings, jumps, "with a jump of exposure, judged by sparse points")
+    return said
 
 
-def _moving_light(views: Sequence[SeenView], points: _Points | None) -> tuple[list[str], str]:
+def _moving_light(views: Sequence[SeenView], points: _Points | None, findings: list[str]) -> str:
     """Whether the light moves with the camera, as on a turntable."""
     found = _slope_of_light(views, points)
     if found is None:
-        return [], "whether light moves with the camera is not measured: too few sparse points or near views"
+        return "whether light moves with the camera is not measured: too few sparse points or near views"
     slope, error, pairs = found
     said = (
         f"the brightness of sparse points has a slope of {slope:.2f} +- {error:.2f} along the movement of "
         f"the camera ({pairs} pairs of views; 0 is fixed light)"
     )
-    if abs(slope) <= max(_LEAST_SLOPE, _CERTAINTY * error):
-        return [], said
-    moves = "light moves with the camera, as when an object is turned before fixed lamps"
-    return [f"{moves}: {said}. Shading of a point then changes from view to view"], said
+    if abs(slope) > max(_LEAST_SLOPE, _CERTAINTY * error):
+        moves = "light moves with the camera, as when an object is turned before fixed lamps"
+        findings.append(f"{moves}: {said}. Shading of a point then changes from view to view")
+    return said
 
 
 def _slope_of_light(views: Sequence[SeenView], points: _Points | None) -> tuple[float, float, int] | None:

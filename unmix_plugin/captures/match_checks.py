@@ -85,10 +85,13 @@ class _Star:
 
 
 def check_matches(
-    views: Sequence[MatchedView], angles_deg: Float64[np.ndarray, "N N"]
-) -> tuple[list[str], str]:
-    """What does not fit, one sentence each, and what was measured; of views of one sensor, with the angles between
-    their optical axes."""
+    views: Sequence[MatchedView], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
+) -> str:
+    """What was measured in the views of one sensor; what does not fit is appended to findings.
+
+    Args:
+        angles_deg: Between their optical axes.
+    """
     chosen = _choose_stars(angles_deg)
     used = sorted({index for star in chosen for index in star})
     features = {index: _features_of(views[index][1]) for index in used}
@@ -97,11 +100,11 @@ def check_matches(
     stars = [star for star in found if star is not None]
     lens = cameras[0].lens
     if lens is None or sum(len(star.ideal) for star in stars) < _LEAST_POINTS:
-        return [], "poses and lens are not compared with matched points: too few views share features"
-    return _judge(stars, lens)
+        return "poses and lens are not compared with matched points: too few views share features"
+    return _judge(stars, lens, findings)
 
 
-def _judge(stars: Sequence[_Star], lens: Lens) -> tuple[list[str], str]:
+def _judge(stars: Sequence[_Star], lens: Lens, findings: list[str]) -> str:
     from scipy.optimize import least_squares
 
     def misses(values: np.ndarray) -> np.ndarray:
@@ -132,19 +135,17 @@ def _judge(stars: Sequence[_Star], lens: Lens) -> tuple[list[str], str]:
     )
     is_better = left < min(_BETTER * start, _POSES_OFF_PX) and np.all(np.abs(best) < 0.99 * _BOUNDS)
     if start > _LEAST_OFF_PX and is_better and moved * shrunk > _LEAST_MOVED_PX and count > _LEAST_FOR_LENS:
-        finding = (
+        findings.append(
             f"the pictures do not fit their lens: {said}, but {left / shrunk:.2f} px with a focal length of "
             f"{np.exp(best[0]):.0%} and radial terms that move the corners by {moved:.0f} px: is the lens of another "
             "model (a fisheye), or given for pictures of another size or crop?"
         )
-        return [finding], said
-    if left > _POSES_OFF_PX:
-        finding = (
+    elif left > _POSES_OFF_PX:
+        findings.append(
             f"the pictures do not fit their poses: {said}, and no lens brings them below {left / shrunk:.2f} px: are "
             "the poses those of these pictures, and in the convention that their file is read with?"
         )
-        return [finding], said
-    return [], said
+    return said
 
 
 def _changed(ideal: Points, lens: Float64[np.ndarray, "3"]) -> Points:

@@ -34,8 +34,6 @@ _MOST_UNREAD, _HEADER_BYTES = 2.5, 20_000
 """Bytes of a file over those of the numbers taken from it, and beyond them, that leave nothing of weight unread."""
 _CHOOSING_LAYOUTS = ("nespof", "nespof-real")
 """Layouts that take one channel of several on purpose."""
-_WIDE_NM = 200.0
-"""Of a band, full width at half maximum; panchromatic ones have 400 and more."""
 _SIDE = 48
 """Of the grid of pixels that are looked at."""
 _LEAST_PIXELS = 200
@@ -65,30 +63,20 @@ _OTHER_COVER = 0.3
 """Share of a view by which its mask may differ from those of near views."""
 
 
-def check_files(views: Sequence[CaptureView], options: ProcessOptions) -> list[str]:
-    """Files of which most was not read, and bands that are too wide for one wavelength; one sentence each."""
-    findings, left = [], []
+def check_files(views: Sequence[CaptureView], options: ProcessOptions, findings: list[str]) -> None:
+    """Append files of which most was not read."""
+    left = []
     for view in views:
         cube = view.cube
         size = sum(path.stat().st_size for path in cube.files if path.is_file())
         if size > _MOST_UNREAD * np.prod(cube.shape) * cube.dtype.itemsize + _HEADER_BYTES:
             left.append(f"{cube.path.name} ({cube.shape[2]} bands of {size / 1e6:.1f} MB)")
-    if left and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
-        findings.append(
-            f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
-            "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
-        )
-    wide: dict[float, float] = {}
-    for view in views:
-        centres, widths = view.cube.bands.wavelengths_nm, view.cube.bands.fwhm_nm
-        if centres is not None and widths is not None:
-            wide |= {nm: width for nm, width in zip(centres, widths, strict=True) if width > _WIDE_NM}
-    if wide:
-        named = name_some([f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()], 5)
-        findings.append(
-            f"{counted(len(wide), 'band')} too wide to stand for one wavelength: {named}; --drop-bands leaves them out"
-        )
-    return findings
+    if not left or options.dataset is not None or options.layout in _CHOOSING_LAYOUTS:
+        return
+    findings.append(
+        f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
+        "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
+    )
 
 
 @dataclass(frozen=True)
@@ -125,16 +113,24 @@ def check_values(
     samples: Sequence[ViewSample],
     angles_deg: Float64[np.ndarray, "N N"],
     wavelengths_nm: Float64[np.ndarray, " B"],
-) -> list[str]:
-    """What contradicts itself in the views of one sensor, one sentence each, with the angles between their axes."""
+    findings: list[str],
+) -> None:
+    """Append what contradicts itself in the views of one sensor, one sentence each.
+
+    Args:
+        angles_deg: Between their axes.
+    """
     spectra = np.concatenate([sample.spectra for sample in samples]).astype(np.float64)
-    findings = _exposure_steps(samples, angles_deg)
+    _exposure_steps(samples, angles_deg, findings)
     if spectra.shape[1] >= _LEAST_BANDS and len(spectra) >= _LEAST_PIXELS:
-        findings += [*_dark_level(spectra), *_odd_bands(spectra, wavelengths_nm)]
-    return [*findings, *_masks(samples, angles_deg)]
+        _dark_level(spectra, findings)
+        _odd_bands(spectra, wavelengths_nm, findings)
+    _masks(samples, angles_deg, findings)
 
 
-def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[str]:
+def _exposure_steps(
+    samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
+) -> None:
     """Pairs of near views of which one is brighter by the same factor everywhere."""
     usable = [
         index
@@ -142,11 +138,9 @@ def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarra
         if len(sample.spectra) >= _LEAST_PIXELS and np.median(sample.spectra) > _BLACK
     ]
     if len(usable) < 2 or samples[usable[0]].spectra.shape[1] < 3:
-        return []
-    levels = {
-        index: np.log(np.maximum(np.percentile(samples[index].spectra, _PERCENTILES, axis=0), 1e-5))
-        for index in usable
-    }
+        return
+    percentiles = {index: np.percentile(samples[index].spectra, _PERCENTILES, axis=0) for index in usable}
+    levels = {index: np.log(np.maximum(numbers, 1e-5)) for index, numbers in percentiles.items()}
     steps: dict[tuple[int, int], float] = {}
     for view in usable:
         others = sorted((other for other in usable if other != view), key=lambda at: angles_deg[view, at])
@@ -157,21 +151,20 @@ def _exposure_steps(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarra
             if step > _STEP and spread < _UNLIKE * step:
                 steps[view, other] = step
     if not steps:
-        return []
+        return
     names = [
         f"{samples[second].record.name} is {np.exp(step):.2f} times as bright as {samples[first].record.name}"
         for (first, second), step in sorted(steps.items(), key=lambda item: -item[1])
     ]
     concerned = {view for pair in steps for view in pair}
-    finding = (
+    findings.append(
         f"{counted(len(concerned), 'view')} brighter or darker than near ones by one factor in all bands, from dark "
         f"to bright pixels, as with other exposures ({'; '.join(names[:3])}): look for exposure times or gains that "
         "the files do not tell"
     )
-    return [finding]
 
 
-def _dark_level(spectra: Float64[np.ndarray, "P B"]) -> list[str]:
+def _dark_level(spectra: Float64[np.ndarray, "P B"], findings: list[str]) -> None:
     """Whether a level is added to all spectra."""
     mean = spectra.mean(axis=0)
     variances, axes = np.linalg.eigh(np.cov(spectra.T))
@@ -188,16 +181,17 @@ def _dark_level(spectra: Float64[np.ndarray, "P B"]) -> list[str]:
         if away / usual > worst:
             worst, off, rank = away / usual, away / size, count
     if worst < _OFF_FLAT or off < _LEAST_LEVEL:
-        return []
-    finding = (
+        return
+    findings.append(
         f"a level seems to be added to all values: their spectra vary in {rank} ways that do not lead to black (by "
         f"{off:.1%} of the mean spectrum, {worst:.0f} times their spread), as light would: "
         "look for a dark frame that was not taken off, or an offset stored beside the numbers"
     )
-    return [finding]
 
 
-def _odd_bands(spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"]) -> list[str]:
+def _odd_bands(
+    spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.ndarray, " B"], findings: list[str]
+) -> None:
     """Bands with a gain of their own."""
     logs = np.log(np.maximum(spectra[spectra.mean(axis=1) > np.median(spectra.mean(axis=1))], 1e-5))
     found: dict[int, float] = {}
@@ -213,14 +207,13 @@ def _odd_bands(spectra: Float64[np.ndarray, "P B"], wavelengths_nm: Float64[np.n
         found[band] = float(gains[band])
         logs[:, band] -= gains[band]  # it disturbs what its neighbours are compared with
     if not found:
-        return []
+        return
     named = [f"{wavelengths_nm[band]:g} nm ({np.exp(gain):.2f} times)" for band, gain in found.items()]
-    finding = (
+    findings.append(
         f"{counted(len(found), 'band')} off against both neighbours by one factor in all views and materials: "
         f"{', '.join(named)}: a gain that was not applied, or a line of the lamp without a white reference; leave such "
         "bands out with --drop-bands"
     )
-    return [finding]
 
 
 def _excess(
@@ -240,9 +233,11 @@ def _excess(
     return excess
 
 
-def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]) -> list[str]:
+def _masks(
+    samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"], findings: list[str]
+) -> None:
     """Masks that are the wrong way round, or unlike those of near views."""
-    records, findings = [sample.record for sample in samples], []
+    records = [sample.record for sample in samples]
     inverted = [
         record.name
         for record in records
@@ -251,11 +246,10 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
         and record.brightness < _BLACK_SHARE * record.background_brightness
         and record.background_spread > _TEXTURE
     ]
+    hollow = [sample.record.name for sample in samples if sample.is_hollow]
     wrong, how = inverted, "matter is black while the background has light and texture"
-    if not wrong:
-        wrong = [sample.record.name for sample in samples if sample.is_hollow]
-        wrong = wrong if 2 * len(wrong) > len(samples) else []
-        how = "mask takes the border of the picture for matter and its middle for background"
+    if not wrong and 2 * len(hollow) > len(samples):
+        wrong, how = hollow, "mask takes the border of the picture for matter and its middle for background"
     if wrong:
         findings.append(
             f"{counted(len(wrong), 'view')} whose {how} ({name_some(wrong, 5)}): are the masks the wrong way round? "
@@ -263,7 +257,7 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
         )
     shares = np.array([record.matter_share for record in records])
     if len(shares) <= _NEIGHBOURS or np.ptp(shares) == 0:
-        return findings
+        return
     off = []
     for view, share in enumerate(shares):
         near = [other for other in np.argsort(angles_deg[view]) if other != view][:_NEIGHBOURS]
@@ -274,4 +268,3 @@ def _masks(samples: Sequence[ViewSample], angles_deg: Float64[np.ndarray, "N N"]
             f"{counted(len(off), 'view')} whose mask covers another share of the picture than those of near views: "
             f"{name_some(off, 5)}; look at these masks"
         )
-    return findings

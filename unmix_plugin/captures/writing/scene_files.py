@@ -68,13 +68,19 @@ def write_scene_files(
     # Views of sensors with other bands can't be compared with those of the one that took the most.
     ((greatest, _),) = Counter(view.record.sensor for view in seen).most_common(1)
     alike = {name for name, sensor in plan.sensors.items() if _has_bands_of(sensor, plan.sensors[greatest])}
-    findings, measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points)
-    more, said = _contradictions(folder, plan, posed, seen, greatest, options)
-    findings = [*dict.fromkeys((*plan.warnings, *posed.poses.warnings)), *findings, *more]
-    measured = [*measured, said]
+    findings = [*dict.fromkeys((*plan.warnings, *posed.poses.warnings))]
+    measured = check_views([v for v in seen if v.record.sensor in alike], posed.poses.points, findings)
+    findings += posed.findings
+    check_files(posed.views, options, findings)
+    for name, sensor in plan.sensors.items():
+        same = [view for view in seen if view.record.sensor == name]
+        samples = [ViewSample.of(view.record, folder) for view in same]
+        check_values(samples, angles_between(same), sensor.centers_nm, findings)
+    same = [view for view in seen if view.record.sensor == greatest]
+    measured.append(check_matches([(v.camera, v.picture) for v in same], angles_between(same), findings))
     title = f"{plan.capture.root}: {len(seen)} views, {_sizes_in_words(plan)}"
     done = _what_was_done(plan, posed, [view.record for view in seen])
-    write_file(folder / _REPORT_NAME, report_text(title, (findings, measured), done).encode())
+    write_file(folder / _REPORT_NAME, report_text(title, findings, measured, done).encode())
     write_file(folder / _SHEET_NAME, _contact_sheet(seen, plan.sensors, posed.poses, title))
     views = [asdict(view.record) for view in seen]
     totals = ("num_pixels", "saturated_pixels", "missing_pixels", "clipped_values", "negative_values")
@@ -94,25 +100,6 @@ def write_scene_files(
     _write_json(folder / RECORD_NAME, record)
     _write_json(folder / _SCENE_NAME, _transforms_json(plan, posed.views, seen, keys))
     return findings
-
-
-def _contradictions(
-    folder: Path,
-    plan: Plan,
-    posed: PosedViews,
-    seen: Sequence[SeenView],
-    greatest: str,
-    options: ProcessOptions,
-) -> tuple[list[str], str]:
-    """What contradicts itself in files, poses, values and pictures; and what was measured."""
-    findings = [*posed.findings, *check_files(posed.views, options)]
-    for name, sensor in plan.sensors.items():
-        same = [view for view in seen if view.record.sensor == name]
-        samples = [ViewSample.of(view.record, folder) for view in same]
-        findings += check_values(samples, angles_between(same), sensor.centers_nm)
-    same = [view for view in seen if view.record.sensor == greatest]
-    found, said = check_matches([(view.camera, view.picture) for view in same], angles_between(same))
-    return [*findings, *found], said
 
 
 def _write_points(folder: Path, poses: PoseSet) -> dict[str, str]:
