@@ -1,8 +1,9 @@
-"""What headers say, with units under many names: wavelengths, also as a user writes them and in the names of bands,
-channels and files; exposure times and gains.
+"""What headers say of bands and of what numbers stand for, under many names and in many units; wavelengths also as a
+user writes them and in the names of bands, channels and files.
 
-Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
-Only ratios between files count, so a missing unit matters only where some files have one.
+Every reader brings what a file says to *entries*: texts (of lists with commas), numbers or lists by name, in any case,
+with spaces or `_`. `state_bands` and `state_linear` look them up by one table of names; `check_bands` converts and
+checks. What is left out, and why, is appended to the reader's list of warnings.
 
 Notation: `B` bands; wavelengths in nm.
 """
@@ -21,11 +22,22 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from unmix_plugin.captures.names import common_length
-from unmix_plugin.captures.spectral_file import BandTable
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.captures.spectral_file import BandTable, Linear, linear_values
+from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
 from unmix_plugin.limits import read_bounded
 from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit, require_nanometres
 
+_CENTRES = re.compile(
+    r"list_cw_[^_]*|bands|"
+    r"((band|cent(er|re|ral)|sensor|emission)_?)*(wavelengths?|wavelen|wvls?|wls?|lambdas?|waves?)(_?(nm|um))?"
+)
+_WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
+GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
+_NAMES = re.compile(r"band_?names?")
+_UNIT_NAMES = ("{}_units", "{}_unit", "wavelength_units", "wavelength_unit")
+"""Of wavelengths whose name is put in."""
+_DIVISOR = "reflectance_scale_factor"
+"""Stored number of full reflectance, under the same name everywhere."""
 _DIGITS = r"\d+(?:[.,]\d+)?"
 _UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
 PLUS_MINUS = r"(?:±|\+ ?/? ?-)"
@@ -55,6 +67,36 @@ _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
 _ASK = "give the wavelengths yourself (--wavelengths)"
 
 
+def plain_names(entries: Mapping[str, Any]) -> dict[str, str]:
+    """Names of entries by what tables have: without groups and variables before them, in lower case, with `_` for
+    spaces; the first of those that are alike.
+
+    >>> plain_names({"site/Wavelength Units": "nm", "cube#scale_factor": 2})
+    {'wavelength_units': 'site/Wavelength Units', 'scale_factor': 'cube#scale_factor'}
+    """
+    named: dict[str, str] = {}
+    for key in entries:
+        named.setdefault(re.sub(r"[\s_]+", "_", re.split(r"[/#]", key)[-1].lower()), key)
+    return named
+
+
+def listed(value: Any, separators: str = r"[,;\s]") -> list[Any]:
+    """Items of an entry: numbers of a list, or parts of a text, of which commas in a row part none.
+
+    >>> listed("{1, 2,}"), listed([3.0, 4.0])
+    (['1', '2'], [3.0, 4.0])
+    """
+    if not isinstance(value, str):
+        return list(value) if isinstance(value, list) else np.asarray(value).reshape(-1).tolist()
+    items = [" ".join(item.split()) for item in re.split(separators, value.strip("{}[]\0 \n"))]
+    return [item for item in items if item]
+
+
+def says_bands(name: str) -> bool:
+    """Whether an entry of this plain name lists something of bands."""
+    return any(names.fullmatch(name) for names in (_CENTRES, _WIDTHS, GOOD))
+
+
 @dataclass(frozen=True)
 class StatedBands:
     """Values as they are in a file, text or numbers; None where the file has none."""
@@ -69,26 +111,132 @@ class StatedBands:
     names: Sequence[str] | None = None
 
 
-def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[str, ...]]:
+def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
+    """What entries say of bands, the first of each kind; those whose names have no unit first.
+
+    Args:
+        where: What they are, for people: `header field`.
+    """
+    named = plain_names(entries)
+
+    def find(
+        names: re.Pattern[str], *units: str, separators: str = r"[,;\s]"
+    ) -> tuple[str, list[Any] | None]:
+        for unit in units:
+            for name, key in named.items():
+                items = listed(entries[key], separators) if names.fullmatch(name) else []
+                if (
+                    items
+                    and _unit_in(name) == unit
+                    and not (name == "bands" and _counts(items, unit_of(name)))
+                ):
+                    return name, items
+        return "", None
+
+    def unit_of(name: str) -> str | None:
+        keys = [named[key] for key in (form.format(name) for form in _UNIT_NAMES) if key in named]
+        unit = entries[keys[0]] if keys else _unit_in(name) or None
+        return unit if unit is None or isinstance(unit, str) else str(listed(unit)[0])
+
+    name, centres = find(_CENTRES, "", "nm", "um")
+    fwhm, good = find(_WIDTHS, "", _unit_in(name))[1], find(GOOD, "")[1]
+    marks = good and [int(mark) if isinstance(mark, bool) else mark for mark in good]
+    names = find(_NAMES, "", separators=",")[1]
+    return StatedBands(f"{where} '{named.get(name)}'", centres, unit_of(name), fwhm, marks, names)
+
+
+def _unit_in(name: str) -> str:
+    """The unit that a name ends with; empty without one."""
+    return name[-2:] if name.endswith(("nm", "um")) else ""
+
+
+def _counts(items: Sequence[Any], unit: str | None) -> bool:
+    """Whether a list called `bands` has the number or numbers of bands, and not their wavelengths."""
+    try:
+        numbers = np.array(items, np.float64)
+    except ValueError:
+        return True
+    has_unit = unit is not None and nm_per_unit(unit) is not None
+    return not has_unit and (len(items) == 1 or are_band_numbers(numbers, may_have_gaps=True))
+
+
+def state_linear(
+    path: Path,
+    num_bands: int,
+    entries: Mapping[str, Any],
+    where: str,
+    pairs: Sequence[tuple[Sequence[str], Sequence[str]]],
+    warnings: list[str],
+) -> Linear | None:
+    """Gains and offsets among entries, or one factor that divides. A lone `gain` is a part of the exposure.
+
+    Args:
+        where: What entries are, for people.
+        pairs: Plain names of gains and of offsets; those of an earlier pair go before others.
+    Raises:
+        CaptureError: they are no numbers, impossible, or there is a factor beside them.
+    """
+    named, found = plain_names(entries), []
+    for pair in pairs:
+        keys = [next((named[name] for name in names if name in named), "") for names in pair]
+        gains, offsets = (_floats(path, f"{where} '{key}'", entries.get(key, "")) for key in keys)
+        if len(gains) == 1 and not offsets and named.get("gain") == keys[0]:
+            continue
+        stated = " and ".join(
+            f"'{key}'" for key, column in zip(keys, (gains, offsets), strict=True) if column
+        )
+        if linear := linear_values(path, num_bands, gains, offsets, f"{where} {stated}"):
+            found.append(linear)
+    if len(found) > 1:
+        warnings.append(f"{found[0].evidence} is applied, not {found[1].evidence}")
+    key = named.get(_DIVISOR, "")
+    factor = _factor(key, entries.get(key, "1"), warnings)
+    if factor == 1:
+        return found[0] if found else None
+    if found:
+        raise CaptureError(
+            f"{path}: has '{key}' {factor:g} and other gains ({found[0].evidence}); take one of them out of the file, "
+            "as it is unclear which the numbers need"
+        )
+    return linear_values(path, num_bands, [1 / factor], [], f"{where} '{key}'")
+
+
+def _floats(path: Path, what: str, value: Any) -> list[float]:
+    try:
+        return [float(item) for item in listed(value)]
+    except ValueError as error:
+        found = str(error).partition(": ")[2]
+        raise CaptureError(f"{path}: {what} has {found}; expected numbers, one a band") from None
+
+
+def _factor(key: str, value: Any, warnings: list[str]) -> float:
+    """A number above 0; 1 with a warning for anything else."""
+    try:
+        factor = float(listed(value)[0])
+    except (ValueError, IndexError):
+        factor = np.nan
+    if 0 < factor < np.inf:
+        return factor
+    warnings.append(f"'{key}' is {value} and is left out; expected a number above 0")
+    return 1.0
+
+
+def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> BandTable:
     """The table of an image's bands, with units brought to nm and nothing impossible accepted.
 
     A wavelength of 0 marks a band that is not used, as PRISMA's files have it: the band counts as bad.
-
-    Returns:
-        The table, and warnings of what of it is left out.
     """
-    notes: list[str] = []
-    names = _fitting("names of bands", stated.names, num_bands, notes)
+    names = _fitting("names of bands", stated.names, num_bands, warnings)
     centres, evidence, factor, unused = None, BandTable.evidence, None, np.zeros(num_bands, bool)
     if stated.centres is not None:
         evidence = _UNUSABLE
-        values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, notes)
+        values = _numbers(f"{stated.where}: wavelengths", stated.centres, num_bands, warnings)
         if values is not None:
             unused = values == 0 if (values > 0).any() else unused
             used = values[~unused]
             factor, found = _nm_per_stated(values, used, stated)
             if factor is None:
-                notes.append(found)
+                warnings.append(found)
             else:
                 nearest = np.arange(num_bands)
                 if unused.any():  # an unused band gets the wavelength of the nearest band that is used
@@ -101,50 +249,46 @@ def check_bands(stated: StatedBands, num_bands: int) -> tuple[BandTable, tuple[s
         centres, evidence = named[0], f"names of bands, such as {names[0]!r}: {named[1]}"
         named_fwhm = named[2] if stated.fwhm is None else None
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
-        notes.append("two bands beside each other have the same wavelength")
-    fwhm = _numbers("FWHM", stated.fwhm, num_bands, notes)
+        warnings.append("two bands beside each other have the same wavelength")
+    fwhm = _numbers("FWHM", stated.fwhm, num_bands, warnings)
     if fwhm is not None and factor is not None and (fwhm[~unused] > 0).all():
         fwhm = np.where(unused, fwhm[~unused].mean(), fwhm) * factor
         if centres is not None and ((fwhm > centres) | (fwhm < _LEAST_WIDTH_NM)).any():
             unit = f"{fwhm.min():g} to {fwhm.max():g} nm, as they have the unit of the wavelengths"
-            notes.append(f"FWHM are left out: they would be {unit}")
+            warnings.append(f"FWHM are left out: they would be {unit}")
             fwhm = None
     else:
         fwhm = named_fwhm
-    good = _numbers("marks of bad bands", stated.good, num_bands, notes)
+    good = _numbers("marks of bad bands", stated.good, num_bands, warnings)
     bad = unused if good is None else (good == 0) | unused
-    table = BandTable(
-        centres,
-        evidence,
-        fwhm,
-        None if good is None and not unused.any() else bad,
-        None if names is None else tuple(map(str, names)),
-    )
-    return table, tuple(notes)
+    marks = None if good is None and not unused.any() else bad
+    return BandTable(centres, evidence, fwhm, marks, None if names is None else tuple(map(str, names)))
 
 
 def _fitting(
-    what: str, values: Sequence[object] | None, count: int, notes: list[str]
+    what: str, values: Sequence[object] | None, count: int, warnings: list[str]
 ) -> Sequence[object] | None:
     if values is None or len(values) == count:
         return values
-    notes.append(f"{what} are left out: {len(values)} for {count} bands")
+    warnings.append(f"{what} are left out: {len(values)} for {count} bands")
     return None
 
 
-def _numbers(what: str, values: Sequence[object] | None, count: int, notes: list[str]) -> np.ndarray | None:
-    """One finite number a band; None with a note where it is anything else."""
-    values = _fitting(what, values, count, notes)
+def _numbers(
+    what: str, values: Sequence[object] | None, count: int, warnings: list[str]
+) -> np.ndarray | None:
+    """One finite number a band; None with a warning where it is anything else."""
+    values = _fitting(what, values, count, warnings)
     if values is None:
         return None
     try:
         numbers = np.array([float(str(value)) for value in values])
     except ValueError as error:
-        notes.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
+        warnings.append(f"{what} are not a list of numbers ({str(error)[:80]}) and are left out")
         return None
     if not np.isfinite(numbers).all():
         band = int(np.argmin(np.isfinite(numbers)))
-        notes.append(f"{what} are left out: that of band {band} (from 0) is {numbers[band]:g}")
+        warnings.append(f"{what} are left out: that of band {band} (from 0) is {numbers[band]:g}")
         return None
     return numbers
 
@@ -357,141 +501,3 @@ def _read_words(path: Path) -> list[str]:
     if column is not None:
         return [row[column] if column < len(row) else "" for row in rows[1:]]
     return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]
-
-
-# Exposure time and gain, under whichever name and unit a header, a tag or an attribute has them.
-
-_TIMES = {
-    "tint": 1e-3,
-    **dict.fromkeys(
-        ("integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"), 1e-3
-    ),
-    **dict.fromkeys(("exptime", "shutterspeed"), 1.0),
-}
-"""Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
-_GAINS = ("gain", "analoggain", "analoguegain", "digitalgain")
-"""A plain gain is the whole one; the others multiply each other."""
-_OWNERS = ("camera", "sensor", "detector", "imager")
-"""Words before a name that change nothing."""
-_SECONDS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
-    **dict.fromkeys(("ms", "msec", "msecs", "millisecond", "milliseconds"), 1e-3),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
-    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
-}
-_LONGEST_VALUE = 64
-_MOST_DB = 200.0
-_VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.I)
-"""`20`, `20 ms`, `1/50 s`."""
-
-
-def exposure_facts(entries: Mapping[str, Any], where: str) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """What entries of a file say of its exposure.
-
-    Args:
-        entries: Texts, numbers or lists (one number a band) by name.
-        where: What they are, for people: `header field`.
-    Returns:
-        Metadata `exposure_s`, `gain` and `exposure_evidence`, as far as they are known; and warnings.
-
-    >>> exposure_facts({"tint": "20"}, "header field")[0]["exposure_s"]
-    0.02
-    >>> exposure_facts({"Exposure Time (us)": "500"}, "header field")[0]["exposure_s"]
-    0.0005
-    """
-    found: dict[str, tuple[Any, str]] = {}
-    warnings: list[str] = []
-    named = {name: _split(name) for name in entries}
-    units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
-    for key, (name, unit) in named.items():
-        is_time = name in _TIMES
-        if unit == "unit" or not (is_time or name in _GAINS):
-            continue
-        what = "exposure_s" if is_time else name.replace("analogue", "analog")
-        stated: Any = entries[key]  # one, or one a band
-        stated = stated.decode("utf-8", "replace") if isinstance(stated, bytes) else stated
-        if isinstance(stated, str):
-            items = [item for item in re.split(r"[,;{}\[\]()]+", stated) if item.strip()]
-        else:
-            items = [str(item) for item in np.asarray(stated).reshape(-1).tolist()]
-        values = [_quantity(item, unit or units.get(name, ""), name) for item in items]
-        if not values or None in values:
-            warnings.append(
-                f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood: exposures may differ"
-            )
-        elif what not in found:
-            numbers = [value[0] for value in values if value is not None]
-            has_unit = all(value is not None and value[1] for value in values)
-            assumed = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if is_time else "a factor"
-            taken = "" if has_unit else f", no unit: taken as {assumed}"
-            found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, f"{where} '{key}'{taken}"
-    facts: dict[str, Any] = {}
-    if "exposure_s" in found:
-        facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
-    parts = ["gain"] if "gain" in found else [name for name in ("analoggain", "digitalgain") if name in found]
-    if parts:
-        numbers, evidence = zip(*(found[name] for name in parts), strict=True)
-        if len({np.size(number) for number in numbers} - {1}) > 1:
-            warnings.append(f"{' and '.join(evidence)} are lists of different lengths: exposures may differ")
-        else:
-            facts["gain"] = np.multiply.reduce(np.broadcast_arrays(*numbers)).tolist()
-            facts["gain_evidence"] = " and ".join(evidence)
-    return facts, tuple(warnings)
-
-
-def is_exposure(name: str) -> bool:
-    """Whether an entry of this name is an exposure time or a gain."""
-    return _split(name)[0] in (*_TIMES, *_GAINS)
-
-
-def _split(key: str) -> tuple[str, str]:
-    """A name without what owns it, and the unit that it ends with.
-
-    >>> _split("Integration_Time [ms]"), _split("camera gain"), _split("exposure time units")
-    (('integrationtime', 'ms'), ('gain', ''), ('exposuretime', 'unit'))
-    """
-    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", key).lower())
-    unit = ""
-    if len(words) > 1 and (words[-1] in _SECONDS or words[-1] in ("unit", "units", "db")):
-        unit = words.pop().replace("units", "unit")
-    while len(words) > 1 and words[0] in _OWNERS:
-        words.pop(0)
-    return "".join(words), unit
-
-
-def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
-    """A time in seconds or a gain as a factor, and whether a unit was there; None for anything else."""
-    match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
-    if match is None:
-        return None
-    number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
-    unit = (match[3] or unit).strip().lower()
-    if name in _TIMES:
-        factor = _SECONDS.get(unit, None if unit else _TIMES[name])
-        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
-    if unit == "db":
-        return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
-    # A gain of 0 without a unit can only be in decibels.
-    return None if unit or not number >= 0 else (number or 1.0, False)
-
-
-def exif_exposure(time_s: Any, iso_speed: Any, f_number: Any) -> dict[str, Any]:
-    """The same metadata, and `f_number`, by EXIF's exposure time, speed and f-number, of those that are finite numbers
-    above 0; none without a time.
-
-    >>> exif_exposure("0.01", 200, "f/2.8")
-    {'exposure_s': 0.01, 'exposure_evidence': 'EXIF ExposureTime', 'gain': 2.0}
-    """
-    time_s, speed, f_number = map(_above_0, (time_s, iso_speed, f_number))
-    if time_s is None:
-        return {}
-    facts = {"exposure_s": time_s, "exposure_evidence": "EXIF ExposureTime"}
-    return facts | ({"gain": speed / 100} if speed else {}) | ({"f_number": f_number} if f_number else {})
-
-
-def _above_0(value: Any) -> float | None:
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if 0 < number < np.inf else None

@@ -34,8 +34,8 @@ def natural_order(name: str) -> list[tuple[int, str]]:
     return [*keys, (-2, name)]
 
 
-def common_length(texts: Sequence[str]) -> int:
-    """Number of characters that all texts begin with."""
+def common_length(texts: Sequence[Sequence[str]]) -> int:
+    """Number of characters that all texts begin with, or of words of all lists of them."""
     alike = [len(set(column)) == 1 for column in zip(*texts, strict=False)]
     return alike.index(False) if False in alike else len(alike)
 

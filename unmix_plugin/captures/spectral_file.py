@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.pose_set import PoseSet
-from unmix_plugin.errors import CaptureError, install_hint, name_some
+from unmix_plugin.errors import CaptureError, install_hint
 
 Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 """What the axes of an array are, the slowest first: y rows, x columns, b bands."""
@@ -37,17 +37,12 @@ COLOURS_AS_STORED = (
     "8 bits"
 )
 """Warning of colours that no header says to be linear."""
-_WITH_BANDS_AT: tuple[Axes, Axes, Axes] = ("byx", "ybx", "yxb")
 MOST_WIDTH = 0.25
 """Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
 GIVEN = "given by the user"
 """Evidence of wavelengths that files do not state, or state wrongly."""
 _LARGEST_DIFFERENCE_NM = 0.1
 """Between the same bands of files of one capture."""
-_PARTLY_KNOWN = "only some of the files give wavelengths"
-_PARTLY_LINEAR = (
-    "only some of the files of one view state gains or a scale: numbers of the others are taken as stored"
-)
 _MEASURES_NOTHING = 1e30
 _FLOAT32_EPS = float(np.finfo(np.float32).eps)
 _KEPT_BYTES = 2**28
@@ -326,161 +321,6 @@ def unreadable(path: Path, error: Exception) -> CaptureError:
         return CaptureError(f"{path}: too little memory to read it; cut the file in parts")
     reason = " ".join(str(error).split())[:300] or "no reason given"
     return CaptureError(f"{path}: can't be read ({type(error).__name__}: {reason}); copy the file again")
-
-
-def stack_bands(parts: list[SpectralFile], path: Path) -> SpectralFile:
-    """Files of one view that hold one band each, as one file with all of them, in the order given.
-
-    Metadata are those that all parts share. A number that is no data in one part is missing there alone, but 0 in all.
-
-    Args:
-        parts: At least one, all of one size.
-        path: What the whole is called in messages: the folder that holds them.
-    Raises:
-        CaptureError: their sizes differ.
-    """
-    first = parts[0]
-    for part in parts:
-        if part.shape[:2] != first.shape[:2]:
-            raise CaptureError(
-                f"{part.path} has {part.shape[0]} x {part.shape[1]} pixels; expected the "
-                f"{first.shape[0]} x {first.shape[1]} of {first.path}: the bands of one view have one size"
-            )
-
-    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        return np.concatenate([parts[band].read(rows) for band in np.arange(len(parts))[bands]], axis=-1)
-
-    def join(columns: list[Any]) -> np.ndarray | None:
-        """One column of several; lacking where one is."""
-        return None if any(column is None for column in columns) else np.concatenate(columns)
-
-    tables = [part.bands for part in parts]
-    num_known = sum(table.wavelengths_nm is not None for table in tables)
-    marks, names = [table.bad for table in tables], join([table.names for table in tables])
-    good = np.zeros(1, bool)
-    bands = BandTable(
-        join([table.wavelengths_nm for table in tables]),
-        tables[0].evidence if num_known in (0, len(tables)) else _PARTLY_KNOWN,
-        join([table.fwhm_nm for table in tables]),
-        None if all(mark is None for mark in marks) else join([good if m is None else m for m in marks]),
-        None if names is None else tuple(names.tolist()),
-    )
-    stated = [part.linear for part in parts if part.linear is not None]
-    linear = None
-    if stated:
-        each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
-        gains, offsets = (np.concatenate([getattr(x, name) for x in each]) for name in ("gains", "offsets"))
-        linear = Linear(gains, offsets, stated[0].evidence)
-    own_missing = [
-        replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts
-    ]
-    has_own = len({(repr(part.no_data), part.valid_range) for part in own_missing}) > 1
-    of_all = [number for part in parts for number in part.no_data if number == 0 or not has_own]
-
-    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
-        chosen = [own_missing[band] for band in np.arange(len(parts))[bands]]
-        return np.any([find_missing(part.read(rows), part, rows) for part in chosen], axis=0)
-
-    # Metadata that differ are listed by part.
-    same = {
-        key: value
-        for key, value in first.metadata.items()
-        if all(repr(part.metadata.get(key)) == repr(value) for part in parts)
-    }
-    own = [{key: value for key, value in part.metadata.items() if key not in same} for part in parts]
-    headers = [header for part in parts if isinstance(header := part.metadata.get("header"), dict)]
-    if "header" not in same and len(headers) == len(parts):
-        shared = set.intersection(*(set(header.items()) for header in headers))
-        same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
-    exposure, exposure_warnings = _exposure_of_bands(parts)
-    if exposure is not None:
-        same = {key: value for key, value in same.items() if key not in _EXPOSURE} | exposure
-    return replace(
-        first,
-        path=path,
-        shape=(*first.shape[:2], len(parts)),
-        dtype=np.result_type(*(part.dtype for part in parts)),
-        read_part=read_part,
-        bands=bands,
-        linear=linear,
-        no_data=tuple(dict.fromkeys(of_all)),
-        valid_range=None if has_own else first.valid_range,
-        metadata=same | ({"parts": own} if any(own) else {}),
-        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
-        warnings=(
-            *dict.fromkeys(warning for part in parts for warning in part.warnings),
-            *([_PARTLY_LINEAR] if 0 < len(stated) < len(parts) else []),
-            *exposure_warnings,
-        ),
-        sources=tuple(source for part in parts for source in part.files),
-        dark_lines=0,
-        missing_part=missing_part if has_own or any(part.missing_part for part in parts) else None,
-    )
-
-
-_EXPOSURE: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
-"""Metadata of an exposure, and what counts where a file does not say it."""
-
-
-def _exposure_of_bands(parts: list[SpectralFile]) -> tuple[dict[str, Any] | None, list[str]]:
-    """Time times gain of each band, in s, and the f-number of all; nothing where they are not known, None where all
-    parts have the same. And warnings."""
-    exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
-    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
-    is_exposed, warnings = any(time is not None for time, *_ in exposed), []
-    if is_exposed and 0 < len(lacking) < len(parts):
-        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
-        warnings = [f"{unknown}: exposures are compared without it"]
-        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
-    if len(set(map(repr, exposed))) == 1:
-        return None, warnings
-    if not all(isinstance(number, float) for numbers in exposed for number in numbers):
-        unknown = "one exposure time and gain is not known of every band: exposures are not compared"
-        return {}, [unknown] if is_exposed else []
-    of_first = exposed[0][2]  # so that the bands have one f-number again
-    times_s = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
-    return {"exposure_s": times_s} | ({} if lacking else {"f_number": of_first}), warnings
-
-
-def choose_axes(
-    shape: tuple[int, ...], given: Axes | None, num_wavelengths: int | None, default: Axes = "yxb"
-) -> tuple[Axes, tuple[str, ...]]:
-    """Axes of a 3-D array, and warnings.
-
-    Args:
-        shape: Of the array.
-        given: What the user says, which overrides everything.
-        num_wavelengths: Length that the axis of bands has, if it is known.
-        default: Where no length tells.
-
-    >>> choose_axes((31, 64, 48), None, 31)
-    ('byx', ())
-    """
-    if given is not None:
-        return given, ()
-    fitting = [axis for axis in (2, 0, 1) if shape[axis] == num_wavelengths]
-    if _WITH_BANDS_AT.index(default) in fitting:
-        fitting.insert(0, _WITH_BANDS_AT.index(default))
-    if fitting:
-        several = len(set(fitting)) > 1
-        note = f"{num_wavelengths} wavelengths fit several axes of {shape}; bands are taken to be axis {fitting[0]}"
-        return _WITH_BANDS_AT[fitting[0]], (note,) if several else ()
-    bands = _WITH_BANDS_AT.index(default)
-    shortest = int(np.argmin(shape))
-    if shape[shortest] < shape[bands]:
-        other = "byx" if default == "yxb" else "yxb"
-        note = f"bands are taken to be axis {bands} of {shape}, though axis {shortest} is the shortest"
-        return default, (f"{note}; if that is wrong, say which axis is which (--axes {other})",)
-    return default, ()
-
-
-def image_shape(shape: tuple[int, ...], axes: Axes) -> tuple[int, int, int]:
-    """Rows, columns and bands of a stored array.
-
-    >>> image_shape((31, 64, 48), "byx")
-    (64, 48, 31)
-    """
-    return shape[axes.index("y")], shape[axes.index("x")], shape[axes.index("b")]
 
 
 def take_part(stored: np.ndarray, axes: str, rows: slice, bands: BandIndex) -> np.ndarray:

@@ -16,8 +16,7 @@ from tests.captures.capture_factory import (
     write_poses,
 )
 from tests.captures.file_factory import file_of, present
-from unmix_plugin.captures.calibration.exposures import compare_exposures, exposure_of
-from unmix_plugin.captures.header_values import exposure_facts
+from unmix_plugin.captures.exposures import compare_exposures, exposure_facts, exposure_of
 from unmix_plugin.captures.spectral_file import Linear
 
 
@@ -38,24 +37,38 @@ from unmix_plugin.captures.spectral_file import Linear
     ],
 )
 def test_times_by_any_name_in_any_unit(entries, seconds):
-    facts, warnings = exposure_facts(entries, "header field")
-    assert facts["exposure_s"] == pytest.approx(seconds)
+    warnings: list[str] = []
+    assert exposure_facts(entries, "header field", warnings)["exposure_s"] == pytest.approx(seconds)
     assert not warnings
 
 
-def test_gains_are_factors_or_decibels_and_what_is_not_understood_is_said():
-    assert exposure_facts({"gain": "6.0206 dB"}, "")[0]["gain"] == pytest.approx(2.0, rel=1e-4)
-    assert exposure_facts({"camera gain": "4"}, "")[0]["gain"] == 4
-    facts, (warning,) = exposure_facts({"exposure": "-1.5 EV"}, "header field")
-    assert not facts
-    assert "'exposure' is '-1.5 EV', which is not understood" in warning
-    facts, _ = exposure_facts({"exposure": "1" * 100_000 + "!", "gain": "99999 dB"}, "header field")
-    assert not facts.keys() & {"exposure_s", "gain"}
+@pytest.mark.parametrize(
+    "entries", [{"exposure": "-1.5 EV"}, {"exposure": "1" * 100_000 + "!"}, {"gain": "99999 dB"}]
+)
+def test_what_is_not_understood_is_said(entries):
+    warnings: list[str] = []
+    assert not exposure_facts(entries, "header field", warnings)
+    ((name, text),) = entries.items()
+    assert f"header field '{name}' is '{text[:60]}', which is not understood" in warnings[0]
+
+
+@pytest.mark.parametrize("faulty", ["f/2.8", (28, 10), float("inf"), 0.0, -1.0, None])
+def test_a_faulty_tag_of_exif_leaves_the_others_of_an_exposure(faulty):
+    def facts(time, speed, f_number):
+        entries = {"EXIF ExposureTime": time, "EXIF ISOSpeedRatings": speed, "EXIF FNumber": f_number}
+        found = exposure_facts(entries, "tag", [])
+        return [found.get(name) for name in ("exposure_s", "gain", "f_number")]
+
+    assert facts(0.02, 200, faulty) == [0.02, 2.0, None]
+    assert facts(0.02, faulty, 2.8) == [0.02, None, 2.8]
+    assert faulty == (28, 10) or facts(faulty, 200, 2.8) == [None, None, None]
 
 
 @pytest.mark.parametrize(
     ("entries", "gain"),
     [
+        ({"gain": "6.0206 dB"}, 2.0),
+        ({"camera gain": "4"}, 4.0),
         ({"analog gain": "2", "digital gain": "4"}, 8.0),
         ({"digital gain": "4", "analog gain": "2"}, 8.0),
         ({"analog gain": "6.0206 dB", "digital gain": "{1, 2, 3}"}, [2.0, 4.0, 6.0]),
@@ -65,7 +78,8 @@ def test_gains_are_factors_or_decibels_and_what_is_not_understood_is_said():
     ],
 )
 def test_gains_of_parts_of_a_camera_multiply_each_other_and_a_plain_one_is_the_whole(entries, gain):
-    facts, warnings = exposure_facts(entries, "header field")
+    warnings: list[str] = []
+    facts = exposure_facts(entries, "header field", warnings)
     assert facts.get("gain") == (pytest.approx(gain, rel=1e-4) if gain else None)
     assert len(warnings) == (gain is None)
 
@@ -152,7 +166,7 @@ def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
 
 @pytest.mark.parametrize("stated", ["{10.5, 5.25}", "10,5"])
 def test_exposures_that_are_neither_one_nor_one_a_band_are_not_dropped_in_silence(stated):
-    facts = exposure_facts({"tint": stated}, "header field")[0]
+    facts = exposure_facts({"tint": stated}, "header field", [])
     odd = file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
     other = exposed([0.02, 0.01])
     for views, whites in (([odd, other], []), ([odd], [exposed(0.01)]), ([exposed(0.01)], [odd])):

@@ -8,7 +8,6 @@ from PIL import Image
 
 from tests.captures.file_factory import check_file, present, rows_and_bands_of, write_band_file
 from unmix_plugin.captures.calibration.references import find_missing, finished_by
-from unmix_plugin.captures.header_values import exif_exposure
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
 
@@ -156,11 +155,3 @@ def test_the_exposure_of_a_picture_is_that_of_its_exif(tmp_path):
     check_file(open_spectral_file(tmp_path / "a.png"), exposure_s=0.02, gain=2.0, f_number=2.8)
     picture.save(tmp_path / "b.png")
     check_file(open_spectral_file(tmp_path / "b.png"), exposure_s=None)
-
-
-@pytest.mark.parametrize("faulty", ["f/2.8", (28, 10), float("inf"), 0.0, -1.0, None])
-def test_a_faulty_tag_leaves_the_others_of_an_exposure(faulty):
-    known = {"exposure_s": 0.02, "exposure_evidence": "EXIF ExposureTime"}
-    assert exif_exposure(0.02, 200, faulty) == known | {"gain": 2.0}
-    assert exif_exposure(0.02, faulty, 2.8) == known | {"f_number": 2.8}
-    assert exif_exposure(faulty, 200, 2.8) == {}

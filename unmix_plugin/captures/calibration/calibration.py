@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
-from unmix_plugin.captures.calibration.exposures import exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -27,6 +26,7 @@ from unmix_plugin.captures.calibration.references import (
     refuse_outside,
     stated_values,
 )
+from unmix_plugin.captures.exposures import exposure_of
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import ConfigError

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from unmix_plugin.captures.calibration.calibration import Calibration, Raster
-from unmix_plugin.captures.calibration.exposures import Exposures, compare_exposures, exposure_of
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -28,6 +27,7 @@ from unmix_plugin.captures.calibration.references import (
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.exposures import Exposures, compare_exposures, exposure_of
 from unmix_plugin.captures.header_values import in_ranges
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile

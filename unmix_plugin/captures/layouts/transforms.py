@@ -45,6 +45,7 @@ import numpy as np
 from unmix_plugin.captures.names import FoundFiles, natural_order, path_text, view_names
 from unmix_plugin.captures.poses.pose_set import load_json
 from unmix_plugin.captures.poses.reading import frames_of, read_poses, read_transforms
+from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.readers.exr import channel_names
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import (
@@ -54,7 +55,6 @@ from unmix_plugin.captures.spectral_file import (
     ReadOptions,
     SpectralFile,
     linear_values,
-    stack_bands,
 )
 from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
 from unmix_plugin.scenes.reading.faults import Faults, read_number

@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts
-from unmix_plugin.captures.spectral_file import (
-    BandIndex,
-    Linear,
-    ReadOptions,
-    SpectralFile,
-    linear_values,
-    take_part,
-)
+from unmix_plugin.captures.exposures import exposure_facts
+from unmix_plugin.captures.header_values import check_bands, listed, state_bands, state_linear
+from unmix_plugin.captures.spectral_file import BandIndex, ReadOptions, SpectralFile, take_part
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
     EnviLayout,
     data_beside,
     header_begins,
-    header_items,
     image_size,
     read_header,
     read_layout,
@@ -47,7 +38,12 @@ _DARK_LINES = (
 )
 
 _OF_RESONON = {"shutter", "gain", "framerate"}
-"""In headers of Resonon, whose gains are in decibels without saying so."""
+_OF_BANDS = ("wavelength", "wavelength units", "fwhm", "bbl", "band names")
+_GAINS_AND_OFFSETS = [
+    (("data_reflectance_gain_values",), ("data_reflectance_offset_values",)),
+    (("data_gain_values",), ("data_offset_values",)),
+]
+"""Source: NV5, ENVI Header Files, as of `reflectance scale factor`."""
 
 
 def is_envi_header(path: Path) -> bool:
@@ -135,27 +131,23 @@ def described_image(header_path: Path) -> Path | None:
 
 def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) -> SpectralFile:
     """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
-    num_bands = file.shape[2]
-    stated = StatedBands(
-        "header field 'wavelength'",
-        header_items(header, "wavelength") or None,
-        header.get("wavelength units"),
-        header_items(header, "fwhm") or None,
-        header_items(header, "bbl") or None,
-        header_items(header, "band names", ",") or None,
-    )
-    bands, band_warnings = check_bands(stated, num_bands)
-    linear, linear_warnings = _linear(header_path, header, num_bands)
-    exposure, exposure_warnings = _exposure(header)
-    start, lines = _number(header, _DARK_START), file.shape[0]
-    dark_lines = lines - int(start) if start is not None and 1 <= start < lines else 0
-    if start is None and header.get(_DARK_START):
-        linear_warnings += (
-            f"'{_DARK_START}' is {header[_DARK_START]}, no number: dark lines may be left in the image",
-        )
-    own, (no_data, no_data_warnings) = file.bands, _no_data(header)
+    num_bands, own, warnings = file.shape[2], file.bands, list(file.warnings)
+    stated = state_bands({key: header[key] for key in _OF_BANDS if key in header}, "header field")
+    bands = check_bands(stated, num_bands, warnings)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
         bands = replace(own, bad=own.bad if bands.bad is None else bands.bad)
+    linear = state_linear(header_path, num_bands, header, "header field", _GAINS_AND_OFFSETS, warnings)
+    # Of Resonon, which writes decibels without saying so. Source: massipipe, RadianceConverter.
+    in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
+    exposure = exposure_facts(header | ({"gain unit": "dB"} if in_db else {}), "header field", warnings)
+    if in_db and "gain_evidence" in exposure:
+        exposure["gain_evidence"] += ", taken as decibels, as Resonon writes"
+    start, lines = (
+        _numbers(header, _DARK_START, "dark lines may be left in the image", warnings),
+        file.shape[0],
+    )
+    dark_lines = lines - int(start[0]) if start and 1 <= start[0] < lines else 0
+    no_data = _numbers(header, "data ignore value", "not used", warnings)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
     on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
     return replace(
@@ -166,64 +158,18 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         bands=bands if bands.names is not None else replace(bands, names=own.names),
         linear=linear or file.linear,
         no_data=tuple(dict.fromkeys((*no_data, *file.no_data))),
-        warnings=file.warnings + band_warnings + linear_warnings + no_data_warnings + exposure_warnings,
+        warnings=tuple(warnings),
         metadata=file.metadata | exposure | ({"map": on_map} if on_map else {}) | {"header": shown},
     )
 
 
-def _exposure(header: dict[str, str]) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Time and gain, and warnings. Source of Resonon's unit: massipipe, RadianceConverter."""
-    in_db = header.keys() >= _OF_RESONON and "gain unit" not in header
-    facts, warnings = exposure_facts(header | ({"gain unit": "dB"} if in_db else {}), "header field")
-    if in_db and "gain_evidence" in facts:
-        facts["gain_evidence"] += ", taken as decibels, as Resonon writes"
-    return facts, warnings
-
-
-def _no_data(header: dict[str, str]) -> tuple[list[float], tuple[str, ...]]:
-    """Numbers that stand for no measurement, a comment behind them cut off; and warnings."""
-    key = "data ignore value"
-    items = header_items({key: header.get(key, "").partition(";")[0]}, key)
+def _numbers(header: dict[str, str], key: str, otherwise: str, warnings: list[str]) -> list[float]:
+    """Numbers of an entry, a comment behind them cut off; none with a warning where it is something else."""
     try:
-        return [float(item) for item in items], ()
+        return [float(item) for item in listed(header.get(key, "").partition(";")[0])]
     except ValueError:
-        return [], (f"'{key}' is {header[key]}, no number: not used",)
-
-
-def _linear(path: Path, header: dict[str, str], num_bands: int) -> tuple[Linear | None, tuple[str, ...]]:
-    """Gains and offsets of a header; reflectances go before radiances where it has both; and warnings.
-
-    Source: NV5, ENVI Header Files (`data gain values`, `data reflectance gain values`, `reflectance scale factor`).
-    """
-    found: list[Linear] = []
-    for kind in ("data reflectance", "data"):
-        keys = [f"{kind} gain values", f"{kind} offset values"]
-        columns: list[list[float]] = []
-        for key in keys:
-            items = header_items(header, key)
-            try:
-                columns.append([float(item) for item in items])
-            except ValueError as error:
-                found_is = str(error).partition(": ")[2]
-                raise CaptureError(f"{path}: '{key}' has {found_is}; expected numbers, one a band") from None
-        gains, offsets = columns
-        stated = " and ".join(f"'{key}'" for key, column in zip(keys, columns, strict=True) if column)
-        if one := linear_values(path, num_bands, gains, offsets, f"header field {stated}"):
-            found.append(one)
-    key, warnings = "reflectance scale factor", ()
-    scale = _number(header, key)
-    if key in header and (scale is None or not math.isfinite(scale) or scale <= 0):
-        warnings = (f"'{key}' is {header[key]} and is left out; expected a number above 0",)
-    elif scale is not None and scale != 1:
-        if found:
-            raise CaptureError(
-                f"{path}: has '{key}' {scale:g} and other gains ({found[0].evidence}); take one of them out of the "
-                "header, as it is unclear which the numbers need"
-            )
-        return linear_values(path, num_bands, [1 / scale], [], f"header field '{key}'"), ()
-    if len(found) > 1:
-        warnings = (f"{found[0].evidence} is applied, not {found[1].evidence}",)
-    return (found[0] if found else None), warnings
+        warnings.append(f"'{key}' is {header[key]}, no number: {otherwise}")
+        return []
 
 
 def _read_part(data_path: Path, layout: EnviLayout, rows: slice, bands: BandIndex) -> np.ndarray:
@@ -252,11 +198,3 @@ def _check_size(header_path: Path, data_path: Path, layout: EnviLayout) -> tuple
         f"{data_path}: cut short: {found} bytes; {header_path.name} promises {needed} ({height} lines x {width} "
         f"samples x {num_bands} bands of {layout.dtype.name} after {layout.offset} bytes)"
     )
-
-
-def _number(header: dict[str, str], key: str) -> float | None:
-    """A number; a comment behind it is cut off."""
-    try:
-        return float(header[key].partition(";")[0])
-    except (KeyError, ValueError):
-        return None

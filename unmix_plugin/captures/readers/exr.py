@@ -15,6 +15,7 @@ from __future__ import annotations
 import io
 import re
 import struct
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
@@ -25,7 +26,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.header_values import PLAUSIBLE_NM, exposure_facts, wavelengths_in_names
+from unmix_plugin.captures.exposures import exposure_facts
+from unmix_plugin.captures.header_values import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
 from unmix_plugin.errors import CaptureError
@@ -44,6 +46,8 @@ _PLAIN = re.compile(rf"{_LAYER}{_NUMBER}")
 _METRES_PER_SECOND = 299_792_458.0
 _ALPHA = ("A", "alpha")
 _COLOURS = ("R", "G", "B")
+_OF_EXIF = {"isoSpeed": "EXIF ISOSpeed", "aperture": "EXIF FNumber"}
+"""Attributes of the format, by the names of the same things in EXIF."""
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
 LAYERS = ("S0", "T", "")
 """Which of several layers is taken: radiance, reflectance, any other."""
@@ -89,7 +93,8 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     allow_parts(path, len(channels), "channels", CaptureError)
     wanted, titles = options.dataset, [str(part.header.get("name", "")) for part in parts]
     considered = [one for one in channels if wanted is None or titles[one.part] == wanted]
-    table, chosen, warnings = _choose(path, considered or channels, None if considered else wanted)
+    warnings: list[str] = []
+    table, chosen = _choose(path, considered or channels, None if considered else wanted, warnings)
     if not all(channel.is_whole for channel in chosen):
         raise CaptureError(f"{path}: channels leave out pixels (sampling above 1, or a deep image)")
     header = parts[chosen[0].part].header
@@ -98,7 +103,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     unused = set(range(len(parts))) - {channel.part for channel in chosen}
     if unused and table.wavelengths_nm is None:
         names = ", ".join(titles[index] or f"number {index}" for index in sorted(unused))
-        warnings += (f"only the first part is taken; the file also has the parts {names}",)
+        warnings.append(f"only the first part is taken; the file also has the parts {names}")
     windows = {one.part: _window(parts[one.part].header, "dataWindow") for one in chosen}
     is_partial = False
     for index, own in windows.items():
@@ -119,17 +124,11 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         for name, value in header.items()
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
-    exposure, exposure_warnings = exposure_facts(attributes, "attribute")
-    for key, name, unit in (("isoSpeed", "gain", 100.0), ("aperture", "f_number", 1.0)):
-        number = header.get(key)
-        if exposure and isinstance(number, float) and 0 < number < np.inf:
-            exposure[name] = number / unit
+    as_exif = {name: attributes[key] for key, name in _OF_EXIF.items() if key in attributes}
+    exposure = exposure_facts(attributes | as_exif, "attribute", warnings)
+    counts = Counter(channel.part for channel in channels)
     listed = [
-        {
-            "name": title,
-            "type": str(part.type()),
-            "channels": len([one for one in channels if one.part == index]),
-        }
+        {"name": title, "type": str(part.type()), "channels": counts[index]}
         for index, (title, part) in enumerate(zip(titles, parts, strict=True))
     ]
     keys = tuple((channel.part, channel.name) for channel in chosen)
@@ -141,7 +140,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         read_part=lambda rows, wanted: np.moveaxis(loaded(_load_exr, path, keys)[wanted][:, rows], 0, -1),
         bands=table,
         notes=("the data window is a part of the picture: pixels outside are missing",) if is_partial else (),
-        warnings=(*warnings, *exposure_warnings),
+        warnings=tuple(warnings),
         metadata=attributes
         | exposure
         | ({"other_channels": others} if others else {})
@@ -197,14 +196,14 @@ def _list_channels(header: bytes, is_deep: Sequence[bool]) -> list[_Channel]:
 
 
 def _choose(
-    path: Path, channels: list[_Channel], wanted: str | None
-) -> tuple[BandTable, list[_Channel], tuple[str, ...]]:
-    """The channels of a layer that are wavelengths, or all of the first part if none is; and warnings."""
+    path: Path, channels: list[_Channel], wanted: str | None, warnings: list[str]
+) -> tuple[BandTable, list[_Channel]]:
+    """The channels of a layer that are wavelengths, or all of the first part if none is."""
     names = [channel.name for channel in channels]
     if not names:
         raise CaptureError(f"{path}: no channels in this OpenEXR image")
     if wanted is not None and wanted in names:
-        return BandTable(names=(wanted,)), [channels[names.index(wanted)]], ()
+        return BandTable(names=(wanted,)), [channels[names.index(wanted)]]
     by_name = {channel.name: channel for channel in reversed(channels)}
     spectral = _spectral_channels(list(by_name))
     layers = sorted({channel.layer for channel in spectral}, key=lambda layer: (*LAYERS, layer).index(layer))
@@ -219,7 +218,7 @@ def _choose(
         if found is not None:
             evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
             table = replace(table, wavelengths_nm=found[0], evidence=evidence, fwhm_nm=found[2])
-        return table, [by_name[name] for name in bands], ()
+        return table, [by_name[name] for name in bands]
     layer = layers[0] if wanted is None else wanted
     taken = [channel for channel in spectral if channel.layer == layer]
     widths = [channel.width_nm for channel in taken if channel.width_nm is not None]
@@ -229,14 +228,14 @@ def _choose(
         np.array(widths) if len(widths) == len(taken) else None,
         names=tuple(channel.name for channel in taken),
     )
-    chosen, warnings = [by_name[channel.name] for channel in taken], []
+    chosen = [by_name[channel.name] for channel in taken]
     if others := [repr(other) for other in layers if other != layer and wanted is None]:
         warnings.append(f"layer '{layer}' is taken; the file also has {', '.join(others)} (--dataset)")
     alike = {channel.part for channel in channels if channel.name in (table.names or ())}
     if repeated := alike - {channel.part for channel in chosen}:
         same = f"{len(repeated)} other parts have the same ones"
         warnings.append(f"wavelengths of the first part are taken; {same} (--dataset)")
-    return table, chosen, tuple(warnings)
+    return table, chosen
 
 
 def _spectral_channels(names: Sequence[str]) -> list[_SpectralChannel]:

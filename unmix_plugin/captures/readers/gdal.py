@@ -5,122 +5,72 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeAlias
+from xml.etree.ElementTree import Element
 
-import numpy as np
-
-from unmix_plugin.captures.header_values import StatedBands
-from unmix_plugin.captures.spectral_file import Linear, SpectralFile, linear_values
-from unmix_plugin.errors import CaptureError, counted
+from unmix_plugin.captures.header_values import check_bands, plain_names, state_bands, state_linear
+from unmix_plugin.captures.spectral_file import BandTable, Linear, SpectralFile
+from unmix_plugin.errors import counted
 from unmix_plugin.limits import parse_xml, read_bounded
 
-_CENTRES = ("wavelength", "wavelengths", "center_wavelength", "central_wavelength", "centre_wavelength")
-_UNITS = ("wavelength_units", "wavelength_unit")
-_GAIN_ITEMS = {
-    "scale": ("scale", "scale_factor", "gain", "data_gain_values"),
-    "offset": ("offset", "add_offset", "bias", "data_offset_values"),
-}
-"""Names of gains and offsets, by the role that GDAL itself marks them with."""
+GdalItems: TypeAlias = Mapping[str, Mapping[int | None, str]]
+"""Texts by name in lower case, and by band from 0; None for the whole file."""
+_GAINS = ("scale", "scale_factor", "gain", "data_gain_values")
+_OFFSETS = ("offset", "add_offset", "bias", "data_offset_values")
+_NAMES_BY_ROLE = {"scale": "scale", "offset": "offset", "description": "band_name"}
+"""What entries are that GDAL itself marks with a role."""
 _IMAGE_NAME = re.compile(r"SPECTRAL_IMAGE(_VNIR|_SWIR)?$")
 """End of the name of an image of EnMAP or DESIS; those of EnMAP's level L1B have the bands of one detector."""
 _OF_BANDS = {
-    "gain": (1.0, ("Scale", "GainOfBand", "gainOfBand")),
-    "offset": (0.0, ("Offset", "OffsetOfBand", "offsetOfBand")),
-    "centre": (math.nan, ("wavelengthCenterOfBand",)),
-    "width": (math.nan, ("FWHMOfBand", "wavelengthWidthOfBand")),
-    "no data": (math.nan, ("NoDataValue",)),
+    "scale": ("Scale", "GainOfBand", "gainOfBand"),
+    "offset": ("Offset", "OffsetOfBand", "offsetOfBand"),
+    "wavelength": ("wavelengthCenterOfBand",),
+    "fwhm": ("FWHMOfBand", "wavelengthWidthOfBand"),
+    "no_data": ("NoDataValue",),
 }
-"""What XML beside a file says of a band: what counts where it doesn't, and names in GDAL's, EnMAP's and DESIS's."""
+"""What XML beside a file says of a band, by names in GDAL's, EnMAP's and DESIS's."""
 
 
-@dataclass(frozen=True)
-class GdalItem:
-    """One entry of GDAL's metadata."""
-
-    name: str
-    """In lower case."""
-    value: str
-    sample: int | None
-    """Band from 0; None for the whole file."""
-    role: str | None
-
-
-def gdal_items(text: str) -> list[GdalItem]:
+def gdal_items(text: str) -> GdalItems:
     """Entries of a tag; none where it is damaged."""
     try:
         items = list(parse_xml(text).iter("Item"))
     except ValueError:
-        return []
-    samples = [item.get("sample", "") for item in items]
-    bands = [int(text) if text.isdecimal() and len(text) < 9 else None for text in samples]
-    return [
-        GdalItem(item.get("name", "").lower(), (item.text or "").strip(), band, item.get("role"))
-        for item, band in zip(items, bands, strict=True)
-    ]
+        return {}
+    found: dict[str, dict[int | None, str]] = defaultdict(dict)
+    for item in items:
+        sample, name = item.get("sample", ""), item.get("name", "").lower()
+        band = int(sample) if sample.isdecimal() and len(sample) < 9 else None
+        found[_NAMES_BY_ROLE.get(item.get("role", ""), name)].setdefault(band, (item.text or "").strip())
+    return found
 
 
-def linear_of_items(path: Path, items: Sequence[GdalItem], num_bands: int) -> Linear | None:
-    """Gains and offsets: by their role, by names that ENVI and NetCDF give them, or one factor. A lone `gain` of the
-    whole file is a camera's, and part of the exposure. Raises CaptureError: they are no numbers, or there are both."""
-    columns, said = [], []
-    for role, names in _GAIN_ITEMS.items():
-        by_role = [item for item in items if item.role == role]
-        by_name = [item for item in items if item.name.rpartition("#")[2].replace(" ", "_") in names]
-        chosen = by_role or by_name
-        own = {item.sample: item.value for item in chosen if item.sample is not None}
-        whole = next((item.value for item in chosen if item.sample is None), None)
-        texts = _words(whole or "")
-        if own:
-            usual = whole or ("1" if role == "scale" else "0")
-            texts = [own.get(sample, usual) for sample in range(num_bands)]
-        numbers = [number for text in texts if (number := gdal_number(text)) is not None]
-        if len(numbers) < len(texts):
-            found = next(text for text in texts if gdal_number(text) is None)
-            raise CaptureError(f"{path}: GDAL's {role} is {found!r}; expected a number a band")
-        columns.append(numbers)
-        said.append({(item.name, item.sample, item.role) for item in chosen})
-    if said == [{("gain", None, None)}, set()] and len(columns[0]) == 1:  # that of a camera
-        columns[0] = []
-    named = [gdal_number(item.value) for item in items if item.name == "reflectance_scale_factor"]
-    factor = named[0] if named and named[0] else 1.0
-    gains, offsets = columns
-    names = " and ".join(f"'{name}'" for name in sorted({name for chosen in said for name, *_ in chosen}))
-    linear = linear_values(path, num_bands, gains, offsets, f"GDAL's {names}")
-    if factor != 1 and linear is not None:
-        raise CaptureError(
-            f"{path}: has reflectance_scale_factor {factor:g} and scales or offsets of bands; take one of them out, as "
-            "it is unclear which the numbers need"
-        )
-    return linear or linear_values(path, num_bands, [1.0 / factor], [], "GDAL's reflectance_scale_factor")
+def gdal_entries(items: GdalItems) -> dict[str, Any]:
+    """Entries as `state_bands` takes them: one text a band in the order of bands, or that of the whole file."""
+    entries: dict[str, Any] = {}
+    for name, texts in items.items():
+        bands = sorted(band for band in texts if band is not None)
+        entries[name] = [texts[band] for band in bands] if bands else texts[None]
+    numbered = {int(name[5:]): entries[name] for name in items if re.fullmatch(r"band_\d{1,6}", name)}
+    if sorted(numbered) == [*range(1, len(numbered) + 1)]:  # files list Band_10 before Band_2
+        entries.setdefault("band_names", [numbered[number] for number in sorted(numbered)])
+    return entries
 
 
-def bands_of_items(items: Sequence[GdalItem]) -> StatedBands | None:
-    """What entries say of bands; None where they say neither wavelengths nor names."""
-
-    def of_samples(*names: str, role: str | None = None) -> list[str]:
-        """Values of one entry for each band in the order of bands, or the list in one for the whole file."""
-        chosen = [item for item in items if item.name in names or (role and item.role == role)]
-        found = {item.sample: item.value for item in chosen if item.sample is not None}
-        if found:
-            return [found[sample] for sample in sorted(found)]
-        whole = [item.value for item in items if item.sample is None and item.name in names]
-        return _words(whole[0]) if whole else []
-
-    names = of_samples(role="description") or of_samples("band_name", "bandname")
-    numbered = {int(item.name[5:]): item.value for item in items if re.fullmatch(r"band_\d{1,6}", item.name)}
-    if not names and sorted(numbered) == [*range(1, len(numbered) + 1)]:  # files list Band_10 before Band_2
-        names = [numbered[number] for number in sorted(numbered)]
-    units = [item.value for item in items if item.name in _UNITS]
-    centres, fwhm = of_samples(*_CENTRES), of_samples("fwhm")
-    if not centres:
-        centres, fwhm = of_samples("central_wavelength_um"), of_samples("fwhm_um")
-        units = ["Micrometers"] if centres else units
-    if not centres and not names:
-        return None
-    good, unit = of_samples("bbl") or None, units[0] if units else None
-    return StatedBands("GDAL metadata", centres or None, unit, fwhm or None, good, names or None)
+def gdal_linear(
+    path: Path, items: GdalItems, num_bands: int, where: str, warnings: list[str]
+) -> Linear | None:
+    """Gains and offsets, where bands may lack their own. Raises CaptureError: they are no numbers, or impossible."""
+    entries = gdal_entries(items)
+    for name, key in plain_names(items).items():
+        if name in (*_GAINS, *_OFFSETS) and set(items[key]) != {None}:
+            usual = items[key].get(None, "1" if name in _GAINS else "0")
+            entries[key] = [items[key].get(band, usual) for band in range(num_bands)]
+    return state_linear(path, num_bands, entries, where, [(_GAINS, _OFFSETS)], warnings)
 
 
 def gdal_number(text: str) -> float | None:
@@ -130,10 +80,6 @@ def gdal_number(text: str) -> float | None:
     except ValueError:
         return None
     return number if not math.isinf(number) else None
-
-
-def _words(text: str) -> list[str]:
-    return re.findall(r"[^\s,{}]+", text)
 
 
 def with_xml_beside(file: SpectralFile) -> SpectralFile:
@@ -150,46 +96,55 @@ def with_xml_beside(file: SpectralFile) -> SpectralFile:
         for ending in ("METADATA.XML", "METADATA.xml")
     ]
     for path in filter(Path.is_file, beside):
-        file = _with_xml(file, path)
+        warnings: list[str] = []
+        file = _with_xml(file, path, warnings)
+        file = replace(file, warnings=(*file.warnings, *warnings))
     return file
 
 
-def _with_xml(file: SpectralFile, found: Path) -> SpectralFile:
+def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralFile:
     try:
         root = parse_xml(read_bounded(found))
     except ValueError:
-        return replace(file, warnings=(*file.warnings, f"{found.name} is damaged: what it says is not used"))
+        warnings.append(f"{found.name} is damaged: what it says is not used")
+        return file
     num_bands, first = file.shape[2], 1
     elements = list(root.iter("PAMRasterBand"))
     if not found.name.endswith(".aux.xml"):
-        elements = [
-            *root.iterfind(".//bandCharacterisation/bandID"),
-            *root.iterfind(".//bandCharacterisation/band"),
-        ]
+        places = (".//bandCharacterisation/bandID", ".//bandCharacterisation/band")
+        elements = [element for place in places for element in root.iterfind(place)]
         detector = next((end[1] for path in file.files if (end := _IMAGE_NAME.search(path.stem))), None)
         if len(elements) < num_bands or (len(elements) > num_bands and detector is None):
             listed = f"{found.name} describes {counted(len(elements), 'band')}, the image has {num_bands}"
-            return replace(
-                file, warnings=(*file.warnings, f"{listed}: wavelengths and gains in it are not used")
-            )
+            warnings.append(f"{listed}: wavelengths and gains in it are not used")
+            return file
         first = 1 + len(elements) - num_bands if detector == "_SWIR" else 1
-    columns = {what: np.full(num_bands, usual) for what, (usual, _) in _OF_BANDS.items()}
+    items = _items_of_bands(elements, first, num_bands)
+    bands, of_all = file.bands, {name: texts for name, texts in items.items() if len(texts) == num_bands}
+    if bands.wavelengths_nm is None and "wavelength" in of_all:
+        stated = state_bands(gdal_entries(of_all) | {"wavelength_units": "nm"}, found.name)
+        table = check_bands(stated, num_bands, warnings)
+        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bands.bad, bands.names)
+    linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
+    texts = items.get("no_data", {}).values()
+    no_data = [number for number in map(gdal_number, texts) if number is not None and not math.isnan(number)]
+    return replace(
+        file,
+        bands=bands,
+        linear=linear,
+        no_data=tuple(dict.fromkeys((*file.no_data, *no_data))),
+        sources=(*file.sources, found),
+    )
+
+
+def _items_of_bands(elements: Iterable[Element], first: int, num_bands: int) -> GdalItems:
+    """What elements say of the bands of the image, the first of which has the number `first`."""
+    found: dict[str, dict[int | None, str]] = defaultdict(dict)
     for element in elements:
         number = element.get("band") or element.get("number") or element.findtext("bandNumber") or 0
-        index = int(number) - first
-        for what, (_, names) in _OF_BANDS.items():
-            text = next(filter(None, map(element.findtext, names)), None)
-            if text and 0 <= index < num_bands:
-                columns[what][index] = float(text)
-    gains, offsets = columns["gain"], columns["offset"]
-    bands, centres, widths = file.bands, columns["centre"], columns["width"]
-    if bands.wavelengths_nm is None and np.isfinite(centres).all():
-        known = ((widths > 0) & (widths < np.inf)).all()
-        bands = replace(bands, wavelengths_nm=centres, evidence=f"{found.name}, nm")
-        bands = replace(bands, fwhm_nm=widths) if known else bands
-    stated = (gains.tolist(), offsets.tolist(), found.name)
-    linear = file.linear or linear_values(file.path, file.shape[2], *stated)
-    beside = columns["no data"]
-    no_data = tuple(dict.fromkeys((*file.no_data, *beside[~np.isnan(beside)].tolist())))
-    more = (*file.sources, found)
-    return replace(file, bands=bands, linear=linear, no_data=no_data, sources=more)
+        band = int(number) - first
+        for name, tags in _OF_BANDS.items():
+            text = next(filter(None, map(element.findtext, tags)), None)
+            if text and 0 <= band < num_bands:
+                found[name][band] = text.strip()
+    return found

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.readers.band_files import open_band_folder
 from unmix_plugin.captures.readers.containers import KINDS, open_container, open_hdf5
 from unmix_plugin.captures.readers.envi import (
     described_by_header,
@@ -24,7 +25,7 @@ from unmix_plugin.captures.readers.envi import (
 )
 from unmix_plugin.captures.readers.exr import open_exr
 from unmix_plugin.captures.readers.gdal import with_xml_beside
-from unmix_plugin.captures.readers.pictures import open_band_folder, open_picture
+from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
 from unmix_plugin.captures.spectral_file import (
     GIVEN,

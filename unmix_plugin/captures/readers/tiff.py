@@ -23,24 +23,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
-from unmix_plugin.captures.header_values import StatedBands, check_bands, exif_exposure, exposure_facts
-from unmix_plugin.captures.readers.gdal import (
-    GdalItem,
-    bands_of_items,
-    gdal_items,
-    gdal_number,
-    linear_of_items,
-)
+from unmix_plugin.captures.exposures import exposure_facts
+from unmix_plugin.captures.header_values import StatedBands, check_bands, state_bands
+from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
+from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     Axes,
     BandIndex,
     BandTable,
-    Linear,
     ReadOptions,
     SpectralFile,
-    choose_axes,
-    image_shape,
     import_extra,
     take_part,
     with_mask,
@@ -86,7 +79,6 @@ class _Stack:
     """In the byte order of the file."""
     unlisted_from: int | None = None
     """Where the numbers of all pages lie, if only the first has an entry."""
-    warnings: tuple[str, ...] = ()
     fill: float = 0.0
     """What strips and tiles read as that are not in the file."""
     no_data: tuple[float, ...] = ()
@@ -98,34 +90,41 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
     file is cut short."""
     _check_directories(path)
     with _logged() as messages, import_extra("tifffile").TiffFile(path) as file:
-        stack = _find_stack(path, file)
+        warnings: list[str] = []
+        stack = _find_stack(path, file, warnings)
         if any("page offset" in message for message in messages):
             raise CaptureError(f"{path}: cut short: only {len(file.pages)} pages are there; copy it again")
         first = stack.pages[0]
         tags = camera_tags(first.tags)
         # What holds for the whole file stands in its first page, which may be a preview.
         top: Any = file.pages.first
-        items = next(filter(None, (gdal_items(_text(page, _GDAL_METADATA)) for page in (first, top))), [])
-        stated = bands_of_items(items) or _from_description(first) or _from_description(top)
-        stated = stated or _from_pages(stack.pages, file.imagej_metadata or {})
-        stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)))
+        items = next(filter(None, (gdal_items(_text(page, _GDAL_METADATA)) for page in (first, top))), {})
+        entries = gdal_entries(items)
+        said = [state_bands(entries, "GDAL metadata")]
+        said += [state_bands(_described(page), "image description") for page in (first, top)]
+        from_pages = _from_pages(stack.pages, file.imagej_metadata or {})
+        stated = next((one for one in said if one.centres or one.names), from_pages)
+        stack = _with_fill(stack, gdal_number(_text(first, _GDAL_NODATA)), warnings)
         on_map = any(tag in first.tags for tag in _GEO_TAGS)
         masks = _mask_pages(path, file, first)
     given = options.wavelengths_nm if options.wavelengths_nm is not None else stated.centres
     is_stack = len(stack.pages) > 1 or stack.unlisted_from is not None
-    axes, axis_warnings = "yxb", ()
+    axes: Axes = "yxb"
     interleave = None if first.samplesperpixel == 1 else "bsq" if first.planarconfig == 2 else "bip"
     if is_stack:
         num_known = None if given is None else len(given)
-        axes, axis_warnings = choose_axes(stack.shape, options.axes, num_known, "byx")
+        axes = choose_axes(stack.shape, options.axes, num_known, warnings, "byx")
         interleave = {"b": "bsq", "y": "bip" if axes[2] == "b" else "bil"}.get(axes[0])
     shape = image_shape(stack.shape, axes)
-    bands, band_warnings = check_bands(stated, shape[2])
-    linear = linear_of_items(path, items, shape[2])
-    exposure, exposure_warnings = _exposure(tags, items, linear)
+    bands = check_bands(stated, shape[2], warnings)
+    linear = gdal_linear(path, items, shape[2], "GDAL's", warnings)
+    applied = "" if linear is None else linear.evidence
+    exposed = {f"EXIF {name}": value for name, value in tags["exif"].items()}
+    exposed |= {name: value for name, value in entries.items() if f"'{name}'" not in applied}
+    exposure = exposure_facts(exposed, "tag or metadata", warnings)
     # A picture is as bright as its numbers to the eye only.
     is_colour = first.photometric in _COLOURS and bands.wavelengths_nm is None
-    may_be_picture = is_colour and first.dtype in (np.uint8, np.uint16)
+    warnings += [COLOURS_AS_STORED] if is_colour and first.dtype in (np.uint8, np.uint16) else []
     opened = SpectralFile(
         path=path,
         reader="tiff",
@@ -137,11 +136,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         linear=linear,
         no_data=stack.no_data,
         notes=tuple(text for text in messages if "GDAL_NODATA" not in text)[:3],
-        warnings=stack.warnings
-        + axis_warnings
-        + band_warnings
-        + exposure_warnings
-        + ((COLOURS_AS_STORED,) if may_be_picture else ()),
+        warnings=tuple(warnings),
         metadata={name: value for name, value in tags.items() if value}
         | exposure
         | ({"orientation": turned} if (turned := tags["exif"].get("Orientation")) in range(2, 9) else {})
@@ -198,7 +193,7 @@ def _logged() -> Iterator[list[str]]:
         logger.propagate = propagated
 
 
-def _find_stack(path: Path, file: TiffFile) -> _Stack:
+def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
     """The pages that hold the most bands, all alike; previews and masks are passed over."""
     pages = _image_pages(file)
     if not pages:
@@ -222,7 +217,7 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
     allow_decoded(path, max(of_strip, sum(page.nbytes for page in compressed)), CaptureError)
     others = [group for group in groups.values() if group is not like]
     shown = ", ".join(f"{len(group)} of {' x '.join(map(str, group[0].shape))}" for group in others)
-    warnings = (f"pages of other sizes or types are left out: {shown}",) if others else ()
+    warnings += [f"pages of other sizes or types are left out: {shown}"] if others else []
     planes, _, height, width, samples = first.shaped
     dtype = np.dtype(first.dtype).newbyteorder(file.byteorder)
     # ImageJ describes one page of one band, behind which the others lie.
@@ -233,20 +228,20 @@ def _find_stack(path: Path, file: TiffFile) -> _Stack:
         end = start + series.size * dtype.itemsize
         if end > size:
             raise CaptureError(f"{path}: cut short: {num_pages} pages reach to byte {end} of {size}")
-        return _Stack(like[:1], (num_pages, height, width), dtype, start, warnings)
+        return _Stack(like[:1], (num_pages, height, width), dtype, start)
     if any(extra in _OPACITY for extra in first.extrasamples):
-        warnings = (*warnings, "a number of each pixel is marked as opacity; it is kept as a band")
+        warnings.append("a number of each pixel is marked as opacity; it is kept as a band")
     if len(like) == 1:
-        return _Stack(like, (height, width, planes * samples), dtype, None, warnings)
+        return _Stack(like, (height, width, planes * samples), dtype)
     if planes * samples > 1:
         raise CaptureError(
             f"{path}: {len(like)} pages of {planes * samples} numbers a pixel; expected one page with all bands, or "
             "one band a page"
         )
-    return _Stack(like, (len(like), height, width), dtype, None, warnings)
+    return _Stack(like, (len(like), height, width), dtype)
 
 
-def _with_fill(stack: _Stack, no_data: float | None) -> _Stack:
+def _with_fill(stack: _Stack, no_data: float | None, warnings: list[str]) -> _Stack:
     """The stack with the no-data value of the file, and with what its absent strips and tiles read as.
 
     Source: GDAL, GTiff driver, "Sparse files": they hold the no-data value, or 0 where there is none. Without one,
@@ -263,12 +258,12 @@ def _with_fill(stack: _Stack, no_data: float | None) -> _Stack:
     if no_data is not None and is_usable:
         return replace(stack, fill=no_data, no_data=stated)
     taken = "they count as not measured" if is_float else "pixels of 0 in all bands count as not measured"
-    warning = (
+    warnings.append(
         f"{counted(absent, 'block')} of the image left out in the file, which has no no-data value: {taken}; if these "
         "are dark and not missing, write the file without gaps (GDAL's SPARSE_OK=FALSE)"
     )
     fill, more = (math.nan, ()) if is_float else (0.0, (0.0,))
-    return replace(stack, fill=fill, no_data=(*stated, *more), warnings=(*stack.warnings, warning))
+    return replace(stack, fill=fill, no_data=(*stated, *more))
 
 
 def _image_pages(file: TiffFile) -> list[TiffPage]:
@@ -397,31 +392,24 @@ def _text(page: TiffPage, tag: int) -> str:
     return str(page.tags.valueof(tag) or "").strip("\0 \n")
 
 
-def _from_description(page: TiffPage) -> StatedBands | None:
-    """Wavelengths in OME-XML, in JSON, or in text as `wavelengths = 450, 460`."""
+def _described(page: TiffPage) -> dict[str, Any]:
+    """Entries of a description with wavelengths: OME-XML, JSON, or text as `wavelengths = 450, 460`."""
     text = _text(page, _DESCRIPTION)[: 2**20]
     if "wavelength" not in text.lower():
-        return None
-    if listed := re.findall(r'<Channel\b[^<>]*?\bEmissionWavelength="([^"]+)"', text):
+        return {}
+    if found := re.findall(r'<Channel\b[^<>]*?\bEmissionWavelength="([^"]+)"', text):
         unit = re.search(r'EmissionWavelengthUnit="([^"]+)"', text)
-        return StatedBands("OME-XML, EmissionWavelength", listed, unit[1] if unit else "nm")
+        return {"EmissionWavelength": found, "EmissionWavelength units": unit[1] if unit else "nm"}
     try:
         content = json.loads(text)
     except (ValueError, RecursionError):
         content = None
     if isinstance(content, dict):
-        entries: dict[str, Any] = {str(key).lower().rstrip("s"): value for key, value in content.items()}
-        centres = entries.get("wavelength", entries.get("wavelengths_nm", entries.get("wavelength_nm")))
-        unit = entries.get("wavelength_unit", "nm" if "wavelengths_nm" in map(str.lower, content) else None)
-        if isinstance(centres, list):
-            unit, fwhm = unit if isinstance(unit, str) else None, entries.get("fwhm")
-            return StatedBands("image description", centres, unit, fwhm if isinstance(fwhm, list) else None)
+        return {key: value for key, value in content.items() if isinstance(value, list | str)}
     match = _LIST.search(text)
-    centres = re.findall(r"\d+(?:\.\d+)?", match["list"]) if match else []
-    if match is None or not centres:
-        return None
-    unit = match["unit"] if nm_per_unit(match["unit"] or "") else None
-    return StatedBands("image description", centres, unit)
+    unit = match["unit"] if match and nm_per_unit(match["unit"] or "") else ""
+    found = re.findall(r"\d+(?:\.\d+)?", match["list"]) if match else []
+    return {"wavelength": found, "wavelength units": unit}
 
 
 def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
@@ -448,20 +436,3 @@ def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> 
         return table
     is_fitting = len(found.wavelengths_nm) == num_bands
     return replace(found, names=table.names, bad=table.bad) if is_fitting else table
-
-
-def _exposure(
-    tags: dict[str, Any], items: list[GdalItem], linear: Linear | None
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Time and gain out of EXIF or of items of GDAL that values are not multiplied by, and warnings."""
-    applied = "" if linear is None else linear.evidence
-    # GDAL copies them, numbers in brackets.
-    exif = {item.name: item.value.strip("() ") for item in items if item.sample is None}
-    exif |= {f"exif_{name.lower()}": value for name, value in tags["exif"].items()}
-    speed = exif.get("exif_isospeedratings", exif.get("exif_isospeed"))
-    if facts := exif_exposure(exif.get("exif_exposuretime"), speed, exif.get("exif_fnumber")):
-        return facts, ()
-    texts: dict[str, Any] = defaultdict(list)
-    for item in (item for item in items if f"'{item.name}'" not in applied):
-        texts[item.name.replace("exif_exposuretime", "exposuretime_s")].append(item.value)
-    return exposure_facts({name: ",".join(values) for name, values in texts.items()}, "GDAL metadata")

@@ -1,12 +1,17 @@
-"""How long views and their references were exposed, and what becomes of it.
+"""How long views and their references were exposed: what files say, and what becomes of it.
+
+Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
+Only ratios between files count, so a missing unit matters only where some files have one.
 
 Notation: `b` is 1, or the bands of a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,6 +19,141 @@ from jaxtyping import Float64
 from unmix_plugin.captures.calibration.references import finished_by
 from unmix_plugin.captures.spectral_file import SpectralFile
 from unmix_plugin.errors import counted, name_some
+
+_TIMES = {
+    "tint": 1e-3,
+    **dict.fromkeys(
+        ("integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"), 1e-3
+    ),
+    **dict.fromkeys(("exptime", "shutterspeed", "exifexposuretime"), 1.0),
+}
+"""Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
+_FACTS = {
+    **dict.fromkeys(_TIMES, "exposure_s"),
+    "gain": "gain",
+    "analoggain": "analog",
+    "analoguegain": "analog",
+    "digitalgain": "digital",
+    **dict.fromkeys(("exifisospeedratings", "exifisospeed"), "speed"),
+    "exiffnumber": "f_number",
+}
+"""What names say. A plain gain is the whole one; the others multiply each other."""
+_OF_EXIF = ("speed", "f_number")
+"""Facts that count beside a time, and are left out where they make no sense."""
+_OWNERS = ("camera", "sensor", "detector", "imager")
+"""Words before a name that change nothing."""
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "msecs", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
+}
+_LONGEST_VALUE = 64
+_MOST_DB = 200.0
+_VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.I)
+"""`20`, `20 ms`, `1/50 s`."""
+
+
+def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) -> dict[str, Any]:
+    """What entries of a file say of its exposure: metadata `exposure_s`, `gain` and `f_number`, and `exposure_evidence`
+    and `gain_evidence`, as far as they are known.
+
+    Args:
+        entries: Texts, numbers or lists (one number a band) by name; EXIF's begin with that word.
+        where: What they are, for people: `header field`.
+        warnings: What is not understood is appended.
+
+    >>> exposure_facts({"tint": "20"}, "header field", [])["exposure_s"]
+    0.02
+    >>> exposure_facts({"Exposure Time (us)": "500"}, "header field", [])["exposure_s"]
+    0.0005
+    """
+    found: dict[str, tuple[Any, str]] = {}
+    named = {name: _split(name) for name in entries}
+    units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
+    for key, (name, unit) in named.items():
+        what = _FACTS.get(name)
+        if what is None or unit == "unit":
+            continue
+        stated: Any = entries[key]  # one, or one a band
+        if isinstance(stated, str):
+            items = [item for item in re.split(r"[,;{}\[\]()]+", stated) if item.strip()]
+        else:
+            items = [str(item) for item in np.asarray(stated).reshape(-1).tolist()]
+        values = [_quantity(item, unit or units.get(name, ""), name) for item in items]
+        known = [value for value in values if value is not None]
+        if what in _OF_EXIF and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
+            continue
+        if not known or len(known) < len(values):
+            said = f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood"
+            warnings.append(f"{said}: exposures may differ")
+        elif what not in found:
+            numbers = [number for number, _ in known]
+            has_unit = name.startswith("exif") or all(has_unit for _, has_unit in known)
+            taken = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if name in _TIMES else "a factor"
+            evidence = f"{where} '{key}'" + ("" if has_unit else f", no unit: taken as {taken}")
+            found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, evidence
+    return _combined(found, warnings)
+
+
+def _combined(found: Mapping[str, tuple[Any, str]], warnings: list[str]) -> dict[str, Any]:
+    """Metadata of what was found, with one gain: EXIF's speed beside a time, the whole one, or the product of parts."""
+    facts: dict[str, Any] = {}
+    if "exposure_s" in found:
+        facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
+        facts |= {"f_number": found["f_number"][0]} if "f_number" in found else {}
+    wholes = (["speed"] if "exposure_s" in found else []) + ["gain"]
+    parts = [name for name in wholes if name in found][:1]
+    if parts := parts or [name for name in ("analog", "digital") if name in found]:
+        numbers, evidence = zip(*(found[name] for name in parts), strict=True)
+        if len({np.size(number) for number in numbers} - {1}) > 1:
+            warnings.append(f"{' and '.join(evidence)} are lists of different lengths: exposures may differ")
+        else:
+            facts["gain"] = np.multiply.reduce(np.broadcast_arrays(*numbers)).tolist()
+            facts["gain_evidence"] = " and ".join(evidence)
+    return facts
+
+
+def is_exposure(name: str) -> bool:
+    """Whether an entry of this name says something of the exposure."""
+    return _split(name)[0] in _FACTS
+
+
+def _split(key: str) -> tuple[str, str]:
+    """A name without what owns it, and the unit that it ends with.
+
+    >>> _split("Integration_Time [ms]"), _split("camera gain"), _split("exposure time units")
+    (('integrationtime', 'ms'), ('gain', ''), ('exposuretime', 'unit'))
+    """
+    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", key).lower())
+    unit = ""
+    if len(words) > 1 and (words[-1] in _SECONDS or words[-1] in ("unit", "units", "db")):
+        unit = words.pop().replace("units", "unit")
+    while len(words) > 1 and words[0] in _OWNERS:
+        words.pop(0)
+    return "".join(words), unit
+
+
+def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
+    """A time in seconds, a gain as a factor or an f-number, and whether a unit was there; None for anything else."""
+    match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
+    if match is None:
+        return None
+    number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
+    unit = (match[3] or unit).strip().lower()
+    if name in _TIMES:
+        factor = _SECONDS.get(unit, None if unit else _TIMES[name])
+        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
+    if unit == "db":
+        return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
+    if unit or not number >= 0:
+        return None
+    if _FACTS[name] in _OF_EXIF:
+        return (number / 100 if _FACTS[name] == "speed" else number), True
+    return number or 1.0, False  # a gain of 0 without a unit can only be in decibels
+
+
+# What becomes of exposures.
 
 
 def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:

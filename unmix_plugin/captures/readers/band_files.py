@@ -1,0 +1,173 @@
+"""Files that hold one band each, as one image: a folder of them, or those that a layout lists."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.header_values import wavelengths_in_names
+from unmix_plugin.captures.names import natural_order
+from unmix_plugin.captures.spectral_file import BandIndex, BandTable, Linear, SpectralFile, find_missing
+from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.limits import allow_parts
+
+_KINDS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", ".exr": "OpenEXR", ".jpg": "JPEG", ".jpeg": "JPEG"}
+_EXPOSURE: dict[str, Any] = {"exposure_s": None, "gain": 1.0, "f_number": 1.0}
+"""Metadata of an exposure, and what counts where a file does not say it."""
+
+
+def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) -> SpectralFile:
+    """Open the files of a folder as the bands of one image, by rising wavelength or in the order of their names.
+
+    Wavelengths are in the files, or in their names. Raises CaptureError: there are no such files, they hold several
+    bands each or differ in size, or a lens of a rig took each.
+    """
+    found = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    kinds = Counter(_KINDS[path.suffix.lower()] for path in found if path.suffix.lower() in _KINDS)
+    if not kinds:
+        raise CaptureError(f"{folder}: no band files in this folder; expected one {', '.join(_KINDS)} a band")
+    kind, number = kinds.most_common(1)[0]
+    allow_parts(folder, number, "band files", CaptureError)
+    files = [path for path in found if _KINDS.get(path.suffix.lower()) == kind]
+    bands = [open_band(path) for path in sorted(files, key=lambda path: natural_order(path.name))]
+    for band in bands:
+        if band.shape[2] != 1:
+            raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
+        if (model := radiometric_model(band)) is not None:
+            raise CaptureError(
+                f"{band.path}: of one lens of a {model.maker} camera, with a calibration of its own, and bands of "
+                "several lenses do not lie on each other; read the folder with the layout rig"
+            )
+    centres = _joined([band.bands.wavelengths_nm for band in bands])
+    named = wavelengths_in_names([band.path.stem for band in bands]) if centres is None else None
+    centres = named[0] if named else centres
+    order = np.arange(len(bands)) if centres is None else np.argsort(centres, kind="stable")
+    stack, others = stack_bands([bands[index] for index in order], folder), kinds.total() - number
+    if named is not None:
+        evidence = f"names of files, such as {bands[0].path.name!r}: {named[1]}"
+        widths = stack.bands.fwhm_nm if named[2] is None else named[2][order]
+        table = replace(stack.bands, wavelengths_nm=named[0][order], evidence=evidence, fwhm_nm=widths)
+        stack = replace(stack, bands=table)
+    noun = "picture of another kind" if others == 1 else "pictures of other kinds"
+    notes = (f"{others} {noun} than {kind} in the folder left out",) if others else ()
+    return replace(stack, interleave="bsq", notes=stack.notes + notes)
+
+
+def stack_bands(parts: Sequence[SpectralFile], path: Path) -> SpectralFile:
+    """Files of one view that hold one band each, as one file with all of them, in the order given.
+
+    Metadata are those that all parts share. A number that is no data in one part is missing there alone, but 0 in all.
+
+    Args:
+        parts: At least one, all of one size.
+        path: What the whole is called in messages: the folder that holds them.
+    Raises:
+        CaptureError: their sizes differ.
+    """
+    first = parts[0]
+    for part in parts:
+        if part.shape[:2] != first.shape[:2]:
+            raise CaptureError(
+                f"{part.path} has {part.shape[0]} x {part.shape[1]} pixels; expected the "
+                f"{first.shape[0]} x {first.shape[1]} of {first.path}: the bands of one view have one size"
+            )
+    warnings = [*dict.fromkeys(warning for part in parts for warning in part.warnings)]
+    stated = [part.linear for part in parts if part.linear is not None]
+    if 0 < len(stated) < len(parts):
+        said = "only some of the files of one view state gains or a scale"
+        warnings.append(f"{said}: numbers of the others are taken as stored")
+    each = [part.linear or Linear(np.ones(1), np.zeros(1), "") for part in parts]
+    gains, offsets = (np.concatenate([getattr(one, name) for one in each]) for name in ("gains", "offsets"))
+    own = [replace(part, no_data=tuple(number for number in part.no_data if number != 0)) for part in parts]
+    differ = len({(repr(part.no_data), part.valid_range) for part in own}) > 1
+    of_all = [number for part in parts for number in part.no_data if number == 0 or not differ]
+
+    def read_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        return np.concatenate([parts[band].read(rows) for band in np.arange(len(parts))[bands]], axis=-1)
+
+    def missing_part(rows: slice, bands: BandIndex) -> np.ndarray:
+        chosen = [own[band] for band in np.arange(len(parts))[bands]]
+        return np.any([find_missing(part.read(rows), part, rows) for part in chosen], axis=0)
+
+    return replace(
+        first,
+        path=path,
+        shape=(*first.shape[:2], len(parts)),
+        dtype=np.result_type(*(part.dtype for part in parts)),
+        read_part=read_part,
+        bands=_table_of([part.bands for part in parts]),
+        linear=Linear(gains, offsets, stated[0].evidence) if stated else None,
+        no_data=tuple(dict.fromkeys(of_all)),
+        valid_range=None if differ else first.valid_range,
+        metadata=_shared_metadata(parts, warnings),
+        notes=tuple(dict.fromkeys(note for part in parts for note in part.notes)),
+        warnings=tuple(warnings),
+        sources=tuple(source for part in parts for source in part.files),
+        dark_lines=0,
+        missing_part=missing_part if differ or any(part.missing_part for part in parts) else None,
+    )
+
+
+def _joined(columns: Sequence[Any]) -> np.ndarray | None:
+    """One column of several; lacking where one is."""
+    return None if any(column is None for column in columns) else np.concatenate(columns)
+
+
+def _table_of(tables: Sequence[BandTable]) -> BandTable:
+    """The table of all bands; a band that nobody marks is good."""
+    centres = _joined([table.wavelengths_nm for table in tables])
+    is_partial = centres is None and any(table.wavelengths_nm is not None for table in tables)
+    is_marked = any(table.bad is not None for table in tables)
+    marks = [np.zeros(1, bool) if table.bad is None else table.bad for table in tables]
+    names = _joined([table.names for table in tables])
+    return BandTable(
+        centres,
+        "only some of the files give wavelengths" if is_partial else tables[0].evidence,
+        _joined([table.fwhm_nm for table in tables]),
+        np.concatenate(marks) if is_marked else None,
+        None if names is None else tuple(names.tolist()),
+    )
+
+
+def _shared_metadata(parts: Sequence[SpectralFile], warnings: list[str]) -> dict[str, Any]:
+    """Metadata that all parts share, and lines that their headers do; the others are listed by part."""
+    every = [part.metadata for part in parts]
+    same = {
+        k: value for k, value in every[0].items() if all(repr(own.get(k)) == repr(value) for own in every)
+    }
+    others = [{key: value for key, value in own.items() if key not in same} for own in every]
+    headers = [header for own in every if isinstance(header := own.get("header"), dict)]
+    if "header" not in same and len(headers) == len(parts):
+        shared = set.intersection(*(set(header.items()) for header in headers))
+        same["header"] = {key: value for key, value in headers[0].items() if (key, value) in shared}
+    exposure = _exposure_of_bands(parts, warnings)
+    if exposure is not None:
+        same = {key: value for key, value in same.items() if key not in _EXPOSURE} | exposure
+    return same | ({"parts": others} if any(others) else {})
+
+
+def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> dict[str, Any] | None:
+    """Time times gain of each band, in s, and the f-number of all; nothing where they are not known, None where all
+    parts have the same."""
+    exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
+    lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
+    is_exposed = any(time is not None for time, *_ in exposed)
+    if is_exposed and 0 < len(lacking) < len(parts):
+        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
+        warnings.append(f"{unknown}: exposures are compared without it")
+        exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
+    if len(set(map(repr, exposed))) == 1:
+        return None
+    if not all(isinstance(number, float) for numbers in exposed for number in numbers):
+        unknown = "one exposure time and gain is not known of every band: exposures are not compared"
+        warnings += [unknown] if is_exposed else []
+        return {}
+    of_first = exposed[0][2]  # so that the bands have one f-number again
+    times_s = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
+    return {"exposure_s": times_s} | ({} if lacking else {"f_number": of_first})
