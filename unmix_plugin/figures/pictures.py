@@ -11,16 +11,23 @@ Notation: pictures are (H, W, 3) sRGB in [0, 1]; `h x W` pixels, some rows of th
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float64, UInt8
 
-from unmix_plugin.figures.plotting import FIGURE_DPI, Colour, draw_colour_bar, draw_swatch, figure_bytes
+from unmix_plugin.figures.plotting import (
+    FIGURE_DPI,
+    Colour,
+    draw_colour_bar,
+    draw_swatch,
+    figure_bytes,
+    page_in_inches,
+)
 from unmix_plugin.formats.files import rgba_png_bytes
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 
@@ -83,6 +90,14 @@ def premultiplied_over_neutral(linear_rgb: Picture, opacity: Float[np.ndarray, "
     return encode_srgb(np.clip(light.astype(np.float64), 0, 1))
 
 
+def id_palette(colours: Mapping[int, Colour]) -> Float64[np.ndarray, "256 3"]:
+    """sRGB of each id, neutral grey for those without a colour."""
+    palette = np.full((256, 3), NEUTRAL)
+    for index, colour in colours.items():
+        palette[index] = colour
+    return palette
+
+
 def columns_for(count: int) -> int:
     """Columns of a grid of `count` panels that is wider than high."""
     return count if count <= 4 else max(4, int(np.ceil(np.sqrt(1.6 * count))))
@@ -108,43 +123,50 @@ def draw_panels(
         scale: Drawn as a colour bar on the right.
         legend: Names and their colours, listed below.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     height_px, width_px, _ = rows[0][0].image.shape
     longer = float(np.clip(max(height_px, width_px) / FIGURE_DPI, *_PANEL_BOUNDS))
-    width, height = (longer * side / max(height_px, width_px) for side in (width_px, height_px))
-    width = max(width, 1.3)  # room for a title
+    size = (longer * width_px / max(height_px, width_px), longer * height_px / max(height_px, width_px))
+    width = max(size[0], 1.3)  # room for a title
     num_columns = max(len(row) for row in rows)
     bar = 0.0 if scale is None else _BAR_SPACE
     grid_width = num_columns * (width + _GAP) - _GAP
-    page_width = max(grid_width + bar, _HEADING_LETTER * len(heading), _legend_width(legend)) + 2 * _MARGIN
-    legend_columns = max(1, int((page_width - 2 * _MARGIN) / _legend_width(legend)))
-    below = _LEGEND_ROW * -(-len(legend) // legend_columns) + (_GAP if legend else 0.0)
-    grid_height = len(rows) * (height + _TITLE + _GAP) - _GAP
-    page = (page_width, _MARGIN + below + grid_height + _HEADING + _MARGIN)
-    figure = Figure(figsize=page, facecolor="white")
-    top = page[1] - _MARGIN
-    figure.text(_MARGIN / page[0], top / page[1], heading, fontsize=_FONT_PT + 2, fontweight="bold", va="top")
+    inner_width = max(grid_width + bar, _HEADING_LETTER * len(heading), _entry_width(legend))
+    below = legend_height(legend, inner_width) + (_GAP if legend else 0.0)
+    grid_height = len(rows) * (size[1] + _TITLE + _GAP) - _GAP
+    top = _MARGIN + below + grid_height + _HEADING
+    figure, page = page_in_inches(inner_width + 2 * _MARGIN, top + _MARGIN)
+    page.text(_MARGIN, top, heading, fontsize=_FONT_PT + 2, fontweight="bold", va="top")
     for row, panels in enumerate(rows):
-        bottom = top - _HEADING - (row + 1) * (height + _TITLE) - row * _GAP
+        bottom = top - _HEADING - (row + 1) * (size[1] + _TITLE) - row * _GAP
         for column, panel in enumerate(panels):
-            left = _MARGIN + column * (width + _GAP)
-            _draw_panel(figure, panel, (left, bottom, width, height), page)
+            _draw_panel(page, panel, (_MARGIN + column * (width + _GAP), bottom), size, width)
     if scale is not None:
         box = (_MARGIN + grid_width + 0.18, _MARGIN + below, _BAR_WIDTH, grid_height - _TITLE)
-        axes = figure.add_axes(_in_parts(box, page))
-        bar = draw_colour_bar(figure, axes, scale.colour_map, (scale.low, scale.high))
-        bar.set_label(scale.label, fontsize=_FONT_PT)
-        bar.ax.tick_params(labelsize=_FONT_PT - 1)
-        bar.locator = MaxNLocator(5)
-    for index, (name, colour) in enumerate(legend):
-        row, column = divmod(index, legend_columns)
-        left = _MARGIN + column * _legend_width(legend)
-        base = _MARGIN + below - _GAP - (row + 1) * _LEGEND_ROW
-        draw_swatch(figure, colour, (left, base + 0.02))
-        figure.text((left + 0.24) / page[0], (base + 0.03) / page[1], name, fontsize=_FONT_PT, va="bottom")
+        drawn = draw_colour_bar(page, box, scale.colour_map, (scale.low, scale.high))
+        drawn.set_label(scale.label, fontsize=_FONT_PT)
+        drawn.ax.tick_params(labelsize=_FONT_PT - 1)
+        drawn.locator = MaxNLocator(5)
+    draw_legend_entries(page, legend, (_MARGIN, _MARGIN + below - _GAP), inner_width)
     return figure_bytes(figure)
+
+
+def legend_height(legend: Sequence[tuple[str, Colour]], width: float) -> float:
+    """Inches that the entries take on a page so wide."""
+    return _LEGEND_ROW * -(-len(legend) // max(1, int(width / _entry_width(legend))))
+
+
+def draw_legend_entries(
+    page: Any, legend: Sequence[tuple[str, Colour]], corner: tuple[float, float], width: float
+) -> None:
+    """Swatches and names on a page in inches, in rows of this width; the corner is their left and top."""
+    columns = max(1, int(width / _entry_width(legend)))
+    for index, (name, colour) in enumerate(legend):
+        row, column = divmod(index, columns)
+        left, base = corner[0] + column * _entry_width(legend), corner[1] - (row + 1) * _LEGEND_ROW
+        draw_swatch(page, colour, (left, base + 0.02))
+        page.text(left + 0.24, base + 0.03, name, fontsize=_FONT_PT, va="bottom")
 
 
 def one_above_the_other(paths: Sequence[Path], captions: Sequence[str]) -> bytes:
@@ -167,31 +189,26 @@ def one_above_the_other(paths: Sequence[Path], captions: Sequence[str]) -> bytes
 
 
 def _draw_panel(
-    figure: Any, panel: TitledPicture, box: tuple[float, float, float, float], page: tuple[float, float]
+    page: Any, panel: TitledPicture, corner: tuple[float, float], size: tuple[float, float], width: float
 ) -> None:
-    axes = figure.add_axes(_in_parts(box, page))
-    axes.imshow(np.clip(panel.image, 0, 1))
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set(color="0.75", linewidth=0.8)
-    left, bottom, width, height = box
-    base = bottom + height + 0.07
+    """A panel on a page, `width` wide in all, with its title above."""
+    from matplotlib.patches import Rectangle
+
+    left, bottom = corner
+    left_of_picture = left + (width - size[0]) / 2
+    extent = (left_of_picture, left_of_picture + size[0], bottom, bottom + size[1])
+    page.imshow(np.clip(panel.image, 0, 1), extent=extent, aspect="auto")
+    frame = Rectangle((left_of_picture, bottom), *size, fill=False, edgecolor="0.75", linewidth=0.8)
+    page.add_patch(frame)
+    base = bottom + size[1] + 0.09
     if panel.swatch is not None:
-        draw_swatch(figure, panel.swatch, (left, base + 0.02))
+        draw_swatch(page, panel.swatch, (left, base))
         left, width = left + 0.22, width - 0.22
     title = textwrap.shorten(panel.title, max(8, int(width / _LETTER)), placeholder="...")
-    figure.text(left / page[0], (base + 0.02) / page[1], title, fontsize=_FONT_PT, va="bottom")
+    page.text(left, base, title, fontsize=_FONT_PT, va="bottom")
 
 
-def _in_parts(
-    box: tuple[float, float, float, float], page: tuple[float, float]
-) -> tuple[float, float, float, float]:
-    left, bottom, width, height = box
-    return left / page[0], bottom / page[1], width / page[0], height / page[1]
-
-
-def _legend_width(legend: Sequence[tuple[str, Colour]]) -> float:
+def _entry_width(legend: Sequence[tuple[str, Colour]]) -> float:
     """Inches that one entry takes."""
     return 0.52 + _LETTER * max((len(name) for name, _ in legend), default=8)
 
@@ -220,12 +237,8 @@ class CanvasLayout:
     def of(
         tile_size: tuple[int, int], captions: Sequence[str] = (), count: int | None = None
     ) -> CanvasLayout:
-        """The layout of one tile without a name, or of tiles with room for names.
-
-        Args:
-            tile_size: Width and height of a tile in pixels.
-            captions: Every name that a tile may have.
-            count: Number of tiles; None: that of the names.
+        """The layout of one tile without a name, or of `count` tiles (None: one for each name) with room for the names
+        that they may have.
 
         >>> CanvasLayout.of((96, 64)).size, CanvasLayout.of((96, 64), ["oak"] * 7).size
         ((96, 64), (390, 166))
@@ -261,13 +274,7 @@ class Canvas:
         captions: Sequence[str] = (),
         swatches: Sequence[Colour] | np.ndarray = (),
     ) -> None:
-        """
-        Args:
-            layout: Where tiles are.
-            num_channels: 3 for colours, 4 with opacity.
-            captions: One for each tile; none for one tile without a name.
-            swatches: Colours of small squares before the captions; one for each, or none.
-        """
+        """3 channels are colours, a fourth is opacity; captions and swatches before them one for each tile, or none."""
         self._layout = layout
         width, height = layout.size
         self.pixels: UInt8[np.ndarray, "H W C"] = np.full((height, width, num_channels), 255, dtype=np.uint8)

@@ -47,34 +47,41 @@ def css_colour(srgb: Colour) -> str:
     return "#" + "".join(f"{round(255 * min(max(float(value), 0.0), 1.0)):02x}" for value in srgb)
 
 
+def page_in_inches(width: float, height: float) -> tuple[Any, Any]:
+    """A white figure, and axes without ticks that fill it, whose unit is an inch: whatever is placed on them lies where
+    it is said to."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), facecolor="white")
+    page = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(0, height))
+    page.axis("off")
+    return figure, page
+
+
 def draw_swatch(
-    figure: Any, colour: Colour, corner: tuple[float, float], side: float = 0.15, edge: str = "0.3"
+    page: Any, colour: Colour, corner: tuple[float, float], side: float = 0.15, edge: str = "0.3"
 ) -> None:
-    """A square of a colour, its left and bottom and its side in inches; `edge` is the colour of its outline, or
-    `none`."""
+    """A square of a colour on a page, by its left and bottom; `edge` is the colour of its outline, or `none`."""
     from matplotlib.patches import Rectangle
 
-    width, height = figure.get_size_inches()
-    square = Rectangle(
-        (corner[0] / width, corner[1] / height),
-        side / width,
-        side / height,
-        transform=figure.transFigure,
-        facecolor=tuple(np.clip(colour, 0, 1)),
-        edgecolor=edge,
-        linewidth=0.6,
-    )
-    figure.add_artist(square)
+    fill = tuple(np.clip(colour, 0, 1))
+    page.add_patch(Rectangle(corner, side, side, facecolor=fill, edgecolor=edge, linewidth=0.6))
 
 
 def draw_colour_bar(
-    figure: Any, axes: Any, colour_map: str, bounds: tuple[float, float], orientation: str = "vertical"
+    page: Any,
+    box: tuple[float, float, float, float],
+    colour_map: str,
+    bounds: tuple[float, float],
+    orientation: str = "vertical",
 ) -> Any:
-    """A colour bar over `bounds` that fills `axes`; matplotlib's, for labels and ticks."""
+    """A colour bar over `bounds` in a box (left, bottom, width, height) of a page; matplotlib's, for labels."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    return figure.colorbar(ScalarMappable(Normalize(*bounds), colour_map), cax=axes, orientation=orientation)
+    axes = page.inset_axes(box, transform=page.transData)
+    mapped = ScalarMappable(Normalize(*bounds), colour_map)
+    return page.figure.colorbar(mapped, cax=axes, orientation=orientation)
 
 
 def plain_axes(axes: Any) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.figures.plotting import draw_swatch, figure_bytes
+from unmix_plugin.figures.plotting import draw_swatch, figure_bytes, page_in_inches
 from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
@@ -97,35 +97,25 @@ def _find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
 
 def _draw_metamers(found: _Metamers) -> bytes:
     """A row a pair, a column a light: both surfaces side by side as an eye adapted to the light sees them."""
-    from matplotlib.figure import Figure
-
     drawn = found.pairs[:_MOST_DRAWN]
-    rows, columns = max(1, len(drawn)), len(found.lights)
-    page = (_NAME_WIDTH + max(3, columns) * _CELL + 2 * _MARGIN, _HEADING + rows * _ROW + 2 * _MARGIN)
-    figure = Figure(figsize=page, facecolor="white")
+    columns = [_MARGIN + _NAME_WIDTH + index * _CELL for index in range(max(3, len(found.lights)))]
+    top = _ROW * max(1, len(drawn)) + _MARGIN
+    figure, page = page_in_inches(columns[-1] + _CELL + _MARGIN, top + _HEADING + _MARGIN)
     heading = f"{len(found.pairs)} pairs of {len(found.names)} materials look alike in one light, different in another"
-    figure.text(_MARGIN / page[0], 1 - _MARGIN / page[1], heading, fontsize=11, fontweight="bold", va="top")
+    page.text(_MARGIN, top + _HEADING, heading, fontsize=11, fontweight="bold", va="top")
     labels = ["CIEDE2000 beside the swatches", *found.lights]
-    for label, left in zip(labels, [_MARGIN, *(_column(index) for index in range(columns))], strict=True):
-        figure.text(left / page[0], 1 - (_MARGIN + 0.68) / page[1], label, fontsize=10, va="bottom")
+    for label, left in zip(labels, [_MARGIN, *columns], strict=False):
+        page.text(left, top + 0.07, label, fontsize=10, va="bottom")
     labs = [reflectance_to_lab(found.reflectance, power, found.bands) for power in found.powers]
     for row, pair in enumerate(drawn):
-        base = page[1] - _MARGIN - _HEADING - (row + 1) * _ROW
-        for index, surface in enumerate((pair.first, pair.second)):
-            height = (base + 0.36 - 0.2 * index) / page[1]
-            figure.text(_MARGIN / page[0], height, found.names[surface][:42], fontsize=9, va="center")
-        for column, lab in enumerate(labs):
-            left = _column(column)
-            for index, colour in enumerate(lab_to_srgb(lab[[pair.first, pair.second]])):
-                draw_swatch(figure, colour, (left + index * _SWATCH, base + 0.06), _SWATCH, "none")
-            place = ((left + 2 * _SWATCH + 0.08) / page[0], (base + 0.29) / page[1])
-            figure.text(*place, f"{pair.differences[column]:.1f}", fontsize=10, va="center")
+        base, surfaces = top - (row + 1) * _ROW, [pair.first, pair.second]
+        for index, surface in enumerate(surfaces):
+            page.text(_MARGIN, base + 0.36 - 0.2 * index, found.names[surface][:42], fontsize=9, va="center")
+        for left, lab, difference in zip(columns, labs, pair.differences, strict=False):
+            for index, colour in enumerate(lab_to_srgb(lab[surfaces])):
+                draw_swatch(page, colour, (left + index * _SWATCH, base + 0.06), _SWATCH, "none")
+            page.text(left + 2 * _SWATCH + 0.08, base + 0.29, f"{difference:.1f}", fontsize=10, va="center")
     return figure_bytes(figure)
-
-
-def _column(index: int) -> float:
-    """Where the column of a light begins."""
-    return _MARGIN + _NAME_WIDTH + index * _CELL
 
 
 def _table(found: _Metamers) -> bytes:

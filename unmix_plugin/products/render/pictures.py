@@ -9,6 +9,7 @@ Notation: `h x W` pixels, some rows of an image; `T` tiles, `K` endmembers.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,16 +17,19 @@ from jaxtyping import Float, Float64, UInt8
 
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.figures.pictures import (
-    NEUTRAL,
     ColourScale,
+    draw_legend_entries,
+    id_palette,
+    legend_height,
     over_neutral,
     paint,
     premultiplied_over_neutral,
 )
-from unmix_plugin.figures.plotting import Colour, draw_colour_bar, draw_swatch, figure_bytes, id_colours
+from unmix_plugin.figures.plotting import Colour, draw_colour_bar, figure_bytes, id_colours, page_in_inches
 from unmix_plugin.formats.files import csv_bytes, eight_bits
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.spectral.segmentation import NOTHING_ID
 from unmix_plugin.trained.run_materials import endmember_colours
 
 LIGHT_KINDS = frozenset({"srgb", "linear", "grey"})
@@ -57,9 +61,7 @@ class Palette:
     def by_id(self, output: Output) -> Float64[np.ndarray, "256 3"]:
         """Colour of each id, neutral grey for those that stand for nothing."""
         own = [colour for _, colour in output.classes] if output.classes else self.colours
-        colours = np.full((256, 3), NEUTRAL)
-        colours[: len(own)] = own
-        return colours
+        return id_palette(dict(enumerate(own)))
 
     def scale(self, output: Output) -> ColourScale | None:
         """The scale of an output's colours; None where its colours are not a scale."""
@@ -153,46 +155,32 @@ def _over_grey(
     return eight_bits(premultiplied_over_neutral(linear, opacity))[:, :, None]
 
 
-_WIDTH, _BAR_ROW, _NAME_ROW, _MARGIN = 5.2, 0.66, 0.26, 0.16
+_WIDTH, _BAR_ROW, _MARGIN = 5.2, 0.66, 0.16
 """Inches."""
-_NAMES_A_ROW, _LONG_NAMES_A_ROW = 3, 2
-_SHORT_NAME, _LONGEST_NAME = 18, 30
+_LONGEST_NAME = 30
 _FONT_PT = 9
 
 
-def legend_csv(output: Output) -> bytes:
-    """What the ids of an output with classes of its own mean: `id,name,red,green,blue`, sRGB 0 to 255."""
-    rows = [
-        [index, name, *np.round(255 * np.asarray(colour)).astype(int)]
-        for index, (name, colour) in enumerate(output.classes)
-    ]
+def legend_csv(classes: Iterable[tuple[str, Colour]], nothing: Colour | None = None) -> bytes:
+    """What ids mean, counted from 0: `id,name,red,green,blue`, sRGB 0 to 255; and `nothing`, if it has a colour."""
+    named = [(index, name, colour) for index, (name, colour) in enumerate(classes)]
+    named += [] if nothing is None else [(NOTHING_ID, "nothing", nothing)]
+    rows = [[index, name, *np.round(255 * np.asarray(colour)).astype(int)] for index, name, colour in named]
     return csv_bytes([["id", "name", "red", "green", "blue"], *rows])
 
 
 def draw_legend(output: Output, palette: Palette) -> bytes:
     """The legend of an output as a PNG."""
-    from matplotlib.figure import Figure
-
-    scale = palette.scale(output)
-    has_names = output.kind in ("labels", "shares")
-    names = palette._entries(output) if has_names else []
-    bar = 0.0 if scale is None else _BAR_ROW
-    is_long = max((len(name) for name, _ in names), default=0) > _SHORT_NAME
-    columns = _LONG_NAMES_A_ROW if is_long else _NAMES_A_ROW
-    height = 2 * _MARGIN + bar + -(-len(names) // columns) * _NAME_ROW
-    figure = Figure(figsize=(_WIDTH, height), facecolor="white")
-    top = height - _MARGIN - bar
+    scale, width = palette.scale(output), _WIDTH - 2 * _MARGIN
+    shown = palette._entries(output) if output.kind in ("labels", "shares") else []
+    names = [(name[:_LONGEST_NAME], colour) for name, colour in shown]
+    names_height = legend_height(names, width) if names else 0.0
+    height = 2 * _MARGIN + (0.0 if scale is None else _BAR_ROW) + names_height
+    figure, page = page_in_inches(_WIDTH, height)
     if scale is not None:
-        box = (_MARGIN / _WIDTH, (top + 0.3) / height, 1 - 2 * _MARGIN / _WIDTH, 0.14 / height)
-        bounds = (scale.low, scale.high)
-        drawn = draw_colour_bar(figure, figure.add_axes(box), scale.colour_map, bounds, "horizontal")
+        box = (_MARGIN, _MARGIN + names_height + 0.3, width, 0.14)
+        drawn = draw_colour_bar(page, box, scale.colour_map, (scale.low, scale.high), "horizontal")
         drawn.ax.tick_params(labelsize=_FONT_PT - 1, length=2, pad=2)
         drawn.ax.set_title(f"{output.name}: {scale.label}", fontsize=_FONT_PT, loc="left", pad=3)
-    for index, (name, colour) in enumerate(names):
-        row, column = divmod(index, columns)
-        left = _MARGIN + column * (_WIDTH - 2 * _MARGIN) / columns
-        bottom = top - (row + 1) * _NAME_ROW
-        draw_swatch(figure, colour, (left, bottom + 0.05))
-        place = ((left + 0.22) / _WIDTH, (bottom + 0.06) / height)
-        figure.text(*place, name[:_LONGEST_NAME], fontsize=_FONT_PT, va="bottom")
+    draw_legend_entries(page, names, (_MARGIN, _MARGIN + names_height), width)
     return figure_bytes(figure)
