@@ -3,88 +3,23 @@
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.errors import counted
+from unmix_plugin.errors import ConfigError, counted
+from unmix_plugin.products.render import RenderOptions
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from unmix_plugin.engine.processes import Processes
-    from unmix_plugin.products.render.cameras import CameraRequest, RenderCameras
+    from unmix_plugin.products.render.cameras import RenderCameras
     from unmix_plugin.products.render.files import FormattedOutput
     from unmix_plugin.products.render.pictures import Palette
-    from unmix_plugin.scenes.scene import Normalisation
     from unmix_plugin.trained.open_run import LoadedRun
-
-
-@dataclass(frozen=True)
-class _RenderOptions:
-    """Render views of a trained run: spectra, pictures, maps and videos, from the run folder alone."""
-
-    run: Path | None = None
-    """Run folder, as training printed it; None takes the newest under --output-dir."""
-    cameras: str = "dataset-eval"
-    """dataset-eval, dataset-train, orbit (around the scene), interpolate (through the evaluation cameras), map (from
-    above without perspective, north up; map:bottom, map:east, map:north, map:west, map:south or map:X,Y,Z: from there),
-    or a file: nerfstudio's camera_path.json, or poses as in transforms.json."""
-    view: tuple[str, ...] = ()
-    """Only these of the cameras, by name or by number from 0."""
-    outputs: tuple[str, ...] = ()
-    """spectral, reflectance, continuum, derivative, second_derivative, rgb, linear_rgb, diffuse, specular, abundances,
-    material_scores, probe_probabilities, segmentation, confidence, depth, ray_distance, normals, accumulation, pca,
-    band:650nm, false-colour:860,650,550; index:ndvi or index:(r800-r670)/(r800+r670), target:paint.csv or
-    target:ace:paint.csv>0.5, library:mine.csv<0.1 or library:angle:mine.csv, absorption:650-700 (depth; or
-    absorption:centre:650-700, absorption:area:650-700); or all (but those with a colon). None given: spectral rgb
-    abundances segmentation depth for single views, rgb for a path."""
-    formats: tuple[str, ...] = ()
-    """envi, exr, npy, png, mp4, tif (GeoTIFF of maps); each output is written in those that suit it. None given:
-    what suits each best. mp4 of spectra goes through the bands."""
-    size: str | None = None
-    """Width and height in pixels, as in 640x480; the vertical field of view stays. None: the dataset's or the file's;
-    orbit and interpolate have at least 512 rows."""
-    downscale: float | None = None
-    """Divide width and height by this."""
-    pixel_size: float | None = None
-    """Of maps: edge of a pixel in metres, or in units of the world where the run has no scale; None: about that of the
-    scene's views."""
-    epsg: int | None = None
-    """Of maps from above: EPSG code of the projected coordinate system in metres that geo-referenced poses are in, as
-    32632 for UTM zone 32N; it is written into the files."""
-    frames: int | None = None
-    """Number of cameras of orbit or interpolate; None: 120."""
-    fps: float | None = None
-    """Frames a second of videos; None: as the camera file says, or a default for each kind of video."""
-    edits: Path | None = None
-    """Recipe (YAML) of edits of materials and light to apply first."""
-    illuminant: str | None = None
-    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
-    sensor: Path | None = None
-    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
-    environment: str | None = None
-    """Environment to light an object with: an .exr or .hdr file, or the name of a built-in one; for methods that know
-    light and material apart. None: that of the pictures."""
-    environment_rotation: float = 0.0
-    """Degrees by which the environment is turned about the world's +z."""
-    environment_exposure: float = 0.0
-    """Stops by which the environment is brighter."""
-    output: Path | None = None
-    """Folder to write to; None: exports/render in the run folder."""
-    output_dir: Path = Path("outputs")
-    """Folder in which to look for the newest run."""
-    device: DeviceName = "auto"
-    """Where to compute; auto takes CUDA where there is one."""
-    num_devices: int = 1
-    """Processes that share the views, on CUDA each on a device of its own."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace files of an earlier render."""
 
 
 def render(argv: list[str]) -> None:
@@ -98,20 +33,18 @@ def render(argv: list[str]) -> None:
         SceneError: the environment map is missing, damaged or unusable.
         SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
     """
-    options = tyro.cli(_RenderOptions, prog="unmix-render", args=argv)
-    request = _camera_request(options)
+    options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
 
     from unmix_plugin.engine.processes import joined, start_together
 
     start_together("unmix_plugin.commands.render", argv, options.num_devices)
     with joined(options.device) as processes:
-        _render_run(options, request, processes)
+        _render_run(options, processes)
 
 
-def _render_run(options: _RenderOptions, request: CameraRequest, processes: Processes) -> None:
+def _render_run(options: RenderOptions, processes: Processes) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, say, working
     from unmix_plugin.editing.edited_run import load_edited_run
-    from unmix_plugin.errors import ConfigError
     from unmix_plugin.products.render.cameras import choose_cameras
     from unmix_plugin.products.render.files import choose_formats, with_units
 
@@ -121,7 +54,7 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
         with working(console, f"reading {path}"):
             loaded = load_edited_run(path, options.device, options.edits, options.illuminant, options.sensor)
             loaded = _relit(loaded, options)
-            cameras = choose_cameras(loaded.scene, request, loaded.scale)
+            cameras = choose_cameras(loaded.scene, options, loaded.scale)
         for line in loaded.scene.notes:
             say(console, line)
         own = {view.name: view.camera.size(0) for view in loaded.scene.views}
@@ -138,11 +71,8 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
             raise ConfigError(
                 "--fps is for videos, and none is asked for; add mp4 to --formats, or leave it out"
             )
-        if (
-            cameras.map_info is not None
-            and not cameras.map_info.has_coordinates
-            and formats & {"envi", "tif"}
-        ):
+        has_place = cameras.map_info is None or cameras.map_info.has_coordinates
+        if not has_place and formats & {"envi", "tif"}:
             say(
                 console,
                 f"--cameras {options.cameras}: files have no map coordinates, which would mirror or misplace the map",
@@ -150,33 +80,10 @@ def _render_run(options: _RenderOptions, request: CameraRequest, processes: Proc
     _render(options, loaded, cameras, outputs, console, processes)
 
 
-def _camera_request(options: _RenderOptions) -> CameraRequest:
-    from unmix_plugin.errors import ConfigError
-    from unmix_plugin.products.render.cameras import CameraRequest
-
-    size = None
-    if options.size is not None:
-        match = re.fullmatch(r"(\d{1,9})[xX*](\d{1,9})", options.size)
-        if match is None:
-            raise ConfigError(f"--size {options.size}: expected width and height in pixels, as in 640x480")
-        size = (int(match[1]), int(match[2]))
-    return CameraRequest(
-        options.cameras,
-        options.view,
-        size,
-        options.downscale,
-        options.frames,
-        options.fps,
-        options.pixel_size,
-        options.epsg,
-    )
-
-
-def _relit(loaded: LoadedRun, options: _RenderOptions) -> LoadedRun:
+def _relit(loaded: LoadedRun, options: RenderOptions) -> LoadedRun:
     """The run in the environment asked for."""
     from dataclasses import replace
 
-    from unmix_plugin.errors import ConfigError
     from unmix_plugin.trained.model_scene import LightChoice, relit
 
     choice = LightChoice(options.environment, options.environment_rotation, options.environment_exposure)
@@ -190,7 +97,7 @@ def _relit(loaded: LoadedRun, options: _RenderOptions) -> LoadedRun:
 
 
 def _render(
-    options: _RenderOptions,
+    options: RenderOptions,
     loaded: LoadedRun,
     cameras: RenderCameras,
     outputs: tuple[FormattedOutput, ...],
@@ -199,10 +106,11 @@ def _render(
 ) -> None:
     """Render block by block, then list what was written."""
     from unmix_plugin.commands.reporting import follow, say, working
-    from unmix_plugin.formats.files import refuse_to_overwrite, write_file
+    from unmix_plugin.formats.files import refuse_to_overwrite, safe_name, write_file
     from unmix_plugin.products.render.files import file_name, needs_legend
     from unmix_plugin.products.render.job import RenderJob, Survey, needs_survey, output_paths, take_survey
     from unmix_plugin.products.render.pictures import draw_legend, legend_csv
+    from unmix_plugin.trained.camera_files import camera_file_bytes
 
     scene, asked = loaded.scene, dict.fromkeys(one.output for one in outputs)
     folder = (options.output or loaded.folder.exports / "render").resolve()
@@ -212,7 +120,12 @@ def _render(
         if needs_legend(one, scene)
     }
     tables = {folder / f"{file_name(output)}_legend.csv": output for output in asked if output.classes}
-    camera_files = _camera_files(folder, options, cameras, scene.frame)
+    camera_files: dict[Path, bytes] = {}
+    if cameras.map_info is None:  # which no camera file can hold
+        frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
+        name = safe_name(f"cameras-{Path(options.cameras).stem}")
+        data = camera_file_bytes(cameras.views, frames_per_second, scene.frame)
+        camera_files[folder / f"{name}.json"] = data
     paths = [path for one in outputs for path in output_paths(folder, one, cameras)]
     paths += [*legends, *tables]
     paths += [path for path, data in camera_files.items() if not path.is_file() or path.read_bytes() != data]
@@ -239,26 +152,12 @@ def _render(
     for path, output in legends.items():
         write_file(path, draw_legend(output, job.palette))
     for path, output in tables.items():
-        write_file(path, legend_csv(output))
+        write_file(path, legend_csv(output.classes))
     _list(folder, outputs, cameras, job.palette)
     for path in (*legends, *tables):
         print(f"{path}  what the colours mean")
     for path in camera_files:
         print(f"{path}  the cameras, to be given to --cameras again")
-
-
-def _camera_files(
-    folder: Path, options: _RenderOptions, cameras: RenderCameras, frame: Normalisation
-) -> dict[Path, bytes]:
-    """The file of the cameras; none of a map, which no camera file can hold."""
-    from unmix_plugin.formats.files import safe_name
-    from unmix_plugin.trained.camera_files import camera_file_bytes
-
-    if cameras.map_info is not None:
-        return {}
-    frames_per_second = (cameras.frames_per_second or 24.0) if cameras.is_path else None
-    data = camera_file_bytes(cameras.views, frames_per_second, frame)
-    return {folder / f"{safe_name(f'cameras-{Path(options.cameras).stem}')}.json": data}
 
 
 def _list(

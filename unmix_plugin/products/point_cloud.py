@@ -28,7 +28,7 @@ from unmix_plugin.spectral.materials import Materials, seen_reflectance
 from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.trained.reflectance_maps import ReflectanceMap, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import directions_to_world, positions_for_files
-from unmix_plugin.trained.surface import SurfaceAppearance, SurfacePoints
+from unmix_plugin.trained.surface import SeenSurface, SurfaceAppearance, SurfacePoints
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _OUTLIER_NEIGHBOURS = 8
@@ -94,9 +94,7 @@ def _plane_normals(
         around = around - around.mean(axis=1, keepdims=True)
         _, axes = np.linalg.eigh(around.swapaxes(1, 2) @ around)
         normals[start : start + _CHUNK] = axes[:, :, 0]
-    flipped = (normals * towards[wanted]).sum(axis=1) < 0
-    normals[flipped] *= -1
-    return normals
+    return normals * np.where((normals * towards[wanted]).sum(axis=1, keepdims=True) < 0, -1, 1)
 
 
 def _cube_numbers(offsets: Float[np.ndarray, "P 3"], edge: float) -> Int64[np.ndarray, " P"]:
@@ -130,10 +128,8 @@ class _PointScore:
         """What a file says of it, and what its numbers stand for where they are ids."""
         caveat = "" if materials.is_light_known else "; of radiance, since the scene's light is unknown"
         said = f"{self.property}: {self.output}, {self.map.what}"[:_LONGEST_COMMENT] + caveat
-        return [
-            said,
-            *(f"{self.property} {index}: {name}" for index, (name, _) in enumerate(self.map.classes)),
-        ]
+        classes = enumerate(self.map.classes)
+        return [said, *(f"{self.property} {index}: {name}" for index, (name, _) in classes)]
 
 
 def _require_point_scores(
@@ -161,8 +157,7 @@ def _plain(output: str) -> str:
 
 
 def _property_name(output: str, taken: Sequence[str]) -> str:
-    """`index_ndvi` of a named index; otherwise the kind and the least number that is free: formats know few
-    characters."""
+    """`index_ndvi` of a named index; else the kind and the least number that is free: formats know few characters."""
     kind, _, argument = output.partition(":")
     if kind == "index" and argument in NAMED_INDICES:
         return f"index_{argument.replace('-', '_')}"
@@ -186,7 +181,10 @@ def export(job: Job, asked: PointCloud) -> list[Path]:
         find_output(score.output, materials)  # which refuses libraries through another sensor
     path = job.folder / "points.ply"
     job.claim([path])
-    surface = job.surface(_RAYS_PER_POINT * count)
+    cameras = [view.camera for view in job.views("all")]
+    surface = SeenSurface(job.scene, _RAYS_PER_POINT * count, cameras)
+    for camera in job.follow("looking at the surface", cameras):
+        surface.look(camera)
     with job.working("cleaning and thinning the points"):
         written = _write_point_cloud(path, surface.points(), count, job.scene, job.frame, scores)
     job.say(counted(written, "point"))

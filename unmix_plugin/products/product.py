@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -13,25 +14,21 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import tyro
 
 from unmix_plugin.engine.configs import DeviceName
-from unmix_plugin.formats.files import refuse_to_overwrite
 
 if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
-    from unmix_plugin.scenes.scene import Normalisation
+    from unmix_plugin.scenes.scene import Normalisation, Scene
     from unmix_plugin.spectral.materials import Materials
     from unmix_plugin.trained.evaluation import PredictedView
     from unmix_plugin.trained.open_run import LoadedRun
+    from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.run_views import RunView, ViewChoice
-    from unmix_plugin.trained.surface import SeenSurface
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 
 @dataclass(frozen=True)
-class RunWork(ABC):
-    """What is done with a run of any method: a product, or what is kept in its folder."""
-
-    name: ClassVar[str]
-    """Of the product, and of its folder."""
+class RunOptions:
+    """Which run a command is about, and where it computes."""
 
     run: Path | None = None
     """Run folder, as training printed it; None takes the newest under --output-dir."""
@@ -39,6 +36,44 @@ class RunWork(ABC):
     """Folder in which to look for the newest run."""
     device: DeviceName = "auto"
     """Where to compute; auto takes CUDA where there is one."""
+
+
+@dataclass(frozen=True)
+class WriteOptions:
+    """Where files go."""
+
+    output: Path | None = None
+    """Folder to write to; None: exports/ and the product's name (of a render: render), in the run folder."""
+    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Replace files of an earlier export."""
+
+
+@dataclass(frozen=True)
+class EditOptions:
+    """How a scene of mixed materials is shown."""
+
+    edits: Path | None = None
+    """Recipe (YAML) of edits of materials and light to apply first."""
+    illuminant: str | None = None
+    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
+    sensor: Path | None = None
+    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
+
+
+@dataclass(frozen=True)
+class SharedViews:
+    """How many work on views."""
+
+    num_devices: int = 1
+    """Processes that share the views, on CUDA each on a device of its own."""
+
+
+@dataclass(frozen=True)
+class RunWork(RunOptions, ABC):
+    """What is done with a run of any method: a product, or what is kept in its folder."""
+
+    name: ClassVar[str]
+    """Of the product, and of its folder."""
 
     @abstractmethod
     def write(self, job: Job) -> list[Path]:
@@ -52,25 +87,16 @@ class RunWork(ABC):
 
 
 @dataclass(frozen=True)
-class RunProduct(RunWork):
+class RunProduct(WriteOptions, RunWork):
     """Options that every product of any method has."""
-
-    output: Path | None = None
-    """Folder to write to; None: exports/ and the product's name, in the run folder."""
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace files of an earlier export."""
 
 
 @dataclass(frozen=True)
-class Product(RunProduct):
-    """A product of a scene of mixed materials, which can be edited before."""
+class Product(EditOptions, RunProduct):
+    """A product of a scene of mixed materials, which can be edited before; named for its class."""
 
-    edits: Path | None = None
-    """Recipe (YAML) of edits of materials and light to apply first."""
-    illuminant: str | None = None
-    """Light to show the scene under: D65, A, E, FL2, ... or a .csv file; None: the one it was taken under."""
-    sensor: Path | None = None
-    """CSV file (wavelength,NAME,...) of the spectral responses of another camera, to see the result with."""
+    def __init_subclass__(cls) -> None:
+        cls.name = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", cls.__name__).lower()
 
     def write(self, job: Job) -> list[Path]:
         """Write the product by `export` of the module of its name, which is imported for it alone."""
@@ -79,13 +105,15 @@ class Product(RunProduct):
 
 
 @dataclass(frozen=True)
-class ViewProduct(Product):
+class ViewProduct(SharedViews, Product):
     """A product of which every view has files of its own."""
 
     views: Literal["eval", "train", "all"] = "eval"
     """Which of the scene's views to render."""
-    num_devices: int = 1
-    """Processes that share the views, on CUDA each on a device of its own."""
+
+    def write(self, job: Job) -> list[Path]:
+        """Write the product by the function of its name."""
+        return getattr(import_module("unmix_plugin.products.views"), self.name)(job, self)
 
 
 @dataclass(frozen=True)
@@ -116,11 +144,7 @@ class Job:
 
     @property
     def materials(self) -> Materials:
-        """Its endmembers and the light that they are seen in.
-
-        Raises:
-            ConfigError: its method does not unmix spectra.
-        """
+        """Its endmembers and the light that they are seen in; raises as `scene` does."""
         return self.scene.materials
 
     @property
@@ -134,6 +158,8 @@ class Job:
         Raises:
             ConfigError: one of them exists, and overwriting was not asked for.
         """
+        from unmix_plugin.formats.files import refuse_to_overwrite
+
         refuse_to_overwrite(paths, self.overwrite)
 
     def views(self, choice: ViewChoice) -> list[RunView]:
@@ -141,6 +167,16 @@ class Job:
         from unmix_plugin.trained.run_views import views_of
 
         return views_of(self.loaded.scene.views, choice)
+
+    def measured_scene(self, data: Path | None) -> Scene | None:
+        """The scene that the run was trained on, where it was or at `data`; None, which is said, if it is not there."""
+        from unmix_plugin.trained.open_run import find_scene
+
+        with self.working("looking for the scene"):
+            scene = find_scene(self.loaded.record.summary, self.loaded.folder.path, data)
+        if scene is None:
+            self.say("the scene folder was not found: nothing measured is shown; give it with --data")
+        return scene
 
     def render(self, view: RunView) -> PredictedView:
         """A view of the run."""
@@ -151,31 +187,21 @@ class Job:
     def write_views(
         self,
         choice: ViewChoice,
-        paths: Callable[[Path, str], list[Path]],
-        write: Callable[[Path, str, PredictedView, Materials], None],
+        paths: Callable[[str], list[Path]],
+        write: Callable[[str, MaterialView], None],
     ) -> list[Path]:
         """Render views, one after the other, each at its own size, and write each; several processes share them.
 
         Args:
             choice: Of the run's views.
-            paths: Files of a view, from the folder and its name.
+            paths: Files of a view, from its name.
             write: Writes them.
         """
         views, processes = self.views(choice), self.processes
-        files = [path for view in views for path in paths(self.folder, view.name)]
+        files = [path for view in views for path in paths(view.name)]
         with processes.together():
             self.claim(files)
         with processes.together():
             for view in self.follow("rendering views", views[processes.rank :: processes.count]):
-                write(self.folder, view.name, self.render(view), self.materials)
+                write(view.name, self.scene.look(view.camera))
         return files
-
-    def surface(self, num_rays: int) -> SeenSurface:
-        """What all cameras of the run see, with about so many rays."""
-        from unmix_plugin.trained.surface import SeenSurface
-
-        cameras = [view.camera for view in self.views("all")]
-        surface = SeenSurface(self.scene, num_rays, cameras)
-        for camera in self.follow("looking at the surface", cameras):
-            surface.look(camera)
-        return surface

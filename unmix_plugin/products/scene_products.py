@@ -1,6 +1,6 @@
 """What `unmix-export` offers of scenes of mixed materials: each product with its options.
 
-The help needs nothing else, so the work of a product, `export` in the module of its name, is imported when asked for.
+The name of a product follows from that of its class. Help needs nothing else: its work is imported when asked for.
 """
 
 from __future__ import annotations
@@ -13,11 +13,18 @@ from unmix_plugin.products.product import Job, Product, RunWork, ViewProduct
 
 
 @dataclass(frozen=True)
+class _ComparedProduct(Product):
+    """A product in which known spectra stand beside the run's."""
+
+    library: tuple[Path, ...] = ()
+    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
+    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
+
+
+@dataclass(frozen=True)
 class Abundances(ViewProduct):
     """Abundance of each endmember, summing to the opacity, 0 where nothing is: of each view VIEW.npy, (H, W, K)
     float32, and VIEW.png, a figure; on request ENVI and EXR images."""
-
-    name = "abundances"
 
     formats: tuple[Literal["npy", "png", "envi", "exr"], ...] = ("npy", "png")
     """npy, envi (.hdr and .img), exr (a channel for each endmember), png."""
@@ -28,22 +35,15 @@ class Cubes(ViewProduct):
     """Spectral images: of each view radiance or reflectance on black, (H, W, bands) float32, 1 = full scale, as ENVI
     (VIEW.hdr and VIEW.img), spectral OpenEXR (VIEW.exr) or VIEW.npy."""
 
-    name = "cubes"
-
     formats: tuple[Literal["envi", "exr", "npy"], ...] = ("envi",)
     """envi, exr, npy (without wavelengths)."""
 
 
 @dataclass(frozen=True)
-class Endmembers(Product):
+class Endmembers(_ComparedProduct):
     """Spectra of the endmembers: endmembers.csv, the ENVI spectral library endmembers.hdr and .sli, a plot over
     wavelength, endmembers.png, and angles.csv, their angles to all known spectra."""
 
-    name = "endmembers"
-
-    library: tuple[Path, ...] = ()
-    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
-    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     compare: Literal["scale", "continuum"] = "scale"
     """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
 
@@ -52,8 +52,6 @@ class Endmembers(Product):
 class Mesh(Product):
     """The surface as triangles: mesh.ply, mesh.glb or mesh.obj with position and normal in the scene's world
     coordinates, colour, material and every abundance; GLB and OBJ with textures of them."""
-
-    name = "mesh"
 
     formats: tuple[Literal["ply", "glb", "obj"], ...] = ("ply", "glb")
     """ply, glb, obj (with mesh.mtl)."""
@@ -74,11 +72,9 @@ class Mesh(Product):
 
 
 @dataclass(frozen=True)
-class Metamerism(Product):
+class Metamerism(_ComparedProduct):
     """Pairs of materials that look alike in one light and differ in another, as an eye adapted to each light sees them:
     metamerism.csv, the pairs with their differences, and metamerism.png, swatches."""
-
-    name = "metamerism"
 
     surfaces: Literal["run", "library", "all"] = "all"
     """Pair the run's endmembers, materials of the library, or both together."""
@@ -88,34 +84,24 @@ class Metamerism(Product):
     """Colour difference (CIEDE2000) up to which two materials look alike."""
     different: float = 4.0
     """Colour difference from which they look different."""
-    library: tuple[Path, ...] = ()
-    """Known spectra to pair in place of the built-in ones: .csv files, ENVI spectral libraries, texts of ECOSTRESS
-    or USGS, or folders of them; +builtin adds the built-in ones."""
 
 
 @dataclass(frozen=True)
-class Page(Product):
+class Page(_ComparedProduct):
     """One HTML file to mail to others, page.html: the surface in 3-D in any band, light, abundance or index; a click
     shows spectrum and mixture. It opens in a browser and needs no server, no network and no installation."""
-
-    name = "page"
 
     title: str = ""
     """Title of the page; the scene's name where none is given."""
     resolution: int = 256
     """Cells along the longest edge of the scene box; fewer where the page would have more than 600,000 triangles or
     exceed 20 MB."""
-    library: tuple[Path, ...] = ()
-    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
-    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
 
 
 @dataclass(frozen=True)
 class Pca(Product):
     """Principal components as colours, the same in all views: VIEW.png, pixel by pixel, and components.csv, which says
     what red, green and blue stand for."""
-
-    name = "pca"
 
     of: Literal["spectra", "abundances"] = "spectra"
     """What has its components taken."""
@@ -127,8 +113,6 @@ class Pca(Product):
 class PointCloud(Product):
     """The surface as points: points.ply with position and normal in the scene's world coordinates, colour, material and
     every abundance of each point, and with --outputs more numbers."""
-
-    name = "point-cloud"
 
     num_points: int = 100_000
     """Most points to write; they cover what the run's cameras see evenly."""
@@ -142,16 +126,12 @@ class Poses(Product):
     """Cameras of all views as transforms.json, in the world of the scene's poses; those of training views as training
     corrected them, where it did."""
 
-    name = "poses"
-
 
 @dataclass(frozen=True)
 class Regions(Product):
     """Named parts of the surface, kept with the run: area, abundances, mean spectrum and its standard deviation of each
     of them and of each material (regions.csv, regions-spectra.csv, and the library regions.sli). With --add a region is
     kept, with --remove one is forgotten."""
-
-    name = "regions"
 
     add: str | None = None
     """Name of a region to keep, which one of the next five options says."""
@@ -170,20 +150,15 @@ class Regions(Product):
 
 
 @dataclass(frozen=True)
-class Report(Product):
+class Report(_ComparedProduct):
     """One HTML file about the run, report.html, which needs nothing else: scene, views, materials with their nearest
     known ones, abundances, segmentation, figures of merit, errors, settings. Measured images and labels are
     shown where the scene folder is found."""
-
-    name = "report"
 
     max_views: int = 24
     """Most evaluation views to render; of more, an even choice."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
-    library: tuple[Path, ...] = ()
-    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
-    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     title: str | None = None
     """Heading of the report. It and the following are kept with the run; an empty text removes one."""
     author: str | None = None
@@ -224,16 +199,12 @@ class Segmentation(ViewProduct):
     """Material of each pixel: labels/VIEW.png with ids and their palette (255: nothing), VIEW.npy with scores (H, W, K)
     float32, VIEW.png, a figure with a legend, and legend.csv, which names the ids."""
 
-    name = "segmentation"
-
 
 @dataclass(frozen=True)
-class Spectrum(Product):
+class Spectrum(_ComparedProduct):
     """Spectrum of a pixel (--view 3 --pixel 120,80), of a point of space (--point=0.1,-0.2,0.5) or of a kept region
     (--region NAME, with its standard deviation): predicted, and measured where the scene folder is found, with the
     spread over training views, as CSV and plot; abundances and nearest known materials as JSON."""
-
-    name = "spectrum"
 
     view: str | None = None
     """View of the pixel: its name, or its number among the evaluation views, from 0."""
@@ -245,9 +216,6 @@ class Spectrum(Product):
     """Name of a region that is kept with the run (unmix-export regions)."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
-    library: tuple[Path, ...] = ()
-    """Known spectra to compare with in place of the built-in ones: .csv files, ENVI spectral libraries, texts of
-    ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
     compare: Literal["scale", "continuum"] = "scale"
     """How spectra are compared with known ones: by their shape, or after removal of the continuum."""
 
@@ -256,8 +224,6 @@ class Spectrum(Product):
 class Splats(Product):
     """The surface as Gaussians for splat viewers: splats.glb (KHR_gaussian_splatting) and splats.ply, one flat Gaussian
     for each piece of the surface, in the colour that cameras see, with its material and every abundance."""
-
-    name = "splats"
 
     formats: tuple[Literal["glb", "ply"], ...] = ("glb", "ply")
     """glb (up is +y), ply (up is -y, as viewers of splats expect)."""
@@ -271,8 +237,6 @@ class Splats(Product):
 class Volume(Product):
     """Density and abundances on a regular grid: volume.npz with `density` (X, Y, Z), per world unit, `abundances`
     (X, Y, Z, K), the matrix `index_to_world`, and names and spectra of the endmembers."""
-
-    name = "volume"
 
     resolution: int = 128
     """Cells along the longest edge of the scene box."""

@@ -11,8 +11,8 @@ from spectral.io.bipfile import BipFile
 
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render import files
-from unmix_plugin.products.render.cameras import CameraRequest, choose_cameras
+from unmix_plugin.products.render import RenderOptions, files
+from unmix_plugin.products.render.cameras import choose_cameras
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.products.render.job import RenderJob, Survey, take_survey
 from unmix_plugin.products.render.maps import map_camera
@@ -31,7 +31,7 @@ SCALE = Scale(1.0, "test")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("maps")
     for source in ("map", "map:east"):
-        cameras = choose_cameras(SCENE, CameraRequest(source, pixel_size=0.2), SCALE)
+        cameras = choose_cameras(SCENE, RenderOptions(cameras=source, pixel_size=0.2), SCALE)
         outputs = choose_formats(["accumulation", "spectral"], ["tif", "envi"], SCENE, False)
         job = RenderJob(SCENE, cameras, outputs, Survey(), folder)
         job.render(job.blocks())
@@ -94,7 +94,7 @@ def test_a_map_along_no_axes_of_the_world_says_the_size_of_pixels_and_no_coordin
 
 def test_units_and_a_coordinate_system_that_are_known_are_written():
     [utm, national] = (
-        choose_cameras(SCENE, CameraRequest("map", pixel_size=1.0, epsg=code), SCALE).map_info
+        choose_cameras(SCENE, RenderOptions(cameras="map", pixel_size=1.0, epsg=code), SCALE).map_info
         for code in (32632, 25832)
     )
     assert utm is not None
@@ -111,7 +111,7 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
     assert (3072, 0, 1, 25832) in {tuple(key) for key in np.array(national.geotiff[2][3]).reshape(-1, 4)}
     assert national.envi["map info"][0] == "Arbitrary"
     with pytest.raises(ConfigError, match="--epsg needs a world in metres"):
-        choose_cameras(SCENE, CameraRequest("map", epsg=32632), None)
+        choose_cameras(SCENE, RenderOptions(cameras="map", epsg=32632), None)
     _, info = map_camera(SCENE, None, "top", 0.2)
     assert info.envi["map info"][-1] == "units=Unknown"
     _, millimetres = map_camera(SCENE, Scale(0.001, "test"), "top", 0.0002)
@@ -123,7 +123,7 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
 )
 def test_heights_of_a_map_are_in_the_unit_of_its_coordinates_and_say_it(scale, unit, factor, tmp_path):
     pixel_size = 0.5 * factor
-    cameras = choose_cameras(SCENE, CameraRequest("map", pixel_size=pixel_size), scale)
+    cameras = choose_cameras(SCENE, RenderOptions(cameras="map", pixel_size=pixel_size), scale)
     names = ["depth", "ray_distance", "accumulation"]
     outputs = files.with_units(choose_formats(names, ["tif"], SCENE, False), cameras.map_info)
     survey = take_survey(SCENE, cameras.views, [one.output for one in outputs], cameras.map_info)
@@ -148,7 +148,7 @@ def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
     for limit, is_big in ((48, False), (47, True)):
         monkeypatch.setattr(files, "_LARGEST_TIFF", limit)
         with files.still(files.still_paths(setting.folder, depth, "v")[0], depth, setting) as sink:
-            sink(files.Rows(0, {"depth": values}))
+            sink(files.Rows(0, {"depth": values, "accumulation": np.ones_like(values)}))
         with tifffile.TiffFile(tmp_path / "depth" / "v.tif") as file:
             assert file.is_bigtiff == is_big
             np.testing.assert_array_equal(file.asarray(), values)
@@ -157,15 +157,18 @@ def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        (CameraRequest("map", pixel_size=0.0), "--pixel-size is 0; it must be greater than 0"),
-        (CameraRequest("map", pixel_size=1e-7), "--pixel-size 1e-07: .* expected whole numbers"),
-        (CameraRequest("map:up"), "--cameras map:up: expected top, bottom"),
-        (CameraRequest("map:0,0,0"), "--cameras map:0,0,0: expected top"),
-        (CameraRequest("map", size=(10, 10)), "--cameras map has one view of the size that --pixel-size"),
-        (CameraRequest("orbit", pixel_size=0.1), "--pixel-size is for --cameras map"),
-        (CameraRequest("orbit", epsg=32632), "--epsg is for --cameras map"),
-        (CameraRequest("map", epsg=4326), "--epsg 4326 is no projected coordinate system"),
-        (CameraRequest("map:east", epsg=32632), "--epsg is for maps from above"),
+        (RenderOptions(cameras="map", pixel_size=0.0), "--pixel-size is 0; it must be greater than 0"),
+        (RenderOptions(cameras="map", pixel_size=1e-7), "--pixel-size 1e-07: .* expected whole numbers"),
+        (RenderOptions(cameras="map:up"), "--cameras map:up: expected top, bottom"),
+        (RenderOptions(cameras="map:0,0,0"), "--cameras map:0,0,0: expected top"),
+        (
+            RenderOptions(cameras="map", size="10x10"),
+            "--cameras map has one view of the size that --pixel-size",
+        ),
+        (RenderOptions(cameras="orbit", pixel_size=0.1), "--pixel-size is for --cameras map"),
+        (RenderOptions(cameras="orbit", epsg=32632), "--epsg is for --cameras map"),
+        (RenderOptions(cameras="map", epsg=4326), "--epsg 4326 is no projected coordinate system"),
+        (RenderOptions(cameras="map:east", epsg=32632), "--epsg is for maps from above"),
     ],
 )
 def test_what_makes_no_map_is_refused(request_, message):

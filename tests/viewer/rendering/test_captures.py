@@ -13,9 +13,9 @@ import torch
 import tyro
 
 from tests.viewer.view_factory import make_frame, make_services, some_pose
-from unmix_plugin.commands.render import _RenderOptions
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.products.render import RenderOptions
 from unmix_plugin.products.render.files import choose_formats
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
@@ -169,14 +169,14 @@ def test_what_a_video_has_otherwise_than_the_page_is_said():
 def test_the_words_are_those_of_the_command(tmp_path):
     paths = (tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
     light = LightChoice("studio", rotation_deg=-30.0, exposure_stops=0.5)
-    options = tyro.cli(_RenderOptions, args=render_argv(*paths, light))
+    options = tyro.cli(RenderOptions, args=render_argv(*paths, light))
     assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
     assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
     assert options.edits == tmp_path / "recipe.yml"
     assert options.environment == "studio"
     assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
-    plain = tyro.cli(_RenderOptions, args=render_argv(*paths[:4], None))
-    assert (plain.edits, plain.environment) == (None, _RenderOptions().environment)
+    plain = tyro.cli(RenderOptions, args=render_argv(*paths[:4], None))
+    assert (plain.edits, plain.environment) == (None, RenderOptions().environment)
 
 
 @pytest.fixture
