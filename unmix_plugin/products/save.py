@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.products.render.files import COVERAGE, RenderSetting, Rows, choose_formats, still
-from unmix_plugin.products.render.job import channel_names, take_survey
-from unmix_plugin.products.render.pictures import Palette
+from unmix_plugin.products.render.files import COVERAGE, Rows, choose_formats, still
+from unmix_plugin.products.render.job import setting_for, take_survey
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_views import RunView
 
@@ -37,16 +36,9 @@ def save(view: MaterialView, name: str, path: str | Path) -> Path:
         raise ConfigError(f"{path}: the suffix {path.suffix!r} says no format; give one of {known}")
     scene, camera = view.scene, view.camera
     (formatted,) = choose_formats([name], [_FORMATS[path.suffix]], scene, is_path=False)
-    output = formatted.output
-    survey = take_survey(scene, [RunView(path.stem, camera)], [output] if path.suffix == ".png" else [])
-    setting = RenderSetting(
-        folder=path.parent,
-        size=(camera.width, camera.height),
-        palette=Palette.of(scene.materials, survey.scales),
-        bands=scene.bands,
-        channels=channel_names(scene, camera, [output]),
-        frames_per_second=None,
-    )
+    outputs = [formatted.output]
+    survey = take_survey(scene, [RunView(path.stem, camera)], outputs if path.suffix == ".png" else [])
+    setting = setting_for(scene, camera, outputs, survey, path.parent)
     values: dict[str, np.ndarray] = {
         "accumulation": view.opacity.cpu().numpy(),
         COVERAGE: view.coverage.cpu().numpy(),

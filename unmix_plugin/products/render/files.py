@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -42,10 +42,7 @@ from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _Format = Literal["envi", "exr", "npy", "png", "mp4", "tif"]
-_FORMATS: tuple[_Format, ...] = ("envi", "exr", "npy", "png", "mp4", "tif")
-_EVERY_OUTPUT = "all"
-"""Stands for every output that takes no argument."""
-
+_FORMATS: tuple[_Format, ...] = get_args(_Format)
 _LARGEST_TIFF = 1 << 31
 """Bytes; of more numbers BigTIFF is written, as addresses in a TIFF end at 4 GiB."""
 _DEFAULT_STILLS = ("spectral", "rgb", "abundances", "segmentation", "depth")
@@ -125,7 +122,8 @@ def choose_formats(
     """Every output in every asked format that suits it.
 
     Args:
-        outputs: Names, or `all`; none: those that are usually wanted, as far as the scene has them.
+        outputs: Names, or `all`, every output that takes no argument; none: those that are usually wanted, as far as
+            the scene has them.
         formats: Of `_FORMATS`; none: what suits each output best.
         scene: It says what outputs there are.
         is_path: Whether views follow each other.
@@ -137,19 +135,18 @@ def choose_formats(
     if not outputs:
         usual = ("rgb",) if is_path else _DEFAULT_STILLS
         outputs = [name for name in usual if name in known] or known
-    names = dict.fromkeys(one for name in outputs for one in (known if name == _EVERY_OUTPUT else [name]))
+    names = dict.fromkeys(one for name in outputs for one in (known if name == "all" else [name]))
     chosen = [scene.output(name) for name in names]
     wanted: list[_Format] = [_format(name) for name in dict.fromkeys(formats)]
     if "tif" in wanted:
         _require_tifffile()
     owners: dict[str, str] = {}
     for output in chosen:
-        name = file_name(output).casefold()
-        if name in owners:
+        owner = owners.setdefault(file_name(output).casefold(), output.name)
+        if owner != output.name:
             raise ConfigError(
-                f"the outputs {owners[name]} and {output.name} would have the same files; ask for one of them"
+                f"the outputs {owner} and {output.name} would have the same files; ask for one of them"
             )
-        owners[name] = output.name
     found: list[FormattedOutput] = []
     for output in chosen:
         # Linear light is for other programs, but a composite of bands is for people.
@@ -163,14 +160,13 @@ def choose_formats(
                 f"{output.name} can't be written as {' or '.join(wanted)}: {reason}. "
                 f"Formats for {output.name}: {', '.join(able)}"
             )
-        found += [
-            FormattedOutput(output, one)
-            for one in suited or (possible.moving if is_path else possible.stills)
-        ]
+        usual = possible.moving if is_path else possible.stills
+        found += [FormattedOutput(output, one) for one in suited or usual]
     for one in wanted:
         if all(formatted.format != one for formatted in found):
-            asked = " or ".join(output.name for output in chosen)
-            raise ConfigError(f"--formats {one} suits none of the outputs asked for: {asked}")
+            raise ConfigError(
+                f"--formats {one} suits none of the outputs asked for: {' or '.join(owners.values())}"
+            )
     return tuple(found)
 
 
@@ -187,11 +183,7 @@ def with_units(outputs: Sequence[FormattedOutput], info: MapInfo | None) -> tupl
 
 
 def _require_tifffile() -> Any:
-    """tifffile, which only captures need otherwise.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """tifffile, which only captures need otherwise."""
     try:
         return importlib.import_module("tifffile")
     except ImportError as error:
@@ -201,9 +193,8 @@ def _require_tifffile() -> Any:
 
 
 def _format(name: str) -> _Format:
-    for known in _FORMATS:
-        if name == known:
-            return known
+    if name in _FORMATS:
+        return name
     hint = did_you_mean(name, _FORMATS, likeness=0.5, form=" ({})")
     raise ConfigError(f"there is no format {name!r}{hint}; known are {', '.join(_FORMATS)}")
 
@@ -246,7 +237,7 @@ class RenderSetting:
     """Of outputs of kind `channels`; None where the scene has no spectra."""
     channels: dict[str, tuple[str, ...]]
     """Names of the channels of each output that has several."""
-    frames_per_second: float | None
+    frames_per_second: float | None = None
     """Of sweeps; None: so that they take about six seconds."""
     map_info: MapInfo | None = None
     """Where a map lies."""
@@ -305,12 +296,48 @@ def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSin
             rows.first, opaque_band(rows.values[output.name][..., band], rows._filled_by(output))
         )
     else:
-        canvas = _canvas(output, setting, 3)
-        yield lambda rows: canvas.put(
-            rows.first,
-            opaque_tiles(output, rows.values[output.name], rows._filled_by(output), setting.palette),
-        )
+        canvas, put = _picture(output, setting, opaque_tiles)
+        yield put
     add(canvas.pixels)
+
+
+def _picture(
+    output: Output, setting: RenderSetting, paint: Callable[..., np.ndarray]
+) -> tuple[Canvas, RowsSink]:
+    """A canvas, and a sink that paints rows on it as opaque or as transparent tiles."""
+    palette, captions, swatches = setting.palette, (), ()
+    if output.kind == "shares":
+        captions = setting.channels[output.name]
+        swatches = palette.colours if palette.names else ()
+    canvas = Canvas(_layout(output, setting), 3 if paint is opaque_tiles else 4, captions, swatches)
+
+    def put(rows: Rows) -> None:
+        canvas.put(rows.first, paint(output, rows.values[output.name], rows._filled_by(output), palette))
+
+    return canvas, put
+
+
+def _layout(output: Output, setting: RenderSetting) -> CanvasLayout:
+    """One tile, or one for each share under its name; of spectra, one band at a time under its wavelength."""
+    if output.kind not in ("channels", "shares"):
+        return CanvasLayout.of(setting.size)
+    count = 1 if output.kind == "channels" else None
+    return CanvasLayout.of(setting.size, setting.channels[output.name], count)
+
+
+def _whole(output: Output, setting: RenderSetting) -> tuple[RowsSink, np.ndarray, np.ndarray]:
+    """A sink that keeps all rows; what it keeps, a plane (H, W) a channel; and how much of each pixel is filled."""
+    width, height = setting.size
+    count = len(setting.channels.get(output.name, (output.name,)))
+    planes = np.zeros((count, height, width), dtype=np.uint8 if output.kind == "labels" else np.float32)
+    filled = np.zeros((height, width), dtype=np.float32)
+
+    def add(rows: Rows) -> None:
+        values = rows.values[output.name].reshape(-1, width, count)
+        place = slice(rows.first, rows.first + len(values))
+        planes[:, place], filled[place] = np.moveaxis(values, -1, 0), rows._filled_by(output)
+
+    return add, planes, filled
 
 
 @contextmanager
@@ -340,23 +367,17 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
 @contextmanager
 def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
     """Numbers as TIFF, a band after the other; of a map as GeoTIFF."""
-    width, height = setting.size
-    names = setting.channels.get(output.name, (output.name,))
-    planes = np.zeros((len(names), height, width), dtype=np.uint8 if output.kind == "labels" else np.float32)
-
-    def add(rows: Rows) -> None:
-        values = rows.values[output.name].reshape(-1, width, len(names))
-        planes[:, rows.first : rows.first + len(values)] = np.moveaxis(values, -1, 0)
-
+    add, planes, _ = _whole(output, setting)
     yield add
     buffer, info = io.BytesIO(), setting.map_info
+    names = list(setting.channels.get(output.name, (output.name,)))
     with _require_tifffile().TiffWriter(buffer, bigtiff=planes.nbytes > _LARGEST_TIFF) as writer:
         writer.write(
             planes,
             photometric="minisblack",
             planarconfig="separate" if len(names) > 1 else None,
             compression="zlib",
-            description=json.dumps({"output": output.name, "what": output.what, "bands": list(names)}),
+            description=json.dumps({"output": output.name, "what": output.what, "bands": names}),
             metadata=None,
             extratags=[] if info is None else info.geotiff,
         )
@@ -365,91 +386,20 @@ def _tif(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
 
 @contextmanager
 def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    width, height = setting.size
-    names = _exr_names(output, setting)
     # One plane a channel, as the format wants them: nothing is copied when the file is written.
-    planes = np.zeros((len(names), height, width), dtype=np.float32)
-    bands = setting.bands if output.kind == "channels" else None
-    to_rgb = None if bands is None else rgb_matrix(bands).numpy()
-    preview = np.zeros((0 if bands is None else 3, height, width), dtype=np.float32)
-    opacity = np.zeros((height, width), dtype=np.float32)
-
-    def add(rows: Rows) -> None:
-        values = rows.values[output.name].reshape(-1, width, len(planes))
-        place = slice(rows.first, rows.first + len(values))
-        planes[:, place] = np.moveaxis(values, -1, 0)
-        opacity[place] = rows._filled_by(output)
-        if to_rgb is not None:
-            preview[:, place] = np.moveaxis(np.clip(np.clip(values, 0, None) @ to_rgb, 0, 1), -1, 0)
-
+    add, planes, opacity = _whole(output, setting)
     yield add
     comments = f"{output.name}: {output.what}"
-    if bands is not None:
-        spectra, rgb = np.moveaxis(planes, 0, -1), np.moveaxis(preview, 0, -1)
+    if output.kind == "channels" and setting.bands is not None:
+        to_rgb = rgb_matrix(setting.bands).numpy()
+        rows = (np.clip(row, 0, None).T @ to_rgb for row in planes.swapaxes(0, 1))
+        preview = np.stack([np.clip(row, 0, 1) for row in rows])
         quantity = "reflectance" if "reflectance" in output.what else "radiance"
-        write_spectral_exr(path, spectra, bands, rgb, opacity, comments, quantity)
+        spectra = np.moveaxis(planes, 0, -1)
+        write_spectral_exr(path, spectra, setting.bands, preview, opacity, comments, quantity)
         return
-    pixels = dict(zip(names, planes, strict=True))
+    pixels = dict(zip(_exr_names(output, setting), planes, strict=True))
     write_exr(path, {**pixels, "A": opacity} if output.kind == "linear" else pixels, {"comments": comments})
-
-
-@contextmanager
-def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    palette = setting.palette
-    if output.kind == "labels":
-        ids = np.full(setting.size[::-1], NOTHING_ID, dtype=np.uint8)
-
-        def add(rows: Rows) -> None:
-            found = rows.values[output.name]
-            ids[rows.first : rows.first + len(found)] = found
-
-        yield add
-        write_file(path, indexed_png_bytes(ids, palette.by_id(output), NOTHING_ID, palette.describe(output)))
-        return
-    canvas = _canvas(output, setting, 4)
-    yield lambda rows: canvas.put(
-        rows.first, transparent_tiles(output, rows.values[output.name], rows._filled_by(output), palette)
-    )
-    write_file(path, rgba_png_bytes(canvas.pixels, palette.describe(output)))
-
-
-@contextmanager
-def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
-    """Band after band of one view."""
-    width, height = setting.size
-    names = setting.channels[output.name]
-    frames = np.zeros((len(names), height, width, 3), dtype=np.uint8)
-
-    def add(rows: Rows) -> None:
-        values = rows.values[output.name]
-        for band, radiance in enumerate(np.moveaxis(values, -1, 0)):
-            painted = opaque_band(radiance, rows._filled_by(output))
-            frames[band, rows.first : rows.first + len(values)] = painted[:, :, 0]
-
-    yield add
-    usual = float(np.clip(len(names) / _SWEEP_SECONDS, *_SWEEP_FPS))
-    layout = _layout(output, setting)
-    with video_frames(path, *layout.size, setting.frames_per_second or usual) as show:
-        for name, one in zip(names, frames, strict=True):
-            canvas = Canvas(layout, 3, [name])
-            canvas.put(0, one[:, :, None])
-            show(canvas.pixels)
-
-
-def _canvas(output: Output, setting: RenderSetting, num_channels: int) -> Canvas:
-    layout = _layout(output, setting)
-    if output.kind != "shares":
-        return Canvas(layout, num_channels)
-    swatches = setting.palette.colours if setting.palette.names else ()
-    return Canvas(layout, num_channels, setting.channels[output.name], swatches)
-
-
-def _layout(output: Output, setting: RenderSetting) -> CanvasLayout:
-    """One tile, or one for each share under its name; of spectra, one band at a time under its wavelength."""
-    if output.kind not in ("channels", "shares"):
-        return CanvasLayout.of(setting.size)
-    count = 1 if output.kind == "channels" else None
-    return CanvasLayout.of(setting.size, setting.channels[output.name], count)
 
 
 def _exr_names(output: Output, setting: RenderSetting) -> list[str]:
@@ -461,3 +411,31 @@ def _exr_names(output: Output, setting: RenderSetting) -> list[str]:
     if output.name in setting.channels:
         return layer_names(file_name(output), setting.channels[output.name])
     return ["Z" if output.name == "depth" else file_name(output).replace(".", "_")]
+
+
+@contextmanager
+def _png(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
+    palette, about = setting.palette, setting.palette.describe(output)
+    if output.kind == "labels":
+        add, planes, _ = _whole(output, setting)
+        yield add
+        data = indexed_png_bytes(planes[0], palette.by_id(output), NOTHING_ID, about)
+    else:
+        canvas, put = _picture(output, setting, transparent_tiles)
+        yield put
+        data = rgba_png_bytes(canvas.pixels, about)
+    write_file(path, data)
+
+
+@contextmanager
+def _sweep(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSink]:
+    """Band after band of one view."""
+    add, planes, filled = _whole(output, setting)
+    yield add
+    names, layout = setting.channels[output.name], _layout(output, setting)
+    usual = float(np.clip(len(names) / _SWEEP_SECONDS, *_SWEEP_FPS))
+    with video_frames(path, *layout.size, setting.frames_per_second or usual) as show:
+        for name, radiance in zip(names, planes, strict=True):
+            canvas = Canvas(layout, 3, [name])
+            canvas.put(0, opaque_band(radiance, filled))
+            show(canvas.pixels)

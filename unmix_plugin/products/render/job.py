@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -81,6 +81,8 @@ def take_survey(
 ) -> Survey:
     """Look at up to twelve views, evenly spread over all, and find what `outputs` of all views, or of the map of
     `info`, share."""
+    if not needs_survey(outputs):
+        return Survey()
     maps = [output for output in outputs if is_reflectance_map(output.name)]
     ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
     has_pca = any(output.name == "pca" for output in outputs)
@@ -103,9 +105,8 @@ def take_survey(
 
 def _units(output: Output, info: MapInfo | None) -> float:
     """What an output's numbers are multiplied with to be in the unit that it says."""
-    if info is None or info.metres_per_unit is None or IN_METRES not in output.what:
-        return 1.0
-    return info.metres_per_unit
+    metres = None if info is None else info.metres_per_unit
+    return 1.0 if metres is None or IN_METRES not in output.what else metres
 
 
 def _is_ranged(output: Output) -> bool:
@@ -166,40 +167,30 @@ class RenderJob:
     ) -> None:
         """
         Args:
-            scene: Of any method.
-            cameras: To render from.
+            scene, cameras: Of any method, and where to render it from.
             outputs: What to write.
             survey: Of these cameras and outputs.
             folder: Where to write.
             processes: That share the views, each with a job like this one.
         """
         self._scene, self._cameras, self._survey, self._processes = scene, cameras, survey, processes
-        self._materials = scene.materials if isinstance(scene, TrainedScene) else None
-        self.palette = Palette.of(self._materials, survey.scales)
-        """The colours of the pictures."""
-        self._setting = RenderSetting(
-            folder,
-            cameras.size,
-            self.palette,
-            _scene_bands(scene),
-            channel_names(scene, cameras.views[0].camera, [one.output for one in outputs]),
-            cameras.frames_per_second,
-            cameras.map_info,
+        asked = [one.output for one in outputs]
+        setting = setting_for(scene, cameras.views[0].camera, asked, survey, folder)
+        self._setting = replace(
+            setting, frames_per_second=cameras.frames_per_second, map_info=cameras.map_info
         )
+        self.palette = self._setting.palette
+        """The colours of the pictures."""
         self._moving = [one for one in outputs if is_video_of_all(one, cameras)]
         self._still = [one for one in outputs if one not in self._moving]
+        self._units = {output.name: _units(output, cameras.map_info) for output in asked}
         # What all views share is computed here, from spectra.
         own = {*survey.scores, *(["pca"] if survey.pca is not None else [])}
-        self._units = {one.output.name: _units(one.output, cameras.map_info) for one in outputs}
-        asked = dict.fromkeys("spectral" if one.output.name in own else one.output.name for one in outputs)
-        self._asked = [name for name in asked if name != "accumulation"]
+        names = dict.fromkeys("spectral" if output.name in own else output.name for output in asked)
+        self._asked = [name for name in names if name != "accumulation"]
 
     def blocks(self, pixels: int | None = None) -> list[_Block]:
-        """All that this process is to render.
-
-        Args:
-            pixels: Most of a block; None: what keeps a block's numbers small.
-        """
+        """All that this process is to render, in blocks of at most so many pixels; None: what keeps numbers few."""
         width, height = self._cameras.size
         if pixels is None:
             most = max((len(names) for names in self._setting.channels.values()), default=1)
@@ -221,9 +212,8 @@ class RenderJob:
             Follower: this is not the first process, and one failed.
         """
         views, processes, setting = self._cameras.views, self._processes, self._setting
-        frames_per_second = self._cameras.frames_per_second or (
-            _PATH_FPS if self._cameras.is_path else _VIEWS_FPS
-        )
+        usual = _PATH_FPS if self._cameras.is_path else _VIEWS_FPS
+        frames_per_second = self._cameras.frames_per_second or usual
         with ExitStack() as files:
             videos = [
                 files.enter_context(video(one, setting, frames_per_second))
@@ -274,8 +264,8 @@ class RenderJob:
         if self._survey.pca is not None:
             seen = (opacity > OCCUPIED_ACCUMULATION)[..., None]
             rendered["pca"] = self._survey.pca(rendered["spectral"].cpu()) * seen.cpu()
-        if self._survey.scores and self._materials is not None:
-            reflectance = self._materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
+        if self._survey.scores and isinstance(self._scene, TrainedScene):
+            reflectance = self._scene.materials.reflectance_of(rendered["spectral"].cpu(), opacity.cpu())
             rendered |= {name: score(reflectance) for name, score in self._survey.scores.items()}
         return {name: values.detach().cpu().numpy() for name, values in rendered.items()}
 
@@ -294,12 +284,15 @@ def output_paths(folder: Path, formatted: FormattedOutput, cameras: RenderCamera
     return [path for view in cameras.views for path in still_paths(folder, formatted, view.name)]
 
 
-def channel_names(
-    scene: RenderableScene, camera: Cameras, outputs: Sequence[Output]
-) -> dict[str, tuple[str, ...]]:
-    """Names of the channels of outputs that have several; a scene without materials is asked how many."""
+def setting_for(
+    scene: RenderableScene, camera: Cameras, outputs: Sequence[Output], survey: Survey, folder: Path
+) -> RenderSetting:
+    """What files of views share that are as large as those of a camera; a scene without materials is asked how many
+    channels an output has."""
+    materials = scene.materials if isinstance(scene, TrainedScene) else None
+    bands = getattr(scene, "bands", None)
+    bands = bands if isinstance(bands, Bands) else None
     names: dict[str, tuple[str, ...]] = {}
-    bands = _scene_bands(scene)
     for output in outputs:
         if output.kind in ("grey", "map", "labels"):
             continue
@@ -307,15 +300,10 @@ def channel_names(
             names[output.name] = ("x", "y", "z") if output.kind == "vectors" else ("red", "green", "blue")
         elif output.kind in ("channels", "spectra") and bands is not None:
             names[output.name] = tuple(f"{wavelength:g} nm" for wavelength in bands.centers_nm)
-        elif not isinstance(scene, TrainedScene):
+        elif materials is None:
             pixel = scene.render(one_pixel(camera, 0, 0), [output.name])[output.name]
             names[output.name] = tuple(f"{output.title} {index}" for index in range(pixel.shape[-1]))
         else:
-            names[output.name] = scene.materials.names
-    return names
-
-
-def _scene_bands(scene: RenderableScene) -> Bands | None:
-    """Of outputs of kind `channels`; None where a scene has no spectra."""
-    bands = getattr(scene, "bands", None)
-    return bands if isinstance(bands, Bands) else None
+            names[output.name] = materials.names
+    palette = Palette.of(materials, survey.scales)
+    return RenderSetting(folder, camera.size(0), palette, bands, names)
