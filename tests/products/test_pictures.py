@@ -14,13 +14,13 @@ from unmix_plugin.figures.pictures import (
     ColourScale,
     TitledPicture,
     draw_panels,
+    id_palette,
     in_rows,
     over_neutral,
     paint,
     premultiplied_over_neutral,
 )
 from unmix_plugin.products import evaluation as evaluation_module
-from unmix_plugin.products.abundances import colour_panel, draw_abundances
 from unmix_plugin.products.endmembers import _write_endmembers
 from unmix_plugin.products.evaluation import (
     _draw_colour,
@@ -28,7 +28,7 @@ from unmix_plugin.products.evaluation import (
     _draw_matched_segmentation,
     material_look,
 )
-from unmix_plugin.products.segmentation import _scores_of, draw_segmentation, paint_ids
+from unmix_plugin.products.views import _scores_of, colour_panel, draw_abundances, draw_segmentation
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.evaluation import Evaluation, PredictedView, ViewTruth, _SceneTruth
@@ -93,11 +93,9 @@ def test_where_nothing_is_pictures_are_neutral():
     np.testing.assert_allclose(premultiplied_over_neutral(black, nothing), NEUTRAL, atol=1e-6)
     np.testing.assert_allclose(premultiplied_over_neutral(white, all_there), 1.0, atol=1e-6)
     np.testing.assert_allclose(premultiplied_over_neutral(black, all_there), 0.0, atol=1e-6)
-    painted = paint_ids(np.array([[0, 1, 255]], dtype=np.uint8), {0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
-    np.testing.assert_array_equal(painted[0], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
-    painted = paint(np.array([[-1.0, 0.0, 1.0, 7.0]]), SCALE)[
-        0
-    ]  # values beyond a scale have the colours of its ends
+    palette = id_palette({0: (1.0, 0.0, 0.0), 1: (0.0, 0.0, 1.0)})
+    np.testing.assert_array_equal(palette[[0, 1, 255]], [[1, 0, 0], [0, 0, 1], [NEUTRAL] * 3])
+    [painted] = paint(np.array([[-1.0, 0.0, 1.0, 7.0]]), SCALE)  # beyond a scale are the colours of its ends
     np.testing.assert_array_equal(painted[[0, 3]], painted[[1, 2]])
     assert np.abs(painted[1] - painted[2]).max() > 0.5
 
@@ -171,7 +169,7 @@ def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_it
     given = materials(3)
     evaluation = Evaluation(_SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
     look = material_look(evaluation)
-    colours = look.pred_colours({0: 1, 2: 0})
-    np.testing.assert_array_equal(colours[0], look.true_colours[1])
-    np.testing.assert_array_equal(colours[2], look.true_colours[0])
-    assert min(np.abs(colours[1] - colour).max() for colour in look.true_colours) > 0.05
+    first, second, third = look.predicted(np.array([0, 1, 2], dtype=np.uint8), {0: 1, 2: 0})
+    np.testing.assert_array_equal(first, look.true_colours[1])
+    np.testing.assert_array_equal(third, look.true_colours[0])
+    assert min(np.abs(second - colour).max() for colour in look.true_colours) > 0.05

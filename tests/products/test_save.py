@@ -4,8 +4,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import spectral.io.envi as envi
+import torch
 from PIL import Image
 
 from tests.method_factory import make_scene, with_a_sky
@@ -50,6 +52,23 @@ def test_every_suffix_holds_the_numbers_of_the_view_and_a_file_that_is_there_is_
     (tmp_path / "file").touch()
     with pytest.raises(RunError):
         save(view, "depth", tmp_path / "file" / "depth.npy")
+
+
+def test_names_of_materials_are_layers_and_bands_and_reflectance_is_called_so(view, tmp_path):
+    def of(**changed):
+        return replace(view, scene=replace(view.scene, materials=replace(view.scene.materials, **changed)))
+
+    named = of(names=("oak, old", "v1.2", "V1_2"))
+    channels = read_exr(save(named, "abundances", tmp_path / "shares.exr"))
+    for index, name in enumerate(("oak, old", "v1_2", "V1_2_1")):
+        np.testing.assert_array_equal(channels[f"abundances.{name}"], view["abundances"][..., index])
+    image: Any = envi.open(save(named, "abundances", tmp_path / "shares.hdr"))
+    assert image.metadata["band names"] == ["oak- old", "v1.2", "V1_2"]
+    flat = save(of(light=torch.ones(len(view.scene.bands))), "spectral", tmp_path / "flat.exr")
+    np.testing.assert_array_equal(read_exr(flat)["T.500,000000nm"], view["spectral"][..., 1])
+    header = OpenEXR.File(str(flat)).header()
+    assert header["comments"] == "spectral: reflectance on black, 1 = full scale"
+    assert "emissiveUnits" not in header
 
 
 @pytest.mark.parametrize(

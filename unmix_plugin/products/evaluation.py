@@ -27,16 +27,17 @@ from unmix_plugin.engine.processes import Processes
 from unmix_plugin.figures.pictures import (
     NEUTRAL,
     ColourScale,
+    Picture,
     TitledPicture,
     draw_panels,
+    id_palette,
     in_rows,
     over_neutral,
     paint,
 )
 from unmix_plugin.figures.plotting import RIGHT, WRONG, Colour, distinct_colours, own_colours
 from unmix_plugin.formats.files import rgba_png_bytes, write_file
-from unmix_plugin.products.abundances import SHARE_SCALE, share_panels
-from unmix_plugin.products.segmentation import paint_ids
+from unmix_plugin.products.views import SHARE_SCALE, share_panels
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import describe_colour
@@ -60,8 +61,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _ERROR_SCALE = ColourScale("magma", 0.0, 0.2, "error of sRGB")
 _COLUMNS = 7
-
-
 _Follow = Callable[[str, Sequence[Any]], Iterator[Any]]
 """The items given, while it is shown how many are done."""
 
@@ -84,11 +83,10 @@ class Evaluated:
 
     def write(self, path: Path, times: Mapping[str, float | None]) -> dict[str, Any]:
         """Write metrics.json; its figures, those of training among them."""
-        known = {**self.figures, **times}
-        figures = (
-            {name: known[name] for name in DEFINITIONS if name in known} if self.has_materials else known
-        )
-        content = {**figures, "per_view" if self.has_materials else "per_image": self.per_image, **self.more}
+        figures, each = {**self.figures, **times}, "per_image"
+        if self.has_materials:
+            figures, each = {name: figures[name] for name in DEFINITIONS if name in figures}, "per_view"
+        content = {**figures, each: self.per_image, **self.more}
         write_file(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
         return figures
 
@@ -151,12 +149,11 @@ def evaluate_scene(
             drawn = _draw_matched_abundances(view, predicted, evaluation, look)
             write_file(folder / "abundances" / name, drawn)
             ids[index] = predicted.segmentation.numpy()
-    if processes.count > 1:
-        parts = processes.gather((evaluation, ids))
-        if not processes.is_first:
-            return None
-        evaluation.merge((other for other, _ in parts[1:]), [measured.frames[i].name for i, _ in views])
-        ids = {index: found for _, part in parts for index, found in part.items()}
+    parts = processes.gather((evaluation, ids))
+    if not processes.is_first:
+        return None
+    evaluation.merge((other for other, _ in parts[1:]), [measured.frames[i].name for i, _ in views])
+    ids = {index: found for _, part in parts for index, found in part.items()}
     matching = evaluation.segmentation().matching
     for index in follow("drawing segmentations", list(ids)):
         name, labels = measured.frames[index].name, measured.labels(index)
@@ -189,16 +186,32 @@ class MaterialLook:
         """Name and colour of each true material."""
         return list(zip(self.true_names, self.true_colours, strict=True))
 
-    def pred_colours(self, matching: Mapping[int, int]) -> dict[int, np.ndarray]:
-        """Colour of each predicted endmember.
+    def surplus(self, matching: Mapping[int, int]) -> dict[int, tuple[str, Colour]]:
+        """Name and colour of each predicted endmember that the matching (predicted -> true) has no partner for."""
+        entries = enumerate(zip(self.pred_names, self.surplus_colours, strict=True))
+        return {index: entry for index, entry in entries if index not in matching}
 
-        Args:
-            matching: Predicted -> true.
-        """
-        return {
-            index: self.true_colours[matching[index]] if index in matching else self.surplus_colours[index]
-            for index in range(len(self.pred_names))
-        }
+    def predicted(self, ids: UInt8[np.ndarray, "H W"], matching: Mapping[int, int]) -> Picture:
+        """Predicted ids in the colours of the true materials that they are matched to, or in their own."""
+        matched = {pred: self.true_colours[true] for pred, true in matching.items()}
+        own = {index: colour for index, (_, colour) in self.surplus(matching).items()}
+        return id_palette({**matched, **own})[ids]
+
+    def beside_labels(
+        self, ids: UInt8[np.ndarray, "H W"], labels: UInt8[np.ndarray, "H W"], matching: Mapping[int, int]
+    ) -> tuple[Picture, Picture, Picture]:
+        """True labels, predicted materials in their colours, and where they differ."""
+        agreement = np.where((as_true(ids, matching) != labels)[..., None], WRONG, RIGHT)
+        agreement[labels == NOTHING_ID] = NEUTRAL
+        true = id_palette(dict(enumerate(self.true_colours)))[labels]
+        return true, self.predicted(ids, matching), agreement
+
+
+def as_true(ids: UInt8[np.ndarray, "H W"], matching: Mapping[int, int]) -> UInt8[np.ndarray, "H W"]:
+    """Predicted ids as those of the true materials that they are matched to, 255 for the others."""
+    table = np.full(256, NOTHING_ID, dtype=np.uint8)
+    table[list(matching)] = list(matching.values())
+    return table[ids]
 
 
 def material_look(evaluation: Evaluation) -> MaterialLook:
@@ -238,27 +251,17 @@ def _draw_matched_segmentation(
     look: MaterialLook,
     matching: Mapping[int, int],
 ) -> bytes:
-    """True labels, predicted materials in the colours of those they are matched to, and where they differ."""
-    colours = look.pred_colours(matching)
-    as_true = np.full(256, NOTHING_ID, dtype=np.uint8)
-    as_true[list(matching)] = list(matching.values())
-    panels = [TitledPicture(paint_ids(ids, colours), "predicted")]
-    seen = set(np.unique(as_true[ids]).tolist())
-    extra: list[tuple[str, Colour]] = []
-    if labels is not None:
-        agreement = np.where((as_true[ids] != labels)[..., None], WRONG, RIGHT)
-        agreement[labels == NOTHING_ID] = NEUTRAL
-        true = TitledPicture(paint_ids(labels, dict(enumerate(look.true_colours))), "true")
-        panels = [true, *panels, TitledPicture(agreement, "disagreement")]
+    seen = set(np.unique(as_true(ids, matching)).tolist())
+    legend = [entry for index, entry in look.surplus(matching).items() if (ids == index).any()]
+    if labels is None:
+        panels = [TitledPicture(look.predicted(ids, matching), "predicted")]
+    else:
+        titles = ("true", "predicted", "disagreement")
+        panels = list(map(TitledPicture, look.beside_labels(ids, labels, matching), titles))
         seen |= set(np.unique(labels).tolist())
-        extra = [("right", RIGHT), ("wrong", WRONG), ("not counted", (NEUTRAL,) * 3)]
+        legend += [("right", RIGHT), ("wrong", WRONG), ("not counted", (NEUTRAL,) * 3)]
     true_entries = [entry for index, entry in enumerate(look.true_entries) if index in seen]
-    surplus = [
-        (name, colours[index])
-        for index, name in enumerate(look.pred_names)
-        if index not in matching and (ids == index).any()
-    ]
-    return draw_panels([panels], f"{name}: segmentation", legend=true_entries + surplus + extra)
+    return draw_panels([panels], f"{name}: segmentation", legend=true_entries + legend)
 
 
 def _draw_matched_abundances(
@@ -273,10 +276,8 @@ def _draw_matched_abundances(
     has_truth = view.abundances.sum(dim=-1) > 0
     true_panels = share_panels(view.abundances, view.opacity * has_truth, look.true_names, look.true_colours)
     blank = TitledPicture(np.full_like(true_panels[0].image, NEUTRAL), "none matched")
-    partners = dict(zip(matching.true_ids, matching.pred_ids, strict=True))
-    partner_panels = [
-        pred_panels[partners[index]] if index in partners else blank for index in range(len(true_panels))
-    ]
+    partners = dict(zip(matching.true_ids, (pred_panels[index] for index in matching.pred_ids), strict=True))
+    partner_panels = [partners.get(index, blank) for index in range(len(true_panels))]
     columns = min(len(true_panels), _COLUMNS)
     pairs = zip(in_rows(true_panels, columns), in_rows(partner_panels, columns), strict=True)
     surplus = [panel for index, panel in enumerate(pred_panels) if index not in matching.pred_ids]

@@ -41,6 +41,7 @@ from unmix_plugin.spectral.segmentation import NOTHING_ID, SegmentationScores, S
 from unmix_plugin.spectral.sensor import SceneSensor
 
 if TYPE_CHECKING:
+    from unmix_plugin.trained.outputs import MaterialView
     from unmix_plugin.trained.trained_scene import TrainedScene
 
 
@@ -81,11 +82,15 @@ class PredictedView:
 
 def render_view(scene: TrainedScene, camera: Cameras, subpixels: int | None = None) -> PredictedView:
     """Render all that is written about a view; `subpixels` squared rays a pixel, None for as many as in training."""
+    return predicted_view(scene.look(camera, subpixels))
+
+
+def predicted_view(view: MaterialView) -> PredictedView:
+    """All that is written about a rendered view."""
     names = ("spectral", "accumulation", "abundances", "segmentation", "material_scores")
-    view = scene.look(camera, subpixels)
     parts = (view[name].detach().cpu() for name in names)
     confidence = view["confidence"].detach().cpu()
-    return PredictedView(*parts, has_sky=scene.field.has_sky, confidence=confidence)
+    return PredictedView(*parts, has_sky=view.scene.field.has_sky, confidence=confidence)
 
 
 def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:

@@ -18,12 +18,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from itertools import compress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int, UInt8, UInt16
+from jaxtyping import Float, Float64, Int, UInt16
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -33,11 +34,11 @@ from unmix_plugin.editing.recipe import Light
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
-from unmix_plugin.products.abundances import draw_abundances
 from unmix_plugin.products.mesh import find_surface
 from unmix_plugin.products.product import Job
+from unmix_plugin.products.regions import measure_regions
 from unmix_plugin.products.scene_products import Page
-from unmix_plugin.products.segmentation import draw_segmentation
+from unmix_plugin.products.views import draw_abundances, draw_segmentation
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.maps.indices import NAMED_INDICES, available_indices
@@ -167,12 +168,8 @@ def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _Kno
         )
     reflectances = known.resampled(materials.bands)[chosen]
     steps = reflectances / np.nanmax(reflectances, axis=1, keepdims=True, initial=1e-9) * (_UNKNOWN - 1)
-    named = [
-        {"name": one.name, "source": one.source}
-        for one, is_in in zip(known.materials, chosen, strict=True)
-        if is_in
-    ]
-    return _KnownSpectra(named, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2"))
+    sources = [{"name": one.name, "source": one.source} for one in compress(known.materials, chosen)]
+    return _KnownSpectra(sources, np.nan_to_num(np.round(steps), nan=_UNKNOWN).astype("<u2"))
 
 
 def _light_of(materials: Materials) -> Float64[np.ndarray, " B"] | None:
@@ -219,42 +216,26 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
     with job.working("looking at the surface's points"):
         arrays = _vertex_arrays(job.scene, mesh, job.frame)
     arrays["areas"] = vertex_areas(mesh.areas() / job.frame.scale**2, mesh.faces, len(mesh.vertices))
-    names, shares = _kept_regions(job, mesh, arrays["areas"], notes)
-    if names:
-        arrays["regions"] = shares
+    kept = job.loaded.measures.regions
+    names: list[str] = []
+    if kept:
+        surface = MeasuredSurface(job.scene, mesh)
+        found, failed = measure_regions(surface, kept)
+        notes += [f"The region {name} is left out: {reason}." for name, reason in failed.items()]
+        inside = [surface.vertex_areas(surface.shares(kept[name])) for name in found]
+        names, of_vertex = list(found), np.maximum(arrays["areas"], 1e-30)
+        if names:  # how much of each vertex is in each, 255 for all of it
+            arrays["regions"] = np.round(255 * np.stack(inside) / of_vertex).astype(np.uint8)
     view = [*job.views("eval"), *job.views("all")][0]
-    enlarged = _PICTURE_PX / max(view.camera.width, view.camera.height)
-    size = [max(1, round(enlarged * side)) for side in (view.camera.width, view.camera.height)]
-    seen = job.render(replace(view, camera=view.camera.resized(*size)))
+    width, height = view.camera.size(0)
+    enlarged = _PICTURE_PX / max(width, height)
+    camera = view.camera.resized(max(1, round(enlarged * width)), max(1, round(enlarged * height)))
+    seen = job.render(replace(view, camera=camera))
     pictures = {
         f"{view.name}: materials": draw_segmentation(view.name, seen, job.materials),
         f"{view.name}: abundances": draw_abundances(view.name, seen, job.materials),
     }
     return PageContent(arrays, {"regions": names, "notes": notes}, pictures, job.materials), resolution
-
-
-def _kept_regions(
-    job: Job, mesh: TriangleMesh, areas: Float64[np.ndarray, " V"], notes: list[str]
-) -> tuple[list[str], UInt8[np.ndarray, "R V"]]:
-    """Names of the regions that are kept with the run, and how much of each vertex is in each, 255 for all of it;
-    notes get what is to be said of regions that can't be shown."""
-    kept = job.loaded.measures.regions
-    names, shares = [], np.zeros((len(kept), len(areas)), np.uint8)
-    if not kept:
-        return names, shares
-    surface = MeasuredSurface(job.scene, mesh)
-    for name, region in kept.items():
-        try:
-            inside = surface.vertex_areas(surface.shares(region))
-        except ConfigError as error:
-            notes.append(f"The region {name} is left out: {error}.")
-            continue
-        if not inside.any():
-            notes.append(f"The region {name} is left out: nothing of the surface is in it.")
-            continue
-        shares[len(names)] = np.round(255 * inside / np.maximum(areas, 1e-30))
-        names.append(name)
-    return names, shares[: len(names)]
 
 
 def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | None) -> dict[str, Any]:
@@ -310,20 +291,15 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
 
 def _camera_facts(views: list[RunView], frame: Normalisation) -> list[dict[str, Any]]:
     """Where the cameras stand, in the world's axes."""
-    shown = views[:: -(-len(views) // _MOST_CAMERAS)]
     cameras = []
-    for view in shown:
-        pose = view.camera.camera_to_world[0].double().cpu().numpy()
-        focal = view.camera.focal_px[0].tolist()
-        cameras.append(
-            {
-                "name": view.name,
-                "position": frame.to_world(pose[None, :, 3])[0].tolist(),
-                "axes": directions_to_world(frame, pose[:, :3].T).tolist(),
-                "size": [view.camera.width, view.camera.height],
-                "focal_px": focal,
-            }
-        )
+    for view in views[:: -(-len(views) // _MOST_CAMERAS)]:
+        pose, size = view.camera.camera_to_world[0].double().cpu().numpy(), view.camera.size(0)
+        place = {
+            "position": frame.to_world(pose[None, :, 3])[0].tolist(),
+            "axes": directions_to_world(frame, pose[:, :3].T).tolist(),
+        }
+        focal_px = view.camera.focal_px[0].tolist()
+        cameras.append({"name": view.name, **place, "size": list(size), "focal_px": focal_px})
     return cameras
 
 
