@@ -98,8 +98,11 @@ def exported(tmp_path_factory):
 def test_regions_that_can_not_be_shown_are_said(exported):
     facts, said, _ = exported
     assert facts["regions"] == ["cap <b>", "below"]
-    assert "The region nowhere is left out: nothing of the surface is in it." in said
-    assert any("of no material is left out: the scene has no material 7; it has 3." in text for text in said)
+    for text in (
+        "The region nowhere is left out: the region nowhere has nothing of the surface in it",
+        "The region of no material is left out: the scene has no material 7; it has 3.",
+    ):
+        assert any(one.startswith(text) for one in said)
 
 
 def test_a_page_of_an_edited_run_says_so(exported, tmp_path):

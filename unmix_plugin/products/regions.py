@@ -3,6 +3,7 @@ the command line asks for them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtyping import Bool
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.envi import envi_library_paths, write_envi_library
 from unmix_plugin.formats.files import csv_bytes, make_folder, write_file
+from unmix_plugin.products.measuring import find_point
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Regions
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
@@ -25,11 +27,24 @@ def measured_surface(job: Job) -> MeasuredSurface:
     return MeasuredSurface.of(job.scene, job.follow, job.working)
 
 
+def measure_regions(
+    surface: MeasuredSurface, regions: Mapping[str, Region]
+) -> tuple[dict[str, MeasuredRegion], dict[str, str]]:
+    """What each region is, by its name; and why others could not be measured."""
+    found: dict[str, MeasuredRegion] = {}
+    failed: dict[str, str] = {}
+    for name, region in regions.items():
+        try:
+            found[name] = surface.measure(region, name)
+        except ConfigError as error:  # noqa: PERF203 - said, and the others are measured
+            failed[name] = str(error)
+    return found, failed
+
+
 def export(job: Job, asked: Regions) -> list[Path]:
     """Keep a region with the run, after a look at what is in it, or forget one; otherwise measure all of them."""
-    described = (asked.box, asked.material, asked.view, asked.polygon, asked.mask)
-    is_described = any(what is not None for what in described)
-    if asked.add is None and not is_described:
+    described = (asked.add, asked.box, asked.material, asked.view, asked.polygon, asked.mask)
+    if all(what is None for what in described):
         if asked.remove is None:
             return _measure_all(job)
         return [keep_region(job.loaded.folder, asked.remove, None)]
@@ -48,13 +63,10 @@ def _measure_all(job: Job) -> list[Path]:
     table, spectra = job.folder / "regions.csv", job.folder / "regions-spectra.csv"
     job.claim([table, spectra, *envi_library_paths(job.folder / "regions")])
     surface, names, scale = measured_surface(job), job.materials.names, job.scene.scale
-    found: dict[str, MeasuredRegion] = {}
     materials = {f"material {name}": OfMaterial(index) for index, name in enumerate(names)}
-    for name, region in {**job.loaded.measures.regions, **materials}.items():
-        try:
-            found[name] = surface.measure(region, name)
-        except ConfigError as error:  # noqa: PERF203 - said, and the others are measured
-            job.say(str(error))
+    found, failed = measure_regions(surface, {**job.loaded.measures.regions, **materials})
+    for reason in failed.values():
+        job.say(reason)
     factor = None if scale is None else 1e4 * scale.metres_per_unit**2
     rows = [["name", "area_square_units", "area_cm2", *names]]
     for name, one in found.items():
@@ -63,24 +75,13 @@ def _measure_all(job: Job) -> list[Path]:
         job.say(f"{name}: {one.said(names, scale)}")
     make_folder(job.folder)
     write_file(table, csv_bytes(rows))
-    columns = {
-        f"{name} {what}": values
-        for name, one in found.items()
-        for what, values in (("mean", one.mean), ("standard deviation", one.spread))
-    }
-    bands, quantity = job.materials.bands, job.materials.quantity
-    write_spectra_csv(
-        spectra, SpectraTable(bands, tuple(columns), np.stack(list(columns.values())).clip(min=0))
-    )
+    columns = [f"{name} {what}" for name in found for what in ("mean", "standard deviation")]
+    values = np.stack([row for one in found.values() for row in (one.mean, one.spread)]).clip(min=0)
+    write_spectra_csv(spectra, SpectraTable(job.materials.bands, tuple(columns), values))
     means = np.stack([one.mean for one in found.values()]).astype(np.float32)
-    written = write_envi_library(
-        job.folder / "regions",
-        means,
-        bands,
-        tuple(found),
-        f"mean spectra of regions: {quantity}, 1 = full scale",
-    )
-    return [table, spectra, *written]
+    about = f"mean spectra of regions: {job.materials.quantity}, 1 = full scale"
+    library = write_envi_library(job.folder / "regions", means, job.materials.bands, tuple(found), about)
+    return [table, spectra, *library]
 
 
 def _requested(job: Job, asked: Regions) -> Region:
@@ -89,8 +90,6 @@ def _requested(job: Job, asked: Regions) -> Region:
     if len(given) != 1 or (asked.view is not None) != (asked.polygon is not None or asked.mask is not None):
         raise ConfigError("give one of --box, --material, --view with --polygon, and --view with --mask")
     if asked.box is not None:
-        from unmix_plugin.products.measuring import find_point
-
         first, second = (find_point(job, text) for text in asked.box)
         low, high = np.minimum(first, second).tolist(), np.maximum(first, second).tolist()
         return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
@@ -102,12 +101,11 @@ def _requested(job: Job, asked: Regions) -> Region:
             return OfMaterial(int(asked.material))
         raise ConfigError(f"no material {asked.material!r}; there are {', '.join(names)}, or numbers from 0")
     assert asked.view is not None
-    view = find_view(job.views("eval"), asked.view, job.views("train"))
-    size = view.camera.size(0)
+    camera = find_view(job.views("eval"), asked.view, job.views("train")).camera
     if asked.polygon is not None:
-        return InView.of_mask(view.camera, polygon_mask(_corners(asked.polygon), size))
+        return InView.of_mask(camera, polygon_mask(_corners(asked.polygon), camera.size(0)))
     assert asked.mask is not None
-    return InView.of_mask(view.camera, _read_mask(asked.mask, size))
+    return InView.of_mask(camera, _read_mask(asked.mask, camera.size(0)))
 
 
 def _corners(text: str) -> list[tuple[float, float]]:

@@ -6,9 +6,10 @@ Notation: `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import describe_scale
-from unmix_plugin.trained.open_run import find_scene
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_materials import (
     LIGHT_UNKNOWN,
@@ -50,69 +50,70 @@ _WHOLE = 0.95
 
 def export(job: Job, asked: Spectrum) -> list[Path]:
     """Probe a place and write what is there."""
-    view_name, pixel_text, point_text, region = asked.view, asked.pixel, asked.point, asked.region
-    measured = over_views = spread = None
-    others = (view_name, pixel_text, point_text)
-    if region is not None and others == (None, None, None):
-        title, name = f"region {region}", safe_name(f"region_{region}", NOT_PORTABLE)
-        kept = job.loaded.measures.region(region)
-        job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
-        found = measured_surface(job).measure(kept, region)
-        probe = Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None)
-        spread = found.spread
-        facts: dict[str, Any] = {"region": region, "area_square_units": found.area}
-        job.say(f"{region}: {found.said(job.materials.names, job.scene.scale)}")
-    elif region is not None:
-        raise ConfigError("give --region alone, without a pixel or a point")
-    elif point_text is not None and view_name is None and pixel_text is None:
-        point = _numbers(point_text, 3, "--point", "0.1,0.2,0.5")
-        name = f"point_{'_'.join(f'{value:g}' for value in point)}"
-        job.claim(_spectrum_paths(job.folder, name))
-        probe = job.scene.probe_point(point[0], point[1], point[2])
-        facts = {"point": point}
-        title = f"point {', '.join(f'{value:g}' for value in point)}"
-        over_views = _over_views(job, _scene_of(job, asked.data), probe)
-    elif point_text is None and view_name is not None and pixel_text is not None:
-        if not re.fullmatch(r"\s*\d+\s*,\s*\d+\s*", pixel_text):
-            raise ConfigError(f"--pixel {pixel_text} is not a column and a row from 0, such as 120,80")
-        column, row = map(int, pixel_text.split(","))
-        view = find_view(job.views("eval"), view_name, job.views("train"))
-        name = f"{view.name}_x{column}_y{row}"
-        job.claim(_spectrum_paths(job.folder, name))
-        probe = job.scene.probe(view.camera, column, row)
-        facts = {"view": view.name, "pixel": [column, row]}
-        title = f"{view.name}, column {column}, row {row}"
-        scene = _scene_of(job, asked.data)
-        measured, over_views = _measured(job, scene, view, (column, row)), _over_views(job, scene, probe)
-    else:
-        raise ConfigError(
-            "give a pixel with --view and --pixel, a point with --point, or a region with --region"
-        )
-    light, matches = job.scene.light_power, []
-    known = library_of(asked.library, job.materials.bands, light)
-    if not job.materials.is_light_known:
+    place = _asked_place(job, asked)
+    materials, light, probe = job.materials, job.scene.light_power, place.probe
+    known = library_of(asked.library, materials.bands, light)
+    if not materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
     if probe.opacity < OCCUPIED_ACCUMULATION:
         job.say(f"hardly anything is there: opacity {probe.opacity:.2f}")
     else:
-        spectra, bands = probe.spectra["predicted"][None], job.materials.bands
-        [matches] = shown_matches(spectra, bands, light, known, asked.compare)
-    probed = _ProbedPlace(title, facts, probe, measured, matches, spread, over_views)
-    written = _write_spectrum(job.folder, name, probed, job.scene)
-    if spread is not None:
+        spectra = probe.spectra["predicted"][None]
+        [matches] = shown_matches(spectra, materials.bands, light, known, asked.compare)
+        place = replace(place, matches=matches)
+    written = _write_spectrum(job.folder, place, job.scene)
+    if place.spread is not None:
         mean = probe.spectra["predicted"][None].astype(np.float32)
-        about = f"mean spectrum: {job.materials.quantity}, 1 = full scale"
-        written += write_envi_library(job.folder / name, mean, job.materials.bands, (title,), about)
+        about = f"mean spectrum: {materials.quantity}, 1 = full scale"
+        base = job.folder / place.name
+        written += write_envi_library(base, mean, materials.bands, (place.title,), about)
     return written
 
 
-def _scene_of(job: Job, data: Path | None) -> Scene | None:
-    """The scene folder, for what was measured."""
-    with job.working("looking for the scene"):
-        scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, data)
-    if scene is None:
-        job.say("the scene folder was not found: no measured spectra; give it with --data")
-    return scene
+def _asked_place(job: Job, asked: Spectrum) -> _ProbedPlace:
+    """What is at the place asked for: exactly one of a pixel, a point and a region."""
+    given = (
+        asked.view is not None,
+        asked.pixel is not None,
+        asked.point is not None,
+        asked.region is not None,
+    )
+    if given == (False, False, False, True):
+        return _region(job, str(asked.region))
+    if given == (False, False, True, False):
+        point = _numbers(str(asked.point))
+        name = f"point_{'_'.join(f'{value:g}' for value in point)}"
+        job.claim(_spectrum_paths(job.folder, name))
+        probe = job.scene.probe_point(*point)
+        title = f"point {', '.join(f'{value:g}' for value in point)}"
+        over_views = _over_views(job, job.measured_scene(asked.data), probe)
+        return _ProbedPlace(name, title, {"point": list(point)}, probe, over_views=over_views)
+    if given != (True, True, False, False):
+        raise ConfigError(
+            "give a pixel with --view and --pixel, a point with --point, or a region with --region alone"
+        )
+    match = re.fullmatch(r"\s*(\d+)\s*,\s*(\d+)\s*", str(asked.pixel))
+    if match is None:
+        raise ConfigError(f"--pixel {asked.pixel} is not a column and a row from 0, such as 120,80")
+    column, row = int(match[1]), int(match[2])
+    view = find_view(job.views("eval"), str(asked.view), job.views("train"))
+    name = f"{view.name}_x{column}_y{row}"
+    job.claim(_spectrum_paths(job.folder, name))
+    probe = job.scene.probe(view.camera, column, row)
+    title, facts = f"{view.name}, column {column}, row {row}", {"view": view.name, "pixel": [column, row]}
+    scene = job.measured_scene(asked.data)
+    measured = _measured(job, scene, view, (column, row))
+    return _ProbedPlace(name, title, facts, probe, measured, over_views=_over_views(job, scene, probe))
+
+
+def _region(job: Job, region: str) -> _ProbedPlace:
+    name, kept = safe_name(f"region_{region}", NOT_PORTABLE), job.loaded.measures.region(region)
+    job.claim([*_spectrum_paths(job.folder, name), *envi_library_paths(job.folder / name)])
+    found = measured_surface(job).measure(kept, region)
+    job.say(f"{region}: {found.said(job.materials.names, job.scene.scale)}")
+    probe = Probe({"predicted": found.mean, "abundances": found.abundances}, 1.0, None, None)
+    facts = {"region": region, "area_square_units": found.area}
+    return _ProbedPlace(name, f"region {region}", facts, probe, spread=found.spread)
 
 
 def _measured(
@@ -187,14 +188,16 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray
 class _ProbedPlace:
     """A place, and all that is known of it."""
 
+    name: str
+    """Of its files."""
     title: str
     """For people."""
     facts: dict[str, Any]
     """Where it is, as JSON has it."""
     probe: Probe
-    measured: Float[np.ndarray, " B"] | None
+    measured: Float[np.ndarray, " B"] | None = None
     """Spectrum that the scene has there, in the light of the prediction."""
-    matches: Sequence[ShownMatch]
+    matches: Sequence[ShownMatch] = ()
     """Known materials that the predicted spectrum resembles, nearest first; none where nothing is."""
     spread: Float[np.ndarray, " B"] | None = None
     """Standard deviation, of a region."""
@@ -207,13 +210,12 @@ def _spectrum_paths(folder: Path, name: str) -> list[Path]:
     return [folder / f"{name}.{kind}" for kind in ("csv", "json", "png")]
 
 
-def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: TrainedScene) -> list[Path]:
+def _write_spectrum(folder: Path, place: _ProbedPlace, scene: TrainedScene) -> list[Path]:
     """Write NAME.csv (`wavelength,predicted,...`, `measured` and mean and standard deviation over views where they are
-    known), NAME.json (where the place is, its
-    opacity, abundances and nearest known materials) and NAME.png, a plot.
+    known), NAME.json (where the place is, its opacity, abundances and nearest known materials) and NAME.png, a plot.
     """
     materials = scene.materials
-    table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), name)
+    table_path, facts_path, plot_path = _spectrum_paths(make_folder(folder), place.name)
     columns = dict(place.probe.spectra)
     if place.measured is not None:
         columns["measured"] = place.measured.astype(np.float64)
@@ -222,11 +224,10 @@ def _write_spectrum(folder: Path, name: str, place: _ProbedPlace, scene: Trained
         columns["standard deviation over views"] = place.over_views.std(axis=0, ddof=1)
     if place.spread is not None:
         columns = {"mean": columns["predicted"].clip(min=0), "standard deviation": place.spread}
-    table = SpectraTable(materials.bands, tuple(columns), np.stack(list(columns.values())))
-    write_spectra_csv(table_path, table)
+    values = np.stack(list(columns.values()))
+    write_spectra_csv(table_path, SpectraTable(materials.bands, tuple(columns), values))
     facts = {**_facts(place, materials), "scale": describe_scale(scene.scale)}
-    content = json.dumps(facts, indent=1, allow_nan=False) + "\n"
-    write_file(facts_path, content.encode())
+    write_file(facts_path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
     return [table_path, facts_path, write_file(plot_path, _draw_spectrum(place, materials))]
 
 
@@ -240,14 +241,11 @@ def _draw_spectrum(place: _ProbedPlace, materials: Materials) -> bytes:
     if place.measured is not None:
         lines.plot(wavelengths, place.measured, color="0.55", linewidth=3.5, label="measured")
     lines.plot(wavelengths, place.probe.spectra["predicted"], color="black", linewidth=1.8, label="predicted")
-    if place.spread is not None:
-        mean = place.probe.spectra["predicted"]
-        lines.fill_between(
-            wavelengths, mean - place.spread, mean + place.spread, color="0.85", label="± 1 std. dev."
-        )
+    mean, spread, label = place.probe.spectra["predicted"], place.spread, "± 1 std. dev."
     if place.over_views is not None:
         mean, spread = place.over_views.mean(axis=0), place.over_views.std(axis=0, ddof=1)
         label = f"{len(place.over_views)} training views, ± 1 std. dev."
+    if spread is not None:
         lines.fill_between(wavelengths, mean - spread, mean + spread, color="0.85", label=label)
     for style, shown in zip(("--", "-.", ":"), place.matches, strict=False):
         label = f"{shown.match.name} ({shown.match.angle_rad:.3f} rad)"
@@ -297,11 +295,11 @@ def _facts(place: _ProbedPlace, materials: Materials) -> dict[str, Any]:
     }
 
 
-def _numbers(text: str, count: int, option: str, example: str) -> list[float]:
+def _numbers(text: str) -> tuple[float, float, float]:
     try:
-        values = [float(part) + 0.0 for part in text.split(",")]  # no minus before a 0
+        x, y, z = (float(part) + 0.0 for part in text.split(","))  # no minus before a 0
     except ValueError:
-        values = []
-    if len(values) != count or not all(abs(value) < float("inf") for value in values):
-        raise ConfigError(f"{option} {text} is not {count} numbers with commas between, such as {example}")
-    return values
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise ConfigError(f"--point {text} is not 3 numbers with commas between, such as 0.1,0.2,0.5")
+    return x, y, z

@@ -18,7 +18,7 @@ from unmix_plugin.products.report.pictures import (
     TrueMaterials,
     evenly,
     material_cards,
-    segmentation_pictures,
+    segmentation_section,
 )
 from unmix_plugin.products.report.report import _figure_rows, _png_url, _render_page, _view_values
 from unmix_plugin.spectral.bands import Bands
@@ -55,6 +55,11 @@ def gathered(offsets, with_truth=True, materials=MATERIALS):
     return views
 
 
+def of_bands(views):
+    assert views.error_of_bands is not None
+    return views.error_of_bands
+
+
 OTHERS = {
     "title": "Title <x>",
     "subtitle": "run",
@@ -81,13 +86,13 @@ def shown_texts(views: ReportViews, **others) -> dict[str, str]:
 
 def test_error_against_wavelength_and_proportions_are_over_pixels_that_show_matter():
     views = gathered([0.1, 0.0])
-    np.testing.assert_allclose(views.rmse_of_bands, [0.1 / math.sqrt(2), 0, 0, 0, 0], atol=1e-7)
-    np.testing.assert_allclose(views.bias_of_bands, [-0.05, 0, 0, 0, 0], atol=1e-7)
+    expected = [[0.1 / math.sqrt(2), 0, 0, 0, 0], [-0.05, 0, 0, 0, 0]]
+    np.testing.assert_allclose(of_bands(views), expected, atol=1e-7)
     np.testing.assert_allclose(views.proportions, 1 / 3)
     assert gathered([]).proportions.tolist() == [0, 0, 0]
     texts = shown_texts(views)
     assert "mean of predicted less measured" in texts["error"]
-    assert len(_view_values(views)["segmentation"].pictures) == 2 * 3
+    assert len(_view_values(views)["segmentation"]["pictures"]) == 2 * 3
     assert texts["segmentation"].count("1.000") == 3  # as matched with the labels
     assert "<clay>" in texts["segmentation"]
 
@@ -160,7 +165,7 @@ def test_each_endmember_has_its_three_nearest_known_materials_and_its_true_one()
     assert "50.0% of what is seen" in text
     for matches in library.nearest(SPECTRA.numpy(), BANDS):
         assert all(match.name in text for match in matches)
-    assert [len(card.chart.lines) for card in cards] == [5, 5, 5]
+    assert [len(card["chart"].lines) for card in cards] == [5, 5, 5]
     infrared = Materials(Bands.of([1000, 1100, 1200, 1300, 1400]), SPECTRA, torch.zeros(0, 5))
     unknown = material_cards(infrared, np.zeros(3), None, library, None)
     text = shown_texts(gathered([]), cards=unknown, light_unknown="taken as flat")["materials"]
@@ -214,7 +219,7 @@ def test_pixels_that_do_not_count_show_neither_error_nor_agreement():
     grey = eight_bits(np.full(3, NEUTRAL))
     assert (shown.error[hidden] == grey).all()
     assert (shown.error[8] != grey).any(axis=-1).all()
-    agreement = segmentation_pictures(views).pictures[-1].image
+    agreement = segmentation_section(views)["pictures"][-1].image
     np.testing.assert_allclose(agreement[hidden], NEUTRAL)
     assert (agreement[8] != NEUTRAL).any(axis=-1).all()
 
@@ -225,5 +230,5 @@ def test_the_gain_fitted_to_a_view_counts_in_its_pictures_and_errors():
     views = gathered([])
     views.add("bright", replace(view, gain=gain), replace(truth, spectra=truth.spectra * gain))
     [shown] = views.shown
-    np.testing.assert_allclose(views.rmse_of_bands, 0, atol=1e-7)
+    np.testing.assert_allclose(of_bands(views), 0, atol=1e-7)
     np.testing.assert_array_equal(shown.predicted, shown.measured)

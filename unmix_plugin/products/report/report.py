@@ -9,6 +9,7 @@ import json
 import os
 import platform
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
@@ -27,9 +28,8 @@ from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.figures.plotting import LineChart, css_colour, draw_chart
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
-from unmix_plugin.products.abundances import SHARE_SCALE
 from unmix_plugin.products.product import Job
-from unmix_plugin.products.regions import measured_surface
+from unmix_plugin.products.regions import measure_regions, measured_surface
 from unmix_plugin.products.report import pictures
 from unmix_plugin.products.report.pictures import (
     ERROR_SCALE,
@@ -40,6 +40,7 @@ from unmix_plugin.products.report.pictures import (
     material_cards,
 )
 from unmix_plugin.products.scene_products import Report
+from unmix_plugin.products.views import SHARE_SCALE
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.colour.conversion import describe_colour
 from unmix_plugin.spectral.library.material_library import MaterialLibrary
@@ -47,11 +48,11 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.alignment import render_aligned
 from unmix_plugin.trained.evaluation import DEFINITIONS, Evaluation, finite_or_none, scene_truth, view_truth
 from unmix_plugin.trained.measures import describe_length
-from unmix_plugin.trained.open_run import LoadedRun, find_scene
+from unmix_plugin.trained.open_run import LoadedRun
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 from unmix_plugin.trained.run_views import RunView, world_frame
 
-_VIEWS_WITH_SHARES = 2
+_VIEWS_WITH_SHARES, _WORST_VIEWS = 2, 3
 
 
 def export(job: Job, asked: Report) -> list[Path]:
@@ -69,64 +70,51 @@ def export(job: Job, asked: Report) -> list[Path]:
             "are those of the run itself."
         )
     else:
-        with job.working("looking for the scene"):
-            scene = find_scene(job.loaded.record.summary, job.loaded.folder.path, asked.data)
-        if scene is None:
-            job.say("the scene folder was not found: nothing measured in the report; give it with --data")
+        scene = job.measured_scene(asked.data)
     views = _look(job, chosen, scene)
     if len(chosen) < len(job.loaded.record.eval_cameras):
         notes.append(f"Rendered: {len(chosen)} of {len(job.loaded.record.eval_cameras)} evaluation views.")
-    regions = _region_cards(job, notes)
+    regions, kept = [], job.loaded.measures.regions
+    if kept:
+        found, failed = measure_regions(measured_surface(job), kept)
+        notes += [f"Not shown: {reason}." for reason in failed.values()]
+        scale = job.scene.scale
+        regions = [pictures.region_card(name, one, job.materials, scale) for name, one in found.items()]
     with job.working("laying out the report"):
-        page = _page(job, views, known, notes, said, regions)
-        return [write_file(job.folder / "report.html", page.encode("utf-8", "backslashreplace"))]
-
-
-def _region_cards(job: Job, notes: list[str]) -> list[Any]:
-    """What is shown of the regions that are kept with the run; `notes` get those of which there is nothing."""
-    kept, cards = job.loaded.measures.regions, []
-    if not kept:
-        return []
-    surface = measured_surface(job)
-    for name, region in kept.items():
-        try:
-            found = surface.measure(region, name)
-        except ConfigError as error:  # noqa: PERF203 - said, and the others are shown
-            notes.append(f"Not shown: {error}.")
-        else:
-            cards.append(pictures.region_card(name, found, job.materials, job.scene.scale))
-    return cards
+        values = {**_page(job, views, known, said), "notes": notes, "regions": regions}
+        page = _render_page(values).encode("utf-8", "backslashreplace")
+        return [write_file(job.folder / "report.html", page)]
 
 
 def _look(job: Job, chosen: Sequence[RunView], scene: Scene | None) -> ReportViews:
     """Render the views, and compare each with what was measured, if the scene folder is found and unchanged; aligned
     first, as unmix-eval does."""
-    materials, evaluation, indices = job.materials, None, {}
+    materials, evaluation = job.materials, None
     if scene is not None:
         evaluation = Evaluation(scene_truth(scene), materials.endmembers, materials.names)
-        indices = {frame.name: index for index, frame in enumerate(scene.frames)}
     views = ReportViews(materials, evaluation, {view.name for view in evenly(chosen, _VIEWS_WITH_SHARES)})
     for view in job.follow("rendering views", chosen):
-        truth = None if scene is None else view_truth(scene, indices[view.name])
-        if truth is not None and truth.sensor is not None:
-            truth = None  # of a rig, only views with all bands are put beside the prediction
-        if scene is None or truth is None:
-            predicted = job.render(view)
-        else:
-            predicted = render_aligned(job.scene, view.camera, scene, indices[view.name], truth)
+        predicted = truth = None
+        if scene is not None:
+            index = [frame.name for frame in scene.frames].index(view.name)
+            truth = view_truth(scene, index)
+            if truth.sensor is None:  # of a rig, only views with all bands are put beside the prediction
+                predicted = render_aligned(job.scene, view.camera, scene, index, truth)
+        if predicted is None:
+            predicted, truth = job.render(view), None
         views.add(view.name, predicted, truth)
     return views
 
 
 def _stored_figures(job: Job) -> dict[str, Any] | None:
     """What `unmix-eval` found, if it was run."""
-    path = job.loaded.folder.eval / "metrics.json"
+    path, figure = job.loaded.folder.eval / "metrics.json", (int, float, type(None))
     try:
         found = read_plain_json(path)
     except FileNotFoundError:
         return None
     words = found.get("definitions", {}) if isinstance(found, dict) else None
-    if not isinstance(words, dict) or not all(isinstance(found.get(name), _FIGURE) for name in DEFINITIONS):
+    if not isinstance(words, dict) or not all(isinstance(found.get(name), figure) for name in DEFINITIONS):
         raise RunError(f"{path} is not what unmix-eval writes; run it again, or remove the file")
     return found
 
@@ -138,19 +126,8 @@ def _aligned_in_words(job: Job) -> str:
     return f", each aligned first in {words}" if words else ""
 
 
-_FIGURE = (int, float, type(None))
-_WORST_VIEWS = 3
-
-
-def _page(
-    job: Job,
-    views: ReportViews,
-    library: MaterialLibrary,
-    notes: Sequence[str],
-    about: Mapping[str, str],
-    regions: Sequence[Any],
-) -> str:
-    """The report; with the figures that `unmix-eval` stored, or else those of `views` if they were compared."""
+def _page(job: Job, views: ReportViews, library: MaterialLibrary, about: Mapping[str, str]) -> dict[str, Any]:
+    """What the report says; with the figures that `unmix-eval` stored, or else those of `views` that were compared."""
     loaded, materials, light = job.loaded, views.materials, job.scene.light_power
     figures, source = _stored_figures(job), "From the run's eval/metrics.json."
     if figures is None and views.evaluation is not None:
@@ -159,29 +136,26 @@ def _page(
     truth = _true_materials(loaded, light)
     cards = material_cards(materials, views.proportions, light, library, truth)
     unknown = [name for name in DEFINITIONS if figures is not None and figures.get(name, 0) is None]
-    return _render_page(
-        {
-            "title": about.get("title") or f"{loaded.scene_name}: materials and spectra",
-            "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
-            "page": _page_link(job.folder, loaded),
-            "summary": _summary(loaded, views, cards, figures, library.names),
-            "about": about.get("notes", ""),
-            "notes": notes,
-            "facts": _scene_facts(loaded, materials, about),
-            "cards": cards,
-            "regions": regions,
-            "quantity": materials.quantity,
-            "num_known": len(library.names),
-            "light_unknown": None if materials.is_light_known else LIGHT_UNKNOWN,
-            "figures": None if figures is None else _figure_rows(figures),
-            "num_main": sum(name in _MAIN_FIGURES for name, *_ in _figure_rows(figures or {})),
-            "unknown": unknown,
-            "figures_source": source,
-            "settings": json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1),
-            "versions": _version_rows(loaded),
-            **_view_values(views),
-        }
-    )
+    rows = _figure_rows(figures or {})
+    return {
+        "title": about.get("title") or f"{loaded.scene_name}: materials and spectra",
+        "subtitle": f"{loaded.config.method_name}, run {loaded.folder.path.name}",
+        "page": _page_link(job.folder, loaded),
+        "summary": _summary(loaded, views, cards, figures, library.names),
+        "about": about.get("notes", ""),
+        "facts": _scene_facts(loaded, materials, about),
+        "cards": cards,
+        "quantity": materials.quantity,
+        "num_known": len(library.names),
+        "light_unknown": None if materials.is_light_known else LIGHT_UNKNOWN,
+        "figures": None if figures is None else rows,
+        "num_main": sum(name in _MAIN_FIGURES for name, *_ in rows),
+        "unknown": unknown,
+        "figures_source": source,
+        "settings": json.dumps(config_to_json(replace(loaded.config, load_run=None)), indent=1),
+        "versions": _version_rows(loaded),
+        **_view_values(views),
+    }
 
 
 def _view_values(views: ReportViews) -> dict[str, Any]:
@@ -200,7 +174,7 @@ def _view_values(views: ReportViews) -> dict[str, Any]:
         "share_columns": pictures.map_columns(len(views.materials.names)),
         "share_scale": (SHARE_SCALE, pictures.scale_strip(SHARE_SCALE)),
         "error_scale": (ERROR_SCALE, pictures.scale_strip(ERROR_SCALE)),
-        "segmentation": pictures.segmentation_pictures(views),
+        "segmentation": pictures.segmentation_section(views),
         "error_chart": pictures.error_chart(views),
     }
 
@@ -297,31 +271,22 @@ def _light_in_words(materials: Materials) -> str:
 def _summary(
     loaded: LoadedRun,
     views: ReportViews,
-    cards: Sequence[Any],
+    cards: Sequence[Mapping[str, Any]],
     figures: Mapping[str, Any] | None,
     known_names: Collection[str],
 ) -> str:
     """What was found and how sure, in two or three sentences."""
-    named = []
-    ordered = sorted(cards, key=lambda card: -card.proportion)
+    named, ordered = [], sorted(cards, key=lambda card: -card["proportion"])
     for card in ordered[:_NAMED_MATERIALS]:
-        near = [
-            line.label for line, angle, _ in card.matches if angle <= NEAR_RAD and line.label in known_names
-        ]
-        like = f", most like {near[0]}" if near else ""
-        named.append(f"{card.name} ({card.proportion:.0%} of what is seen{like})")
+        labels = [line.label for line, angle, _ in card["matches"] if angle <= NEAR_RAD]
+        near = [f", most like {label}" for label in labels if label in known_names]
+        named.append(f"{card['name']} ({card['proportion']:.0%} of what is seen{''.join(near[:1])})")
     if len(ordered) > _NAMED_MATERIALS:
         named.append(f"and {len(ordered) - _NAMED_MATERIALS} more")
     count, known = len(loaded.record.train_cameras), figures or {}
     text = f"{counted(len(cards), 'material')} told apart in {counted(count, 'view')}: {', '.join(named)}."
-    errors = [
-        f"{say} {known[name]:.2g}{unit}"
-        for name, say, unit in (
-            ("sam", "spectra are off by", " rad"),
-            ("rmse", "values by", " of full scale"),
-        )
-        if known.get(name) is not None
-    ]
+    words = (("sam", "spectra are off by", " rad"), ("rmse", "values by", " of full scale"))
+    errors = [f"{said} {known[name]:.2g}{unit}" for name, said, unit in words if known.get(name) is not None]
     if errors:
         text += f" In views that were kept apart from training, {' and '.join(errors)}, on average."
     if views.confidence is not None:
@@ -359,19 +324,15 @@ def _figure_rows(values: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 def _version_rows(loaded: LoadedRun) -> list[tuple[str, str]]:
     """What made this report, of what."""
     hashes = loaded.record.summary.get("input_hashes") or {}
-    return [
+    rows = [
         ("run", str(loaded.folder.path)),
         ("scene", str(loaded.record.summary.get("root", "unknown"))),
         ("input files", f"{len(hashes)}, with their SHA-256 in the run's scene.json"),
         ("report made", f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC"),
         ("unmix-nerf", __version__),
         ("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
-        *((name, version) for name in _PACKAGES if (version := _version(name)) is not None),
     ]
-
-
-def _version(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
+    for name in _PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            rows.append((name, metadata.version(name)))
+    return rows
