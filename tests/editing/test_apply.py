@@ -32,9 +32,9 @@ EVERY_KIND = [
 ]
 
 
-def named_scene() -> TrainedScene:
+def named_scene(specular: str = "dictionary") -> TrainedScene:
     """Three materials with names."""
-    scene = lit_scene()
+    scene = lit_scene(specular=specular)
     return replace(scene, materials=replace(scene.materials, names=("red", "green", "blue")))
 
 
@@ -122,22 +122,17 @@ def test_a_scaled_endmember_is_that_much_brighter_by_its_new_name_which_ends_up_
     assert_close(rendered(same), rendered(scene), rtol=0, atol=0)
 
 
-def test_a_removed_endmember_is_nowhere_and_what_is_left_sums_to_the_opacity():
+def test_a_removed_endmember_is_nowhere_and_removing_some_is_isolating_the_others():
     scene = lit_scene()
+    isolated = rendered(edited(scene, "isolate: endmember_1"))
+    for edits in (["remove: [0, 2]"], ["remove: 0", "remove: 2"]):
+        assert_close(rendered(edited(scene, *edits)), isolated)
     for view in range(2):
         before, after = rendered(scene, view), rendered(edited(scene, "remove: [1]"), view)
         assert after["abundances"][..., 1].abs().max() == 0
         assert_close(after["abundances"].sum(-1), after["accumulation"], rtol=1e-5, atol=1e-6)
         assert (after["accumulation"] <= before["accumulation"] + 1e-5).all()
         assert (before["accumulation"] - after["accumulation"]).max() > 0.01
-
-
-def test_removing_some_is_isolating_the_others():
-    scene = lit_scene()
-    removed, isolated = edited(scene, "remove: [0, 2]"), edited(scene, "isolate: endmember_1")
-    together = edited(scene, "remove: 0", "remove: 2")
-    assert_close(rendered(removed), rendered(isolated))
-    assert_close(rendered(removed), rendered(together))
 
 
 def test_gloss_can_be_taken_away_without_a_trace_on_the_rest():
@@ -152,24 +147,10 @@ def test_gloss_can_be_taken_away_without_a_trace_on_the_rest():
     twice = rendered(edited(edited(scene, "remove: 0", none(1)), none(2)))
     assert twice["specular"].abs().max() == 0
     assert_close(twice["diffuse"], rendered(edited(scene, "remove: 0"))["diffuse"])
-    with pytest.raises(ConfigError, match="no view-dependent part"):
-        edited(lit_scene(specular="none"), "gloss: {scale: 2}")
 
 
 @pytest.mark.parametrize("specular", ["dictionary", "full"])
-def test_the_gloss_of_a_scene_is_the_sum_of_that_of_its_materials(specular):
-    scene = lit_scene(specular=specular, num_specular_spectra=2)
-    only = [
-        edited(scene, *(f"gloss: {{endmember: {other}, scale: 0}}" for other in range(3) if other != k))
-        for k in range(3)
-    ]
-    parts = [rendered(result)["specular"] for result in only]
-    assert all(part.max() > 1e-4 for part in parts)
-    assert_close(sum(parts), rendered(scene)["specular"], rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("specular", ["dictionary", "full"])
-def test_coloured_gloss_mirrors_the_highlights_of_one_material_or_of_all(specular):
+def test_gloss_is_the_sum_of_that_of_all_materials_and_mirrors_in_the_colour_of_one_or_of_all(specular):
     scene = lit_scene(specular=specular, num_specular_spectra=2)
     before = rendered(scene)
     shiny = before["specular"] > 1e-3
@@ -183,6 +164,12 @@ def test_coloured_gloss_mirrors_the_highlights_of_one_material_or_of_all(specula
         if not whose:
             mirror, lamp = (one.materials.specular_spectra.detach().sum(0) for one in (result, scene))
             assert_close(after["specular"], before["specular"] * mirror / lamp, rtol=1e-4, atol=1e-6)
+    others = [
+        [f"gloss: {{endmember: {other}, scale: 0}}" for other in range(3) if other != k] for k in range(3)
+    ]
+    parts = [rendered(edited(scene, *edits))["specular"] for edits in others]
+    assert all(part.max() > 1e-4 for part in parts)
+    assert_close(sum(parts), before["specular"], rtol=1e-4, atol=1e-6)
     white = rendered(edited(scene, "gloss: {endmember: 1, colour: '#ffffff'}"))
     assert_close(white["specular"], before["specular"], rtol=1e-4, atol=1e-6)
 
@@ -231,42 +218,33 @@ def test_an_unknown_light_is_taken_as_flat_and_this_is_said():
     assert assumption_of_light(unknown, recipe("remove: 1")) is None
 
 
+REPLACE, RETINT, COLOURED = (
+    "replace: {endmember: 0, library: ColorChecker/%s}",
+    "retint: {endmember: 0, colour: '808080'}",
+    "gloss: {%scolour: '808080'}",
+)
 REFUSED = [
     (["remove: ochre"], "there is no endmember 'ochre'; the run has 0 red, 1 green, 2 blue"),
     (["remove: geen"], "there is no endmember 'geen'; did you mean green?"),
     (["swap: [0, 3]"], "line 2 (swap): there is no endmember 3; the run has 0 red, 1 green, 2 blue"),
     (["swap: [0, -1]"], "there is no endmember -1"),
     (["swap: [1, green]"], "can't be swapped with itself"),
-    (
-        ["remove: 1", "isolate: [green, red]"],
-        "'green' can't be isolated: edits.yml, line 2 (remove) has it removed",
-    ),
-    (
-        ["isolate: 0", "remove: red"],
-        "line 3 (remove): 'red' can't be removed: edits.yml, line 2 (isolate) has it",
-    ),
+    (["remove: 1", "isolate: [green, red]"], "'green' can't be isolated: edits.yml, line 2 (remove) has it"),
+    (["isolate: 0", "remove: red"], "line 3 (remove): 'red' can't be removed: edits.yml, line 2 (isolate)"),
     (["isolate: 0", "isolate: 1"], "line 3 (isolate): edits.yml, line 2 (isolate) isolates already"),
     (["remove: [0, 1, 2]"], "nothing is left"),
-    (
-        ["replace: {endmember: 0, library: ColorChecker/red}"] * 2,
-        "'red' is replaced already by edits.yml, line 2",
-    ),
-    (["retint: {endmember: 0, colour: '808080'}"] * 2, "'red' is retinted already by edits.yml, line 2"),
-    (
-        ["gloss: {colour: '808080'}", "gloss: {endmember: 2, colour: '808080'}"],
-        "given a colour of gloss already",
-    ),
+    ([REPLACE % "red"] * 2, "'red' can't be replaced: edits.yml, line 2 (replace) has it replaced already"),
+    ([RETINT] * 2, "'red' can't be retinted: edits.yml, line 2 (retint) has it retinted already"),
+    ([COLOURED % "", COLOURED % "endmember: 2, "], "(gloss) has it given a colour of gloss already"),
     (["rename: {endmember: 1, name: red}"], "line 2 (rename): endmember 0 is called 'red' already"),
-    (
-        ["replace: {endmember: 0, library: ColorChecker/rde}"],
-        "no 'ColorChecker/rde'; nearest: ColorChecker/red",
-    ),
+    ([REPLACE % "rde"], "no 'ColorChecker/rde'; nearest: ColorChecker/red"),
+    (["gloss: {scale: 2}"], "no view-dependent part"),
 ]
 
 
 @pytest.mark.parametrize(("edits", "message"), REFUSED)
 def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits, message):
-    scene = named_scene()
+    scene = named_scene("none" if "view-dependent" in message else "dictionary")
     with pytest.raises(ConfigError) as caught:
         edited(scene, *edits)
     assert str(caught.value).startswith("edits.yml, line ")
@@ -290,18 +268,14 @@ def test_doubtful_files_of_spectra_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("edit", "note"),
     [
-        (
-            "retint: {endmember: 0, colour: '#0000ff'}",
-            r"retint\): red can't be #0000ff .* nearest colour, #[0-5]",
-        ),
+        ("retint: {endmember: 0, colour: '#0000ff'}", r"retint\): red can't be #0000ff .* colour, #[0-5]"),
         ("gloss: {colour: '#00ff00'}", r"gloss\): highlights can't be #00ff00 in this light; took"),
     ],
 )
 def test_a_colour_that_no_surface_has_becomes_the_nearest_and_the_user_is_told(edit, note):
-    scene = named_scene()
-    [found] = edited(scene, edit).notes
+    [found] = edited(named_scene(), edit).notes
     assert re.search(note, found)
-    assert edited(scene, "retint: {endmember: 0, colour: '#807060'}").notes == ()
+    assert edited(named_scene(), "retint: {endmember: 0, colour: '#807060'}").notes == ()
 
 
 def test_a_swapped_look_may_be_replaced_where_it_is_now():
@@ -313,5 +287,5 @@ def test_a_swapped_look_may_be_replaced_where_it_is_now():
     for k, name in enumerate(["ColorChecker/green", "ColorChecker/red"]):
         expected = library.reflectance(name, BANDS) * np.array(LIGHT)
         assert_close(result.materials.endmembers[k], torch.tensor(expected, dtype=torch.float32))
-    with pytest.raises(ConfigError, match="'endmember_1' is replaced already"):
+    with pytest.raises(ConfigError, match="'endmember_1' can't be replaced"):
         edited(scene, first, "swap: [0, 1]", edit.format(1, "green"))

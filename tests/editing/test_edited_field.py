@@ -10,7 +10,7 @@ from torch.testing import assert_close
 
 from tests.editing.scenes import CAMERAS, LIGHT, edited, lit_scene
 from unmix_plugin.editing import sample_seen
-from unmix_plugin.editing.edited_field import EditedField, MaterialState, _Appearance, appearance_of
+from unmix_plugin.editing.edited_field import Appearance, EditedField, MaterialState, appearance_of
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.materials import Coefficients
@@ -33,9 +33,6 @@ class GivenField(CoefficientField):
     def density_of(self, encoded):
         return torch.full((len(encoded),), 5.0), encoded
 
-    def get_density(self, positions):
-        return self.density_of(self.encode(positions))
-
     def abundances_of(self, features):
         return features
 
@@ -57,9 +54,13 @@ def look(field: CoefficientField, count: int) -> tuple[Tensor, dict[str, Tensor]
 MIXTURES = torch.tensor([[1.0, 0, 0], [0.8, 0.2, 0], [0.5, 0.3, 0.2], [0.2, 0.4, 0.4], [0, 0, 1.0]])
 
 
-def test_density_is_whole_where_mostly_kept_matter_is_and_none_where_mostly_removed_matter_is():
-    densities, _ = look(EditedField(GivenField(MIXTURES), torch.tensor([False, True, True]), PLAIN), 5)
+def test_what_is_left_is_as_dense_as_its_share_is_large_and_keeps_its_proportions():
+    densities, outputs = look(EditedField(GivenField(MIXTURES), torch.tensor([False, True, True]), PLAIN), 5)
     assert_close(densities, torch.tensor([0.0, 0.0, 2.5, 5.0, 5.0]))
+    assert_close(outputs["abundances"][2], torch.tensor([0.0, 0.6, 0.4]))
+    assert_close(outputs["scaled_abundances"], 0.5 * outputs["abundances"])
+    assert_close(outputs["abundances"].sum(-1), torch.tensor([0.0, 1, 1, 1, 1]))
+    assert torch.isfinite(outputs["abundances"]).all()
 
 
 def test_what_is_removed_and_what_is_isolated_make_up_the_whole():
@@ -71,15 +72,6 @@ def test_what_is_removed_and_what_is_isolated_make_up_the_whole():
     )
     assert_close(without + alone, torch.full((21,), 5.0))
     assert (alone.diff() >= 0).all()
-
-
-def test_abundances_of_what_is_left_keep_their_proportions_and_sum_to_one():
-    kept = torch.tensor([False, True, True])
-    _, outputs = look(EditedField(GivenField(MIXTURES), kept, PLAIN), 5)
-    assert_close(outputs["abundances"][2], torch.tensor([0.0, 0.6, 0.4]))
-    assert_close(outputs["scaled_abundances"], 0.5 * outputs["abundances"])
-    assert_close(outputs["abundances"].sum(-1), torch.tensor([0.0, 1, 1, 1, 1]))
-    assert torch.isfinite(outputs["abundances"]).all()
 
 
 def test_gloss_goes_by_shares_and_each_mirror_has_coefficients_of_its_own():
@@ -102,15 +94,13 @@ def test_edits_over_edits_are_one():
 
 def seen_pixels(shading: list[float], share: float = 1.0) -> Coefficients:
     """Opaque pixels, all of endmember 0 and without gloss."""
-    strengths = torch.tensor(shading)
+    strengths, ones = torch.tensor(shading)[:, None], torch.ones(len(shading))
     abundances = torch.tensor([share, 1 - share, 0.0]).expand(len(shading), 3)
-    return Coefficients.of(
-        torch.ones(len(shading)),
-        torch.ones(len(shading)),
-        abundances,
-        strengths[:, None] * abundances,
-        torch.zeros(len(shading), 1),
-    )
+    return Coefficients.of(ones, ones, abundances, strengths * abundances, 0 * strengths)
+
+
+def srgb(text: str) -> torch.Tensor:
+    return torch.tensor([int(text[i : i + 2], 16) for i in (1, 3, 5)]).double() / 255
 
 
 def own_srgb(spectrum: torch.Tensor, bands) -> torch.Tensor:
@@ -123,8 +113,8 @@ def own_srgb(spectrum: torch.Tensor, bands) -> torch.Tensor:
 def test_a_spectrum_gets_the_colour_itself_where_the_picture_is_not_known_or_not_meant(index, more, seen):
     edit = f"retint: {{endmember: {index}, colour: '#807040'{more}}}"
     result = edited(lit_scene(), edit, seen=None if seen is None else seen_pixels(seen))
-    asked = torch.tensor([0x80, 0x70, 0x40], dtype=torch.float64) / 255
-    assert_close(own_srgb(result.materials.endmembers[index], result.bands), asked, atol=1e-4, rtol=0)
+    found = own_srgb(result.materials.endmembers[index], result.bands)
+    assert_close(found, srgb("#807040"), atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.6])
@@ -134,7 +124,7 @@ def test_pixels_get_the_colour_in_the_mean_where_the_picture_is_known(share):
     pixels = seen_pixels(shading.tolist(), share)
     result = edited(scene, "retint: {endmember: 0, colour: '#a09060'}", seen=pixels)
     shown = own_srgb(pixels.scaled_abundances @ result.materials.endmembers, result.bands).mean(0)
-    assert_close(shown, torch.tensor([0xA0, 0x90, 0x60]).double() / 255, atol=1e-4, rtol=0)
+    assert_close(shown, srgb("#a09060"), atol=1e-4, rtol=0)
 
 
 def test_highlights_count_in_the_mean_and_mixtures_hardly():
@@ -142,41 +132,36 @@ def test_highlights_count_in_the_mean_and_mixtures_hardly():
     pure.specular[:] = 0.1
     pixels = Coefficients.concatenate([pure, mixed])
     materials = edited(lit_scene(), "retint: {endmember: 0, colour: '#a09080'}", seen=pixels).materials
-    asked = torch.tensor([0xA0, 0x90, 0x80]).double() / 255
+    asked = srgb("#a09080")
     of_pure, of_mixed = (own_srgb(materials.spectra(part), materials.bands)[0] for part in (pure, mixed))
     assert_close(of_pure, asked, atol=0.02, rtol=0)
     assert (of_mixed - asked).abs().max() > 0.05
 
 
-def test_a_shaded_material_may_be_brighter_than_white_in_full_light_but_not_where_it_is_seen():
-    appearance = _Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
+def test_a_shaded_material_may_be_brighter_than_white_and_is_as_near_to_a_colour_as_its_pixels_allow():
+    appearance = Appearance(np.linspace(0.2, 0.5, 100), np.zeros((100, 3)), np.ones(100))
     assert appearance.greatest_reflectance == pytest.approx(1 / 0.485, rel=0.01)
-    assert _Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
-
-
-def test_where_the_rest_of_the_pixels_is_too_bright_the_nearest_colour_is_taken():
-    appearance = _Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
-    np.testing.assert_allclose(appearance.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
+    assert Appearance(np.full(9, 2.0), np.zeros((9, 3)), np.ones(9)).greatest_reflectance == 1
+    reddish = Appearance(np.full(20, 0.5), np.full((20, 3), [0.3, 0.0, 0.0]), np.ones(20))
+    np.testing.assert_allclose(reddish.full_colour((0.2, 0.0, 0.5)), [0.0, 0.0, 2 * 0.21404], atol=1e-4)
 
 
 def test_a_colour_that_pictures_cannot_have_becomes_the_nearest_that_they_can():
-    result = edited(
-        lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen_pixels([0.1] * 50 + [0.6] * 10)
-    )
+    seen = seen_pixels([0.1] * 50 + [0.6] * 10)
+    result = edited(lit_scene(), "retint: {endmember: 0, colour: '#ffffff'}", seen=seen)
     [note] = result.notes
     assert "(retint): pictures of endmember_0 can't be #ffffff in this light; took the nearest colour" in note
     brightest = result.materials.endmembers[0].detach().double() / torch.tensor(LIGHT).double()
-    assert_close(
-        brightest, torch.full_like(brightest, 1 / 0.6), rtol=1e-3, atol=0
-    )  # all that the bound allows
+    all_of_bound = torch.full_like(brightest, 1 / 0.6)
+    assert_close(brightest, all_of_bound, rtol=1e-3, atol=0)
 
 
 @pytest.mark.parametrize(
     ("count", "index", "is_seen"), [(15, 0, False), (16, 0, True), (50, 2, False), (None, 0, False)]
 )
 def test_endmembers_that_are_hardly_seen_have_no_appearance(count, index, is_seen):
-    seen = None if count is None else seen_pixels([0.5] * count)
-    state = MaterialState.of(lit_scene().materials, None, seen)
+    state = MaterialState.of(lit_scene().materials, None)
+    state.seen = None if count is None else seen_pixels([0.5] * count)
     assert (appearance_of(state, index) is not None) is is_seen
 
 
@@ -210,8 +195,8 @@ def test_pictures_of_a_scene_have_the_colour_in_the_mean_over_a_materials_pixels
     views = [result.look(CAMERAS[view], subpixels=1) for view in range(2)]
     shares = torch.cat([view["abundances"].flatten(0, 1) for view in views])
     opacity = torch.cat([view.opacity.flatten() for view in views])
-    srgb = torch.cat([view["rgb"].flatten(0, 1) for view in views])
+    colours = torch.cat([view["rgb"].flatten(0, 1) for view in views])
     is_its = (shares.argmax(-1) == index) & (opacity >= 0.5)
     weights = (shares[is_its][:, index] / opacity[is_its])[:, None] ** 4
-    mean = (weights * srgb[is_its]).sum(0) / weights.sum()
-    assert_close(mean, torch.tensor([0x60, 0x68, 0x58]) / 255, atol=2e-3, rtol=0)
+    mean = (weights * colours[is_its]).sum(0) / weights.sum()
+    assert_close(mean.double(), srgb("#606858"), atol=2e-3, rtol=0)

@@ -29,7 +29,7 @@ Notation: `B` bands, `S` channels of a sensor, `K` endmembers, `J` specular spec
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,13 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from unmix_plugin.editing.edited_field import EditedField, MaterialState, appearance_of, sample_seen
+from unmix_plugin.editing.edited_field import (
+    Appearance,
+    EditedField,
+    MaterialState,
+    appearance_of,
+    sample_seen,
+)
 from unmix_plugin.editing.recipe import (
     Colour,
     Gloss,
@@ -64,7 +70,6 @@ from unmix_plugin.spectral.colour.conversion import (
     illuminant_power,
     rgb_matrix,
 )
-from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
     MaterialLibrary,
@@ -129,34 +134,30 @@ _EXACTNESS = 1e5
 """Weight of the colour against smoothness; the error of the colour falls with its square."""
 
 
-@dataclass(frozen=True)
-class _LitReflectance:
-    """A spectrum to change, and the light that it is seen in."""
-
-    bands: Bands
-    reflectance: Float64[np.ndarray, " B"]
-    light: Float64[np.ndarray, " B"]
-    """Relative power."""
-
-    @property
-    def to_linear_rgb(self) -> Float64[np.ndarray, "B 3"]:
-        """Matrix from reflectance to linear RGB of the light that the surface sends."""
-        return self.light[:, None] * rgb_matrix(self.bands, torch.float64).numpy()
-
-
 def _retinted(
-    surface: _LitReflectance, linear_rgb: Float64[np.ndarray, "3"], greatest: float = 1.0
+    bands: Bands,
+    reflectance: Float64[np.ndarray, " B"],
+    to_rgb: Float64[np.ndarray, "B 3"],
+    linear_rgb: Float64[np.ndarray, "3"],
+    greatest: float = 1.0,
 ) -> Float64[np.ndarray, " B"]:
-    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it."""
+    """The reflectance most like a surface's own that has the wanted colour in its light, or comes nearest to it.
+
+    Args:
+        bands: Of the reflectance.
+        reflectance: The surface's own.
+        to_rgb: Matrix from reflectance to linear RGB of the light that the surface sends.
+        linear_rgb: Wanted.
+        greatest: Bound of the reflectance.
+    """
     from scipy.optimize import lsq_linear
 
-    reflectance, to_rgb = surface.reflectance, surface.to_linear_rgb
     base = reflectance + _FLOOR
     # The sRGB curve is 12.92 steep in the dark and 0.44 at white.
     bright = 1.055 / 2.4 * np.clip(linear_rgb, 0.0031308, 1.0) ** (1 / 2.4 - 1)
     weights = (_EXACTNESS * np.where(linear_rgb <= 0.0031308, 12.92, bright))[:, None]
     # Rows whose squares sum to the integral that is minimised, wavelengths in units of the reach.
-    centers, widths = surface.bands.centers_nm / _REACH_NM, surface.bands.widths_nm / _REACH_NM
+    centers, widths = bands.centers_nm / _REACH_NM, bands.widths_nm / _REACH_NM
     slopes = np.diff(np.eye(len(centers)), axis=0) / np.sqrt(np.diff(centers))[:, None]
     smoothness = np.concatenate([slopes, np.diag(np.sqrt(widths))])
     lower, upper = -reflectance / base, np.maximum(greatest - reflectance, 0.0) / base
@@ -207,7 +208,12 @@ def _swap(state: MaterialState, edit: Swap, _: str) -> None:
             f"an endmember can't be swapped with itself; found {edit.first!r} and {edit.second!r}"
         )
     state.spectra[[first, second]] = state.spectra[[second, first]]
-    state.swap_notes((_REPLACED, _RETINTED), first, second)
+    # What was done to looks goes with the looks.
+    places = {(what, one): (what, first + second - one) for what in _OF_LOOKS for one in (first, second)}
+    state.done = {places.get(key, key): edit for key, edit in state.done.items()}
+
+
+_OF_LOOKS = (_REPLACED, _RETINTED)
 
 
 def _replace(state: MaterialState, edit: Replace, where: str) -> None:
@@ -245,19 +251,23 @@ def _retint(state: MaterialState, edit: Retint, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_RETINTED, index, where)
     seen = appearance_of(state, index) if edit.match == "picture" else None
+    shown = _IN_FULL_LIGHT if seen is None else seen
     is_lit = state.light > DARK_LIGHT * state.light.max()
     light = np.where(is_lit, state.light, 0.0)
     reflectance = np.where(is_lit, state.spectra[index] / np.where(is_lit, light, 1.0), 0.0)
-    surface = _LitReflectance(state.bands, reflectance, light)
-    if seen is None:
-        changed = _retinted(surface, decode_srgb(np.array(edit.colour)))
-        reached = encode_srgb(np.clip(changed @ surface.to_linear_rgb, 0, 1))
-    else:
-        changed = _retinted(surface, seen.full_colour(edit.colour), seen.greatest_reflectance)
-        reached = seen.mean_srgb(changed @ surface.to_linear_rgb)
+    to_rgb, wanted = light[:, None] * _rgb_matrix(state), shown.full_colour(edit.colour)
+    changed = _retinted(state.bands, reflectance, to_rgb, wanted, shown.greatest_reflectance)
     state.spectra[index] = changed * light
     what = state.names[index] if seen is None else f"pictures of {state.names[index]}"
-    _note_nearest(state, f"{where}: {what}", edit.colour, reached)
+    _note_nearest(state, f"{where}: {what}", edit.colour, shown.mean_srgb(changed @ to_rgb))
+
+
+_IN_FULL_LIGHT = Appearance(np.ones(1), np.zeros((1, 3)), np.ones(1))
+"""Of a spectrum itself."""
+
+
+def _rgb_matrix(state: MaterialState) -> Float64[np.ndarray, "B 3"]:
+    return rgb_matrix(state.bands, torch.float64).numpy()
 
 
 def _note_nearest(state: MaterialState, what: str, asked: Colour, reached: np.ndarray) -> None:
@@ -274,8 +284,7 @@ def _scale(state: MaterialState, edit: Scale, _: str) -> None:
 
 def _remove(state: MaterialState, edit: Remove, where: str) -> None:
     for index in [state.index_of(endmember) for endmember in edit.endmembers]:
-        _refuse_both(state, index, _ISOLATED, _REMOVED)
-        state.done[_REMOVED, index] = where
+        state.note(_REMOVED, index, where, refuse_after=_ISOLATED)
         state.is_kept[index] = False
     if not state.is_kept.any():
         raise ConfigError("nothing is left: every endmember is removed; keep at least one")
@@ -287,16 +296,15 @@ def _isolate(state: MaterialState, edit: Isolate, where: str) -> None:
         raise ConfigError(f"{earlier[0]} isolates already; name all that are to stay in one edit")
     kept = [state.index_of(endmember) for endmember in edit.endmembers]
     for index in kept:
-        _refuse_both(state, index, _REMOVED, _ISOLATED)
-        state.done[_ISOLATED, index] = where
+        state.note(_ISOLATED, index, where, refuse_after=_REMOVED)
     state.is_kept &= np.isin(np.arange(len(state.names)), kept)
 
 
 def _rename(state: MaterialState, edit: Rename, where: str) -> None:
     index = state.index_of(edit.endmember)
     state.note(_NAMED, index, where)
-    if edit.name in state.names and state.names.index(edit.name) != index:
-        other = state.names.index(edit.name)
+    other = state.names.index(edit.name) if edit.name in state.names else index
+    if other != index:
         raise ConfigError(f"endmember {other} is called {edit.name!r} already; names must differ")
     state.names[index] = edit.name
 
@@ -308,12 +316,10 @@ def _gloss(state: MaterialState, edit: Gloss, where: str) -> None:
         )
     chosen = range(len(state.names)) if edit.endmember is None else [state.index_of(edit.endmember)]
     if edit.colour is not None and edit.colour not in state.mirror_reflectances:
-        flat = np.ones(len(state.bands))
-        white = _LitReflectance(state.bands, flat, flat)
-        mirror = _retinted(white, decode_srgb(np.array(edit.colour)))
+        white, to_rgb = np.ones(len(state.bands)), _rgb_matrix(state)
+        mirror = _retinted(state.bands, white, to_rgb, _IN_FULL_LIGHT.full_colour(edit.colour))
         state.mirror_reflectances[edit.colour] = mirror
-        reached = encode_srgb(np.clip(mirror @ white.to_linear_rgb, 0, 1))
-        _note_nearest(state, f"{where}: highlights", edit.colour, reached)
+        _note_nearest(state, f"{where}: highlights", edit.colour, _IN_FULL_LIGHT.mean_srgb(mirror @ to_rgb))
     for index in chosen:
         state.gloss[index] *= edit.scale
         if edit.colour is not None:
@@ -331,14 +337,6 @@ _HANDLERS: dict[type[Operation], Callable[[MaterialState, Any, str], None]] = {
     Rename: _rename,
     Gloss: _gloss,
 }
-
-
-def _refuse_both(state: MaterialState, index: int, before: str, now: str) -> None:
-    edit = state.done.get((before, index))
-    if edit is not None:
-        raise ConfigError(
-            f"{state.names[index]!r} can't be {now}: {edit} has it {before}; keep one of the two"
-        )
 
 
 def edit_scene(
@@ -374,12 +372,13 @@ def edit_scene(
         specular_spectra=_tensor(state.mirrored()[0] * factors, scene),
     )
     if recipe.illuminant is not None:
-        lit = factors if light is None else light * factors
-        is_assumed = not scene.materials.is_light_known
         asked = recipe.illuminant.light
-        name = asked.stem if isinstance(asked, Path) else asked
-        lamp = _tensor(lit, scene)
-        materials = replace(materials, light=lamp, is_light_assumed=is_assumed, light_name=name)
+        materials = replace(
+            materials,
+            light=_tensor(factors if light is None else light * factors, scene),
+            is_light_assumed=not scene.materials.is_light_known,
+            light_name=asked.stem if isinstance(asked, Path) else asked,
+        )
     assumed = assumption_of_light(scene, recipe)
     notes = [*scene.notes, *([] if assumed is None else [assumed]), *state.notes, *told]
     return replace(scene, field=_field(scene, state), materials=materials, notes=tuple(notes))
@@ -398,8 +397,9 @@ def _field(scene: TrainedScene, state: MaterialState) -> CoefficientField:
 def changes_geometry(recipe: Recipe) -> bool:
     """Whether the edited scene has to be rendered again; otherwise coefficients of the unedited one serve with its
     materials."""
-    return recipe.removes_parts or any(
-        isinstance(one, Gloss) and one.endmember is not None for one in recipe.operations
+    return any(
+        isinstance(one, Remove | Isolate) or (isinstance(one, Gloss) and one.endmember is not None)
+        for one in recipe.operations
     )
 
 

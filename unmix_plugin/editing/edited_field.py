@@ -59,7 +59,7 @@ def sample_seen(scene: TrainedScene) -> Coefficients:
 
 
 @dataclass(frozen=True)
-class _Appearance:
+class Appearance:
     """An endmember as cameras see it."""
 
     strengths: Float64[np.ndarray, " N"]
@@ -91,7 +91,7 @@ class _Appearance:
         return np.average(encode_srgb(shown), axis=0, weights=self.weights)
 
 
-def appearance_of(state: MaterialState, index: int) -> _Appearance | None:
+def appearance_of(state: MaterialState, index: int) -> Appearance | None:
     """How an endmember looks among the materials as they are now; None where too little of it is seen to tell."""
     seen = state.seen
     if seen is None:
@@ -104,7 +104,7 @@ def appearance_of(state: MaterialState, index: int) -> _Appearance | None:
     others = np.where(np.arange(scaled.shape[1]) == index, 0.0, scaled)
     spectra = others @ state.spectra + specular @ state.mirrored()[0]
     shares = _rows(seen.abundances[..., index] / seen.accumulation, is_its)
-    return _Appearance(
+    return Appearance(
         scaled[:, index],
         spectra @ rgb_matrix(state.bands, torch.float64).numpy(),
         shares**_PURITY_EXPONENT,
@@ -140,7 +140,7 @@ class MaterialState:
     """sRGB colour that the highlights of each endmember are mirrored in."""
     mirror_reflectances: dict[Colour | None, Float64[np.ndarray, " B"]]
     """The surface that each of these colours stands for."""
-    seen: Coefficients | None
+    seen: Coefficients | None = None
     """What cameras see of materials and gloss as they are now, rows of pixels (N, ...); None where it is not known."""
     done: dict[tuple[str, int], str] = field(default_factory=dict)
     """Which edit did what to which endmember."""
@@ -148,12 +148,7 @@ class MaterialState:
     """What the user has to be told about the result."""
 
     @classmethod
-    def of(
-        cls,
-        materials: Materials,
-        light: Float64[np.ndarray, " B"] | None,
-        seen: Coefficients | None = None,
-    ) -> MaterialState:
+    def of(cls, materials: Materials, light: Float64[np.ndarray, " B"] | None) -> MaterialState:
         """The materials of a model as they are, in a light (None: unknown)."""
         spectra = materials.endmembers.detach().to("cpu", torch.float64).numpy().copy()
         count = len(spectra)
@@ -167,21 +162,14 @@ class MaterialState:
             np.ones(count),
             [None] * count,
             {None: np.ones(len(materials.bands))},
-            seen,
         )
 
     def mirrored(self) -> tuple[Float64[np.ndarray, "GJ B"], Float64[np.ndarray, "G K"] | None]:
         """Specular spectra mirrored in each colour, one after the other, and the gloss of each endmember in each of
         them; None where all materials have the same gloss, which the spectra describe fully."""
         colours = list(dict.fromkeys(self.mirrors))
-        gloss = np.array(
-            [
-                [
-                    strength if mirror == colour else 0.0
-                    for strength, mirror in zip(self.gloss, self.mirrors, strict=True)
-                ]
-                for colour in colours
-            ]
+        gloss = np.stack(
+            [np.where([mirror == colour for mirror in self.mirrors], self.gloss, 0.0) for colour in colours]
         )
         mirrored = [self.mirror_reflectances[colour] * self.specular_spectra for colour in colours]
         if len(colours) == 1 and np.ptp(gloss) == 0:
@@ -209,27 +197,24 @@ class MaterialState:
         hint = did_you_mean(endmember, self.names, form="{} ")
         raise ConfigError(f"there is no endmember {endmember!r}; {hint}the run has {self._listed()}")
 
-    def note(self, what: str, index: int, edit: str) -> None:
-        """Remember that an edit did something to an endmember, which may be done once.
+    def note(self, what: str, index: int, edit: str, refuse_after: str = "") -> None:
+        """Remember that an edit did something to an endmember.
 
         Args:
             what: Was done, as in "replaced".
             index: Of the endmember.
             edit: Which edit did it, for messages.
+            refuse_after: What must not be done before; empty for the same.
         Raises:
-            ConfigError: another edit did the same.
+            ConfigError: another edit did that.
         """
-        before = self.done.get((what, index))
-        if before is not None:
-            raise ConfigError(f"{self.names[index]!r} is {what} already by {before}; keep one of the two")
+        refused = refuse_after or what
+        if before := self.done.get((refused, index)):
+            name = self.names[index]
+            raise ConfigError(
+                f"{name!r} can't be {what}: {before} has it {refused} already; keep one of the two"
+            )
         self.done[what, index] = edit
-
-    def swap_notes(self, whats: tuple[str, ...], first: int, second: int) -> None:
-        """Let what was done to two endmembers' looks go with the looks."""
-        for what in whats:
-            at_first, at_second = self.done.pop((what, first), None), self.done.pop((what, second), None)
-            self.done |= {(what, second): at_first} if at_first else {}
-            self.done |= {(what, first): at_second} if at_second else {}
 
     def _listed(self) -> str:
         return ", ".join(f"{index} {name}" for index, name in enumerate(self.names))
@@ -255,7 +240,8 @@ class EditedField(CoefficientField):
         self.field = field
         self.register_buffer("is_kept", is_kept.clone(), persistent=False)
         self.register_buffer("gloss", gloss.clone(), persistent=False)
-        self._removes = not bool(is_kept.all())
+        self.removes = not bool(is_kept.all())
+        """Whether any endmember is transparent."""
 
     @property
     def change(self) -> tuple[bytes, bytes]:
@@ -295,14 +281,10 @@ class EditedField(CoefficientField):
             return None
         return torch.cat([found[:, :-1] * self.is_kept.to(found), found[:, -1:]], dim=-1)
 
-    def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit of what is left, and geometry features."""
-        return self.density_of(self.encode(positions))
-
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """The same where the encoding is known."""
+        """Density per scene unit of what is left, and geometry features."""
         densities, features = self.field.density_of(encoded)
-        if self._removes:
+        if self.removes:
             kept_share = self.field.abundances_of(features) @ self.is_kept.to(features)
             t = ((kept_share - _GONE_SHARE) / (_WHOLE_SHARE - _GONE_SHARE)).clamp(0, 1)
             densities = densities * (t * t * (3 - 2 * t))  # a cubic with level ends

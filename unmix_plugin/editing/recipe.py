@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 from unmix_plugin.errors import ConfigError
 
@@ -20,11 +20,29 @@ Endmember: TypeAlias = str | int
 Colour: TypeAlias = tuple[float, float, float]
 """sRGB, [0, 1]."""
 
-_Match: TypeAlias = Literal["picture", "spectrum"]
-"""What is given a colour: the material as cameras see it, shaded, or its spectrum in full light."""
-
 _LONGEST_NAME = 40
 _GREATEST_FACTOR = 1000.0
+
+
+def _fault(name: str, value: Any) -> str | None:
+    """What is wrong with the value of a field, whichever edit has it; None if nothing."""
+    if name == "colour" and not (len(value) == 3 and all(0 <= part <= 1 for part in value)):
+        return f"a colour is three sRGB values in [0, 1]; found {list(value)}"
+    if name in ("factor", "scale") and not (math.isfinite(value) and 0 <= value <= _GREATEST_FACTOR):
+        return f"{name} must be a number from 0 to {_GREATEST_FACTOR:g}; found {value!r}"
+    if name == "endmembers" and not value:
+        return "no endmember is given; give at least one"
+    if name == "match" and value not in ("picture", "spectrum"):
+        return f"match must be picture or spectrum; found {value!r}"
+    if name == "name":
+        # Names end up in CSV headers, ENVI lists, EXR channels and legends, so they are kept plain.
+        is_plain = all(letter.isalnum() or letter in " _-" for letter in value)
+        if not (value[:1].isalpha() and is_plain and value == value.strip() and len(value) <= _LONGEST_NAME):
+            return (
+                f"a name has at most {_LONGEST_NAME} letters, digits, spaces, - and _ and starts with a letter; "
+                f"found {value!r}"
+            )
+    return None
 
 
 @dataclass(frozen=True)
@@ -35,11 +53,14 @@ class Operation:
     """Its name in a recipe."""
     is_list: ClassVar[bool] = False
     """Whether a recipe has its fields as a list, rather than by name."""
-    needs_one_of: ClassVar[tuple[str, ...]] = ()
-    """Fields of which a recipe must give at least one."""
 
     line: int | None = field(default=None, compare=False, kw_only=True)
     """In the recipe's file, from 1; None if it comes from no file."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None and (fault := _fault(name, value)):
+                raise ConfigError(fault)
 
 
 @dataclass(frozen=True)
@@ -48,7 +69,6 @@ class Swap(Operation):
 
     kind = "swap"
     is_list = True
-
     first: Endmember
     second: Endmember
 
@@ -80,15 +100,10 @@ class Retint(Operation):
     """An endmember's spectrum changes smoothly until it has a colour in the scene's light."""
 
     kind = "retint"
-
     endmember: Endmember
     colour: Colour
-    match: _Match = "picture"
-
-    def __post_init__(self) -> None:
-        _require_colour(self.colour)
-        if self.match not in ("picture", "spectrum"):
-            raise ConfigError(f"match is picture or spectrum; found {self.match!r}")
+    match: Literal["picture", "spectrum"] = "picture"
+    """What is given the colour: the material as cameras see it, shaded, or its spectrum in full light."""
 
 
 @dataclass(frozen=True)
@@ -96,12 +111,8 @@ class Scale(Operation):
     """An endmember becomes brighter or darker."""
 
     kind = "scale"
-
     endmember: Endmember
     factor: float
-
-    def __post_init__(self) -> None:
-        _require_factor("factor", self.factor)
 
 
 @dataclass(frozen=True)
@@ -110,11 +121,7 @@ class Remove(Operation):
 
     kind = "remove"
     is_list = True
-
     endmembers: tuple[Endmember, ...]
-
-    def __post_init__(self) -> None:
-        _require_some(self.endmembers)
 
 
 @dataclass(frozen=True)
@@ -123,11 +130,7 @@ class Isolate(Operation):
 
     kind = "isolate"
     is_list = True
-
     endmembers: tuple[Endmember, ...]
-
-    def __post_init__(self) -> None:
-        _require_some(self.endmembers)
 
 
 @dataclass(frozen=True)
@@ -135,19 +138,8 @@ class Rename(Operation):
     """An endmember gets another name, in all files and figures."""
 
     kind = "rename"
-
     endmember: Endmember
     name: str
-
-    def __post_init__(self) -> None:
-        """Names end up in CSV headers, ENVI lists, EXR channels and legends, so they are kept plain."""
-        name = self.name
-        is_plain = all(letter.isalnum() or letter in " _-" for letter in name)
-        if not (name[:1].isalpha() and is_plain and name == name.strip() and len(name) <= _LONGEST_NAME):
-            raise ConfigError(
-                f"a name has at most {_LONGEST_NAME} letters, digits, spaces, - and _ and starts with a letter; "
-                f"found {name!r}"
-            )
 
 
 @dataclass(frozen=True)
@@ -155,8 +147,6 @@ class Gloss(Operation):
     """The view-dependent part becomes stronger or weaker, and takes a colour."""
 
     kind = "gloss"
-    needs_one_of = ("scale", "colour")
-
     endmember: Endmember | None = None
     """Whose gloss, by its share of each point; None for all."""
     scale: float = 1.0
@@ -164,30 +154,9 @@ class Gloss(Operation):
     colour: Colour | None = None
     """Highlights take it: white leaves them as they are, gold makes them golden."""
 
-    def __post_init__(self) -> None:
-        _require_factor("scale", self.scale)
-        if self.colour is not None:
-            _require_colour(self.colour)
-
 
 OPERATIONS: tuple[type[Operation], ...] = (Swap, Replace, Retint, Scale, Remove, Isolate, Rename, Gloss)
 """Every kind of edit."""
-
-
-def _require_colour(colour: Colour) -> None:
-    if len(colour) != 3 or not all(math.isfinite(value) and 0 <= value <= 1 for value in colour):
-        raise ConfigError(f"a colour is three sRGB values in [0, 1]; found {list(colour)}")
-
-
-def _require_factor(name: str, factor: float) -> None:
-    if not (math.isfinite(factor) and 0 <= factor <= _GREATEST_FACTOR):
-        raise ConfigError(f"{name} must be a number from 0 to {_GREATEST_FACTOR:g}; found {factor!r}")
-
-
-def _require_some(endmembers: tuple[Endmember, ...]) -> None:
-    if not endmembers:
-        raise ConfigError("no endmember is given; give at least one")
-
 
 LightName: TypeAlias = str | Path
 """Name of a known light (`spectral.colour.conversion.illuminant_names`), or a CSV file, wavelength,power."""
@@ -215,12 +184,6 @@ class Recipe:
 
     def where(self, position: int) -> str:
         """The place of an operation, for error messages."""
-        operation = self.operations[position]
-        if operation.line is None:
-            return f"{self.source}, edit {position + 1} ({operation.kind})"
-        return f"{self.source}, line {operation.line} ({operation.kind})"
-
-    @property
-    def removes_parts(self) -> bool:
-        """Whether anything becomes transparent."""
-        return any(isinstance(one, Remove | Isolate) for one in self.operations)
+        one = self.operations[position]
+        place = f"edit {position + 1}" if one.line is None else f"line {one.line}"
+        return f"{self.source}, {place} ({one.kind})"

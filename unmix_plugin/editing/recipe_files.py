@@ -8,23 +8,30 @@
       - retint: {endmember: 4, colour: '#3366cc'}
       - remove: [5, 6]
 
-The fields of each edit's dataclass say what can be written, of what type, and what may be left out. Of YAML only single
-plain values are ever constructed.
+The fields of each edit's dataclass say what can be written, and what may be left out. Of YAML only single plain values
+are ever constructed.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection
-from dataclasses import MISSING, Field, fields, replace
-from functools import lru_cache
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar
 
 import yaml
 
-from unmix_plugin.editing.recipe import OPERATIONS, Colour, Endmember, Light, LightName, Operation, Recipe
+from unmix_plugin.editing.recipe import (
+    OPERATIONS,
+    Colour,
+    Endmember,
+    Gloss,
+    Light,
+    LightName,
+    Operation,
+    Recipe,
+)
 from unmix_plugin.errors import ConfigError, UnmixError, did_you_mean
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.limits import read_bounded
@@ -98,14 +105,33 @@ def recipe_to_yaml(recipe: Recipe) -> str:
     if recipe.illuminant is not None:
         light = _written(recipe.illuminant)
         content["illuminant"] = light if recipe.illuminant.extrapolate else light["light"]
-    edits = []
+    content["edits"] = edits = []
     for one in recipe.operations:
         found: Any = _written(one)
         if one.is_list:
             found = next(iter(found.values())) if len(found) == 1 else list(found.values())
         edits.append({one.kind: found})
-    content["edits"] = edits
     return yaml.safe_dump(content, sort_keys=False, default_flow_style=None, allow_unicode=True, width=110)
+
+
+def _written(value: Operation | Light) -> dict[str, Any]:
+    """A dataclass as a mapping that reads as the same; what has its default is left out, but a factor of gloss."""
+    found: dict[str, Any] = {}
+    for name, default in _defaults(type(value)).items():
+        part = getattr(value, name)
+        if part is None or (part == default and name != "scale"):
+            continue
+        if name == "colour" and all(round(255 * x) / 255 == x for x in part):
+            part = css_colour(part)  # which is exact
+        elif isinstance(part, Path):
+            part = str(part.absolute())
+        found[name] = list(part) if isinstance(part, tuple) else part
+    return found
+
+
+def _defaults(kind: type) -> dict[str, Any]:
+    """The fields that a recipe has of a dataclass, and their defaults; MISSING for those that it must have."""
+    return {one.name: one.default for one in fields(kind) if not one.kw_only}
 
 
 class _NodeError(Exception):
@@ -133,8 +159,8 @@ def _read_edit(node: yaml.Node, folder: Path) -> Operation:
         found = _read_list(value, kind, folder) if kind.is_list else _read_fields(value, kind, name, folder)
     except UnmixError as error:
         raise _NodeError(value, f"{name}: {error}") from error
-    if kind.needs_one_of and not any(key.value in kind.needs_one_of for key, _ in value.value):
-        raise _NodeError(value, f"{name} needs {' or '.join(kind.needs_one_of)}")
+    if kind is Gloss and not any(key.value in ("scale", "colour") for key, _ in value.value):
+        raise _NodeError(value, "gloss needs scale or colour")
     return replace(found, line=node.start_mark.line + 1)
 
 
@@ -147,71 +173,20 @@ def _read_light(node: yaml.Node, folder: Path) -> Light:
 
 def _read_list(node: yaml.Node, kind: type[Operation], folder: Path) -> Operation:
     """An edit whose fields are a list, or its only field."""
-    hints = _types(kind)
-    items = [node] if len(hints) == 1 else _sequence(node, kind.kind, _MOST_ENDMEMBERS)
-    if len(items) != len(hints):
-        raise _NodeError(node, f"{kind.kind} takes a list of {len(hints)}; found {len(items)}")
-    return kind(
-        *(
-            _read_value(hint, item, kind.kind, folder)
-            for hint, item in zip(hints.values(), items, strict=True)
-        )
-    )
+    names = [*_defaults(kind)]
+    items = [node] if len(names) == 1 else _sequence(node, kind.kind, _MOST_ENDMEMBERS)
+    if len(items) != len(names):
+        raise _NodeError(node, f"{kind.kind} takes a list of {len(names)}; found {len(items)}")
+    pairs = zip(names, items, strict=True)
+    return kind(**{name: _READERS[name](item, kind.kind, folder) for name, item in pairs})
 
 
 def _read_fields(node: yaml.Node, kind: type[_T], what: str, folder: Path) -> _T:
     """A dataclass from a mapping of its fields."""
-    optional = [one.name for one in _fields(kind) if one.default is not MISSING]
-    required = [one.name for one in _fields(kind) if one.default is MISSING]
-    parts = _mapping(node, what, required, optional)
-    types = _types(kind)
-    return kind(**{name: _read_value(types[name], part, name, folder) for name, part in parts.items()})
-
-
-def _read_value(hint: Any, node: yaml.Node, what: str, folder: Path) -> Any:
-    """A value of a field's type."""
-    if get_origin(hint) is Literal:
-        word, allowed = _text(node, what), get_args(hint)
-        if word not in allowed:
-            raise _NodeError(node, f"{what} must be {' or '.join(allowed)}; found {_describe(node)}")
-        return word
-    return _READERS[hint](node, what, folder)
-
-
-def _fields(kind: type) -> list[Field[Any]]:
-    return [one for one in fields(kind) if not one.kw_only]
-
-
-@lru_cache
-def _types(kind: type) -> dict[str, Any]:
-    """The types of a dataclass's fields, None taken out: what may be left out is not written as null."""
-    found = {}
-    for name, hint in get_type_hints(kind).items():
-        if get_origin(hint) in (Union, UnionType):
-            hint = Union[tuple(part for part in get_args(hint) if part is not NoneType)]  # noqa: UP007
-        found[name] = hint
-    return {one.name: found[one.name] for one in _fields(kind)}
-
-
-def _written(value: Any) -> dict[str, Any]:
-    """A dataclass as a mapping that reads as the same; what has its default is left out."""
-    found: dict[str, Any] = {}
-    always = value.needs_one_of[:1] if isinstance(value, Operation) else ()
-    for one in _fields(type(value)):
-        part = getattr(value, one.name)
-        if part is None or (part == one.default and one.name not in always):
-            continue
-        if _types(type(value))[one.name] == Colour and all(round(255 * x) / 255 == x for x in part):
-            found[one.name] = css_colour(part)  # which is exact
-        else:
-            found[one.name] = (
-                str(part.absolute())
-                if isinstance(part, Path)
-                else list(part)
-                if isinstance(part, tuple)
-                else part
-            )
-    return found
+    defaults = _defaults(kind)
+    required = [name for name, default in defaults.items() if default is MISSING]
+    parts = _mapping(node, what, required, [name for name in defaults if name not in required])
+    return kind(**{name: _READERS[name](part, name, folder) for name, part in parts.items()})
 
 
 # Values from nodes; each raises a `_NodeError` where it is something else.
@@ -280,31 +255,32 @@ def _scalar(node: yaml.Node) -> Any:
         raise _NodeError(node, f"can't read {_describe(node)} as {node.tag.rpartition(':')[2]}") from error
 
 
-def _text(node: yaml.Node, what: str, _: Path = Path()) -> str:
+def _plain(node: yaml.Node, what: str, kinds: tuple[type, ...], expected: str) -> Any:
+    """A value of some types, of which true and false are none but bool."""
     value = _scalar(node)
-    if not isinstance(value, str):
-        raise _NodeError(
-            node, f"{what} must be text; found {_describe(node)}; put it in quotes if it is text"
-        )
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise _NodeError(node, f"{what} must be {expected}; found {_describe(node)}")
+    return value
+
+
+def _text(node: yaml.Node, what: str, _: Path = Path()) -> str:
+    value = _plain(node, what, (str,), "text, in quotes if it looks like something else")
     if any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in value):
-        raise _NodeError(
-            node, f"{what} has a character that no name or path can have; found {_describe(node)}"
-        )
+        found = _describe(node)
+        raise _NodeError(node, f"{what} has a character that no name or path can have; found {found}")
     return value
 
 
 def _number(node: yaml.Node, what: str, _: Path = Path()) -> float:
-    value = _scalar(node)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise _NodeError(node, f"{what} must be a number; found {_describe(node)}")
-    return float(value)
+    return float(_plain(node, what, (int, float), "a number"))
 
 
 def _boolean(node: yaml.Node, what: str, _: Path) -> bool:
-    value = _scalar(node)
-    if not isinstance(value, bool):
-        raise _NodeError(node, f"{what} must be true or false; found {_describe(node)}")
-    return value
+    return _plain(node, what, (bool,), "true or false")
+
+
+def _path(node: yaml.Node, what: str, folder: Path) -> Path:
+    return folder / _text(node, what)
 
 
 def _colour(node: yaml.Node, what: str, _: Path) -> Colour:
@@ -326,10 +302,7 @@ def _colour(node: yaml.Node, what: str, _: Path) -> Colour:
 
 
 def _endmember(node: yaml.Node, _: str, __: Path) -> Endmember:
-    value = _scalar(node)
-    if isinstance(value, bool) or not isinstance(value, str | int):
-        raise _NodeError(node, f"an endmember is given by its name or number; found {_describe(node)}")
-    return value
+    return _plain(node, "an endmember", (str, int), "given by its name or number")
 
 
 def _endmembers(node: yaml.Node, what: str, folder: Path) -> tuple[Endmember, ...]:
@@ -347,17 +320,17 @@ def _light(node: yaml.Node, _: str, folder: Path) -> LightName:
     return folder / light if isinstance(light, Path) else light
 
 
-_READERS: dict[Any, Callable[[yaml.Node, str, Path], Any]] = {
-    str: _text,
-    float: _number,
-    bool: _boolean,
-    Path: lambda node, what, folder: folder / _text(node, what),
-    Colour: _colour,
-    Endmember: _endmember,
-    tuple[Endmember, ...]: _endmembers,
-    LightName: _light,
+_READERS: dict[str, Callable[[yaml.Node, str, Path], Any]] = {
+    **dict.fromkeys(("first", "second", "endmember"), _endmember),
+    "endmembers": _endmembers,
+    **dict.fromkeys(("library", "spectrum", "name", "match"), _text),
+    "file": _path,
+    "colour": _colour,
+    **dict.fromkeys(("factor", "scale"), _number),
+    "extrapolate": _boolean,
+    "light": _light,
 }
-"""How a value of each type of field is read: node, what messages call it, folder of relative paths."""
+"""How the value of each field is read: node, what messages call it, folder of relative paths."""
 
 
 def _describe(node: yaml.Node) -> str:
