@@ -157,7 +157,7 @@ def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(vie
         assert saved == ["probe-abundances.csv", "probes.csv"]
         page.look_from(0.0, distance=40.0)
         page.click(0.01, 0.01)
-        page.wait_until(lambda: any("nothing is there to probe" in text for _, text in page.notices))
+        page.wait_until(lambda: any("nothing is there" in text for _, text in page.notices))
         assert page.controls[page.control("probe")]["options"] == [
             page.controls[page.control("probe")]["value"]
         ]

@@ -11,7 +11,7 @@ import torch
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.viewer.panels.probe import _abundances_csv, _probe_through, _spectra_csv
+from unmix_plugin.viewer.panels.probe import _abundances_csv, _ProbedPoint, _spectra_csv, surface_at
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -23,11 +23,15 @@ def camera(source):
     return camera_of(pose_of(source.record.train_cameras[0]), 200)
 
 
+def probed(scene, camera, column, row):
+    return _ProbedPoint(1, *surface_at(scene, camera, (column, row)), scene.materials)
+
+
 @pytest.fixture
 def taken(source, camera):
     before = torch.get_rng_state()
     with source.borrowed() as scene:
-        found = _probe_through(scene, camera, camera.width / 2, camera.height / 2, 1)
+        found = probed(scene, camera, camera.width / 2, camera.height / 2)
     assert torch.equal(torch.get_rng_state(), before)
     return found
 
@@ -35,11 +39,9 @@ def taken(source, camera):
 def test_a_probe_is_what_the_picture_shows_there(source, camera, taken):
     row, column = camera.height // 2, camera.width // 2
     with source.borrowed() as scene:
-        outputs = scene.render(camera, ["spectral", "abundances", "diffuse"])
-    shown = {name: values[row, column].numpy() for name, values in outputs.items()}
-    np.testing.assert_allclose(taken.predicted, shown["spectral"], rtol=1e-5)
-    np.testing.assert_allclose(taken.contributions.sum(axis=0), shown["diffuse"], rtol=1e-5)
-    assert taken.abundances.sum() == pytest.approx(1)
+        outputs = scene.render(camera, ["spectral", "abundances"])
+    np.testing.assert_allclose(taken.predicted, outputs["spectral"][row, column], rtol=1e-5)
+    assert taken.found.abundances.sum() == pytest.approx(1)
 
 
 @pytest.mark.parametrize("method", ["abundances", "probe"])
@@ -48,22 +50,21 @@ def test_the_material_of_a_probe_is_that_of_the_segmentation(source, camera, met
         scene = replace(scene, materials=replace(scene.materials, segmentation=method))
         ids = scene.look(camera)["segmentation"]
         for row, column in (ids < 255).nonzero()[::300].tolist():
-            name = _probe_through(scene, camera, column + 0.5, row + 0.5, 1).name
+            name = probed(scene, camera, column + 0.5, row + 0.5).material
             assert name == scene.materials.names[int(ids[row, column])]
 
 
 def test_a_probe_lies_on_the_ray_through_the_click(camera, taken):
-    coords, depth = camera.project(torch.tensor([taken.point]), 0)
+    coords, depth = camera.project(torch.tensor(taken.point[None]).float(), 0)
     assert depth[0] > 0
     assert coords[0].tolist() == pytest.approx([camera.width / 2, camera.height / 2], abs=1.0)
 
 
 def test_what_users_read_of_a_place_is_in_the_world(source, camera, taken):
     with source.borrowed() as scene:
-        shown = replace(scene, frame=WORLD)
-        moved = _probe_through(shown, camera, camera.width / 2, camera.height / 2, 1)
-    assert moved.point == taken.point
-    expected = WORLD.to_world(np.array([taken.point]))[0]
+        moved = probed(replace(scene, frame=WORLD), camera, camera.width / 2, camera.height / 2)
+    np.testing.assert_array_equal(moved.point, taken.point)
+    expected = WORLD.to_world(taken.point[None])[0]
     np.testing.assert_allclose(moved.world, expected, rtol=1e-6)
     rows = list(csv.reader(io.StringIO(_abundances_csv([moved]).decode())))
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], expected, rtol=1e-6)
@@ -73,8 +74,8 @@ def test_where_nothing_is_there_is_nothing_to_probe(source, camera):
     away = camera.camera_to_world.clone()
     away[0, :, 3] *= 50
     away[0, :, 1:3] *= -1  # looks the other way
-    with source.borrowed() as scene, pytest.raises(ConfigError, match="nothing is there to probe"):
-        _probe_through(scene, replace(camera, camera_to_world=away), 100.0, 100.0, 1)
+    with source.borrowed() as scene, pytest.raises(ConfigError, match="nothing is there"):
+        surface_at(scene, replace(camera, camera_to_world=away), (100.0, 100.0))
 
 
 def test_the_files_of_probes_hold_every_number(taken):
@@ -93,7 +94,7 @@ def test_the_files_of_probes_hold_every_number(taken):
     assert rows[0][9:] == list(taken.materials.names)
     assert [rows[2][4], *rows[2][6:9]] == ["", "train_003", "reflectance", "A"]
     assert rows[1][7:9] == ["radiance", ""]
-    np.testing.assert_allclose([float(value) for value in rows[1][9:]], taken.abundances, atol=1e-5)
+    np.testing.assert_allclose([float(value) for value in rows[1][9:]], taken.found.abundances, atol=1e-5)
     np.testing.assert_allclose([float(value) for value in rows[1][1:4]], taken.world, rtol=1e-7)
     rows = list(csv.reader(io.StringIO(_abundances_csv([taken], Scale(0.25, "known")).decode())))
     assert rows[1][4] == "0.25"

@@ -28,8 +28,9 @@ from unmix_plugin.editing import (
 from unmix_plugin.viewer.recipes import (
     RecipeHistory,
     change_of,
+    is_shown,
+    named_by,
     numbered,
-    visibility,
     with_change,
     with_swap,
     with_visible,
@@ -133,10 +134,11 @@ def test_the_same_swap_twice_in_a_row_takes_it_back():
 def test_visibility_is_one_edit_whatever_was_hidden_before():
     recipe = with_visible(Recipe((Scale(0, 2.0),)), {2, 1}, None)
     assert recipe.operations == (Scale(0, 2.0), Remove((1, 2)))
-    assert visibility(recipe) == (frozenset({1, 2}), frozenset())
+    assert [is_shown(recipe, index) for index in range(4)] == [True, False, False, True]
     alone = with_visible(recipe, {1}, 3)
     assert alone.operations == (Scale(0, 2.0), Isolate((3,)))
-    assert visibility(alone) == (frozenset(), frozenset({3}))
+    assert [is_shown(alone, index) for index in range(4)] == [False, False, False, True]
+    assert (named_by(alone, Isolate), named_by(alone, Remove)) == ({3}, set())
     assert with_visible(alone, set(), None).operations == (Scale(0, 2.0),)
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,6 +27,7 @@ _LONGEST_TEXT = 100_000
 
 _LOG = logging.getLogger("unmix_plugin.viewer")
 _ChoiceT = TypeVar("_ChoiceT")
+_FallbackT = TypeVar("_FallbackT")
 
 
 def number(value: Any, low: float | int, high: float | int, fallback: float | int) -> float:
@@ -44,7 +43,12 @@ def number(value: Any, low: float | int, high: float | int, fallback: float | in
     return min(max(found, float(low)), float(high)) if math.isfinite(found) else float(fallback)
 
 
-def choice(value: Any, known: Collection[_ChoiceT], fallback: _ChoiceT) -> _ChoiceT:
+def number_of(control: Any, fallback: float | int) -> float:
+    """The number that a control has, within the control's own bounds; `fallback` for what is none."""
+    return number(control.value, control.min, control.max, fallback)
+
+
+def choice(value: Any, known: Collection[_ChoiceT], fallback: _FallbackT) -> _ChoiceT | _FallbackT:
     """The value if it is one of `known`, otherwise `fallback`."""
     return next((one for one in known if type(one) is type(value) and one == value), fallback)
 
@@ -107,37 +111,29 @@ def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
         _LOG.warning("%s, and the client could not be told: %s", what, message)
 
 
-WAIT_S = 0.4
-"""How long typing must pause before a text is read: browsers send every letter."""
-
-
 class Debounced:
-    """Work that waits until its events have stopped coming."""
+    """Work that waits until its events have stopped coming: browsers send every letter that is typed."""
 
-    def __init__(self, work: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> None:
-        """`work` is done once, after the last event; `clock` tells seconds."""
-        self._work, self._clock = work, clock
-        self._due_s: float | None = None
-        self._lock = threading.Lock()
+    def __init__(self, work: Callable[[], None]) -> None:
+        """`work` is done once, at a tick without events since the one before."""
+        self._work = work
+        self._ticks_left = 0
 
     @property
     def is_waiting(self) -> bool:
         """Whether there is something left to do."""
-        return self._due_s is not None
+        return self._ticks_left > 0
 
     def note(self) -> None:
         """An event came."""
-        with self._lock:
-            self._due_s = self._clock() + WAIT_S
+        self._ticks_left = 2
 
     def tick(self, at_once: bool = False) -> None:
-        """Do the work if the last event was long enough ago, or at once if there is any; called now and then."""
-        with self._lock:
-            is_due = self._due_s is not None and (at_once or self._clock() >= self._due_s)
-            if is_due:
-                self._due_s = None
-        if is_due:
-            self._work()
+        """Do the work if its time has come, or at once if there is any; called twice a second."""
+        if self.is_waiting:
+            self._ticks_left = 0 if at_once else self._ticks_left - 1
+            if not self.is_waiting:
+                self._work()
 
 
 BLOCK_STYLE = "padding:0.2em 0.8em 0.4em;font-size:0.85em;line-height:1.35"
@@ -195,39 +191,35 @@ class Line:
 class Chart:
     """Lines over wavelength or over anything else; hidden while it has none."""
 
-    def __init__(self, gui: viser.GuiApi, title: str, y_label: str, x_label: str = "wavelength (nm)") -> None:
-        self._gui, self._x_label, self._y_label = gui, x_label, y_label
+    def __init__(self, gui: viser.GuiApi, title: str, x_label: str = "wavelength (nm)") -> None:
+        self._gui, self._labels = gui, (x_label, "")
         self._handle: viser.GuiUplotHandle | None = None
         self._place = gui.add_folder(title, visible=False)
 
-    def draw(self, x: Float[np.ndarray, " N"], lines: Sequence[Line], y_label: str = "") -> None:
-        """Show lines over a common axis; nothing without lines or values. A plot keeps its axes, so that one with
-        another `y_label` than before, if one is given, is made anew."""
-        is_same_label = y_label in ("", self._y_label)
-        self._y_label = y_label or self._y_label
-        if len(x) == 0:
-            lines = ()
+    def draw(
+        self, x: Float[np.ndarray, " N"] | None = None, lines: Sequence[Line] = (), y_label: str = ""
+    ) -> None:
+        """Show lines over a common axis; nothing without lines or values."""
+        lines = () if x is None or len(x) == 0 else lines
+        self._place.visible = bool(lines)
+        labels, handle = (self._labels[0], y_label), self._handle
+        series: Any = [{"label": labels[0]}]
+        for line in lines:
+            style: dict[str, Any] = {"stroke": css_colour(line.colour), "width": 1 if line.is_thin else 2.5}
+            series.append({"label": line.name, **style, **({"dash": (6, 4)} if line.is_dashed else {})})
         values = (np.nan_to_num(np.asarray(line.values, np.float64)) for line in lines)
         data = (np.asarray(x, np.float64), *values)
-        series: tuple[Any, ...] = (
-            {"label": self._x_label},
-            *(
-                {"label": line.name, "stroke": css_colour(line.colour), "width": 1 if line.is_thin else 2.5}
-                | ({"dash": (6, 4)} if line.is_dashed else {})
-                for line in lines
-            ),
-        )
-        self._place.visible = bool(lines)
-        if self._handle is not None and is_same_label and len(self._handle.series) == len(series):
-            self._handle.data, self._handle.series = data, series
+        # A plot keeps its axes and the number of its lines.
+        if handle is not None and labels == self._labels and len(handle.series) == len(series):
+            handle.data, handle.series = data, tuple(series)
             return
-        if self._handle is not None:
-            self._handle.remove()
-            self._handle = None
+        if handle is not None:
+            handle.remove()
+        self._handle, self._labels = None, labels
         if lines:
             scales: Any = {"x": {"time": False, "auto": True}, "y": {"auto": True}}
-            axes: Any = ({"label": self._x_label}, {"label": self._y_label})
+            axes: Any = tuple({"label": label} for label in labels)
             with self._place:
                 self._handle = self._gui.add_uplot(
-                    data=data, series=series, scales=scales, axes=axes, aspect=1.3
+                    data=data, series=tuple(series), scales=scales, axes=axes, aspect=1.3
                 )

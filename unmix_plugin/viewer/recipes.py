@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from unmix_plugin.editing import (
     Gloss,
@@ -24,6 +24,8 @@ from unmix_plugin.editing import (
     Scale,
     Swap,
 )
+
+_ChangeT = TypeVar("_ChangeT", bound=Operation)
 
 _MOST_UNDONE = 200
 _MOST_OPERATIONS = 500
@@ -69,7 +71,7 @@ class RecipeHistory:
         return self.present
 
 
-_SUPERSEDED: dict[type[Operation], tuple[type[Operation], ...]] = {
+_SUPERSEDED: dict[type, tuple[type, ...]] = {
     Replace: (Replace, Retint, Scale),
     Retint: (Retint, Scale),
     Scale: (Scale,),
@@ -82,11 +84,8 @@ _SUPERSEDED: dict[type[Operation], tuple[type[Operation], ...]] = {
 def with_change(recipe: Recipe, change: Replace | Retint | Scale | Rename | Gloss) -> Recipe:
     """The recipe with a change of one endmember, in place of earlier ones of which it leaves nothing."""
     earlier, kinds = _changes_of(recipe, change.endmember), _SUPERSEDED[type(change)]
-    others = [
-        one
-        for position, one in enumerate(recipe.operations)
-        if position not in earlier or not isinstance(one, kinds)
-    ]
+    gone = [position for position in earlier if isinstance(recipe.operations[position], kinds)]
+    others = [one for position, one in enumerate(recipe.operations) if position not in gone]
     return _with_operations(recipe, [*others, change])
 
 
@@ -98,28 +97,27 @@ def with_swap(recipe: Recipe, swap: Swap) -> Recipe:
     return _with_operations(recipe, [*recipe.operations, swap])
 
 
-def with_visible(recipe: Recipe, hidden: Iterable[int], isolated: int | None) -> Recipe:
+def with_visible(recipe: Recipe, hidden: Iterable[int], isolated: int | None = None) -> Recipe:
     """The recipe that shows all endmembers but the hidden ones, or the isolated one alone."""
-    others = [one for one in recipe.operations if not isinstance(one, Remove | Isolate)]
-    if isolated is not None:
-        return _with_operations(recipe, [*others, Isolate((isolated,))])
+    changes = [one for one in recipe.operations if not isinstance(one, Remove | Isolate)]
     gone = tuple(sorted(set(hidden)))
-    return _with_operations(recipe, [*others, Remove(gone)] if gone else others)
+    if isolated is not None:
+        changes.append(Isolate((isolated,)))
+    elif gone:
+        changes.append(Remove(gone))
+    return _with_operations(recipe, changes)
 
 
-def visibility(recipe: Recipe) -> tuple[frozenset[int], frozenset[int]]:
-    """Numbers of the endmembers that a numbered recipe removes, and of those that it isolates."""
-    removed, isolated = (
-        frozenset(
-            index
-            for one in recipe.operations
-            if isinstance(one, kind)
-            for index in one.endmembers
-            if isinstance(index, int)
-        )
-        for kind in (Remove, Isolate)
-    )
-    return removed, isolated
+def named_by(recipe: Recipe, kind: type[Remove] | type[Isolate]) -> frozenset[int]:
+    """Numbers of the endmembers that a numbered recipe removes, or of those that it isolates."""
+    edits = [one for one in recipe.operations if isinstance(one, kind)]
+    return frozenset(index for one in edits for index in one.endmembers if isinstance(index, int))
+
+
+def is_shown(recipe: Recipe, index: int) -> bool:
+    """Whether a numbered recipe leaves an endmember visible."""
+    isolated = named_by(recipe, Isolate)
+    return index not in named_by(recipe, Remove) and (not isolated or index in isolated)
 
 
 def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
@@ -148,13 +146,11 @@ def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
     return replace(recipe, operations=tuple(operations))
 
 
-def change_of(recipe: Recipe, kind: type[Operation], endmember: int) -> Operation | None:
+def change_of(recipe: Recipe, kind: type[_ChangeT], endmember: int) -> _ChangeT | None:
     """The change of a kind, in force, that a recipe makes to what an endmember is by its number now."""
-    found = None
-    for one in (recipe.operations[position] for position in _changes_of(recipe, endmember)):
-        if kind in _SUPERSEDED[type(one)]:
-            found = one if type(one) is kind else None
-    return found
+    changes = [recipe.operations[position] for position in _changes_of(recipe, endmember)]
+    last: Any = next((one for one in reversed(changes) if kind in _SUPERSEDED[type(one)]), None)
+    return last if isinstance(last, kind) else None
 
 
 def _changes_of(recipe: Recipe, endmember: str | int | None) -> list[int]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -48,44 +48,8 @@ from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, point_ahead, p
 if TYPE_CHECKING:
     import viser
 
-SceneReader = Callable[[], Scene]
-"""Reads the scene that a run was trained on.
-
-Raises:
-    UnmixError: it is not at hand, or another one.
-"""
-
 _MOST_POINTS = 400
-
-
-class _TrainingCurve:
-    """How loss and PSNR went, in points that are thinned evenly as they become many."""
-
-    def __init__(self) -> None:
-        self._points: list[TrainingStatus] = []
-        self._stride, self._seen = 1, 0
-        self._lock = threading.Lock()
-
-    def add(self, status: TrainingStatus | None) -> None:
-        """Take in a status, if it is one later than the last."""
-        with self._lock:
-            if status is None or (self._points and status.step <= self._points[-1].step):
-                return
-            if self._seen % self._stride == 0:
-                self._points.append(status)
-            self._seen += 1
-            if len(self._points) > _MOST_POINTS:
-                self._points = self._points[::2]
-                self._stride *= 2
-
-    def line(self, name: str) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-        """Steps, and `loss` or `psnr` of the points; none where one has no such value."""
-        with self._lock:
-            points = list(self._points)
-        found = [getattr(point, name) for point in points]
-        if None in found:
-            return np.zeros(0), np.zeros(0)
-        return np.array([float(point.step) for point in points]), np.array(found, dtype=np.float64)
+"""Of the curves of a training."""
 
 
 class Services:
@@ -94,7 +58,7 @@ class Services:
     def __init__(
         self,
         source: SceneSource,
-        read_scene: SceneReader,
+        read_scene: Callable[[], Scene],
         recipe: Recipe | None = None,
         environments: Sequence[Path] = (),
         library: MaterialLibrary | None = None,
@@ -103,7 +67,7 @@ class Services:
 
         Args:
             source: The model.
-            read_scene: Reads the scene.
+            read_scene: Reads the scene that a run was trained on; an UnmixError if it is not at hand.
             recipe: What every client sees the scene with at first.
             environments: Files of lights to offer beside those of the scene.
             library: Known materials; None: the built-in ones.
@@ -119,7 +83,9 @@ class Services:
         """Where files go that clients ask for: in the run folder, and nowhere else."""
         self.recipes_folder = source.run.path / "recipes"
         self.videos = VideoQueue()
-        self.curve = _TrainingCurve()
+        self.curve: list[TrainingStatus] = []
+        """How training went, evenly over its steps."""
+        self._curve_step = 1
         self._read_scene = read_scene
         self._reader = threading.Thread(target=self._read, name="unmix-viewer-scene", daemon=True)
         paths = tuple(str(path.resolve()) for path in environments)
@@ -127,9 +93,8 @@ class Services:
             for path in paths:
                 relit(scene, LightChoice(path), "of this run")
             self.has_materials = isinstance(scene, TrainedScene)
-            self.lights: tuple[str, ...] = (
-                (*scene.lights, *paths) if isinstance(scene, RelightableScene) else ()
-            )
+            lights = scene.lights if isinstance(scene, RelightableScene) else ()
+            self.lights: tuple[str, ...] = (*lights, *paths)
             """Names of the scene's lights, and the paths of those that a user gives."""
         self.maker = PictureMaker(source)
         self.regions = RunRegions(self.maker)
@@ -158,8 +123,13 @@ class Services:
 
     def tick(self) -> None:
         """Note how training goes; called twice a second."""
-        if self.source.control is not None:
-            self.curve.add(self.source.control.status)
+        status = None if self.source.control is None else self.source.control.status
+        if status is None or (self.curve and status.step < self.curve[-1].step + self._curve_step):
+            return
+        curve = [*self.curve, status]
+        if len(curve) > _MOST_POINTS:
+            curve, self._curve_step = curve[::2], 2 * (status.step - curve[0].step) // _MOST_POINTS
+        self.curve = curve  # another one each time: panels read it meanwhile
 
     def stop(self) -> None:
         """End rendering; waits for the scene if it is still being read."""
@@ -196,11 +166,11 @@ def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | N
 class PageState:
     """What a page shows, and the edits that it may go back to."""
 
-    pose: ViewPose | None
     settings: LayerSettings
     history: RecipeHistory
     largest_height: int
-    subpixels: int
+    subpixels: int = 1
+    pose: ViewPose | None = None
     light: LightChoice = LightChoice()
 
 
@@ -213,6 +183,8 @@ _LONGEST_NOTICE = 2000
 
 _SMALL_PIXELS = 1 << 14
 """Pictures of so few pixels are enlarged so much that compression with loss would show; they are sent as PNG."""
+
+_ControlT = TypeVar("_ControlT")
 
 
 class Session:
@@ -227,20 +199,13 @@ class Session:
     ) -> None:
         """`state` is what the page showed before it was loaded again, if it was; `browser` names its browser."""
         self.client, self.services, self.browser = client, services, browser
-        self.history = RecipeHistory(services.first_recipe) if state is None else state.history
-        light = LightChoice() if state is None else state.light
-        self.view = View(show=self._show, report=self._report, edit=Edit(self.history.present, light))
-        if state is None:
-            if services.has_materials:
-                self.view.settings = first_settings(self.materials().bands)
-            elif "rgb" not in services.maker.layers:
-                self.view.settings = LayerSettings(layer=next(iter(services.maker.layers), "rgb"))
-            rows = number(client.camera.image_height, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], DEFAULT_HEIGHT)
-            self.view.largest_height = int(rows) // 16 * 16
-        else:
-            self.view.settings, self.view.pose = state.settings, state.pose
-            self.view.largest_height, self.view.subpixels = state.largest_height, state.subpixels
-        self.is_closed = False
+        state = self._first_state() if state is None else state
+        self.history = state.history
+        edit = Edit(state.history.present, state.light)
+        sizes = (state.largest_height, state.subpixels)
+        self.view = View(self._show, self._report, state.settings, edit, *sizes, pose=state.pose)
+        self.is_closed = self.is_filling = False
+        """The latter while controls are set to what is in force, which is no change of a user's."""
         self._lock = threading.RLock()
         self.on_tick: list[Callable[[], None]] = []
         """Called twice a second."""
@@ -252,21 +217,27 @@ class Session:
         """Of the panels that take clicks; at most one of them is on."""
         self.value_range_shown: tuple[float, float] | None = None
         """Ends of the colour map of the picture shown; None where it has none."""
-        self._legend: viser.GuiHtmlHandle | None = None
-        self._status: viser.GuiHtmlHandle | None = None
         self._legend_shown = ""
         self._object_owners: set[str] = set()
-        self._warning: viser.NotificationHandle | None = None
+        self._notices: dict[str, viser.NotificationHandle] = {}
         self._warning_said = (-math.inf, "")
-        self._note: viser.NotificationHandle | None = None
         self._notes: tuple[str, ...] = ()
+        self._status = client.gui.add_html(paragraph("waiting for the first picture"))
+        self._legend = client.gui.add_html("")
+
+    def _first_state(self) -> PageState:
+        services = self.services
+        history = RecipeHistory(services.first_recipe)
+        if services.has_materials:
+            settings = first_settings(services.maker.edited(Edit(history.present)).materials.bands)
+        else:
+            settings = LayerSettings(layer=next(iter(services.maker.layers), "rgb"))
+        rows = number(self.client.camera.image_height, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], DEFAULT_HEIGHT)
+        return PageState(settings, history, int(rows) // 16 * 16)
 
     def open(self, panels: Sequence[tuple[str, Callable[[Session], object]]]) -> None:
         """Build the panels, given by their titles and what builds them in the tab that is open, and begin to render."""
-        gui, view = self.client.gui, self.view
-        self._status = gui.add_html(paragraph("waiting for the first picture"))
-        self._legend = gui.add_html("")
-        tabs = gui.add_tab_group()
+        view, tabs = self.view, self.client.gui.add_tab_group()
         for title, build in panels:
             with tabs.add_tab(title):
                 build(self)
@@ -296,9 +267,8 @@ class Session:
     def state(self) -> PageState:
         """What the page shows, to be restored when it is loaded again."""
         view = self.view
-        return PageState(
-            view.pose, view.settings, self.history, view.largest_height, view.subpixels, view.edit.light
-        )
+        sizes = (view.largest_height, view.subpixels)
+        return PageState(view.settings, self.history, *sizes, view.pose, view.edit.light)
 
     def tick(self) -> None:
         """Update what panels show of a run in progress."""
@@ -315,39 +285,61 @@ class Session:
 
         return callback
 
-    def say(self, title: str, text: str, colour: Literal["teal", "red"] = "teal") -> Any:
-        """Show a notice; its handle, None once the client has gone."""
+    def say(
+        self, title: str, text: str, colour: Literal["teal", "red"] = "teal", in_place_of: str = ""
+    ) -> None:
+        """Show a notice, in place of the last one that had the same `in_place_of`, if that is given."""
         if self.is_closed:
-            return None
-        text = text[:_LONGEST_NOTICE]
-        return self.client.add_notification(title, text, auto_close_seconds=_NOTICE_S, color=colour)
+            return
+        if in_place_of in self._notices:
+            self._notices.pop(in_place_of).remove()
+        notice = self.client.add_notification(
+            title, text[:_LONGEST_NOTICE], auto_close_seconds=_NOTICE_S, color=colour
+        )
+        if in_place_of:
+            self._notices[in_place_of] = notice
 
     def warn(self, text: str, title: str = "not done") -> None:
         """Show a warning in place of the one before: a control that is dragged causes many. The same one is shown once
         in 8 s."""
         before, self._warning_said = self._warning_said, (time.monotonic(), text)
-        if self.is_closed or (before[1] == text and self._warning_said[0] - before[0] < _NOTICE_S):
-            return
-        if self._warning is not None:
-            self._warning.remove()
-        self._warning = self.say(title, text, "red")
+        if before[1] != text or self._warning_said[0] - before[0] >= _NOTICE_S:
+            self.say(title, text, "red", "warning")
 
     def _show_notes(self, notes: tuple[str, ...]) -> None:
         """Show what is new among the notes of the edit in force, in place of those shown before."""
         new = [note for note in notes if note not in self._notes]
         self._notes = notes
-        if new and not self.is_closed:
-            if self._note is not None:
-                self._note.remove()
-            self._note = self.say("edited", "; ".join(new))
+        if new:
+            self.say("edited", "; ".join(new), in_place_of="notes")
+
+    def on_change(self, control: _ControlT, work: Callable[[], None]) -> _ControlT:
+        """Let something be done when a user changes a control; the control."""
+        update: Any = control
+        update.on_update(self.guarded(lambda: None if self.is_filling else work()))
+        return control
+
+    @contextmanager
+    def filling(self) -> Iterator[None]:
+        """Context in which controls are set to what is in force."""
+        self.is_filling = True
+        try:
+            yield
+        finally:
+            self.is_filling = False
 
     def add_button(
-        self, label: str, work: Callable[[], None], *, is_minor: bool = False
+        self, label: str, work: Callable[[], None], colour: Literal["gray", "red"] | None = None
     ) -> viser.GuiButtonHandle:
-        """Add a button to the folder that is open, grey if it is a minor one, and do something when it is clicked."""
-        button = self.client.gui.add_button(label, color="gray" if is_minor else None)
+        """Add a button to the folder that is open, and do something when it is clicked."""
+        button = self.client.gui.add_button(label, color=colour)
         button.on_click(self.guarded(work))
         return button
+
+    def add_buttons(self, label: str, names: Sequence[str], work: Callable[[str], None]) -> None:
+        """Add buttons side by side, and do something with the name of the one that is clicked."""
+        buttons = self.client.gui.add_button_group(label, names)
+        buttons.on_click(self.guarded(lambda: work(str(buttons.value))))
 
     def materials(self) -> Materials:
         """The materials as this client sees them."""
@@ -404,9 +396,8 @@ class Session:
 
     def say_busy(self, what: str) -> None:
         """Show what is being drawn, in place of what the last picture's colours mean, until it is there."""
-        if self._status is not None and self._legend is not None:
-            self._status.content = paragraph(f"drawing {what} ...")
-            self._legend_shown = self._legend.content = ""
+        self._status.content = paragraph(f"drawing {what} ...")
+        self._legend_shown = self._legend.content = ""
 
     def _moved(self, camera: viser.CameraHandle) -> None:
         """The client's camera moved; what it sends may be anything."""
@@ -427,13 +418,13 @@ class Session:
         )
         legend = shown.legend
         self.value_range_shown = (legend.low, legend.high) if isinstance(legend, ColourScale) else None
-        if self._legend is not None and (content := legend_html(legend)) != self._legend_shown:
+        if (content := legend_html(legend)) != self._legend_shown:
             self._legend_shown = self._legend.content = content
-        if self._status is not None and not self.view.has_reported:
+        if not self.view.has_reported:
             more = ", getting finer" if shown.is_moving else ""
             self._status.content = paragraph(f"{width} x {height} pixels{more}")
 
     def _report(self, text: str) -> None:
         """Show in the panel what is wrong with the picture, until it is right again."""
-        if self._status is not None and not self.is_closed and text:
+        if text and not self.is_closed:
             self._status.content = paragraph(text, is_warning=True)

@@ -59,7 +59,7 @@ class CapturePanel:
             session.add_button("save a screenshot (PNG)", self._save_picture)
             if session.services.has_materials:
                 session.add_button("save the spectra (EXR)", self._save_spectra)
-            session.add_button("cancel", self._cancel, is_minor=True)
+            session.add_button("cancel", self._cancel, "gray")
         with gui.add_folder("camera path"):
             session.add_button("add a key frame here", self._add_key)
             self._key = gui.add_dropdown("key frame", _NO_KEYS)
@@ -72,7 +72,7 @@ class CapturePanel:
             preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
             session.add_button("save the path", lambda: session.say("saved", str(self._save_path())))
             session.add_button("render a video", self._render_video)
-            session.add_button("cancel the video", self._cancel_video, is_minor=True)
+            session.add_button("cancel the video", self._cancel_video, "gray")
             self._video_progress = gui.add_progress_bar(0.0)
         session.on_close += [lambda: self._preview.set(), self._cancel]
 

@@ -6,7 +6,7 @@ Notation: `B` bands, `K` endmembers.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from unmix_plugin.formats.files import csv_bytes, write_file
 from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
 from unmix_plugin.trained.measures import Scale
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.protocol import Probe, RenderableScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
@@ -30,6 +30,22 @@ from unmix_plugin.viewer.view_cameras import camera_of
 if TYPE_CHECKING:
     import viser
 
+Point = Float64[np.ndarray, "3"]
+
+
+def surface_at(
+    scene: RenderableScene, camera: Cameras, place: tuple[float, float]
+) -> tuple[Probe, Point, Point]:
+    """What is seen at a place (column, row) of a picture, and where that is in model space and in the world.
+
+    Raises:
+        ConfigError: nothing is there.
+    """
+    found = scene.probe(camera, int(place[0]), int(place[1]))
+    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
+        raise ConfigError("nothing is there: less than half of the light ends on something")
+    return found, found.position, found.world_position
+
 
 @dataclass(frozen=True)
 class _ProbedPoint:
@@ -37,76 +53,63 @@ class _ProbedPoint:
 
     number: int
     """From 1."""
-    point: tuple[float, float, float]
+    found: Probe
+    point: Point
     """Model space."""
-    world: tuple[float, float, float]
+    world: Point
     """The same point in the world that exports are in."""
     materials: Materials
     """As they are shown."""
-    predicted: Float64[np.ndarray, " B"]
-    """Radiance, as rendered."""
-    abundances: Float64[np.ndarray, " K"]
-    """Shares, sum 1."""
-    contributions: Float64[np.ndarray, "K B"]
-    """Radiance that each endmember adds, as bright as it is there."""
     measured: Float64[np.ndarray, " B"] | None = None
     """Radiance in a training view that sees the point."""
     measured_in: str = ""
     """Name of that view."""
 
     @property
-    def name(self) -> str:
-        """Of its material, chosen as in segmentations."""
-        return self.materials.name_of(self.predicted, self.abundances)
+    def predicted(self) -> Float64[np.ndarray, " B"]:
+        """Radiance, as rendered."""
+        return self.found.values["predicted"]
 
+    @property
+    def material(self) -> str:
+        """Its name, chosen as in segmentations."""
+        return self.materials.name_of(self.predicted, self.found.abundances)
 
-def _probe_through(
-    scene: TrainedScene, camera: Cameras, column: float, row: float, number: int
-) -> _ProbedPoint:
-    """What is seen through a point of a picture, given in pixels; a ConfigError where nothing is there."""
-    pixel = min(max(int(column), 0), camera.width - 1), min(max(int(row), 0), camera.height - 1)
-    found = scene.probe(camera, *pixel)
-    if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
-        raise ConfigError("nothing is there to probe: less than half of the light ends on something")
-    x, y, z = found.position.tolist()
-    world_x, world_y, world_z = found.world_position.tolist()
-    endmembers = scene.materials.endmembers.double().cpu().numpy()
-    return _ProbedPoint(
-        number,
-        (x, y, z),
-        (world_x, world_y, world_z),
-        scene.materials,
-        found.values["predicted"],
-        found.values["abundances"],
-        found.values["scaled_abundances"][:, None] * endmembers,
-    )
+    @property
+    def label(self) -> str:
+        """How menus have it."""
+        return f"{self.number}: {self.material}"
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """sRGB."""
+        return _COLOURS[(self.number - 1) % len(_COLOURS)]
 
 
 def _take_probe(
     maker: PictureMaker, edit: Edit, camera: Cameras, place: tuple[float, float], number: int
 ) -> _ProbedPoint:
-    """What is seen through a point (column, row) of a picture, and what a training view measured there."""
+    """What is seen at a place of a picture, and what a training view measured there."""
     with maker.edit_turn(edit) as (scene, shown):
-        taken = _probe_through(shown, camera, *place, number)
-        measured, point = maker.aids.measured, torch.tensor(taken.point)
+        seen = surface_at(shown, camera, place)
+        measured, point = maker.aids.measured, torch.from_numpy(seen[1]).float()
         found = measured and measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
-        return taken
+        return _ProbedPoint(number, *seen, shown.materials)
     view, spectrum = found
     view = f"{view}, before the edits" if edit.recipe.operations else view
-    return replace(taken, measured=spectrum.double().numpy(), measured_in=view)
+    return _ProbedPoint(number, *seen, shown.materials, spectrum.double().numpy(), view)
 
 
 def _spectra_csv(probes: Sequence[_ProbedPoint]) -> bytes:
     """One row a band: wavelength, and for each probe what was predicted and, where known, measured."""
-    header, columns = ["wavelength"], [probes[0].materials.bands.centers_nm]
+    columns = {"wavelength": probes[0].materials.bands.centers_nm}
     for one in probes:
-        header.append(f"probe_{one.number}_predicted")
-        columns.append(one.predicted)
+        columns[f"probe_{one.number}_predicted"] = one.predicted
         if one.measured is not None:
-            header.append(f"probe_{one.number}_measured")
-            columns.append(one.measured)
-    return csv_bytes([header, *([f"{value:.9g}" for value in row] for row in np.stack(columns, axis=1))])
+            columns[f"probe_{one.number}_measured"] = one.measured
+    rows = np.stack([*columns.values()], axis=1)
+    return csv_bytes([[*columns], *([f"{value:.9g}" for value in row] for row in rows)])
 
 
 def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) -> bytes:
@@ -114,21 +117,12 @@ def _abundances_csv(probes: Sequence[_ProbedPoint], scale: Scale | None = None) 
     training view measured in, what the spectra are, the light lit in place of the recorded one, abundances."""
     metres = "" if scale is None else f"{scale.metres_per_unit:.9g}"
     header = ["probe", "x", "y", "z", METRES_KEY, "material", "measured_in", "quantity", "light"]
-    header += probes[0].materials.names
-    rows = [
-        [
-            str(one.number),
-            *(f"{value:.9g}" for value in one.world),
-            metres,
-            one.name,
-            one.measured_in,
-            one.materials.quantity,
-            one.materials.light_name or "",
-            *(f"{value:.6g}" for value in one.abundances),
-        ]
-        for one in probes
-    ]
-    return csv_bytes([header, *rows])
+    rows = [[*header, *probes[0].materials.names]]
+    for one in probes:
+        place = [str(one.number), *(f"{value:.9g}" for value in one.world), metres]
+        what = [one.material, one.measured_in, one.materials.quantity, one.materials.light_name or ""]
+        rows.append([*place, *what, *(f"{value:.6g}" for value in one.found.abundances)])
+    return csv_bytes(rows)
 
 
 _MOST_PROBES = 12
@@ -142,6 +136,7 @@ _COLOURS = (
     (0.5, 0.2, 0.8),
     (0.0, 0.6, 0.6),
 )
+_MEASURED_COLOUR = (0.35, 0.35, 0.35)
 _SHOWN_SHARE = 0.08
 """Endmembers of at least this share: what they add to a probe's spectrum is drawn beside it."""
 
@@ -161,59 +156,56 @@ class ProbePanel:
         self._taken = 0
         gui = session.client.gui
         add_click_switch(session, "probe where I click", self._take)
-        self._chosen = gui.add_dropdown("probe", _NO_PROBES)
-        self._chosen.on_update(session.guarded(self._show_chosen))
+        self._chosen = session.on_change(gui.add_dropdown("probe", _NO_PROBES), self._show_chosen)
         self._text = gui.add_html(paragraph(_INVITATION))
         self._bars = gui.add_html("")
-        quantity = session.materials().quantity
-        self._chart, self._comparison = (Chart(gui, title, quantity) for title in ("spectrum", "all probes"))
+        self._chart, self._comparison = Chart(gui, "spectrum"), Chart(gui, "all probes")
         session.add_button("save as CSV", self._save)
-        session.add_button("forget all", self._forget, is_minor=True)
+        session.add_button("forget all", self._forget, "gray")
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        session, services = self._session, self._session.services
-        taken = _take_probe(services.maker, session.view.edit, camera, place, self._taken + 1)
+        session = self._session
+        taken = _take_probe(session.services.maker, session.view.edit, camera, place, self._taken + 1)
         self._taken += 1
         self._probes.append(taken)
         while len(self._probes) > _MOST_PROBES:
             self._drop(self._probes[0])
-        red, green, blue = (int(255 * value) for value in _colour(taken))
+        red, green, blue = (int(255 * value) for value in taken.colour)
         self._markers[taken.number] = session.client.scene.add_icosphere(
             f"/probes/{taken.number}", _MARKER_RADIUS, color=(red, green, blue), position=taken.point
         )
         session.show_objects("probe", True)
-        self._chosen.options = tuple(_label(one) for one in self._probes)
-        self._chosen.value = _label(taken)  # which shows it
+        self._chosen.options = tuple(one.label for one in self._probes)
+        self._chosen.value = taken.label  # which shows it
 
     def _show_chosen(self) -> None:
-        shown = next((one for one in self._probes if _label(one) == self._chosen.value), None)
+        shown = next((one for one in self._probes if one.label == self._chosen.value), None)
         if shown is None:
             return
+        materials, abundances = shown.materials, shown.found.abundances
         self._text.content = table(
             [
-                ("material", shown.name),
+                ("material", shown.material),
                 ("position", ", ".join(f"{value:.4g}" for value in shown.world)),
                 ("measured in", shown.measured_in or "no training view at hand measured the point"),
-                *likeness_rows(self._session.services.library, shown.predicted, shown.materials),
+                *likeness_rows(self._session.services.library, shown.predicted, materials),
             ]
         )
-        names, wavelengths = shown.materials.names, shown.materials.bands.centers_nm
-        colours = self._session.colours_of(shown.materials)
-        entries = zip(names, shown.abundances.tolist(), colours, strict=True)
-        self._bars.content = bars(entries)
-        lines = [Line("predicted", shown.predicted, _colour(shown))]
+        colours = self._session.colours_of(materials)
+        self._bars.content = bars(zip(materials.names, abundances.tolist(), colours, strict=True))
+        lines = [Line("predicted", shown.predicted, shown.colour)]
         if shown.measured is not None:
-            grey = (0.35, 0.35, 0.35)
-            lines.append(Line(f"measured, {shown.measured_in}", shown.measured, grey, is_dashed=True))
-        lines += [
-            Line(names[index], shown.contributions[index], colours[index], is_thin=True)
-            for index in np.flatnonzero(shown.abundances >= _SHOWN_SHARE)
-        ]
-        self._chart.draw(wavelengths, lines, shown.materials.quantity)
+            name = f"measured, {shown.measured_in}"
+            lines.append(Line(name, shown.measured, _MEASURED_COLOUR, is_dashed=True))
+        brightness = shown.found.values["scaled_abundances"]
+        for index in np.flatnonzero(abundances >= _SHOWN_SHARE):
+            added = brightness[index] * materials.endmembers[index].double().cpu().numpy()
+            lines.append(Line(materials.names[index], added, colours[index], is_thin=True))
+        self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         # Probes keep the light in which they were taken.
         quantities = " or ".join(sorted({one.materials.quantity for one in self._probes}))
-        every = [Line(f"probe {one.number}", one.predicted, _colour(one)) for one in self._probes]
-        self._comparison.draw(wavelengths, every, quantities)
+        every = [Line(f"probe {one.number}", one.predicted, one.colour) for one in self._probes]
+        self._comparison.draw(materials.bands.centers_nm, every, quantities)
 
     def _save(self) -> None:
         if not self._probes:
@@ -233,8 +225,8 @@ class ProbePanel:
         self._session.show_objects("probe", False)
         self._chosen.options = _NO_PROBES
         self._text.content, self._bars.content = paragraph(_INVITATION), ""
-        for chart in (self._chart, self._comparison):
-            chart.draw(np.zeros(0), ())
+        self._chart.draw()
+        self._comparison.draw()
 
     def _drop(self, one: _ProbedPoint) -> None:
         self._probes.remove(one)
@@ -260,16 +252,8 @@ def add_click_switch(
         x, y = (number(value, 0.0, 1.0, fallback=0.5) for value in place)
         work(camera, (min(x * camera.width, camera.width - 1), min(y * camera.height, camera.height - 1)))
 
-    switch.on_update(session.guarded(untick_others))
+    session.on_change(switch, untick_others)
     session.client.scene.on_click()(lambda event: session.guarded(lambda: clicked(*event.screen_pos))())
-
-
-def _label(one: _ProbedPoint) -> str:
-    return f"{one.number}: {one.name}"
-
-
-def _colour(one: _ProbedPoint) -> tuple[float, float, float]:
-    return _COLOURS[(one.number - 1) % len(_COLOURS)]
 
 
 _MOST_NUMBERS = 8
@@ -290,9 +274,8 @@ class ValuesPanel:
         self._text = session.client.gui.add_html(paragraph(_INVITATION))
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        column, row = place
         with self._session.services.maker.shown_turn(self._session.view.edit) as (_, shown):
-            found = shown.probe(camera, int(column), int(row))
+            found = shown.probe(camera, int(place[0]), int(place[1]))
         rows = [(name, _first_numbers(values)) for name, values in found.values.items()]
         if found.world_position is not None:
             rows.append(("position", ", ".join(f"{value:.3f}" for value in found.world_position)))

@@ -17,6 +17,7 @@ from unmix_plugin.trained.regions import InView, Region, check_name, polygon_mas
 from unmix_plugin.viewer.page import Chart, Line, bars, failures_said, paragraph, table, text
 from unmix_plugin.viewer.panels.probe import add_click_switch
 from unmix_plugin.viewer.session import Session
+from unmix_plugin.viewer.view_cameras import ViewPose
 
 _OUTLINE, _PART = "/outline", "/region"
 _COLOUR = (230, 30, 90)
@@ -37,24 +38,23 @@ class RegionsPanel:
         self._session = session
         self._camera: Cameras | None = None
         """From which the corners were clicked."""
+        self._pose: ViewPose | None = None
         self._corners: list[tuple[float, float]] = []
         """Column and row in its picture."""
         self._is_busy = False
         self._changed_at = session.services.regions.changed_at
         gui = session.client.gui
         add_click_switch(session, "draw where I click", self._take, is_on=False)
-        self._shape = gui.add_dropdown("shape", _SHAPES)
-        self._shape.on_update(session.guarded(self._forget))
+        self._shape = session.on_change(gui.add_dropdown("shape", _SHAPES), self._forget)
         self._text = gui.add_html(paragraph(_INVITATION))
         self._name = gui.add_text("region name", "")
         session.add_button("keep the region", self._keep)
-        session.add_button("forget the corners", self._forget, is_minor=True)
+        session.add_button("forget the corners", self._forget, "gray")
         self._progress = gui.add_html("")
-        self._chosen = gui.add_dropdown("region", _NO_REGION)
-        self._chosen.on_update(session.guarded(self._show_chosen))
+        self._chosen = session.on_change(gui.add_dropdown("region", _NO_REGION), self._show_chosen)
         self._found, self._bars = gui.add_html(""), gui.add_html("")
-        self._chart = Chart(gui, "mean spectrum", session.materials().quantity)
-        session.add_button("remove the region", self._remove, is_minor=True)
+        self._chart = Chart(gui, "mean spectrum")
+        session.add_button("remove the region", self._remove, "gray")
         session.guarded(lambda: self._list(_NO_REGION[0]))()
         session.on_tick.append(self._follow)
 
@@ -67,15 +67,11 @@ class RegionsPanel:
         return [(left, top), (right, top), (right, bottom), (left, bottom)]
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        before = self._camera
-        has_moved = before is not None and not (
-            torch.equal(before.camera_to_world, camera.camera_to_world)
-            and torch.equal(before.focal_px, camera.focal_px)
-            and before.width == camera.width
-        )
+        pose = self._session.pose()
+        has_moved = bool(self._corners) and pose != self._pose
         if has_moved or (self._shape.value == _SHAPES[0] and len(self._corners) == 2):
             self._corners = []
-        self._camera = camera
+        self._camera, self._pose = camera, pose
         self._corners.append(place)
         self._draw()
         begun = "The view has changed, so the outline begins here. " if has_moved else ""
@@ -142,21 +138,19 @@ class RegionsPanel:
         threading.Thread(target=work, name="unmix-viewer-region", daemon=True).start()
 
     def _list(self, chosen: str) -> None:
-        """Show the names of what is kept, and what one of them is."""
-        self._chosen.options = (*_NO_REGION, *self._session.services.regions.kept)
-        self._chosen.value = chosen
-        self._show_chosen()
+        """Show the names of what is kept, where they are others, and what one of them is, if it is kept still."""
+        names = (*_NO_REGION, *self._session.services.regions.kept)
+        if tuple(self._chosen.options) != names:
+            self._chosen.options = names
+            self._chosen.value = chosen if chosen in names else _NO_REGION[0]
+            self._show_chosen()
 
     def _follow(self) -> None:
         """Other pages and commands keep and remove regions, too."""
         changed_at = self._session.services.regions.changed_at
-        if changed_at == self._changed_at:
-            return
-        self._changed_at = changed_at
-        names = (*_NO_REGION, *self._session.services.regions.kept)
-        if tuple(self._chosen.options) != names:
-            chosen = str(self._chosen.value)
-            self._list(chosen if chosen in names else _NO_REGION[0])
+        if changed_at != self._changed_at:
+            self._changed_at = changed_at
+            self._list(str(self._chosen.value))
 
     def _show_chosen(self) -> None:
         self._show(None)  # numbers of another region never stand under this name while it is measured
@@ -176,7 +170,7 @@ class RegionsPanel:
         session.show_objects("region", found is not None)
         if found is None:
             self._found.content = self._bars.content = ""
-            self._chart.draw(np.zeros(0), ())
+            self._chart.draw()
             return
         region, surface = found
         scene, materials = surface.scene, surface.scene.materials
@@ -184,14 +178,12 @@ class RegionsPanel:
         if session.view.edit.has_recipe:
             rows.append(("of", "the run as it was trained, without edits"))
         self._found.content = table(rows)
-        entries = zip(materials.names, region.abundances.tolist(), session.colours_of(materials), strict=True)
-        self._bars.content = bars(entries)
+        colours = session.colours_of(materials)
+        self._bars.content = bars(zip(materials.names, region.abundances.tolist(), colours, strict=True))
         colour = [value / 255 for value in _COLOUR]
-        lines = [
-            Line("mean", region.mean, colour),
-            Line("mean + std. dev.", region.mean + region.spread, colour, is_dashed=True, is_thin=True),
-            Line("mean - std. dev.", region.mean - region.spread, colour, is_dashed=True, is_thin=True),
-        ]
+        lines = [Line("mean", region.mean, colour)]
+        for name, spread in (("mean + std. dev.", region.spread), ("mean - std. dev.", -region.spread)):
+            lines.append(Line(name, region.mean + spread, colour, is_dashed=True, is_thin=True))
         self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         part = surface.mesh.select(region.faces)
         if len(part.faces):

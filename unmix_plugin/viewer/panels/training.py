@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.engine.training.training_control import SHARE_BOUNDS
-from unmix_plugin.viewer.page import Chart, Line, number, table
+from unmix_plugin.viewer.page import Chart, Line, number_of, table
 from unmix_plugin.viewer.session import Session
 
-_LOSS_COLOUR, _PSNR_COLOUR = (0.85, 0.3, 0.1), (0.1, 0.4, 0.8)
+_CURVES = (("loss", "loss", (0.85, 0.3, 0.1)), ("psnr", "PSNR (dB)", (0.1, 0.4, 0.8)))
+"""Names in the status, what users read, colours."""
+
 _TICKS_A_CHART = 4
 
 
@@ -22,24 +26,15 @@ class TrainingPanel:
         gui = session.client.gui
         self._state = gui.add_html("")
         self._bar = gui.add_progress_bar(0.0)
-        self._pause = gui.add_button("pause")
-        self._pause.on_click(session.guarded(self._toggle))
+        self._pause = session.add_button("pause", self._toggle)
         save = session.add_button("save a checkpoint", self._save)
         self._sure = gui.add_checkbox("really stop", False)
-        stop = gui.add_button("stop training", color="red")
-        stop.on_click(session.guarded(self._stop))
+        stop = session.add_button("stop training", self._stop, "red")
         self._steering = (self._pause, save, self._sure, stop)
-        low, high = SHARE_BOUNDS
-        self._share = gui.add_slider(
-            "viewer's share",
-            low,
-            high,
-            0.05,
-            control.device.guest_share,
-            hint="Of the device's time, while someone moves.",
-        )
-        self._share.on_update(session.guarded(self._change_share))
-        self._loss, self._psnr = (Chart(gui, title, title, "step") for title in ("loss", "PSNR (dB)"))
+        hint = "Of the device's time, while someone moves."
+        share = gui.add_slider("viewer's share", *SHARE_BOUNDS, 0.05, control.device.guest_share, hint=hint)
+        self._share = session.on_change(share, self._change_share)
+        self._charts = [Chart(gui, title, "step") for _, title, _ in _CURVES]
         self._tick()
         session.on_tick.append(self._tick)
 
@@ -52,12 +47,12 @@ class TrainingPanel:
             steering.disabled = not control.is_running
         self._bar.value = 0.0 if status is None else 100 * status.progress
         if self._ticks % _TICKS_A_CHART == 0:
-            for chart, name, colour in (
-                (self._loss, "loss", _LOSS_COLOUR),
-                (self._psnr, "psnr", _PSNR_COLOUR),
-            ):
-                steps, values = self._session.services.curve.line(name)
-                chart.draw(steps, [Line(name, values, colour)])
+            curve = self._session.services.curve
+            steps = np.array([float(point.step) for point in curve])
+            for chart, (name, title, colour) in zip(self._charts, _CURVES, strict=True):
+                values = [getattr(point, name) for point in curve]
+                lines = [] if None in values else [Line(name, np.array(values), colour)]
+                chart.draw(steps, lines, title)
         self._ticks += 1
 
     def _condition(self) -> str:
@@ -80,28 +75,26 @@ class TrainingPanel:
         self._session.say("saving", "a checkpoint is saved after the step under way")
 
     def _stop(self) -> None:
-        if self._sure.value is not True:
+        if self._sure.value is True:
+            self._control.request_stop()
+        else:
             self._session.say("stop?", "tick the box above first: training ends, saved, and can be resumed")
-            return
-        self._control.request_stop()
 
     def _change_share(self) -> None:
-        self._control.device.guest_share = number(
-            self._share.value, *SHARE_BOUNDS, fallback=self._control.device.guest_share
-        )
+        device = self._control.device
+        device.guest_share = number_of(self._share, device.guest_share)
 
 
 def _rows(status: TrainingStatus | None, condition: str, is_running: bool) -> list[tuple[str, str]]:
-    if status is None:
-        return [("training", condition)]
-    rows = [
-        ("training", condition),
-        ("step", f"{status.step}, {100 * status.progress:.0f} %"),
-        ("loss", f"{status.loss:.4g}"),
-        ("PSNR of the batch", "-" if status.psnr is None else f"{status.psnr:.2f} dB"),
-    ]
-    if is_running:
-        left = status.seconds_left
-        rows.append(("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"))
-        rows.append(("time left", "-" if left is None else f"{left:.0f} s of training"))
+    rows = [("training", condition)]
+    if status is not None:
+        psnr, left = status.psnr, status.seconds_left
+        rows += [
+            ("step", f"{status.step}, {100 * status.progress:.0f} %"),
+            ("loss", f"{status.loss:.4g}"),
+            ("PSNR of the batch", "-" if psnr is None else f"{psnr:.2f} dB"),
+        ]
+        if is_running:
+            rows.append(("speed", f"{status.rays_per_second / 1000:.1f} k rays/s"))
+            rows.append(("time left", "-" if left is None else f"{left:.0f} s of training"))
     return rows

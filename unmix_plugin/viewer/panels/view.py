@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.maps.indices import available_indices
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
-from unmix_plugin.viewer.page import Debounced, choice, index_in, number, text
-from unmix_plugin.viewer.recipes import visibility
+from unmix_plugin.viewer.page import Debounced, choice, index_in, number, number_of, text
+from unmix_plugin.viewer.recipes import is_shown
 from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, SUBPIXEL_BOUNDS
 from unmix_plugin.viewer.rendering.scene import Edit
@@ -37,6 +37,10 @@ if TYPE_CHECKING:
     import viser
 
 _NO_INDEX = "none for these bands"
+_FORMULA_HINT = (
+    "Such as (r650-r550)/(r650+r550), where r650 is the reflectance at 650 nm; or absorption:centre:650-700 (or depth, "
+    "area); empty: the index above."
+)
 
 
 class LayerPanel:
@@ -47,48 +51,51 @@ class LayerPanel:
         self._settings = settings = session.view.settings
         self._gui = session.client.gui
         self._of_control: dict[str, list[Any]] = {}
-        self._is_filling = False
         self._layers = session.services.maker.layers
-        titles = {one.title: name for name, one in self._layers.items()}
-        shown = layer_named(settings.layer, self._layers).title
-        layer = self._gui.add_dropdown("layer", tuple(titles), initial_value=shown)
-        self._connect(layer, "layer", read=lambda: titles.get(layer.value, layer.value))
+        self._add_menu("layer", "layer", {name: one.title for name, one in self._layers.items()})
         if session.services.has_materials:
             self._add_spectral(session.materials())
-        self._add_scale()
+        self._add_menu("colour map", "colour_map", {name: name for name in COLOUR_MAPS}, "scale")
+        self._add_range()
         exposure = self._gui.add_slider("exposure (stops)", *EXPOSURE_BOUNDS, 0.1, settings.exposure_ev)
         self._connect(exposure, "exposure_ev", "tone")
         self._connect(self._gui.add_slider("gamma", *GAMMA_BOUNDS, 0.05, settings.gamma), "gamma", "tone")
-        transforms = {title: name for name, title in VIEW_TRANSFORMS.items()}
-        shown = VIEW_TRANSFORMS[settings.view_transform]
-        transform = self._gui.add_dropdown("highlights", tuple(transforms), initial_value=shown)
-        self._connect(transform, "view_transform", "tone", lambda: transforms.get(transform.value))
-        backgrounds = tuple(BACKGROUNDS)
-        background = self._gui.add_dropdown("background", backgrounds, initial_value=settings.background)
-        self._connect(background, "background")
+        self._add_menu("highlights", "view_transform", VIEW_TRANSFORMS, "tone")
+        self._add_menu("background", "background", {name: name for name in BACKGROUNDS})
         self._show_controls()
+
+    def _add_menu(self, label: str, setting: str, titles: Mapping[Any, str], kind: str | None = None) -> None:
+        """A menu of the values of a setting, by what users read of them."""
+        names = {title: name for name, title in titles.items()}
+        shown = titles[getattr(self._settings, setting)]
+        menu = self._gui.add_dropdown(label, tuple(names), initial_value=shown)
+        self._connect(menu, setting, kind, lambda: names.get(menu.value, menu.value))
 
     def _add_spectral(self, materials: Materials) -> None:
         """What is chosen by wavelength, by endmember or by an index."""
         bands, settings = materials.bands, self._settings
         low_nm, high_nm = float(bands.edges_nm[0]), float(bands.edges_nm[-1])
         step = round(max((high_nm - low_nm) / 500, 0.01), 2)
-        start = covered(bands, settings.wavelength_nm)
-        wavelength = self._gui.add_slider("wavelength (nm)", low_nm, high_nm, step, start)
-        self._connect(wavelength, "wavelength_nm", "wavelength")
-        sliders = [
+        wavelength, *sliders = (
             self._gui.add_slider(f"{name} (nm)", low_nm, high_nm, step, start)
-            for name, start in zip(("red", "green", "blue"), settings.false_colour_nm, strict=True)
-        ]
-        for slider in sliders:
-            self._connect(
-                slider, "false_colour_nm", "false-colour", lambda: tuple(one.value for one in sliders)
+            for name, start in zip(
+                ("wavelength", "red", "green", "blue"),
+                (covered(bands, settings.wavelength_nm), *settings.false_colour_nm),
+                strict=True,
             )
+        )
+        self._connect(wavelength, "wavelength_nm", "wavelength")
+
+        def false_colour() -> tuple[float, ...]:
+            return tuple(slider.value for slider in sliders)
+
+        for slider in sliders:
+            self._connect(slider, "false_colour_nm", "false-colour", false_colour)
         name = materials.names[min(settings.endmember, len(materials.names) - 1)]
         self._endmember = self._gui.add_dropdown("endmember", materials.names, initial_value=name)
         self._connect(self._endmember, "endmember", "endmember", lambda: index_in(self._endmember))
-        self._add_index(bands)
         self._session.on_edit.append(self._show_names)
+        self._add_index(bands)
 
     def _show_names(self) -> None:
         """Endmembers may have other names."""
@@ -99,43 +106,32 @@ class LayerPanel:
 
     def _add_index(self, bands: Bands) -> None:
         """The named indices that the bands allow, and a formula that overrides them."""
-        names = tuple(available_indices(bands))
-        options, index = names or (_NO_INDEX,), self._settings.index
-        known = self._gui.add_dropdown(
-            "index", options, initial_value=index if index in names else options[0]
-        )
-        formula = self._gui.add_text(
-            "formula",
-            "" if index in names else index,
-            hint="Such as (r650-r550)/(r650+r550), where r650 is the reflectance at 650 nm; or "
-            "absorption:centre:650-700 (or depth, area); empty: the index above.",
-        )
+        names, index = tuple(available_indices(bands)), self._settings.index
+        options = names or (_NO_INDEX,)
+        first, typed = (index, "") if index in names else (options[0], index)
+        known = self._gui.add_dropdown("index", options, initial_value=first)
+        formula = self._gui.add_text("formula", typed, hint=_FORMULA_HINT)
 
         def chosen() -> str:
             return text(formula.value).strip() or (text(known.value) if names else "")
 
         self._connect(known, "index", "index", chosen)
         self._of_control["index"].append(formula)
-        typed = Debounced(lambda: self._change("index", chosen))
-        formula.on_update(self._session.guarded(typed.note))
-        self._session.on_tick.append(typed.tick)
+        waiting = Debounced(lambda: self._change("index", chosen()))
+        self._session.on_change(formula, waiting.note)
+        self._session.on_tick.append(waiting.tick)
 
-    def _add_scale(self) -> None:
-        colour_map = self._gui.add_dropdown(
-            "colour map", COLOUR_MAPS, initial_value=self._settings.colour_map
-        )
-        self._connect(colour_map, "colour_map", "scale")
-        own_range = self._settings.value_range
-        is_own = self._gui.add_checkbox(
-            "own range", own_range is not None, hint="Choose the values at the ends of the colour map."
-        )
+    def _add_range(self) -> None:
+        """The ends of the colour map: the layer's, or one's own, which begin as they were."""
+        own_range, hint = self._settings.value_range, "Choose the values at the ends of the colour map."
+        is_own = self._gui.add_checkbox("own range", own_range is not None, hint=hint)
         ends = [
             self._gui.add_number(label, value, step=1e-4)
             for label, value in zip(("low", "high"), own_range or (0.0, 1.0), strict=True)
         ]
 
-        def value_range() -> tuple[Any, ...] | None:
-            if not is_own.value or self._is_filling:
+        def read() -> tuple[float, ...] | None:
+            if not is_own.value:
                 return None
             low, high = (number(end.value, -math.inf, math.inf, fallback=math.nan) for end in ends)
             if low >= high:
@@ -144,18 +140,17 @@ class LayerPanel:
                 )
             return low, high
 
-        def start_from_shown() -> None:
-            if is_own.value and self._session.value_range_shown is not None:
-                shown = self._session.value_range_shown
-                self._is_filling = True
-                for end, value in zip(ends, shown, strict=True):
-                    end.value = value
-                self._is_filling = False
+        def start() -> None:
+            shown = self._session.value_range_shown
+            if is_own.value and shown is not None:
+                with self._session.filling():
+                    for end, value in zip(ends, shown, strict=True):
+                        end.value = value
 
-        is_own.on_update(self._session.guarded(start_from_shown))
-        self._connect(is_own, "value_range", "scale", value_range)
+        self._session.on_change(is_own, start)
+        self._connect(is_own, "value_range", "scale", read)
         for end in ends:
-            self._connect(end, "value_range", "own-range", value_range)
+            self._connect(end, "value_range", "own-range", read)
 
     def _connect(
         self, control: Any, setting: str, kind: str | None = None, read: Callable[[], Any] | None = None
@@ -163,11 +158,12 @@ class LayerPanel:
         """Let a control, or what `read` says, change a setting, checked; show it only for layers that have its kind."""
         if kind is not None:
             self._of_control.setdefault(kind, []).append(control)
-        read = read or (lambda: control.value)
-        control.on_update(self._session.guarded(lambda: self._change(setting, read)))
+        self._session.on_change(
+            control, lambda: self._change(setting, control.value if read is None else read())
+        )
 
-    def _change(self, setting: str, read: Callable[[], Any]) -> None:
-        self._settings = self._settings.changed(setting, read())
+    def _change(self, setting: str, value: Any) -> None:
+        self._settings = self._settings.changed(setting, value)
         if setting in ("layer", "value_range"):
             self._show_controls()
         if setting == "layer":
@@ -191,28 +187,20 @@ class LightPanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._lights = session.services.lights
-        gui, light = session.client.gui, session.view.edit.light
-        name = choice(light.name, self._lights, self._lights[0])
-        self._name = gui.add_dropdown("environment", self._lights, initial_value=name)
+        gui, light, lights = session.client.gui, session.view.edit.light, session.services.lights
+        hint = "Of the light itself; the exposure of the picture is under view."
+        name = choice(light.name, lights, lights[0])
+        self._name = gui.add_dropdown("environment", lights, initial_value=name)
         self._rotation = gui.add_slider("turned by (deg)", *_ROTATION_BOUNDS, 1.0, light.rotation_deg)
         self._exposure = gui.add_slider(
-            "brightness (stops)",
-            *_BRIGHTNESS_BOUNDS,
-            0.1,
-            light.exposure_stops,
-            hint="Of the light itself; the exposure of the picture is under view.",
+            "brightness (stops)", *_BRIGHTNESS_BOUNDS, 0.1, light.exposure_stops, hint=hint
         )
         for control in (self._name, self._rotation, self._exposure):
-            control.on_update(session.guarded(self._change))
+            session.on_change(control, self._change)
 
     def _change(self) -> None:
-        name = choice(self._name.value, self._lights, self._lights[0])
-        light = LightChoice(
-            None if name == self._lights[0] else name,
-            number(self._rotation.value, *_ROTATION_BOUNDS, fallback=0.0),
-            number(self._exposure.value, *_BRIGHTNESS_BOUNDS, fallback=0.0),
-        )
+        name = choice(self._name.value, self._session.services.lights[1:], None)
+        light = LightChoice(name, number_of(self._rotation, 0.0), number_of(self._exposure, 0.0))
         view = self._session.view
         self._session.services.loop.change(view, edit=Edit(view.edit.recipe, light))
 
@@ -238,23 +226,18 @@ class ScenePanel:
         with gui.add_folder("camera"):
             self._view = gui.add_dropdown("view of the scene", tuple(self._views))
             session.add_button("look from there", self._look_from_view)
+        view, height = (
+            session.view,
+            "Of the finest picture, which comes when the camera rests; more takes longer.",
+        )
+        rays = "Rays along the edge of a pixel, 1 to 4: 2 takes four times as long as 1."
         with gui.add_folder("quality"):
             self._height = gui.add_slider(
-                "picture height (px)",
-                *HEIGHT_BOUNDS,
-                _HEIGHT_STEP,
-                session.view.largest_height,
-                hint="Of the finest picture, which comes when the camera rests; more takes longer.",
+                "picture height (px)", *HEIGHT_BOUNDS, _HEIGHT_STEP, view.largest_height, hint=height
             )
-            self._subpixels = gui.add_slider(
-                "smooth edges",
-                *SUBPIXEL_BOUNDS,
-                1,
-                session.view.subpixels,
-                hint="Rays along the edge of a pixel, 1 to 4: 2 takes four times as long as 1.",
-            )
+            self._subpixels = gui.add_slider("smooth edges", *SUBPIXEL_BOUNDS, 1, view.subpixels, hint=rays)
         for control in (self._height, self._subpixels):
-            control.on_update(session.guarded(self._change_quality))
+            session.on_change(control, self._change_quality)
         with gui.add_folder("objects"):
             self._add_switch("cameras", self._add_cameras)
             self._add_switch("scene box", self._add_box)
@@ -265,21 +248,19 @@ class ScenePanel:
     def _renew_points(self) -> None:
         """Materials may have other colours, or be hidden."""
         if "point cloud" in self._objects:
-            for handle in self._objects["point cloud"]:
-                handle.remove()
-            self._objects["point cloud"] = self._add_points()
+            self._show("point cloud", self._add_points)
 
     def _add_switch(self, label: str, make: Callable[[], list[Any]]) -> None:
         switch = self._session.client.gui.add_checkbox(label, False)
+        self._session.on_change(switch, lambda: self._show(label, make if switch.value is True else None))
 
-        def change() -> None:
-            for handle in self._objects.pop(label, []):
-                handle.remove()
-            if switch.value is True:
-                self._objects[label] = make()
-            self._session.show_objects("scene", bool(self._objects))
-
-        switch.on_update(self._session.guarded(change))
+    def _show(self, label: str, make: Callable[[], list[Any]] | None) -> None:
+        """Show objects that are made anew, or none."""
+        for handle in self._objects.pop(label, []):
+            handle.remove()
+        if make is not None:
+            self._objects[label] = make()
+        self._session.show_objects("scene", bool(self._objects))
 
     def _look_from_view(self) -> None:
         name = str(self._view.value)
@@ -288,8 +269,8 @@ class ScenePanel:
         self._session.look_from(self._views[name])
 
     def _change_quality(self) -> None:
-        height = int(number(self._height.value, *HEIGHT_BOUNDS, fallback=DEFAULT_HEIGHT))
-        subpixels = int(number(self._subpixels.value, *SUBPIXEL_BOUNDS, fallback=1))
+        height = int(number_of(self._height, DEFAULT_HEIGHT))
+        subpixels = int(number_of(self._subpixels, 1))
         self._session.services.loop.change(self._session.view, largest_height=height, subpixels=subpixels)
 
     def _add_cameras(self) -> list[viser.CameraFrustumHandle]:
@@ -330,10 +311,10 @@ class ScenePanel:
         are too many."""
         aids, materials = self._session.services.maker.aids.for_layers(), self._session.materials()
         assert aids is not None
-        hidden, isolated = visibility(self._session.history.present)
-        is_shown = [i not in hidden and (not isolated or i in isolated) for i in range(len(materials.names))]
+        recipe = self._session.history.present
+        are_shown = np.array([is_shown(recipe, index) for index in range(len(materials.names))])
         main = aids.reference.abundances.argmax(dim=-1).cpu().numpy()
-        spectra, kept = aids.reference_spectra(materials), np.array(is_shown)[main]
+        spectra, kept = aids.reference_spectra(materials), are_shown[main]
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
         colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()[kept]
         points = aids.reference_points.cpu().numpy()[kept]

@@ -28,7 +28,7 @@ class RunRegions:
         self._measuring, self._keeping = threading.Lock(), threading.Lock()
         """Apart, since finding the surface takes minutes, in which regions are kept and removed all the same."""
         self._surface: MeasuredSurface | None = None
-        self._measured: dict[str, MeasuredRegion] = {}
+        self._measured: dict[str, tuple[MeasuredRegion, MeasuredSurface]] = {}
         """By what a region is, as JSON: names may be given anew."""
 
     @property
@@ -44,8 +44,7 @@ class RunRegions:
 
     def measured(self, region: Region) -> tuple[MeasuredRegion, MeasuredSurface] | None:
         """What a region is, and on which surface; None if it was not measured yet."""
-        found = self._measured.get(json.dumps(region_to_json(region)))
-        return None if found is None or self._surface is None else (found, self._surface)
+        return self._measured.get(json.dumps(region_to_json(region)))
 
     def measure(self, name: str, region: Region, show: Callable[[str], None]) -> MeasuredRegion:
         """What a region of the unedited scene is.
@@ -63,7 +62,7 @@ class RunRegions:
             show(f"measuring {name}")
             with self._turn():
                 found = surface.measure(region, name)
-            self._measured[json.dumps(region_to_json(region))] = found
+            self._measured[json.dumps(region_to_json(region))] = (found, surface)
             return found
 
     def keep(self, name: str, region: Region | None) -> None:
