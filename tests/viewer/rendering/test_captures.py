@@ -33,7 +33,6 @@ from unmix_plugin.viewer.rendering.captures import (
     render_argv,
 )
 from unmix_plugin.viewer.rendering.painting import LAYERS
-from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
 from unmix_plugin.viewer.view_cameras import sized_camera
@@ -47,10 +46,11 @@ def services(source):
 
 
 def captured(services, camera, take):
-    """Capture a picture strip by strip; what it ended with, and the parts told."""
-    reasons, parts = queue.Queue(), []
-    services.loop.capture(Capture(camera, Edit(), 1, take, reasons.put, parts.append))
-    return reasons.get(timeout=120), parts
+    """Take a picture strip by strip; the parts told."""
+    parts = []
+    for strip in services.loop.strips(camera, Edit(), 1, threading.Event(), parts.append):
+        take(*strip)
+    return parts
 
 
 @pytest.mark.parametrize("layer", ["rgb", "depth", "segmentation"])
@@ -62,8 +62,7 @@ def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, 
     def take(row, frame):
         pixels[row : row + frame.camera.height] = services.maker.paint(frame, settings, False, False).picture
 
-    reason, parts = captured(services, camera, take)
-    assert reason == ""
+    parts = captured(services, camera, take)
     assert len(parts) >= 8
     assert parts == sorted(parts)
     assert parts[-1] == pytest.approx(1.0)
@@ -78,10 +77,9 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
     if is_line:
         ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
-    canvas = SpectraCanvas(camera, 5)
-    reason, _ = captured(services, camera, canvas.take)
-    assert reason == ""
     frame = make_frame(source, camera)
+    canvas = SpectraCanvas(camera, frame.materials)
+    captured(services, camera, canvas.take)
     np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
     np.testing.assert_allclose(canvas.coverage, frame.coverage.numpy(), atol=1e-5)
 
@@ -90,7 +88,7 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
 def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_path, light, quantity):
     frame = make_frame(source, sized_camera(some_pose(), 17, 13))
     scene = replace(frame.scene, materials=replace(frame.materials, light=light))
-    canvas = SpectraCanvas(frame.camera, 5)
+    canvas = SpectraCanvas(frame.camera, scene.materials)
     canvas.take(0, replace(frame, scene=scene))
     file = OpenEXR.File(str(canvas.write(tmp_path / "view.exr")), separate_channels=True)
     assert file.header()["comments"] == f"{quantity} on black, 1 = full scale"
@@ -98,21 +96,24 @@ def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_
     assert sum(name.startswith(f"{layer}.") for name in file.channels()) == 5
 
 
-def test_a_strip_that_cannot_be_taken_ends_the_capture(services, caplog):
-    def refuse(*_):
-        raise OSError("the disk is full")
-
-    reason, _ = captured(services, sized_camera(some_pose(), 16, 16), refuse)
-    assert reason == "the picture could not be handed over: OSError: the disk is full"
+def test_a_picture_that_is_cancelled_or_left_ends_and_a_strip_that_is_not_taken_keeps_nobody_waiting(
+    services,
+):
+    camera, cancelled = sized_camera(some_pose(), 16, 16), threading.Event()
+    cancelled.set()
+    with pytest.raises(ConfigError, match="cancelled"):
+        next(services.loop.strips(camera, Edit(), 1, cancelled))
+    assert captured(services, camera, lambda *_: None)[-1] == 1.0
     services.stop()
-    assert "the disk is full" in caplog.text
+    with pytest.raises(ConfigError, match="the viewer was stopped"):
+        captured(services, camera, lambda *_: None)
 
 
 @pytest.mark.parametrize(
     ("size", "message"),
     [
-        ((8192, 8192, None), "67108864|too many for one picture"),
-        ((4096, 4096, 31), "spectra of 4096 x 4096 pixels"),
+        ((8192, 8192, None), "8192 x 8192 pixels are too many for pictures in the viewer; .* 33.6 million"),
+        ((4096, 4096, 31), "4096 x 4096 pixels are too many for spectra in the viewer; .* 4.3 million"),
     ],
 )
 def test_pictures_that_would_not_fit_are_refused(size, message):
@@ -151,19 +152,23 @@ def test_a_wavelength_in_a_gap_of_the_bands_goes_by_the_band_that_is_shown():
     assert output_of(replace(settings, layer="false-colour"), bands) == "false-colour:1330,1330,1000"
 
 
-def test_what_a_video_has_otherwise_than_the_page_is_said():
-    def said(**settings):
-        shown = LayerSettings(**settings)
-        return differences(shown, LAYERS[shown.layer].controls)
-
-    assert said() == said(layer="segmentation") == said(layer="false-colour", colour_map="magma") == []
-    assert said(exposure_ev=1.0) == said(gamma=2.0) == said(view_transform="agx") != []
-    assert said(layer="segmentation", exposure_ev=1.0, background="black") == ["light grey behind it"]
-    assert "side by side" in said(layer="abundance")[0]
-    assert "side by side" in said(layer="abundances")[0]
-    assert "grey values" in said(layer="band", colour_map="magma")[0]
-    assert "range of its own" in said(layer="depth")[0]
-    assert "principal components" in said(layer="pca")[0]
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        *(({"layer": layer}, []) for layer in ("rgb", "segmentation", "false-colour")),
+        *(({name: value}, ["exposure"]) for name, value in (("exposure_ev", 1.0), ("view_transform", "agx"))),
+        ({"layer": "segmentation", "exposure_ev": 1.0, "background": "black"}, ["light grey behind it"]),
+        *(({"layer": layer}, ["side by side"]) for layer in ("abundance", "abundances")),
+        ({"layer": "band", "colour_map": "magma"}, ["grey values"]),
+        ({"layer": "depth"}, ["range of its own"]),
+        ({"layer": "pca"}, ["principal components"]),
+    ],
+)
+def test_what_a_video_has_otherwise_than_the_page_is_said(settings, expected):
+    shown = LayerSettings(**settings)
+    found = differences(shown, LAYERS[shown.layer].controls)
+    assert len(found) == len(expected)
+    assert all(words in said for words, said in zip(expected, found, strict=True))
 
 
 def test_the_words_are_those_of_the_command(tmp_path):
@@ -172,8 +177,7 @@ def test_the_words_are_those_of_the_command(tmp_path):
     options = tyro.cli(RenderOptions, args=render_argv(*paths, light))
     assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
     assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
-    assert options.edits == tmp_path / "recipe.yml"
-    assert options.environment == "studio"
+    assert (options.edits, options.environment) == (tmp_path / "recipe.yml", "studio")
     assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
     plain = tyro.cli(RenderOptions, args=render_argv(*paths[:4], None))
     assert (plain.edits, plain.environment) == (None, RenderOptions().environment)
@@ -189,18 +193,16 @@ class Ending:
     """A video, and how it ended."""
 
     def __init__(self, folder):
-        self.parts, self._ends = [], queue.Queue()
-        self.job = VideoJob(["--some", "words"], folder, self.parts.append, lambda *end: self._ends.put(end))
+        self.parts, self.begun, self._ends = [], threading.Event(), queue.Queue()
+        self.job = VideoJob(["--some", "words"], folder, self._note, lambda *end: self._ends.put(end))
+
+    def _note(self, part):
+        self.parts.append(part)
+        self.begun.set()
 
     def wait(self):
         """The video and the reason why there is none."""
         return self._ends.get(timeout=120)
-
-
-def rendered(folder):
-    one = Ending(folder)
-    VideoQueue().start(one.job)
-    return *one.wait(), one.parts
 
 
 FOLLOWED = "list(follow(Console(), 'rendering', [1, 2])); print('other'); print('rendering: 1 of 4 done')"
@@ -222,10 +224,12 @@ def test_a_video_or_the_reason_why_there_is_none_is_told_and_progress(
         "import sys; from rich.console import Console; from unmix_plugin.commands.reporting import follow\n"
     )
     run_instead(imports + code.format(str(tmp_path / "a.mp4")))
-    found, said, told = rendered(tmp_path)
+    one = Ending(tmp_path)
+    VideoQueue().start(one.job)
+    found, said = one.wait()
     assert found == (name and tmp_path / name)
     assert reason is None or said == reason
-    assert told == parts
+    assert one.parts == parts
 
 
 WAIT = "import sys, time, pathlib; print('rendering: 0 of 1 done', flush=True); time.sleep(60)"
@@ -234,10 +238,8 @@ WAIT = "import sys, time, pathlib; print('rendering: 0 of 1 done', flush=True); 
 def test_videos_are_rendered_in_turn_and_can_be_cancelled(tmp_path, run_instead):
     run_instead(WAIT)
     videos, first, second, third = VideoQueue(), *(Ending(tmp_path) for _ in range(3))
-    begun = threading.Event()
-    first.job.progress = lambda _: begun.set()
     videos.start(first.job)
-    assert begun.wait(120)
+    assert first.begun.wait(120)
     videos.start(second.job)
     videos.cancel(second.job)
     run_instead("print('rendering: 1 of 1 done')")
@@ -261,10 +263,9 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
         "import subprocess, sys; child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)']);"
         "print('rendering: 0 of 1 done', flush=True); child.wait()"
     )
-    videos, one, begun = VideoQueue(), Ending(tmp_path), threading.Event()
-    one.job.progress = lambda _: begun.set()
+    videos, one = VideoQueue(), Ending(tmp_path)
     videos.start(one.job)
-    assert begun.wait(120)
+    assert one.begun.wait(120)
     videos.stop()
     # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
     assert one.wait() == (None, "cancelled")

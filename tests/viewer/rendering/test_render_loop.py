@@ -22,7 +22,6 @@ from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, _num_channels
-from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import camera_of
@@ -256,27 +255,6 @@ def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen
     assert len(screen.shown) == count
     assert screen.view.frame is None
     assert loop._views == []
-
-
-def test_a_capture_that_is_cancelled_or_left_is_told_so(loop):
-    reasons = []
-    for _ in range(2):
-        loop.capture(Capture(camera_of(some_pose(), 400), Edit(), 1, unwanted, reasons.append))
-    loop._captures[0].is_cancelled = True
-    assert loop.step()
-    loop.stop()
-    assert reasons == ["cancelled", "the viewer was stopped"]
-
-
-def test_a_capture_that_ends_while_the_loop_is_stopped_is_told_once(loop):
-    reasons, camera = [], camera_of(some_pose(), 16)
-    loop.capture(Capture(camera, Edit(), 1, unwanted, reasons.append, lambda _: loop.stop()))
-    finish(loop)
-    assert reasons == ["the viewer was stopped"]
-
-
-def unwanted(*_):
-    raise AssertionError("this capture has no end")
 
 
 @pytest.fixture

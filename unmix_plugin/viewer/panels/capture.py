@@ -18,7 +18,7 @@ from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.trained.camera_files import camera_file_bytes
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.trained.run_views import RunView, world_frame
-from unmix_plugin.viewer.page import new_file, number
+from unmix_plugin.viewer.page import failures_said, index_in, new_file, number, number_of
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
     SpectraCanvas,
@@ -29,13 +29,10 @@ from unmix_plugin.viewer.rendering.captures import (
     render_argv,
 )
 from unmix_plugin.viewer.rendering.painting import layer_named
-from unmix_plugin.viewer.rendering.render_loop import Capture
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import ViewPose, camera_of, path_poses, sized_camera
 
 _MOST_KEY_FRAMES = 100
-_SECONDS_BOUNDS = (0.5, 120.0)
-_FPS_BOUNDS = (1, 60)
 _PREVIEW_FPS = 12
 _LARGEST_DOWNLOAD = 1 << 26
 _NO_KEYS: tuple[str, ...] = ("none yet",)
@@ -46,14 +43,17 @@ class CapturePanel:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._capture: Capture | None = None
+        self._capture: threading.Event | None = None
+        """Set to cancel the picture that is being rendered."""
         self._video: VideoJob | None = None
         self._keys: list[ViewPose] = []
         self._preview = threading.Event()
         gui = session.client.gui
+        low, high = SIDE_BOUNDS
         with gui.add_folder("picture"):
-            self._width = gui.add_number("width", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
-            self._height = gui.add_number("height", 1024, min=SIDE_BOUNDS[0], max=SIDE_BOUNDS[1], step=1)
+            self._width, self._height = (
+                gui.add_number(label, 1024, min=low, max=high, step=1) for label in ("width", "height")
+            )
             self._name = gui.add_text("file name", "view")
             self._progress = gui.add_progress_bar(0.0)
             session.add_button("save a screenshot (PNG)", self._save_picture)
@@ -63,13 +63,10 @@ class CapturePanel:
         with gui.add_folder("camera path"):
             session.add_button("add a key frame here", self._add_key)
             self._key = gui.add_dropdown("key frame", _NO_KEYS)
-            keys = gui.add_button_group("this one", ("look", "replace", "remove"))
-            keys.on_click(session.guarded(lambda: self._change_key(str(keys.value))))
-            low, high = _SECONDS_BOUNDS
-            self._seconds = gui.add_number("seconds", 4.0, min=low, max=high, step=0.5)
-            self._fps = gui.add_number("frames a second", 24, min=_FPS_BOUNDS[0], max=_FPS_BOUNDS[1], step=1)
-            preview = gui.add_button_group("preview", ("play", "stop"))
-            preview.on_click(session.guarded(lambda: self._play(preview.value == "play")))
+            session.add_buttons("this one", ("look", "replace", "remove"), self._change_key)
+            self._seconds = gui.add_number("seconds", 4.0, min=0.5, max=120.0, step=0.5)
+            self._fps = gui.add_number("frames a second", 24, min=1, max=60, step=1)
+            session.add_buttons("preview", ("play", "stop"), self._play)
             session.add_button("save the path", lambda: session.say("saved", str(self._save_path())))
             session.add_button("render a video", self._render_video)
             session.add_button("cancel the video", self._cancel_video, "gray")
@@ -82,7 +79,7 @@ class CapturePanel:
 
     def _cancel(self) -> None:
         if self._capture is not None:
-            self._capture.is_cancelled = True
+            self._capture.set()
 
     def _camera(self, num_bands: int | None = None) -> Cameras:
         """What the client sees, in the size asked for, which is checked: the vertical field of view stays."""
@@ -102,36 +99,37 @@ class CapturePanel:
             strip = maker.paint(frame, settings, False, False).picture
             pixels[row : row + len(strip)] = strip
 
-        def finish() -> None:
-            what = f"{settings.layer}, {camera.width} x {camera.height} pixels"
-            self._hand_over(write_file(path, rgba_png_bytes(pixels, what)))
-
-        self._begin(camera, take, finish)
+        what = f"{settings.layer}, {camera.width} x {camera.height} pixels"
+        self._begin(camera, take, lambda: write_file(path, rgba_png_bytes(pixels, what)))
 
     def _save_spectra(self) -> None:
-        num_bands = len(self._session.materials().bands)
-        camera = self._camera(num_bands)
-        canvas, path = SpectraCanvas(camera, num_bands), self._new_file(".exr")
-        self._begin(camera, canvas.take, lambda: self._hand_over(canvas.write(path)))
+        materials = self._session.materials()
+        camera = self._camera(len(materials.bands))
+        canvas, path = SpectraCanvas(camera, materials), self._new_file(".exr")
+        self._begin(camera, canvas.take, lambda: canvas.write(path))
 
     def _begin(
-        self, camera: Cameras, take: Callable[[int, RenderedView], None], finish: Callable[[], None]
+        self, camera: Cameras, take: Callable[[int, RenderedView], None], write: Callable[[], Path]
     ) -> None:
+        """Render a picture strip by strip in a thread of its own, write it and hand it over."""
         if self._capture is not None:
             raise ConfigError("a picture is being rendered already; wait for it or cancel it")
-        session = self._session
-
-        def done(reason: str) -> None:
-            self._capture = None
-            self._show_progress(self._progress, 0.0)
-            if reason:
-                session.warn(reason, "no picture")
-            else:
-                session.guarded(finish)()
-
+        session, view, cancelled = self._session, self._session.view, threading.Event()
         show = partial(self._show_progress, self._progress)
-        self._capture = Capture(camera, session.view.edit, session.view.subpixels, take, done, show)
-        session.services.loop.capture(self._capture)
+        strips = session.services.loop.strips(camera, view.edit, view.subpixels, cancelled, show)
+        self._capture = cancelled
+
+        def work() -> None:
+            with failures_said("the picture failed", lambda reason: session.warn(reason, "no picture")):
+                try:
+                    for first_row, strip in strips:
+                        take(first_row, strip)
+                finally:
+                    self._capture = None
+                    show(0.0)
+                session.guarded(lambda: self._hand_over(write()))()
+
+        threading.Thread(target=work, name="unmix-viewer-picture", daemon=True).start()
 
     def _new_file(self, suffix: str) -> Path:
         return new_file(self._session.services.folder, self._name.value, suffix, "view")
@@ -155,10 +153,9 @@ class CapturePanel:
         self._key.value = names[min(max(chosen, 0), len(names) - 1)]
 
     def _change_key(self, action: str) -> None:
-        names = tuple(self._key.options)
-        if not self._keys or self._key.value not in names:
+        if not self._keys:
             raise ConfigError("there is no key frame yet; add one")
-        index = names.index(self._key.value)
+        index = index_in(self._key)
         if action == "look":
             self._session.look_from(camera_of(self._keys[index], 64))
         elif action == "replace":
@@ -169,13 +166,12 @@ class CapturePanel:
 
     def _path(self, frames_per_second: float) -> list[ViewPose]:
         """The path through the key frames; a ConfigError where there are fewer than two."""
-        seconds = number(self._seconds.value, *_SECONDS_BOUNDS, fallback=4.0)
-        return path_poses(self._keys, max(2, round(seconds * frames_per_second)))
+        return path_poses(self._keys, max(2, round(number_of(self._seconds, 4.0) * frames_per_second)))
 
-    def _play(self, is_on: bool) -> None:
-        """Move the client's camera along the path, in a thread of its own."""
+    def _play(self, action: str) -> None:
+        """Move the client's camera along the path, in a thread of its own, or stop that."""
         self._preview.set()
-        if not is_on:
+        if action == "stop":
             return
         poses = self._path(_PREVIEW_FPS)
         stopped = self._preview = threading.Event()
@@ -190,17 +186,16 @@ class CapturePanel:
 
     def _save_path(self) -> Path:
         """Write the path as a camera file for `unmix-render`."""
-        frames_per_second = number(self._fps.value, *_FPS_BOUNDS, fallback=24)
-        poses = self._path(frames_per_second)
+        frames_per_second, services = number_of(self._fps, 24), self._session.services
         width, height = _side(self._width) // 2 * 2, _side(self._height) // 2 * 2
         views = [
             RunView(f"path_{index:04d}", sized_camera(pose, width, height))
-            for index, pose in enumerate(poses)
+            for index, pose in enumerate(self._path(frames_per_second))
         ]
-        services = self._session.services
         path = new_file(services.folder, f"{self._name.value}-path", ".json", "path")
-        space = world_frame(services.source.record)
-        return write_file(path, camera_file_bytes(views, frames_per_second, space))
+        return write_file(
+            path, camera_file_bytes(views, frames_per_second, world_frame(services.source.record))
+        )
 
     def _render_video(self) -> None:
         session, services = self._session, self._session.services
@@ -216,7 +211,6 @@ class CapturePanel:
             recipe = write_file(cameras.with_suffix(".yml"), text)
         folder = cameras.with_suffix("")
         argv = render_argv(services.source.run.path, cameras, output, folder, recipe, session.view.edit.light)
-
         show = partial(self._show_progress, self._video_progress)
 
         def done(video: Path | None, reason: str) -> None:

@@ -46,37 +46,33 @@ def check_size(width: int, height: int, num_bands: int | None = None) -> None:
     Raises:
         ConfigError: too many pixels, or too many numbers where spectra are kept.
     """
-    if width * height > _MOST_PIXELS:
+    most, what = _MOST_PIXELS, "pictures"
+    if num_bands is not None:
+        most, what = min(most, _LARGEST_SPECTRA_BYTES // (4 * num_bands)), "spectra"
+    if width * height > most:
         raise ConfigError(
-            f"{width} x {height} pixels are too many for one picture; choose at most {_MOST_PIXELS / 1e6:.0f} million, "
-            "or render with unmix-render"
-        )
-    if num_bands is not None and width * height * num_bands * 4 > _LARGEST_SPECTRA_BYTES:
-        most = _LARGEST_SPECTRA_BYTES // (4 * num_bands)
-        raise ConfigError(
-            f"spectra of {width} x {height} pixels are too much for the viewer; choose at most "
-            f"{most / 1e6:.1f} million pixels, or render with unmix-render"
+            f"{width} x {height} pixels are too many for {what} in the viewer; choose at most {most / 1e6:.1f} "
+            "million, or render with unmix-render"
         )
 
 
 class SpectraCanvas:
     """Collects strips of spectra."""
 
-    def __init__(self, camera: Cameras, num_bands: int) -> None:
-        shape = (camera.height, camera.width)
-        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, num_bands), np.float32)
+    def __init__(self, camera: Cameras, materials: Materials) -> None:
+        """`materials` are those that are shown."""
+        shape, self._materials = (camera.height, camera.width), materials
+        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, len(materials.bands)), np.float32)
         self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
         self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
-        self._materials: Materials | None = None
 
     def take(self, first_row: int, frame: RenderedView) -> None:
         """Put a strip in its place."""
         assert isinstance(frame, MaterialView)
-        rows, materials = slice(first_row, first_row + frame.camera.height), frame.materials
-        self._materials = materials
+        rows = slice(first_row, first_row + frame.camera.height)
         self.spectra[rows] = frame["spectral"].cpu().numpy()
-        to_rgb = rgb_matrix(materials.bands)
-        self.linear_rgb[rows] = materials.through(frame.coefficients, to_rgb).cpu().numpy()
+        to_rgb = rgb_matrix(frame.materials.bands)
+        self.linear_rgb[rows] = frame.materials.through(frame.coefficients, to_rgb).cpu().numpy()
         self.coverage[rows] = frame.coverage.cpu().numpy()
 
     def write(self, path: Path) -> Path:
@@ -85,7 +81,6 @@ class SpectraCanvas:
         Raises:
             RunError: the disk is full or refuses.
         """
-        assert self._materials is not None
         bands, quantity = self._materials.bands, self._materials.quantity
         about = f"{quantity} on black, 1 = full scale"
         return write_spectral_exr(path, self.spectra, bands, self.linear_rgb, self.coverage, about, quantity)
@@ -110,54 +105,39 @@ class VideoJob:
     done: Callable[[Path | None, str], None]
     """Takes the video, or None and what went wrong."""
     is_cancelled: bool = False
+    process: subprocess.Popen[str] | None = None
+    """While it is rendered."""
 
 
 class VideoQueue:
     """Renders videos one after another."""
 
     def __init__(self) -> None:
-        self._turn = threading.Lock()
-        self._lock = threading.Lock()
-        self._is_stopping = False
-        self._running: tuple[VideoJob, subprocess.Popen[str]] | None = None
+        self._turn, self._lock = threading.Lock(), threading.Lock()
+        self._jobs: list[VideoJob] = []
 
     def start(self, job: VideoJob) -> None:
         """Render a video when those before it are done."""
+        self._jobs.append(job)
         threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True).start()
 
     def cancel(self, job: VideoJob) -> None:
         """Drop a video, even one that is being rendered."""
         with self._lock:
             job.is_cancelled = True
-            if self._running is not None and self._running[0] is job:
-                _end(self._running[1])
+            if job.process is not None:
+                _end(job.process)
 
     def stop(self) -> None:
         """Drop all videos."""
-        with self._lock:
-            self._is_stopping = True
-            if self._running is not None:
-                _end(self._running[1])
+        for job in [*self._jobs]:
+            self.cancel(job)
 
     def _run(self, job: VideoJob) -> None:
+        lines: deque[str] = deque(maxlen=_LINES_KEPT)
         with self._turn:
-            lines: deque[str] = deque(maxlen=_LINES_KEPT)
             with self._lock:
-                process = None
-                if not self._is_stopping and not job.is_cancelled:
-                    process = subprocess.Popen(
-                        [sys.executable, "-c", _LAUNCH, *job.argv],
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.PIPE,
-                        stderr=subprocess.STDOUT,
-                        text=True,
-                        encoding="utf-8",
-                        errors="replace",
-                        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
-                        start_new_session=True,
-                        creationflags=OWN_GROUP,
-                    )
-                    self._running = (job, process)
+                process = job.process = None if job.is_cancelled else _begin(job.argv)
             if process is not None:
                 with process:
                     for line in process.stdout or ():
@@ -165,13 +145,29 @@ class VideoQueue:
                         if found := _PROGRESS.match(line):
                             job.progress(int(found[1]) / int(found[2]))
             with self._lock:
-                self._running = None
+                job.process = None
+                self._jobs.remove(job)
         if process is not None and process.returncode == 0:
             job.done(next(job.folder.rglob("*.mp4"), None), "no video was written")
-        elif job.is_cancelled or self._is_stopping:
+        elif job.is_cancelled:
             job.done(None, "cancelled")
         else:
             job.done(None, f"rendering the video failed: {''.join(lines).strip()[-_LONGEST_MESSAGE:]}")
+
+
+def _begin(argv: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", _LAUNCH, *argv],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        env={**os.environ, "PYTHONIOENCODING": "utf-8"},
+        start_new_session=True,
+        creationflags=OWN_GROUP,
+    )
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -207,26 +203,28 @@ def output_of(settings: LayerSettings, bands: Bands | None) -> str:
         return "false-colour:" + ",".join(map(shown, settings.false_colour_nm))
     if settings.layer == "index" and settings.index:
         return index_output(settings.index)
-    if settings.layer == "abundance":
-        return "abundances"
     if settings.layer in _NO_VIDEO:
         raise ConfigError(f"videos can't show the layer {settings.layer}; choose another one")
-    return settings.layer
+    return "abundances" if settings.layer == "abundance" else settings.layer
 
 
 _NO_VIDEO = ("error", "index", "diffuse", "specular")
 """Layers that no output of a render is, or one that a video goes through band by band."""
 
 
+_UNLIKE = {
+    "abundance": "a map of each endmember, side by side",
+    "abundances": "a map of each endmember, side by side",
+    "band": "grey values from 0 to 1",
+    "pca": "the principal components of its own views",
+}
+
+
 def differences(settings: LayerSettings, controls: Collection[str]) -> list[str]:
     """What a video has by `unmix-render` that a layer with these controls has otherwise on the page, in words."""
     found = []
-    if settings.layer in ("abundance", "abundances"):
-        found.append("a map of each endmember, side by side")
-    elif settings.layer == "band":
-        found.append("grey values from 0 to 1")
-    elif settings.layer == "pca":
-        found.append("the principal components of its own views")
+    if settings.layer in _UNLIKE:
+        found.append(_UNLIKE[settings.layer])
     elif "scale" in controls:
         found.append("a colour map and a range of its own")
     tones = (settings.exposure_ev, settings.gamma, settings.view_transform)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.protocol import RenderedView
 from unmix_plugin.viewer.page import failures_said
 from unmix_plugin.viewer.rendering.pictures import (
@@ -77,28 +78,6 @@ class View:
         return self.restyled_at if self.moved_at is None else self.moved_at
 
 
-@dataclass(eq=False)
-class Capture:
-    """A picture of any size, rendered strip by strip apart from any view, when there is nothing more urgent."""
-
-    camera: Cameras
-    """One camera."""
-    edit: Edit
-    subpixels: int
-    """Rays through a pixel along each of its edges."""
-    take: Callable[[int, RenderedView], None]
-    """Takes the first row of a strip and the strip; this and the following are called in the render loop's thread."""
-    done: Callable[[str], None]
-    """Told the end: an empty text, or what went wrong."""
-    progress: Callable[[float], None] = lambda _: None
-    """Told the part that is rendered."""
-    is_cancelled: bool = False
-    served_at: float = 0.0
-    first_row: int = 0
-    """Of the strip under way."""
-    strip: FrameRender | None = None
-
-
 class RenderLoop:
     """Renders for all views until stopped; nothing that goes wrong in a picture ends it."""
 
@@ -106,8 +85,8 @@ class RenderLoop:
         self._maker = maker
         self._changed = threading.Condition()
         self._views: list[View] = []
-        self._captures: list[Capture] = []
         self._is_stopping = False
+        self._capturing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="unmix-viewer-render", daemon=True)
 
     def start(self) -> None:
@@ -115,16 +94,14 @@ class RenderLoop:
         self._thread.start()
 
     def stop(self) -> None:
-        """End after the block under way; unfinished captures are reported as such."""
+        """End after the blocks under way, also those of pictures that are rendered in strips."""
         with self._changed:
             self._is_stopping = True
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
-        with self._changed:
-            unfinished, self._captures = self._captures, []
-        for capture in unfinished:
-            capture.done("the viewer was stopped")
+        with self._capturing:
+            pass
 
     def add(self, view: View) -> None:
         """Serve a view."""
@@ -152,11 +129,45 @@ class RenderLoop:
                 view.restyled_at = view.restyled_at or time.monotonic()
             self._changed.notify_all()
 
-    def capture(self, capture: Capture) -> None:
-        """Render a picture of its own."""
+    def strips(
+        self,
+        camera: Cameras,
+        edit: Edit,
+        subpixels: int,
+        cancelled: threading.Event,
+        show: Callable[[float], None] = lambda _: None,
+    ) -> Iterator[tuple[int, RenderedView]]:
+        """A picture of any size apart from any view: strips with their first rows, each rendered in the caller's thread
+        when nothing is more urgent. Pictures of several callers are rendered one after another.
+
+        Args:
+            camera: One camera.
+            edit: What to see the scene with.
+            subpixels: Rays through a pixel along each of its edges.
+            cancelled: Set once the picture is no longer wanted.
+            show: Told the part that is rendered.
+        Raises:
+            ConfigError: it was cancelled, or the loop stopped.
+            UnmixError: the edit does not fit the run.
+        """
+        rows = max(1, _STRIP_PIXELS // camera.width)
+        with self._capturing:
+            for first in range(0, camera.height, rows):
+                part = camera.crop(0, first, camera.width, min(rows, camera.height - first))
+                render, frame = FrameRender(part, subpixels, is_finished=True), None
+                while frame is None:
+                    self._give_way()
+                    if self._is_stopping or cancelled.is_set():
+                        raise ConfigError("the viewer was stopped" if self._is_stopping else "cancelled")
+                    frame = self._maker.advance(render, edit, self._maker.speed.block_rays, RESTING_COST)
+                    show((first + part.height * (1 - render.rays_left / render.num_rays)) / camera.height)
+                yield first, frame
+
+    def _give_way(self) -> None:
+        """Wait until no view waits for a picture at once."""
         with self._changed:
-            self._captures.append(capture)
-            self._changed.notify_all()
+            while self._waiting and not self._is_stopping:
+                self._changed.wait(_POLL_S)
 
     def step(self) -> bool:
         """Do the most urgent piece of work; False if there is none at this moment."""
@@ -172,23 +183,27 @@ class RenderLoop:
                 while (unit := None if self._is_stopping else self._next_unit()) is None:
                     if self._is_stopping:
                         return
-                    self._changed.wait(_POLL_S if self._views or self._captures else None)
+                    self._changed.wait(_POLL_S if self._views else None)
             unit()
+
+    @property
+    def _active(self) -> list[View]:
+        return [view for view in self._views if view.pose is not None and not view.is_stuck]
+
+    @property
+    def _waiting(self) -> list[View]:
+        return [view for view in self._active if view._asked_at is not None]
 
     def _next_unit(self) -> Callable[[], None] | None:
         """What is most urgent: answers in the order in which they were asked for, then blocks in turn."""
-        active = [view for view in self._views if view.pose is not None and not view.is_stuck]
-        waiting = [view for view in active if view._asked_at is not None]
-        if waiting:
+        if waiting := self._waiting:
             first = min(waiting, key=lambda view: view._asked_at or 0.0)
             return lambda: self._guarded(first, self._answer if first.moved_at is not None else self._redraw)
         if not self._maker.source.device.guest_may_go:
             return None
-        unfinished: list[View | Capture] = [view for view in active if self._has_more(view)]
-        served = min([*unfinished, *self._captures], key=lambda one: one.served_at, default=None)
-        if isinstance(served, View):
-            return lambda: self._guarded(served, self._refine)
-        return None if served is None else lambda: self._advance_capture(served)
+        unfinished = [view for view in self._active if self._has_more(view)]
+        served = min(unfinished, key=lambda view: view.served_at, default=None)
+        return None if served is None else lambda: self._guarded(served, self._refine)
 
     def _has_more(self, view: View) -> bool:
         if view.render is not None or view.frame is None or view.pose is None:
@@ -269,36 +284,3 @@ class RenderLoop:
         view.shown_at = time.monotonic()
         if had_reported:
             view.report("")
-
-    def _advance_capture(self, capture: Capture) -> None:
-        """A block of a capture; each finished strip is handed over."""
-        capture.served_at = time.monotonic()
-        camera, first = capture.camera, capture.first_row
-        rows = min(max(1, _STRIP_PIXELS // camera.width), camera.height - first)
-        frame: RenderedView | None = None
-        reasons = ["cancelled"] if capture.is_cancelled else []
-        with failures_said("the picture failed", reasons.append):
-            if not reasons:
-                strip = capture.strip = capture.strip or FrameRender(
-                    camera.crop(0, first, camera.width, rows), capture.subpixels, is_finished=True
-                )
-                frame = self._maker.advance(strip, capture.edit, self._maker.speed.block_rays, RESTING_COST)
-                part = 1 - strip.rays_left / strip.num_rays
-                capture.progress((first + rows * part) / camera.height)
-        if frame is None and not reasons:
-            return
-        with self._changed:
-            if capture not in self._captures:
-                return  # `stop` has said that it will not be finished
-        if frame is not None:
-            with failures_said("the picture could not be handed over", reasons.append):
-                capture.take(first, frame)
-            capture.first_row, capture.strip = first + rows, None
-            if not reasons and capture.first_row < camera.height:
-                return
-        with self._changed:
-            if capture not in self._captures:
-                return
-            self._captures.remove(capture)
-        with failures_said("the picture could not be handed over", lambda _: None):
-            capture.done("".join(reasons))
