@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
@@ -21,7 +22,6 @@ from unmix_plugin.errors import ConfigError
 
 if TYPE_CHECKING:
     import viser
-
 
 FOV_BOUNDS = (math.radians(1.0), math.radians(170.0))
 """Least and greatest vertical field of view."""
@@ -48,24 +48,20 @@ class ViewPose:
 def _checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
     """The pose that a browser sent, whatever that is; a ConfigError where nothing can be shown from there."""
     try:
-        rotation = np.array([float(value) for value in wxyz])
-        place = np.array([float(value) for value in position])
+        rotation, place = ([float(value) for value in values] for values in (wxyz, position))
         angle, shape = float(fov), float(aspect)
     except (TypeError, ValueError) as error:
         raise ConfigError(f"the browser sent a camera of something other than numbers: {error}") from error
-    numbers = np.concatenate([rotation, place, [angle, shape]])
+    numbers = np.array([*rotation, *place, angle, shape])
     if len(rotation) != 4 or len(place) != 3 or not np.isfinite(numbers).all():
         raise ConfigError(f"the browser sent a camera with numbers that are missing or not finite: {numbers}")
     length = float(np.linalg.norm(rotation))
     if length < 1e-6 or np.abs(place).max() > _LARGEST_COORDINATE or shape <= 0:
         raise ConfigError(f"the browser sent a camera that sees nothing: {numbers}; reset the camera")
-    w, x, y, z = (rotation / length).tolist()
-    return ViewPose(
-        (w, x, y, z),
-        (float(place[0]), float(place[1]), float(place[2])),
-        min(max(angle, FOV_BOUNDS[0]), FOV_BOUNDS[1]),
-        min(max(shape, _ASPECT_BOUNDS[0]), _ASPECT_BOUNDS[1]),
-    )
+    w, x, y, z = (value / length for value in rotation)
+    low, high = _ASPECT_BOUNDS
+    fov = min(max(angle, FOV_BOUNDS[0]), FOV_BOUNDS[1])
+    return ViewPose((w, x, y, z), (place[0], place[1], place[2]), fov, min(max(shape, low), high))
 
 
 def pose_from(camera: viser.CameraHandle) -> ViewPose:
@@ -76,9 +72,8 @@ def pose_from(camera: viser.CameraHandle) -> ViewPose:
     """
     height, width = camera.image_height, camera.image_width
     has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
-    return _checked_pose(
-        camera.wxyz, camera.position, camera.fov, width / height if has_size else float("nan")
-    )
+    aspect = width / height if has_size else math.nan
+    return _checked_pose(camera.wxyz, camera.position, camera.fov, aspect)
 
 
 def camera_of(pose: ViewPose, height: int, largest_pixels: int = 1 << 24) -> Cameras:
@@ -90,9 +85,8 @@ def camera_of(pose: ViewPose, height: int, largest_pixels: int = 1 << 24) -> Cam
 def sized_camera(pose: ViewPose, width: int, height: int) -> Cameras:
     """The pinhole camera of a pose for pictures of a size: the vertical field of view stays, whatever the aspect."""
     focal = height / 2 / math.tan(pose.fov / 2)
-    camera_to_world = np.concatenate(
-        [_rotation_matrix(pose.wxyz) @ _OPENCV_TO_OPENGL, np.array(pose.position)[:, None]], axis=1
-    )
+    axes = _rotation(pose.wxyz).as_matrix() @ _OPENCV_TO_OPENGL
+    camera_to_world = np.concatenate([axes, np.array(pose.position)[:, None]], axis=1)
     return Cameras(
         torch.tensor(camera_to_world, dtype=torch.float32)[None],
         torch.tensor([[focal, focal]], dtype=torch.float32),
@@ -106,10 +100,9 @@ def sized_camera(pose: ViewPose, width: int, height: int) -> Cameras:
 def pose_of(camera: Cameras) -> ViewPose:
     """The pose from which a browser sees about what one of our cameras sees: centred, without distortion."""
     pose = camera.camera_to_world[0].double().cpu().numpy()
+    wxyz = _wxyz(Rotation.from_matrix(pose[:, :3] @ _OPENCV_TO_OPENGL))
     fov = 2 * math.atan(camera.height / 2 / float(camera.focal_px[0, 1]))
-    return _checked_pose(
-        _quaternion(pose[:, :3] @ _OPENCV_TO_OPENGL), pose[:, 3], fov, camera.width / camera.height
-    )
+    return _checked_pose(wxyz, pose[:, 3], fov, camera.width / camera.height)
 
 
 def point_ahead(camera: Cameras, box: SceneBox) -> tuple[float, float, float]:
@@ -127,8 +120,6 @@ _START_TURN_RAD, _START_DISTANCE = math.radians(12.0), 1.25
 def beside(camera: Cameras, box: SceneBox, up: tuple[float, float, float]) -> Cameras:
     """Where a page looks from at first: near one of the scene's cameras, but beside it and further back, so that all
     is seen and the camera's own picture does not fill the page. A camera within the scene box stays."""
-    from scipy.spatial.transform import Rotation
-
     place, (low, high) = camera.camera_to_world[0, :, 3], box.aabb.to(camera.camera_to_world)
     if bool(((place > low) & (place < high)).all()):
         return camera
@@ -139,19 +130,13 @@ def beside(camera: Cameras, box: SceneBox, up: tuple[float, float, float]) -> Ca
     return replace(camera, camera_to_world=pose)
 
 
-def _rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Rotation of a unit quaternion."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
+def _rotation(wxyz: Sequence[Any]) -> Rotation:
+    """Rotations of unit quaternions; SciPy has w last."""
+    return Rotation.from_quat(np.roll(wxyz, -1, axis=-1))
 
 
-def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> tuple[float, float, float, float]:
-    """Unit quaternion w, x, y, z of a rotation."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat().tolist()
-    return (w, x, y, z)
+def _wxyz(rotation: Rotation) -> np.ndarray:
+    return np.roll(rotation.as_quat(), 1, axis=-1)
 
 
 def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose]:
@@ -166,16 +151,10 @@ def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose
     """
     if len(key_frames) < 2:
         raise ConfigError("a path needs at least two key frames; look from elsewhere and add another one")
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, Slerp
-
     keys = np.arange(len(key_frames), dtype=np.float64)
     times = np.linspace(0.0, keys[-1], num_frames)
     values = np.array([[*pose.position, pose.fov] for pose in key_frames])
     smooth = CubicSpline(keys, values, bc_type="natural")(times)
-    turns = Slerp(keys, Rotation.from_matrix(np.stack([_rotation_matrix(pose.wxyz) for pose in key_frames])))
+    turns = _wxyz(Slerp(keys, _rotation([pose.wxyz for pose in key_frames]))(times))
     aspect = key_frames[0].aspect
-    return [
-        _checked_pose(_quaternion(rotation), row[:3], float(row[3]), aspect)
-        for row, rotation in zip(smooth, turns(times).as_matrix(), strict=True)
-    ]
+    return [_checked_pose(wxyz, row[:3], row[3], aspect) for row, wxyz in zip(smooth, turns, strict=True)]
