@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from html import escape
 from http import HTTPStatus
 from pathlib import Path
@@ -138,9 +139,10 @@ def _is_heard(data: bytes) -> bool:
 class _Connection(ServerConnection):
     """A page's connection: what comes is bounded in size and pace before anything of it is kept."""
 
-    gate: Gate | None = None
-    _paid_until = 0.0
-    _has_spoken = False
+    def __init__(self, gate: Gate, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._gate = gate
+        self._paid_until, self._has_spoken = 0.0, False
 
     async def recv(self, decode: bool | None = None) -> Any:
         """The next message that the viewer listens to; a page that sends what none sends loses its connection."""
@@ -185,22 +187,18 @@ class _Connection(ServerConnection):
     def connection_lost(self, exc: Exception | None) -> None:
         """Give back the page's place."""
         super().connection_lost(exc)
-        if self.gate is not None:
-            self.gate.leave(self)
+        self._gate.leave(self)
 
 
 class _PageServer(infra.WebsockServer):
     """Sends viser's page under our title, dark where the browser's user prefers that."""
 
-    title = LABEL
-
-    def __init__(self, *, http_server_root: Path, **options: Any) -> None:
+    def __init__(self, title: str, *, http_server_root: Path, **options: Any) -> None:
         folder = Path(tempfile.mkdtemp(prefix="unmix-viewer-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         page = (http_server_root / "index.html").read_text(encoding="utf-8")
         (folder / "index.html").write_text(
-            page.replace("<title>Viser</title>", _HEAD.replace("TITLE", escape(self.title)), 1),
-            encoding="utf-8",
+            page.replace("<title>Viser</title>", _HEAD.replace("TITLE", escape(title)), 1), encoding="utf-8"
         )
         super().__init__(http_server_root=folder, **options)
 
@@ -225,7 +223,7 @@ def open_server(
         say: Told of what pages caused that should not have happened, in a short line each.
     """
     before = infra.WebsockServer, getattr(_infra, _NAME)
-    infra.WebsockServer = type("_TitledServer", (_PageServer,), {"title": title})
+    infra.WebsockServer = partial(_PageServer, title)  # type: ignore[misc, assignment]
     # viser asks websockets for its server in this module's name of it, once, while it starts.
     gated = SimpleNamespace(
         asyncio=SimpleNamespace(server=SimpleNamespace(serve=_serve_through(gate, say))),
@@ -243,24 +241,16 @@ def open_server(
 
 def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., websockets.asyncio.server.serve]:
     """websockets' own `serve`, with the gate before what else answers requests, and our bounds."""
-    logger = logging.Logger(
-        "unmix_plugin.viewer"
-    )  # of nobody: strangers' requests are not for the user's log
+    logger = logging.Logger(LABEL)  # of nobody: strangers' requests are not for the user's log
     logger.addHandler(logging.NullHandler())
-
-    class GatedConnection(_Connection):
-        pass
-
-    GatedConnection.gate = gate
 
     def serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
         async def judge(connection: ServerConnection, request: Request) -> Response | None:
-            refusal = await _judged(gate, connection, request)
-            return process_request(connection, request) if refusal is None else refusal
+            return await _refusal(gate, connection, request) or process_request(connection, request)
 
         asyncio.get_running_loop().set_exception_handler(_Faults(say))
         ours = {
-            "create_connection": GatedConnection,
+            "create_connection": partial(_Connection, gate),
             "max_size": _LARGEST_MESSAGE,
             "max_queue": 4,
             "logger": logger,
@@ -272,14 +262,14 @@ def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., webs
     return serve
 
 
-async def _judged(gate: Gate, connection: ServerConnection, request: Request) -> Response | None:
+async def _refusal(gate: Gate, connection: ServerConnection, request: Request) -> Response | None:
     headers = {name.lower(): value for name, value in request.headers.raw_items()}
     opens = headers.get("upgrade", "").lower() == "websocket"
     words = [word.strip() for word in headers.get("sec-websocket-protocol", "").split(",")]
     if opens and f"viser-v{viser.__version__}" not in words:
         return connection.respond(HTTPStatus.BAD_REQUEST, "this page is of another version: load it again")
-    remote, local = connection.remote_address, connection.local_address
-    refusal = await gate.judge(connection, headers, remote[0] if remote else "", local[1] if local else 0)
+    remote, local = connection.remote_address or ("",), connection.local_address or ("", 0)
+    refusal = await gate.judge(connection, headers, remote[0], local[1])
     if refusal is None:
         return None
     response = connection.respond(refusal.status, refusal.text)

@@ -26,7 +26,6 @@ from unmix_plugin.viewer.view_cameras import beside, point_ahead, pose_of
 _TICK_S = 0.5
 _UNWATCHED_S = 5
 
-
 _KEPT_S = 600.0
 """How long what a page left is kept."""
 
@@ -75,16 +74,8 @@ class Viewer:
     def __init__(
         self, services: Services, options: ViewerOptions, say: Callable[[str], None] = lambda _: None
     ) -> None:
-        """
-        Args:
-            services: What all pages share.
-            options: Where to listen, and the token to ask for.
-            say: Prints a line on the user's terminal.
-        Raises:
-            ConfigError: the token can't be read.
-        """
-        self._options = options
-        self._say = say
+        """`say` prints a line on the user's terminal; a ConfigError if the token can't be read."""
+        self._options, self._say = options, say
         self._gate = Gate(options.host, options.secret(os.environ), say)
         self._kept_pages = _KeptPages()
         self.services = services
@@ -152,12 +143,8 @@ class Viewer:
         return len(self._sessions)
 
     def wait(self, while_watched: bool = False) -> None:
-        """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread.
-
-        Args:
-            while_watched: End once no page has been open for some seconds, too; a page that is loaded again is back by
-                then.
-        """
+        """Serve until Ctrl-C, SIGTERM or SIGHUP, which raise KeyboardInterrupt, or until stopped by another thread;
+        `while_watched` ends once no page has been open for so long that one that is loaded again is back."""
         unwatched_s = 0
         with _interrupting_signals():
             while not self._stopped.wait(1.0):
@@ -167,21 +154,22 @@ class Viewer:
 
     def _connected(self, client: viser.ClientHandle) -> None:
         """Serve a page that was let in."""
-        with failures_said("this page could not be served", lambda said: _warn(client, said)):
-            self._open(client)
 
-    def _open(self, client: viser.ClientHandle) -> None:
-        browser = _browser_of(client)
-        session = Session(client, self.services, self._kept_pages.take(browser), browser)
-        with self._lock:
-            if self._stopped.is_set() or client.client_id in self._sessions:
-                return
-            self._sessions[client.client_id] = session
-        try:
-            session.open(panels_of(self.services))
-        finally:  # where the page left meanwhile, opening may have failed for it
-            if self._server is not None and client.client_id not in self._server.get_clients():
-                self._disconnected(client)  # it left before it was noted
+        def warn(reason: str) -> None:
+            client.gui.add_html(paragraph(reason, is_warning=True))
+
+        with failures_said("this page could not be served", warn):
+            browser = _browser_of(client)
+            session = Session(client, self.services, self._kept_pages.take(browser), browser)
+            with self._lock:
+                if self._stopped.is_set() or client.client_id in self._sessions:
+                    return
+                self._sessions[client.client_id] = session
+            try:
+                session.open(panels_of(self.services))
+            finally:  # where the page left meanwhile, opening may have failed for it
+                if self._server is not None and client.client_id not in self._server.get_clients():
+                    self._disconnected(client)  # it left before it was noted
 
     def _disconnected(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -213,7 +201,3 @@ def _interrupting_signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _warn(client: viser.ClientHandle, reason: str) -> None:
-    client.gui.add_html(paragraph(reason, is_warning=True))
