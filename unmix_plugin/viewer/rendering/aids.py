@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,9 +31,8 @@ _NUM_RAYS = 6000
 @torch.no_grad()
 def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficients, Float[Tensor, "N 3"]]:
     """Coefficients of rays through some of the cameras, spread over all, and where the rays end, model space."""
-    step = max(1, len(cameras) // _NUM_CAMERAS)
-    chosen = list(range(0, len(cameras), step))[:_NUM_CAMERAS]
-    cameras = cameras.one_size()
+    step, cameras = max(1, len(cameras) // _NUM_CAMERAS), cameras.one_size()
+    chosen = range(0, len(cameras), step)[:_NUM_CAMERAS]
     aspect = cameras.width / cameras.height
     height = max(1, min(cameras.height, int((_NUM_RAYS / len(chosen) / aspect) ** 0.5)))
     parts, points = [], []
@@ -41,15 +40,12 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficient
         camera = cameras[index].resized(max(1, round(aspect * height)), height)
         seen = scene.look(camera, subpixels=1).coefficients.flatten()
         rays = camera.to(scene.device).image_rays(0)
-        ends = rays.origins + seen.ray_distance[:, None] * rays.directions
-        is_seen = seen.is_occupied
-        parts.append(seen.map(lambda packed, chosen=is_seen: packed[chosen]))
-        points.append(ends[is_seen])
+        parts.append(seen.map(lambda packed, is_seen=seen.is_occupied: packed[is_seen]))
+        points.append((rays.origins + seen.ray_distance[:, None] * rays.directions)[seen.is_occupied])
     return Coefficients.concatenate(parts), torch.cat(points)
 
 
 _MOST_REMEMBERED = 32
-_ValueT = TypeVar("_ValueT")
 
 _ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
 """A view's error against the nearest training view, where it is known, and that view's name."""
@@ -75,15 +71,11 @@ class LayerAids:
 
     def colours_of(self, materials: Materials) -> Float[Tensor, "K 3"]:
         """sRGB colours that stand for the materials, as in all pictures of a run."""
-        return self._remembered(
-            "colours",
-            materials,
-            lambda: torch.as_tensor(endmember_colours(materials)).to(materials.endmembers),
-        )
+        return self._remembered("colours", materials, _colours)
 
     def pca_of(self, materials: Materials) -> PcaColours:
         """Principal components of what the reference rays show with the materials."""
-        return self._remembered("pca", materials, lambda: PcaColours.fit(self.reference_spectra(materials)))
+        return self._remembered("pca", materials, lambda shown: PcaColours.fit(self.reference_spectra(shown)))
 
     def depth_range(self, frame: MaterialView) -> tuple[float, float]:
         """Distances between which the scene box lies, world units."""
@@ -92,7 +84,7 @@ class LayerAids:
         distance = float((frame.camera.camera_to_world[0, :, 3].cpu() - middle).norm())
         return (max(0.0, distance - radius) / scale, (distance + radius) / scale)
 
-    def _remembered(self, what: str, materials: Materials, make: Callable[[], _ValueT]) -> _ValueT:
+    def _remembered(self, what: str, materials: Materials, make: Callable[[Materials], Any]) -> Any:
         """What `make` gives, kept for the materials that clients look at."""
         spectra = torch.cat([materials.endmembers, materials.specular_spectra])
         key = (what, spectra.cpu().numpy().tobytes())
@@ -100,8 +92,12 @@ class LayerAids:
         if found is None:
             if len(self._kept) >= _MOST_REMEMBERED:
                 self._kept.clear()
-            found = self._kept[key] = make()
+            found = self._kept[key] = make(materials)
         return found
+
+
+def _colours(materials: Materials) -> Float[Tensor, "K 3"]:
+    return torch.as_tensor(endmember_colours(materials)).to(materials.endmembers)
 
 
 class SceneAids:

@@ -53,7 +53,6 @@ _Picture: TypeAlias = Float[Tensor, "H W 3"]
 
 _LEVELS = 1024
 
-
 Legend: TypeAlias = ColourScale | tuple[tuple[str, tuple[float, ...]], ...] | str
 """What the colours of a picture mean: values, names with their sRGB colours, or one phrase."""
 
@@ -146,7 +145,6 @@ class _Layer:
     name: str
     """As in outputs of renders, where there is such an output."""
     title: str
-    """What users read."""
     paint: _Painter
     controls: frozenset[str]
     """Which of `wavelength`, `false-colour`, `endmember`, `index`, `tone`, `scale` apply."""
@@ -165,15 +163,11 @@ def layer_named(name: str, layers: Mapping[str, _Layer]) -> _Layer:
     return layers[name]
 
 
+_TONE, _SCALE, _NONE = frozenset({"tone"}), frozenset({"scale"}), frozenset[str]()
 _PAINTED_KINDS: dict[OutputKind, frozenset[str]] = {
-    "srgb": frozenset({"tone"}),
-    "linear": frozenset({"tone"}),
-    "picture": frozenset(),
-    "grey": frozenset({"scale"}),
-    "map": frozenset({"scale"}),
-    "labels": frozenset(),
-    "shares": frozenset(),
-    "vectors": frozenset(),
+    **dict.fromkeys(("srgb", "linear"), _TONE),
+    **dict.fromkeys(("grey", "map"), _SCALE),
+    **dict.fromkeys(("picture", "labels", "shares", "vectors"), _NONE),
 }
 """Kinds of outputs that can be painted without knowing more of them, and the controls of their layers."""
 
@@ -182,37 +176,45 @@ def _layer_of(output: Output) -> _Layer:
     """The layer of an output of a kind that can be painted."""
 
     def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[_Picture, Legend]:
-        values, opacity, legend = frame[output.name], frame.opacity, output.what
-        if output.kind in ("srgb", "linear"):
-            light = values if output.kind == "linear" else srgb_to_linear(values.clamp(0, 1))
-            return _tone_mapped(light, frame.coverage, settings), legend
-        if output.kind in ("grey", "map"):
+        values, opacity, kind = frame[output.name], frame.opacity, output.kind
+        if kind in ("srgb", "linear"):
+            light = values if kind == "linear" else srgb_to_linear(values.clamp(0, 1))
+            return _tone_mapped(light, frame.coverage, settings), output.what
+        if kind in ("grey", "map"):
             is_known = values.isfinite()
-            scale = output.value_range or _percentile_range(
-                values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
-            )
+            seen = values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
             # Opacity itself is shown everywhere, also where there is little of it.
             part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
+            scale = output.value_range or _percentile_range(seen)
             return _paint_scaled(values, part, settings, scale, output.what)
         palette = torch.from_numpy(id_colours()).to(opacity)
-        if output.kind == "labels":
-            if output.classes:
+        if kind == "labels":
+            names = [name for name, _ in output.classes]
+            if names:
                 palette = palette.new_tensor([colour for _, colour in output.classes])
-                legend = _swatches([name for name, _ in output.classes], palette)
-            of_ids = palette.new_full((256, 3), NEUTRAL)
-            of_ids[: len(palette)] = palette
-            opacity, values = (values != NOTHING_ID).to(opacity), of_ids[values.long()]
-        elif output.kind == "shares":
+            picture, legend = _paint_labels(values, settings, names, palette)
+            return picture, legend if names else output.what
+        if kind == "shares":
             palette = palette[: values.shape[-1]]
-            values = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6) @ palette
-            names = [f"{output.title} {number}" for number in range(len(palette))]
-            legend = _swatches(names, palette)
-        elif output.kind == "vectors":
-            values = (values + 1) / 2
-            legend = f"{output.what}; red, green, blue: x, y, z from -1 to 1"
+            shares = values / values.sum(dim=-1, keepdim=True).clamp(min=1e-6)
+            legend = _swatches([f"{output.title} {number}" for number in range(len(palette))], palette)
+            return _over_background(shares @ palette, opacity, settings), legend
+        legend = output.what
+        if kind == "vectors":
+            values, legend = (values + 1) / 2, f"{legend}; red, green, blue: x, y, z from -1 to 1"
         return _over_background(values.clamp(0, 1), opacity, settings), legend
 
     return _Layer(output.name, output.title, paint, _PAINTED_KINDS[output.kind], output.kind == "labels")
+
+
+def _paint_labels(
+    ids: UInt8[Tensor, "H W"], settings: LayerSettings, names: Sequence[str], colours: Float[Tensor, "K 3"]
+) -> tuple[_Picture, Legend]:
+    """Each id in its colour, those without one in grey, and the background where nothing is."""
+    palette = colours.new_full((256, 3), NEUTRAL)
+    palette[: len(colours)] = colours
+    picture = _over_background(palette[ids.long()], (ids != NOTHING_ID).to(colours), settings)
+    return picture, _swatches(names, colours[: len(names)])
 
 
 def _paint_scaled(
@@ -257,15 +259,13 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     index, rows = asked.fit(torch.empty(0, len(bands))), frame.coefficients.flatten()
     # Chunk by chunk: the spectra of a whole picture may not fit into memory.
     chunks = [rows.map(lambda _, part=part: part) for part in rows.packed.split(_CHUNK)]
-    values = torch.cat([index(materials.reflectance(chunk)) for chunk in chunks]).unflatten(
-        0, frame.opacity.shape
-    )
+    values = torch.cat([index(materials.reflectance(chunk)) for chunk in chunks]).view_as(frame.opacity)
     scale = settings.value_range or asked.usual_range
     if scale is None:
         seen = index(materials.reflectance(aids.reference))
         scale = _percentile_range(seen[seen.isfinite()])
-    what = asked.what if len(asked.what) <= _LONGEST_LABEL else f"{asked.what[:_LONGEST_LABEL]}..."
-    label = what if materials.is_light_known else f"{what}; of radiance: light unknown"
+    label = asked.what if len(asked.what) <= _LONGEST_LABEL else f"{asked.what[:_LONGEST_LABEL]}..."
+    label += "" if materials.is_light_known else "; of radiance: light unknown"
     if bool((frame.opacity > OCCUPIED_ACCUMULATION).any()) and not bool(values.isfinite().any()):
         label += (
             "; undefined wherever something is: the light has no power at its wavelengths, or it divides by 0"
@@ -299,12 +299,10 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     materials, bands = frame.materials, frame.materials.bands
     band = bands.nearest(covered(bands, settings.wavelength_nm))
     column = torch.eye(len(bands))[:, band : band + 1]
-    reference = materials.through(aids.reference, column)[:, 0] / aids.reference.accumulation.clamp(min=1e-3)
+    reference = _unpremultiplied(materials.through(aids.reference, column), aids.reference.accumulation)
     values = _unpremultiplied(materials.through(frame.coefficients, column), frame.coverage)[..., 0]
-    scale, label = (
-        _percentile_range(reference, low_at_most=0.0),
-        f"{materials.quantity} at {bands.centers_nm[band]:.0f} nm",
-    )
+    scale = _percentile_range(reference[:, 0], low_at_most=0.0)
+    label = f"{materials.quantity} at {bands.centers_nm[band]:.0f} nm"
     return _paint_scaled(values, frame.coverage, settings, scale, label)
 
 
@@ -326,10 +324,8 @@ def _paint_abundances(
 def _paint_segmentation(
     frame: MaterialView, settings: LayerSettings, aids: LayerAids
 ) -> tuple[_Picture, Legend]:
-    ids, colours = frame["segmentation"], aids.colours_of(frame.materials)
-    palette = torch.cat([colours, colours.new_zeros(256 - len(colours), 3)])
-    picture = _over_background(palette[ids.long()], (ids != NOTHING_ID).to(colours.dtype), settings)
-    return picture, _swatches(frame.materials.names, colours)
+    colours = aids.colours_of(frame.materials)
+    return _paint_labels(frame["segmentation"], settings, frame.materials.names, colours)
 
 
 def _paint_pca(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
@@ -354,7 +350,9 @@ def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     return _paint_scaled(values, is_known.to(values), settings, (0.0, 0.1), label)
 
 
-def _unpremultiplied(values: Float[Tensor, "H W C"], part: Float[Tensor, "H W"]) -> Float[Tensor, "H W C"]:
+def _unpremultiplied(
+    values: Float[Tensor, "*pixels C"], part: Float[Tensor, "*pixels"]
+) -> Float[Tensor, "*pixels C"]:
     """Values of what is seen in a part of each pixel, rather than of what is seen on black."""
     return values / part.clamp(min=1e-3)[..., None]
 
@@ -372,9 +370,7 @@ LAYERS: dict[str, _Layer] = {
         _own("false-colour", _paint_false_colour, "tone", "false-colour"),
         _own("band", _paint_band, "scale", "wavelength"),
         _own("index", _paint_index, "scale", "index"),
-        _Layer(
-            "abundance", "abundance of one endmember", _paint_abundance, frozenset({"scale", "endmember"})
-        ),
+        _Layer("abundance", "abundance of one endmember", _paint_abundance, _SCALE | {"endmember"}),
         _own("abundances", _paint_abundances),
         _own("segmentation", _paint_segmentation),
         _layer_of(OUTPUTS["confidence"]),
@@ -383,7 +379,7 @@ LAYERS: dict[str, _Layer] = {
         _own("pca", _paint_pca),
         _own("depth", _paint_depth, "scale"),
         _layer_of(OUTPUTS["accumulation"]),
-        _Layer("error", "error against a training view", _paint_error, frozenset({"scale"})),
+        _Layer("error", "error against a training view", _paint_error, _SCALE),
     )
 }
 """All that can be shown of mixed materials, in the order in which it is offered."""

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from unmix_plugin.editing.edited_field import EditedField
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
+from unmix_plugin.spectral.materials import Coefficients, Materials
 from unmix_plugin.trained.model_scene import EstimatedScene, ModelView
 from unmix_plugin.trained.open_run import require_materials
 from unmix_plugin.trained.outputs import MaterialView
@@ -101,11 +101,9 @@ class FrameRender:
         `is_finished` if it has to be as fine as the scene makes it, rather than an estimate."""
         self.camera = camera
         self._subpixels, self._before, self._is_finished = subpixels, before, is_finished
-        centres = [(index + 0.5) / subpixels for index in range(subpixels)]
-        self._offsets = [(x, y) for y in centres for x in centres]
         self._num_pixels = camera.width * camera.height
         self._stride = _coprime_stride(self._num_pixels)
-        self.num_rays = self._num_pixels * len(self._offsets)
+        self.num_rays = self._num_pixels * subpixels**2
         """Rays of the whole view."""
         self._rays_done = 0
         self._coefficients: Coefficients | None = None
@@ -123,10 +121,11 @@ class FrameRender:
         done, chunk = 0, _CUDA_CHUNK if scene.device.type == "cuda" else _CPU_CHUNK
         while done < num_rays and self.rays_left:
             count = min(num_rays - done, chunk)
-            if isinstance(scene, TrainedScene):
-                rendered = self._render_chunk(scene, count)
-            else:
-                rendered = self._render_rows(scene, count)
+            rendered = (
+                self._render_chunk(scene, count)
+                if isinstance(scene, TrainedScene)
+                else self._render_rows(scene, count)
+            )
             self._rays_done += rendered
             done += rendered
         return done
@@ -137,21 +136,21 @@ class FrameRender:
         # Spread over the picture, so that every block has its share of what is empty and of what is costly.
         pixels = torch.arange(start, end, device=scene.device) * self._stride % self._num_pixels
         rows, columns = pixels // self.camera.width, pixels % self.camera.width
-        x, y = self._offsets[turn]
+        y, x = ((part + 0.5) / self._subpixels for part in divmod(turn, self._subpixels))
         coords = torch.stack([columns + x, rows + y], dim=-1).to(torch.float32)
         bundle = self.camera.to(scene.device).generate_rays(torch.zeros_like(pixels), coords)
         block = scene.renderer.composite(scene.field, bundle)
         if self._coefficients is None:
             self._coefficients = block.map(lambda packed: packed.new_zeros(self._num_pixels, packed.shape[1]))
-        self._coefficients.packed[pixels] += block.packed / len(self._offsets)
+        self._coefficients.packed[pixels] += block.packed / self._subpixels**2
         return end - start
 
     def _render_rows(self, scene: RenderableScene, num_rays: int) -> int:
         """Whole rows from top to bottom, of a scene that only renders views; one ray a pixel."""
-        width, turns = self.camera.width, len(self._offsets)
-        first = self._rays_done // (width * turns)
-        count = min(max(1, num_rays // (width * turns)), self.camera.height - first)
-        camera = self.camera.crop(0, first, width, count).to(scene.device)
+        row_rays = self.camera.width * self._subpixels**2
+        first = self._rays_done // row_rays
+        count = min(max(1, num_rays // row_rays), self.camera.height - first)
+        camera = self.camera.crop(0, first, self.camera.width, count).to(scene.device)
         if isinstance(scene, EstimatedScene) and self._is_finished:
             strip = scene.look(camera, self._subpixels)
         elif isinstance(scene, EstimatedScene):
@@ -162,7 +161,7 @@ class FrameRender:
             strip = scene.look(camera)
         named = {output.name: strip[output.name] for output in scene.outputs}
         self._strips.append({"accumulation": strip.opacity, **named})
-        return count * width * turns
+        return count * row_rays
 
     def frame(self, scene: RenderableScene) -> RenderedView:
         """The finished view, with the materials of a scene that has some."""
@@ -202,16 +201,8 @@ _MOST_DEPTH_ROWS = 256
 
 def _picture_depth(frame: MaterialView) -> Float32[np.ndarray, "rows columns"]:
     """Depth along the viewing axis, scene units, of the pixels or of every n-th; far where they are half empty."""
-    coefficients, camera = frame.coefficients, frame.camera
-    distance = coefficients.distance / coefficients.accumulation.clamp(min=1e-6)
-    sides = (camera.width, camera.height)
-    x, y = (
-        (torch.arange(side) + 0.5 - float(camera.center_px[0, axis])) / float(camera.focal_px[0, axis])
-        for axis, side in enumerate(sides)
-    )
-    per_distance = torch.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).to(distance)
-    depth = (distance / per_distance).clamp(0, _FAR)
-    depth = torch.where(coefficients.accumulation > OCCUPIED_ACCUMULATION, depth, _FAR)
+    depth = (frame.depth * frame.scene.frame.scale).clamp(0, _FAR)
+    depth = depth.where(frame.coefficients.is_occupied, _FAR)
     every = -(-depth.shape[0] // _MOST_DEPTH_ROWS)
     chosen = depth[every // 2 :: every, every // 2 :: every]
     return ((chosen / _DEPTH_STEP).round() * _DEPTH_STEP).cpu().numpy().astype(np.float32)
@@ -258,10 +249,9 @@ class PictureMaker:
         with source.borrowed() as scene:
             self.layers = layers_of(scene)
             """What can be shown, by name."""
-            self.aids = SceneAids(source, isinstance(scene, TrainedScene))
-            numbers = (
-                _num_channels(scene.materials) if isinstance(scene, TrainedScene) else 4 * len(scene.outputs)
-            )
+            is_mixed = isinstance(scene, TrainedScene)
+            self.aids = SceneAids(source, is_mixed)
+            numbers = _num_channels(scene.materials) if is_mixed else 4 * len(scene.outputs)
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
         self._queue, self._num_asking = threading.Condition(), 0
 
@@ -348,11 +338,8 @@ class PictureMaker:
         """
         layer, aids = layer_named(settings.layer, self.layers), self.aids.for_layers()
         with torch.no_grad():
-            if (
-                isinstance(frame, MaterialView)
-                and isinstance(frame.scene.field, EditedField)
-                and not bool(frame.scene.field.is_kept.all())
-            ):
+            field = frame.scene.field if isinstance(frame, MaterialView) else None
+            if isinstance(frame, MaterialView) and isinstance(field, EditedField) and field.removes:
                 # Removed materials leave faint specks where they were mixed with others.
                 is_left = (frame.opacity >= _TRACE_OPACITY)[..., None]
                 frame = frame.map(lambda packed: packed * is_left)
