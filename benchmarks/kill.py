@@ -196,7 +196,7 @@ def inspect(run: Path, moment: Moment, attempts: int, seconds: float, left_behin
     ended = _common.run_command(words, must_succeed=False)
     checkpoint = newest_complete_checkpoint(run / "checkpoints")
     remains = half_written(run / "checkpoints")
-    if ended.status != 0 or checkpoint is None or remains:
+    if ended.status != 0 or remains:
         failure = f"exit code {ended.status}, left in the folder: {remains}: {ended.output[-500:]}"
         return Kill(moment, attempts, seconds, left_behind, steps, loaded, None, failure)
     return Kill(moment, attempts, seconds, left_behind, steps, loaded, checkpoint.step)

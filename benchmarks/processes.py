@@ -135,7 +135,6 @@ def step_seconds(scene: Path, folder: Path, steps: int, share: float) -> float:
 def exchanged_bytes(run: Path) -> int:
     """Bytes of the gradients that each process gives in a step."""
     checkpoint = newest_complete_checkpoint(run / "checkpoints")
-    assert checkpoint is not None
     tensors = checkpoint.tensors
     return sum(4 * value.numel() for name, value in tensors.items() if name.endswith("/exp_avg"))
 

@@ -132,10 +132,7 @@ def steps_taken(folder: Path, before: set[Path]) -> int:
 
 def newest(run: Path) -> Checkpoint:
     """The newest complete checkpoint of a run that has one."""
-    checkpoint = newest_complete_checkpoint(run / "checkpoints")
-    if checkpoint is None:
-        raise SystemExit("the run has no complete checkpoint")
-    return checkpoint
+    return newest_complete_checkpoint(run / "checkpoints")
 
 
 def read(run: Path) -> Finished:

@@ -138,16 +138,13 @@ def resumed(work: Path, steps: int) -> dict[str, Any]:
         process.wait()
     [run] = work.glob("killed/*/*/*")
     killed_at = newest_complete_checkpoint(run / "checkpoints")
-    assert killed_at is not None
     _common.run_command([_common.console_script("unmix-train"), "unmix-nerf", "--load-run", str(run)])
     ends = [newest_complete_checkpoint(path / "checkpoints") for path in (straight.run, run)]
-    assert ends[0] is not None
-    assert ends[1] is not None
     one, other = ends[0].tensors, ends[1].tensors
     return {
         "on disk": "stay on disk" in straight.output,
         "killed_at": killed_at.record["steps"],
-        "ended_at": [end.record["steps"] for end in ends if end is not None],
+        "ended_at": [end.record["steps"] for end in ends],
         "tensors": len(one),
         "different": sum(not torch.equal(one[name], other[name]) for name in one),
     }

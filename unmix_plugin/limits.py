@@ -127,17 +127,22 @@ def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int 
         )
 
 
-def open_regular(path: Path) -> BinaryIO:
-    """Open a file for reading that is one: opening a pipe or a device may wait for ever.
+def regular_file(path: str, flags: int) -> int:
+    """An `opener` for `open` of files that are ones: opening a pipe or a device may wait for ever.
 
     Raises:
         OSError: it can't be opened, or is no regular file.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(None, "is no regular file", str(path))
-    return os.fdopen(descriptor, "rb")
+    return descriptor
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file for reading, if it is a regular one. Raises OSError."""
+    return open(path, "rb", opener=regular_file)
 
 
 def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:

@@ -18,13 +18,13 @@ from tests.engine.rgb_nerf_plugin import rgb_nerf
 from unmix_plugin.commands.entry import run_command
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.runs import load_run
-from unmix_plugin.engine.training.trainer import (
-    Trainer,
+from unmix_plugin.engine.training.steps import (
     TrainingSteps,
-    _prepare_steps,
     follow_training,
     joined_training,
+    prepare_steps,
 )
+from unmix_plugin.engine.training.trainer import Trainer
 
 STEPS = 12
 
@@ -52,7 +52,7 @@ def train(folder: Path, config: Any) -> None:
 def gradients(folder: Path, config: Any) -> None:
     """Average the gradients of half a batch in each process; each keeps what it has then."""
     with joined_training(config) as processes:
-        _, steps = _prepare_steps(config, processes)
+        _, steps = prepare_steps(config, processes)
         steps.begin(0)
         rays, batch = fixed_batch(steps.pipeline)
         half = slice(processes.rank, None, processes.count)

@@ -40,6 +40,4 @@ def stop_at(config: TrainerConfig, step: int, number: int = signal.SIGINT) -> In
 
 
 def newest(run: Path) -> Checkpoint:
-    checkpoint = newest_complete_checkpoint(run / "checkpoints")
-    assert checkpoint is not None
-    return checkpoint
+    return newest_complete_checkpoint(run / "checkpoints")

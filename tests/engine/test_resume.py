@@ -43,7 +43,7 @@ def test_stopped_and_resumed_equals_straight_to_the_bit(
     resumed = quiet_trainer(load_config(stopped.run))
     assert resumed.step == 6
     assert [float(state["step"]) for state in resumed.optimizer.state.values()] == [6.0]
-    log = resumed.log.path.read_text()
+    log = resumed.run.log_path.read_text()
     assert "stopped at step 6: on request" in log
     assert "failed" not in log
     resumed.train()

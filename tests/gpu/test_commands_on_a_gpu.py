@@ -49,7 +49,7 @@ def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def _use(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("training.trainer", "runs.load_run"):
+    for module in ("training.steps", "runs.load_run"):
         monkeypatch.setattr(f"unmix_plugin.engine.{module}.resolve_device", lambda _: device)
 
 

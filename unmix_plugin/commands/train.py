@@ -139,7 +139,7 @@ def train(argv: list[str]) -> None:
 
     from unmix_plugin.engine.processes import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole
-    from unmix_plugin.engine.training.trainer import follow_training, joined_training
+    from unmix_plugin.engine.training.steps import follow_training, joined_training
 
     start_together("unmix_plugin.commands.train", argv, config.machine.num_devices)
     with joined_training(config) as processes:

@@ -169,10 +169,10 @@ def prepare(config: TrainerConfig, console: Console, processes: Processes | None
         f"{counted(len(data.train_cameras), 'view')} to train on, {len(data.eval_cameras)} for evaluation; "
         f"computing on {trainer.pipeline.model.device}",
     )
-    if trainer.limits.reached(trainer.step, trainer.clock.seconds):
+    if trainer.progress >= 1.0:
         say(
             console,
-            f"nothing to train: the run is at its limit, with {trainer.step} steps in {trainer.clock.seconds:.1f} s; "
+            f"nothing to train: the run is at its limit, with {trainer.step} steps in {trainer.seconds:.1f} s; "
             "give a larger --max-num-iterations or --max-seconds",
         )
     return trainer

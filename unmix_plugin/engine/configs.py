@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import tyro
 
@@ -212,3 +212,27 @@ class TrainerConfig:
             "a file name as method-name": bool(self.method_name) and "/" not in self.method_name,
         }
         require("a training", self, rules)
+
+    def progress(self, steps: int, seconds: float) -> float:
+        """Fraction in [0, 1] that so many steps and seconds of training are of the limit that is nearer its end."""
+        limits = ((steps, self.max_num_iterations), (seconds, self.max_seconds))
+        parts = [spent / limit if limit else 1.0 for spent, limit in limits if limit is not None]
+        return min(1.0, max(parts))
+
+
+def refuse_changes_at_start(before: Any, now: Any, flag: str = "--") -> None:
+    """Compare the settings of a run with those to go on with.
+
+    Raises:
+        ConfigError: one differs that is annotated with `AtStart`, and would be written down without having acted.
+    """
+    hints = get_type_hints(type(now), include_extras=True)
+    for name in (entry.name for entry in fields(now)):
+        old, new, own = getattr(before, name, None), getattr(now, name), flag + name.replace("_", "-")
+        if is_dataclass(new):
+            refuse_changes_at_start(old, new, f"{own}.")
+        elif AtStart in getattr(hints[name], "__metadata__", ()) and old != new:
+            raise ConfigError(
+                f"{own} is {new}, and the run to go on with was started with {old}: it acts when "
+                "a run is started alone; leave it out, or start a new run"
+            )

@@ -1,11 +1,17 @@
-"""What a training has of its machine: a device, memory that stays, and random numbers.
+"""What a training has of its machine: a device, memory that stays, signals, and random numbers.
 
 Randomness is a function of (seed, step), so that a resumed run draws what a straight one drew.
 """
 
+from __future__ import annotations
+
 import ctypes
 import random
+import signal
 import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import FrameType
 
 import numpy as np
 import torch
@@ -52,6 +58,18 @@ def keep_freed_memory() -> None:
         return
     mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
     mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+@contextmanager
+def handled_signals(handlers: Mapping[str, Callable[[int, FrameType | None], None]]) -> Iterator[None]:
+    """Context in which these signals, by name, go to these functions; those that the system lacks are passed over."""
+    known = {getattr(signal, name): handler for name, handler in handlers.items() if hasattr(signal, name)}
+    before = {number: signal.signal(number, handler) for number, handler in known.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 _MASK = (1 << 64) - 1

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -22,12 +21,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from types import FrameType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor, distributed, nn
 
 from unmix_plugin.engine.configs import MOST_PROCESSES, require_in_range
+from unmix_plugin.engine.machine import handled_signals
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
 _T = TypeVar("_T")
@@ -80,17 +80,14 @@ class Processes:
             parameter.grad = mean.view_as(parameter).to(parameter.dtype) if count > 0 else None
         return list(found)
 
-    def smallest(self, values: Tensor) -> Tensor:
-        """Smallest value over the processes, entry by entry, in place."""
-        return self._reduce(values, "MIN")
-
-    def largest(self, values: Tensor) -> Tensor:
-        """Largest value over the processes, entry by entry, in place."""
-        return self._reduce(values, "MAX")
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Mean over the processes, entry by entry, in place."""
-        return self._reduce(values, "SUM").div_(self.count) if self.count > 1 else values
+    def reduce(self, values: Tensor, how: Literal["min", "max", "mean"]) -> Tensor:
+        """Smallest, largest or mean value over the processes, entry by entry, in place."""
+        if self.count > 1:
+            operation = getattr(distributed.ReduceOp, {"min": "MIN", "max": "MAX", "mean": "SUM"}[how])
+            self._call(lambda: distributed.all_reduce(values, op=operation))
+            if how == "mean":
+                values.div_(self.count)
+        return values
 
     def of_first(self, values: Tensor) -> Tensor:
         """The first process's values, in place."""
@@ -149,11 +146,6 @@ class Processes:
         if failure is not None:
             raise failure
         raise RunError(f"process {failed[0] + 1} of {self.count}: {said[failed[0]]}")
-
-    def _reduce(self, values: Tensor, operation: str) -> Tensor:
-        if self.count > 1:
-            self._call(lambda: distributed.all_reduce(values, op=getattr(distributed.ReduceOp, operation)))
-        return values
 
     def _call(self, exchange: Callable[[], object]) -> None:
         """An exchange with the others; a RunError if one of them is gone."""
@@ -310,8 +302,15 @@ def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
         for rank in range(count)
     ]
     codes: list[int | None] = [None] * count
+
+    def forward(number: int, _frame: FrameType | None) -> None:
+        with suppress(OSError):
+            workers[0].send_signal(number)
+
+    # Ctrl-C reaches all processes of a terminal by itself.
+    handlers = {"SIGTERM": forward, "SIGHUP": forward, "SIGINT": lambda *_: None}
     try:
-        with _forwarded_signals(workers[0]):
+        with handled_signals(handlers):
             while workers[0].poll() is None and not any(worker.poll() for worker in workers):
                 time.sleep(0.05)
             deadline = time.monotonic() + _GRACE_SECONDS
@@ -330,21 +329,3 @@ def _run_processes(module: str, argv: Sequence[str], count: int) -> int:
         f"process {rank + 1} of {count} ended with exit code {codes[rank]}, and with it all others. Checkpoints saved "
         "before are whole: go on with --load-run"
     )
-
-
-@contextmanager
-def _forwarded_signals(first: subprocess.Popen[bytes]) -> Iterator[None]:
-    """Context in which the first process gets the signals of this one; Ctrl-C reaches all of a terminal by itself."""
-
-    def forward(number: int, _frame: FrameType | None) -> None:
-        with suppress(OSError):
-            first.send_signal(number)
-
-    handlers = {"SIGTERM": forward, "SIGHUP": forward, "SIGINT": lambda *_: None}
-    known = {getattr(signal, name): handler for name, handler in handlers.items() if hasattr(signal, name)}
-    before = {number: signal.signal(number, handler) for number, handler in known.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -93,8 +93,8 @@ class _RobustWeights(nn.Module):
     @torch.no_grad()
     def update(self, processes: Processes) -> None:
         """Decide what pixels weigh, alike in all processes."""
-        processes.mean(self.squares)
-        processes.mean(self.counts)
+        processes.reduce(self.squares, "mean")
+        processes.reduce(self.counts, "mean")
         is_known = self.counts > _FEWEST_PIXELS
         errors = self.squares / self.counts.clamp(min=_FEWEST_PIXELS)
         usual = errors[is_known].median() if bool(is_known.any()) else errors.new_ones(())

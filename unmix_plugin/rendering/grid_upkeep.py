@@ -32,9 +32,8 @@ _FIRST_CELLS_UNTIL = 0.5
 """That part."""
 
 _SHARE_OF_PIXELS = 0.07
-"""Of the pixels of the training views, that must be cast before it is decided anew what is visible. In large
-pictures a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good.
-"""
+"""Of the pixels of the training views, that must be cast before it is decided anew what is visible. In large pictures
+a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good."""
 
 
 def is_due(step: int) -> bool:
@@ -62,10 +61,14 @@ def update_grid(
         progress: Part of the training that is over.
         num_pixels: Of the training views; 0 if it is not known.
     """
-    device = torch.device("cpu") if generator is None else generator.device
-    drawn = torch.randint(2**62, (1,), generator=generator, device=device)
-    seed = int(processes.of_first(drawn))
-    _share_sights(grid, processes)
+    device = "cpu" if generator is None else generator.device
+    drawn = processes.of_first(torch.randint(2**62, (1,), generator=generator, device=device))
+    # Which cells the rays of all processes saw, and what they met; sharing it twice is as good as once.
+    visibility = grid.visibility
+    processes.reduce(visibility.lowest_view, "min")
+    for values in (visibility.highest_view, visibility.num_rays, grid.observed):
+        if values is not None:
+            processes.reduce(values, "max")
     space = renderer.space
     begins_coarsely = renderer.is_unbounded and progress < _FIRST_CELLS_UNTIL
     grid.update(
@@ -73,35 +76,17 @@ def update_grid(
         threshold=_occupied_density(renderer, max(grid.occupied.shape)),
         decay=_GRID_DECAY,
         num_cells=_PROBED_CELLS,
-        generator=torch.Generator().manual_seed(seed),
+        generator=torch.Generator().manual_seed(int(drawn)),
         block=max(len(grid.occupied) // _FIRST_CELLS, 1) if begins_coarsely else 1,
         fewest_rays=int(_SHARE_OF_PIXELS * num_pixels),
     )
 
 
 def _occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
-    """Density from which a cell counts as occupied.
-
-    Args:
-        renderer: With the distance of samples.
-        num_cells: Along an edge of the grid.
-
-    Returns:
-        Optical depth per model unit.
-    """
+    """Density per model unit from which a cell counts as occupied, of which so many lie along an edge of the grid."""
     by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
     across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.shortest_edge) / num_cells)
     return min(by_sample, across)
-
-
-def _share_sights(grid: OccupancyGrid, processes: Processes) -> None:
-    """Share which cells the rays of all processes saw, and what they met; twice is as good as once."""
-    visibility = grid.visibility
-    processes.smallest(visibility.lowest_view)
-    processes.largest(visibility.highest_view)
-    processes.largest(visibility.num_rays)
-    if grid.observed is not None:
-        processes.largest(grid.observed)
 
 
 def record_seen(

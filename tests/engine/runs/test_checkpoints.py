@@ -16,7 +16,7 @@ from torch import Tensor
 from tests.systems import needs_posix
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
-from unmix_plugin.engine.runs.checkpoints import Checkpoint, newest_complete_checkpoint, save_checkpoint
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.errors import RunError
 
@@ -60,12 +60,6 @@ class Killed(BaseException):
     """Stands for SIGKILL: nothing that runs after it has any effect."""
 
 
-def complete(folder: Path) -> Checkpoint:
-    found = newest_complete_checkpoint(folder)
-    assert found is not None
-    return found
-
-
 def calls_of_a_save(folder: Path, dead: bool = True) -> int:
     with pytest.MonkeyPatch.context() as monkeypatch:
         faults = Faults(monkeypatch, None, Killed, dead)
@@ -90,7 +84,7 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
     }
     path = save_checkpoint(tmp_path / "new", 7, tensors, {"seconds": 1.25, "list": [1, "x", None]})
     assert path.name == "step-000007.json"
-    loaded = complete(tmp_path / "new")
+    loaded = newest_complete_checkpoint(tmp_path / "new")
     assert (loaded.step, loaded.record["seconds"], loaded.record["list"]) == (7, 1.25, [1, "x", None])
     assert set(loaded.tensors) == set(tensors)
     for name, tensor in tensors.items():
@@ -114,7 +108,7 @@ def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path, 
             Faults(monkeypatch, at, Killed, dead=True)
             with contextlib.suppress(Killed):
                 save_checkpoint(folder, 2, tensors_of(2), {}, keep=1 + same_step)
-        found = complete(folder)
+        found = newest_complete_checkpoint(folder)
         assert found.damaged == ()
         assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
         seen.add(found.step)
@@ -141,7 +135,7 @@ def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Pa
         names = {path.name for path in folder.iterdir()}
         assert not [name for name in names if name.endswith(".tmp")]
         assert {"step-000001.json", "step-000001.safetensors"} <= names
-        found = complete(folder)
+        found = newest_complete_checkpoint(folder)
         assert found.damaged == ()
 
 
@@ -197,19 +191,20 @@ def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    found = complete(tmp_path)
+    found = newest_complete_checkpoint(tmp_path)
     assert found.step == 1
     assert "step-000002" in found.damaged[0]
     path.unlink()
-    assert complete(tmp_path).step == 1
+    assert newest_complete_checkpoint(tmp_path).step == 1
     (tmp_path / "step-000002.json").write_text('{"format_ver')
-    found = complete(tmp_path)
+    found = newest_complete_checkpoint(tmp_path)
     assert found.step == 1
 
 
 def test_the_newest_two_stay_and_a_damaged_one_does_not_count_among_them(tmp_path: Path):
-    assert newest_complete_checkpoint(tmp_path / "missing") is None
-    assert newest_complete_checkpoint(tmp_path) is None
+    for folder in (tmp_path / "missing", tmp_path):
+        with pytest.raises(RunError, match=r"no complete checkpoint in .*: training ended before the first"):
+            newest_complete_checkpoint(folder)
     for step in (10, 999_999, 1_000_000, 1_000_001):
         save_checkpoint(tmp_path / "many", step, tensors_of(step), {})
     assert checkpoint_steps(tmp_path / "many") == [1_000_001, 1_000_000]
@@ -234,6 +229,6 @@ def test_saving_the_same_tensors_again_only_rewrites_the_record(tmp_path: Path):
     save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 1})
     before = (tmp_path / "step-000001.safetensors").stat().st_mtime_ns
     save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 2})
-    found = complete(tmp_path)
+    found = newest_complete_checkpoint(tmp_path)
     assert found.record["seconds"] == 2
     assert (tmp_path / "step-000001.safetensors").stat().st_mtime_ns == before

@@ -156,7 +156,7 @@ def test_a_poisoned_step_changes_no_parameter_and_is_counted_and_logged(short_co
     assert record.skipped_steps == 1
     assert torch.equal(seen[5], seen[4])
     assert not torch.equal(seen[6], seen[5])
-    assert "step 5 skipped: non-finite loss (nan)" in trainer.log.path.read_text()
+    assert "step 5 skipped: non-finite loss (nan)" in trainer.run.log_path.read_text()
     assert '"loss": null' in trainer.run.metrics_path.read_text()
 
 
@@ -168,7 +168,6 @@ def test_training_that_stays_poisoned_ends_with_the_last_checkpoint_whole(
     with pytest.raises(RunError, match="3 training steps in a row"):
         trainer.train()
     checkpoint = newest_complete_checkpoint(trainer.run.checkpoints)
-    assert checkpoint is not None
     assert checkpoint.step == 8
     assert all(tensor.isfinite().all() for tensor in checkpoint.tensors.values())
 

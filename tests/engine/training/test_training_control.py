@@ -50,7 +50,7 @@ def contest(monkeypatch):
         guest = threading.Thread(target=be_guest)
         guest.start()
         for _ in range(steps):
-            while device._num_waiting == 0:  # the guest is on its way to its next turn
+            while device._waiting["guest"] == 0:  # the guest is on its way to its next turn
                 time.sleep(0)
             step(device.training_turn(), "training")
         is_over.set()
@@ -157,7 +157,7 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under
     training = threading.Thread(target=warm_up)
     with device.guest_turn():
         training.start()
-        while not device._is_training_waiting:
+        while device._waiting["training"] == 0:
             time.sleep(0)
     for _ in range(3):
         with device.guest_turn():
@@ -231,9 +231,9 @@ def test_a_pause_stops_the_steps_and_the_clock_until_it_is_over(short_config):
     assert owners == [thread.ident]  # kernels are compiled once, in a turn of training
     assert control.is_running
     assert not control.device.is_training
-    seconds = trainer.clock.seconds
+    seconds = trainer.seconds
     wait_for_rounds(control, 3)
-    assert (trainer.step, trainer.clock.seconds) == (5, seconds)
+    assert (trainer.step, trainer.seconds) == (5, seconds)
     control.resume()
     thread.join(120)
     assert trainer.step == 12

@@ -31,8 +31,6 @@ from unmix_plugin.limits import read_bounded
 
 _MOST_BYTES = 1 << 33
 """Of a checkpoint's tensors; the largest grids that settings allow take some gigabytes with the optimiser's state."""
-
-
 _MODEL, _OPTIMIZER, AVERAGE = "model/", "optimizer/", "average/"
 
 
@@ -87,31 +85,23 @@ def save_checkpoint(
     return record_path
 
 
-def newest_complete_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint whose tensors have the hash that its record says; None if there is none.
+def newest_complete_checkpoint(folder: Path) -> Checkpoint:
+    """The newest checkpoint whose tensors have the hash that its record says.
 
     Raises:
+        RunError: there is none.
         OtherFormatError: another version of this package wrote a record.
     """
-    return _newest(folder, damaged=[])
-
-
-def reason_for_none(folder: Path) -> str:
-    """Why there is no complete checkpoint: what is wrong with the newest one, or that there is none."""
     damaged: list[str] = []
-    _newest(folder, damaged)
-    if not damaged:
-        return "training ended before the first was saved"
-    return f"the files there are damaged or cut short ({damaged[0]}); copy the run again, or train anew"
-
-
-def _newest(folder: Path, damaged: list[str]) -> Checkpoint | None:
     for step in checkpoint_steps(folder):
         found = _read(folder / f"{_stem(step)}.json")
         if not isinstance(found, str):
             return Checkpoint(step, *found, tuple(damaged))
         damaged.append(f"{_stem(step)}: {found}")
-    return None
+    reason = "training ended before the first was saved"
+    if damaged:
+        reason = f"the files there are damaged or cut short ({damaged[0]}); copy the run again, or train anew"
+    raise RunError(f"no complete checkpoint in {folder}: {reason}")
 
 
 def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
@@ -128,15 +118,13 @@ def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
         return tensors, record
     except OtherFormatError:
         raise
-    except (OSError, RunError, SafetensorError, ValueError, KeyError) as error:
+    except (OSError, RunError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         return str(error)
 
 
 def _is_sound(name: str, tensor: Tensor) -> bool:
     """Whether a tensor holds numbers; what a model keeps beside its parameters may be infinite."""
-    is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
-    values = tensor.float() if is_small else tensor
-    is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
+    is_sound = tensor.isnan().logical_not() if name.startswith(_MODEL) else tensor.isfinite()
     return bool(is_sound.all())
 
 

@@ -9,13 +9,7 @@ from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
-from unmix_plugin.engine.runs.checkpoints import (
-    Checkpoint,
-    TrainingRecord,
-    newest_complete_checkpoint,
-    reason_for_none,
-    restore_model,
-)
+from unmix_plugin.engine.runs.checkpoints import TrainingRecord, newest_complete_checkpoint, restore_model
 from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, read_scene_record
@@ -57,7 +51,7 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = require_checkpoint(run)
+    checkpoint = newest_complete_checkpoint(run.checkpoints)
     try:
         model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
     except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -78,7 +72,7 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = require_checkpoint(run)
+    checkpoint = newest_complete_checkpoint(run.checkpoints)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)
     check_same_scene(scene, pipeline.datamanager, run)
@@ -105,32 +99,12 @@ def load_config(path: Path) -> TrainerConfig:
 
 
 def write_config(run: RunFolder, config: TrainerConfig) -> None:
-    """Write `config.json`.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write `config.json`."""
     write_run_json(run.config_path, {"config": config_to_json(replace(config, load_run=None))})
 
 
-def require_checkpoint(run: RunFolder) -> Checkpoint:
-    """The newest complete checkpoint.
-
-    Raises:
-        RunError: there is none.
-    """
-    checkpoint = newest_complete_checkpoint(run.checkpoints)
-    if checkpoint is None:
-        raise RunError(f"no complete checkpoint in {run.checkpoints}: {reason_for_none(run.checkpoints)}")
-    return checkpoint
-
-
 def require_data(config: TrainerConfig) -> Path:
-    """The scene's path.
-
-    Raises:
-        ConfigError: none was given.
-    """
+    """The scene's path. Raises ConfigError: none was given."""
     if config.data is None:
         raise ConfigError("no scene: give its folder with --data")
     return config.data

@@ -45,6 +45,11 @@ class RunFolder:
         return self.path / "metrics.jsonl"
 
     @property
+    def log_path(self) -> Path:
+        """Events of the training, one a line."""
+        return self.path / "run.log"
+
+    @property
     def eval(self) -> Path:
         """Folder of evaluations."""
         return self.path / "eval"

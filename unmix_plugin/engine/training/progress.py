@@ -1,7 +1,7 @@
-"""How far training has come: when it ends, how that is shown, and what is written down of it.
+"""How far training has come: how that is shown, and what is written down of it.
 
-It ends by steps, by seconds of training, or by whichever is first. A terminal has a live bar, other outputs a plain
-line every few seconds; metrics become JSON lines (and TensorBoard files, where it is installed), events a log.
+A terminal has a live bar, other outputs a plain line every few seconds; metrics become JSON lines (and TensorBoard
+files, where it is installed), events a log.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import os
-import stat
 import time
 import warnings
 from collections.abc import Iterator, Mapping
@@ -18,7 +16,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
@@ -27,49 +24,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from unmix_plugin.engine.runs.atomic_files import cannot_write, parse_plain_json, write_file
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import RunError
-from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
+from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded, regular_file
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Where training ends."""
-
-    max_steps: int | None
-    """Steps; None: no such limit."""
-    max_seconds: float | None
-    """Seconds of training; None: no such limit."""
-
-    def progress(self, step: int, seconds: float) -> float:
-        """Fraction in [0, 1] used up of the limit that is nearer its end; 0 without limits."""
-        parts = [
-            1.0 if limit <= 0 else spent / limit
-            for spent, limit in ((step, self.max_steps), (seconds, self.max_seconds))
-            if limit is not None
-        ]
-        return min(1.0, max(parts, default=0.0))
-
-    def reached(self, step: int, seconds: float) -> bool:
-        """Whether training is over."""
-        return self.progress(step, seconds) >= 1.0
-
-
-class TrainingClock:
-    """Counts the seconds spent in training steps and nothing else."""
-
-    def __init__(self, seconds: float = 0.0) -> None:
-        self.seconds = seconds
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Context whose time counts."""
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds += time.perf_counter() - started
 
 
 _BAR_WIDTH, _WIDTH_WITH_BAR = 24, 100
@@ -147,13 +105,10 @@ class ProgressDisplay:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             with self._noting_a_closed_console():
                 self._bar.stop()
-            self._bar = None
 
     @property
     def is_due(self) -> bool:
@@ -204,31 +159,23 @@ def _count(number: float) -> str:
     return f"{number:.0f}"
 
 
-_Split = Literal["train", "eval_all"]
-"""Which rays a metric is of: a training batch, all evaluation views."""
-
-
 class MetricsWriter:
     """Appends to `metrics.jsonl` and, if the package is installed, to TensorBoard's files in `tensorboard/`."""
 
     def __init__(self, run: RunFolder, resumed_step: int = 0) -> None:
-        """Go on after step `resumed_step`; what a stopped run wrote beyond it is cut off.
-
-        Raises:
-            RunError: the file can't be written.
-        """
-        self.path = run.metrics_path
-        _keep_until(self.path, resumed_step)
+        """Go on after step `resumed_step`; what a stopped run wrote beyond it is cut off. Raises RunError."""
+        self._path = run.metrics_path
+        _keep_until(self._path, resumed_step)
         self._board = _tensorboard(run.path / "tensorboard", resumed_step)
 
-    def write(self, step: int, seconds: float, split: _Split, values: Mapping[str, float]) -> None:
-        """One line; numbers that are not finite become null.
-
-        Raises:
-            RunError: the file can't be written.
-        """
+    def write(
+        self, step: int, seconds: float, split: Literal["train", "eval_all"], values: Mapping[str, float]
+    ) -> None:
+        """One line, of a training batch or of all evaluation views; numbers that are not finite become null."""
         finite = {name: value if math.isfinite(value) else None for name, value in values.items()}
-        _append(self.path, json.dumps({"step": step, "seconds": round(seconds, 3), "split": split, **finite}))
+        _append(
+            self._path, json.dumps({"step": step, "seconds": round(seconds, 3), "split": split, **finite})
+        )
         if self._board is not None:
             for name, value in values.items():
                 self._board.add_scalar(f"{split}/{name}", value, step)
@@ -245,38 +192,19 @@ class MetricsWriter:
             self._board.close()
 
 
-class RunLog:
-    """Appends dated lines to `run.log`."""
-
-    def __init__(self, run: RunFolder) -> None:
-        self.path = run.path / "run.log"
-
-    def write(self, text: str) -> None:
-        """One event.
-
-        Raises:
-            RunError: the file can't be written.
-        """
-        _append(self.path, f"{datetime.now(timezone.utc).isoformat(timespec='seconds')} {text}")
+def write_event(run: RunFolder, text: str) -> None:
+    """Append a dated line to `run.log`. Raises RunError: it can't be written."""
+    _append(run.log_path, f"{datetime.now(timezone.utc).isoformat(timespec='seconds')} {text}")
 
 
 def _append(path: Path, line: str) -> None:
     try:
-        with open(path, "a", encoding="utf-8", errors="backslashreplace", opener=_open_regular) as file:
+        with open(path, "a", encoding="utf-8", errors="backslashreplace", opener=regular_file) as file:
             file.write(line + "\n")
     except OSError as error:
         raise RunError(
             f"can't write {path}: {error.strerror or error}; checkpoints saved before are whole"
         ) from error
-
-
-def _open_regular(path: str, flags: int) -> int:
-    """Open for writing what is a regular file: a pipe that nobody reads would wait for ever."""
-    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(None, "is no regular file", path)
-    return descriptor
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:

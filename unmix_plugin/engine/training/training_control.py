@@ -5,12 +5,13 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any
+from types import FrameType
+from typing import Literal
 
+from unmix_plugin.engine.machine import handled_signals
 from unmix_plugin.engine.training.progress import TrainingStatus
 
 SHARE_BOUNDS = (0.05, 0.9)
@@ -39,9 +40,8 @@ class DeviceShare:
         self._turn = threading.Condition()
         self._owner: int | None = None
         self._is_training = False
-        self._num_waiting = 0
-        self._is_training_waiting = False
-        self._was_guests_turn = False
+        self._waiting = {"training": 0, "guest": 0}
+        self._last = "training"
         self._credit_s = _LARGEST_CREDIT_S
         self.guest_share = guest_share
         self.training_turns = 0
@@ -71,51 +71,25 @@ class DeviceShare:
     @contextmanager
     def training_turn(self) -> Iterator[None]:
         """Context in which training has the device; earns the guest credit."""
-        with self._turn:
-            self._refuse_nesting()
-            self._is_training_waiting = True
+        earned_a_second = self._guest_share / (1 - self._guest_share)
+        with self._turn_of("training", lambda: not self._guest_goes_first, earned_a_second):
             try:
-                self._turn.wait_for(lambda: self._owner is None and not self._guest_goes_first)
+                yield
             finally:
-                self._is_training_waiting = False
-            self._owner = threading.get_ident()
-            self._was_guests_turn = False
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.training_turns += 1
-            self._release((time.perf_counter() - started) * self._guest_share / (1 - self._guest_share))
+                self.training_turns += 1
 
-    @contextmanager
-    def guest_turn(self, cost: float = 1.0) -> Iterator[None]:
+    def guest_turn(self, cost: float = 1.0) -> AbstractContextManager[None]:
         """Context in which the guest has the device.
 
         Args:
             cost: Seconds of credit that a second takes; more than 1 for work that may wait.
         """
-        with self._turn:
-            self._refuse_nesting()
-            self._num_waiting += 1
-            try:
-                self._turn.wait_for(
-                    lambda: self._owner is None and self.guest_may_go and not self._training_goes_first
-                )
-            finally:
-                self._num_waiting -= 1
-            self._owner = threading.get_ident()
-            self._was_guests_turn = True
-        started = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._release(-cost * (time.perf_counter() - started))
+        return self._turn_of("guest", lambda: self.guest_may_go and not self._training_goes_first, -cost)
 
     def charge(self, seconds: float) -> None:
         """Count time that the guest computed outside its turns, on processors that training could have used."""
         with self._turn:
-            if self._is_training:
-                self._credit_s -= seconds
+            self._earn(-seconds)
 
     @property
     def guest_may_go(self) -> bool:
@@ -124,23 +98,37 @@ class DeviceShare:
 
     @property
     def _guest_goes_first(self) -> bool:
-        return self._num_waiting > 0 and self.guest_may_go and not self._training_goes_first
+        return self._waiting["guest"] > 0 and self.guest_may_go and not self._training_goes_first
 
     @property
     def _training_goes_first(self) -> bool:
-        return self._is_training_waiting and self._was_guests_turn and not self._is_training
+        return self._waiting["training"] > 0 and self._last == "guest" and not self._is_training
 
-    def _refuse_nesting(self) -> None:
-        """A thread that has the device would wait for itself forever."""
-        if self._owner == threading.get_ident():
-            raise RuntimeError("this thread has the device already: turns do not nest")
-
-    def _release(self, credit_s: float) -> None:
+    @contextmanager
+    def _turn_of(
+        self, who: Literal["training", "guest"], may_go: Callable[[], bool], credit_a_second: float
+    ) -> Iterator[None]:
         with self._turn:
-            self._owner = None
-            if self._is_training:
-                self._credit_s = min(self._credit_s + credit_s, _LARGEST_CREDIT_S)
-            self._turn.notify_all()
+            if self._owner == threading.get_ident():
+                raise RuntimeError("this thread has the device already: turns do not nest")
+            self._waiting[who] += 1
+            try:
+                self._turn.wait_for(lambda: self._owner is None and may_go())
+            finally:
+                self._waiting[who] -= 1
+            self._owner, self._last = threading.get_ident(), who
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._turn:
+                self._owner = None
+                self._earn(credit_a_second * (time.perf_counter() - started))
+                self._turn.notify_all()
+
+    def _earn(self, credit_s: float) -> None:
+        if self._is_training:
+            self._credit_s = min(self._credit_s + credit_s, _LARGEST_CREDIT_S)
 
 
 _STATUS_INTERVAL_S = 0.25
@@ -210,7 +198,7 @@ class TrainingControl:
         return asked
 
     @property
-    def is_status_due(self) -> bool:
+    def is_due(self) -> bool:
         """Whether it is time for the trainer to renew `status`."""
         return time.monotonic() - self._status_at >= _STATUS_INTERVAL_S
 
@@ -231,36 +219,22 @@ class Interrupted(Exception):  # noqa: N818
         """Step of the newest checkpoint, from which `load_config(run)` resumes; None if there is none."""
 
 
-class StopSignals:
-    """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted, and a second one raises KeyboardInterrupt.
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Context in which Ctrl-C, SIGTERM or SIGHUP is only noted in the list, and a second one raises KeyboardInterrupt.
 
     A lost terminal often sends SIGHUP twice, so that a second one of these changes nothing; under nohup it stays
     ignored. In a thread that is not the main one signals can't be caught, and nothing is ever noted.
     """
+    noted: list[int] = []
 
-    def __init__(self) -> None:
-        self.requested = False
-        """Whether a stop was asked for."""
-        self._previous: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> "StopSignals":
-        if threading.current_thread() is threading.main_thread():
-            names = ("SIGINT", "SIGTERM", "SIGHUP")
-            caught = [getattr(signal, name) for name in names if hasattr(signal, name)]
-            self._previous = {
-                number: signal.signal(number, self._note)
-                for number in caught
-                if number.name != "SIGHUP" or signal.getsignal(number) is not signal.SIG_IGN
-            }
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.requested and signal.Signals(number).name != "SIGHUP":
+    def note(number: int, _frame: FrameType | None) -> None:
+        if noted and signal.Signals(number).name != "SIGHUP":
             raise KeyboardInterrupt
-        self.requested = True
+        noted.append(number)
+
+    names = ["SIGINT", "SIGTERM", "SIGHUP"] if threading.current_thread() is threading.main_thread() else []
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and names:
+        names.remove("SIGHUP")
+    with handled_signals(dict.fromkeys(names, note)):
+        yield noted
