@@ -28,18 +28,13 @@ _READERS_S = (0.02, 0.1, 0.5, 1.0) if os.name == "nt" else ()
 _LONGEST_PATH = 259 if os.name == "nt" else None
 """Letters of a path, where Windows has not been told to take long ones; its error is that of a missing folder."""
 
-_MAKE_ROOM, _ELSEWHERE = "; make room or choose another folder", "; choose a folder that you may write to"
-_RAISE_LIMIT = "; raise the limit of a file's size (ulimit -f), or choose a folder on another file system"
 _ADVICE = {
-    os.strerror(number): advice
-    for advice, numbers in (
-        (_MAKE_ROOM, (errno.ENOSPC, errno.EDQUOT)),
-        (_RAISE_LIMIT, (errno.EFBIG,)),
-        (_ELSEWHERE, (errno.EACCES, errno.EPERM, errno.EROFS)),
-        ("; choose a shorter name", (errno.ENAMETOOLONG,)),
-    )
-    for number in numbers
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "make room or choose another folder"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "choose a folder that you may write to"),
+    errno.EFBIG: "raise the limit of a file's size (ulimit -f), or choose a folder on another file system",
+    errno.ENAMETOOLONG: "choose a shorter name",
 }
+_ADVICE_FOR = {os.strerror(number): f"; {advice}" for number, advice in _ADVICE.items()}
 
 NOT_PLAIN, NOT_PORTABLE = r"[^\w.+-]+", r'[\\/:*?"<>|]'
 """What a name needn't have, and what some system refuses in one."""
@@ -101,7 +96,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> Path:
-    """Write `data` under a temporary name, force it to disk, then give it its own; the folder is made.
+    """Write `data` as a `whole_file`; its path.
 
     Raises:
         RunError: the disk is full or refuses; what was there before is untouched.
@@ -123,11 +118,7 @@ def write_all(descriptor: int, data: memoryview) -> None:
 
 
 def make_folder(path: Path) -> Path:
-    """The folder, made if it is not there.
-
-    Raises:
-        RunError: it can't be made.
-    """
+    """The folder, made if it is not there. Raises RunError: it can't be made."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -139,22 +130,18 @@ def make_folder(path: Path) -> Path:
 
 @contextmanager
 def write_errors_as(path: Path) -> Iterator[None]:
-    """Context in which an error of the system becomes one of writing `path`.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Context in which an error of the system becomes one of writing `path`, a RunError."""
     try:
         yield
     except OSError as error:
         # Windows has words of its own, in its user's language.
         known = os.strerror(error.errno) if error.errno is not None else ""
-        raise cannot_write(path, known if known in _ADVICE else error.strerror or str(error)) from error
+        raise cannot_write(path, known if known in _ADVICE_FOR else error.strerror or str(error)) from error
 
 
 def cannot_write(path: Path, reason: str) -> RunError:
     """The error of a file that can't be written, with advice where the reason calls for some."""
-    return RunError(f"can't write {path}: {reason}{_too_long(path) or _ADVICE.get(reason, '')}")
+    return RunError(f"can't write {path}: {reason}{_too_long(path) or _ADVICE_FOR.get(reason, '')}")
 
 
 def _too_long(path: Path) -> str:
@@ -205,8 +192,7 @@ def write_run_json(path: Path, values: dict[str, Any]) -> None:
 
     Raises:
         RunError: the disk is full or refuses.
-        TypeError: a value that JSON has no form for.
-        ValueError: a number that is not finite.
+        TypeError, ValueError: a value that JSON has no form for, or a number that is not finite.
     """
     text = json.dumps({"format_version": RUN_FORMAT, **values}, indent=1, allow_nan=False)
     write_file(path, (text + "\n").encode())
@@ -228,21 +214,18 @@ def read_run_json(path: Path) -> dict[str, Any]:
     version = values.get("format_version") if isinstance(values, dict) else None
     if type(version) is not int:
         raise RunError(f"{path} is not a file of a run: it has no format_version")
-    if version > RUN_FORMAT:
+    if version != RUN_FORMAT:
+        age, advice = ("a newer", "update this package")
+        if version < RUN_FORMAT:
+            age, advice = ("an older", "train again, or use the version that trained it")
         raise OtherFormatError(
-            f"{path} has format {version}, written by a newer version; this one reads format {RUN_FORMAT}: "
-            "update this package"
-        )
-    if version < RUN_FORMAT:
-        raise OtherFormatError(
-            f"{path} has format {version}, written by an older version; this one reads format {RUN_FORMAT}: "
-            "train again, or use the version that trained it"
+            f"{path} has format {version}, written by {age} version; this one reads format {RUN_FORMAT}: {advice}"
         )
     return values
 
 
 def read_plain_json(path: Path) -> Any:
-    """The value in any JSON file that lies in a run folder, with nothing in it that no run writes.
+    """The value in any JSON file of a run folder.
 
     Raises:
         FileNotFoundError: there is none.
@@ -252,18 +235,13 @@ def read_plain_json(path: Path) -> Any:
         return parse_plain_json(read_bounded(path, MOST_TABLE_BYTES).decode("utf-8-sig"))
     except FileNotFoundError:
         raise
-    except OSError as error:
-        raise RunError(f"can't read {path}: {error.strerror or error}; the run is damaged") from error
-    except ValueError as error:
-        raise RunError(f"can't read {path}: {error}; the run is damaged") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RunError(f"can't read {path}: {reason}; the run is damaged") from error
 
 
 def parse_plain_json(text: str) -> Any:
-    """The value in a text of JSON.
-
-    Raises:
-        ValueError: it is none, or holds what no run writes.
-    """
+    """The value in a text of JSON. Raises ValueError: it is none, or holds what no run writes."""
     try:
         value = parse_json(text)
         _require_plain(value, DEEPEST)
@@ -276,12 +254,8 @@ def _require_plain(value: Any, depth: int) -> None:
     """Refuse what Python's JSON reader accepts and no run writes."""
     if depth == 0:
         raise ValueError(f"nested more than {DEEPEST} levels deep")
-    if isinstance(value, dict):
-        for key, entry in value.items():
-            _require_plain(key, depth - 1)
-            _require_plain(entry, depth - 1)
-    elif isinstance(value, list):
-        for entry in value:
+    if isinstance(value, dict | list):
+        for entry in [*value, *value.values()] if isinstance(value, dict) else value:
             _require_plain(entry, depth - 1)
     elif isinstance(value, str):
         os.fsencode(value)  # may become a path; raises for a lone surrogate

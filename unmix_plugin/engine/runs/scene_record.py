@@ -17,7 +17,7 @@ from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, read_run_json, safe_name
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.errors import ConfigError, RunError
+from unmix_plugin.errors import ConfigError, RunError, name_some
 
 
 @dataclass(frozen=True)
@@ -79,12 +79,10 @@ def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolde
         RunError: metadata, scene box or identity differ from what the run was trained with.
     """
     box, other_box = scene.scene_box.aabb.tolist(), datamanager.scene_box.aabb.tolist()
-    kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary)}
-    summary = datamanager.summary()
-    found = {**datamanager.metadata(), "scene_box": other_box, **datamanager.identity(summary)}
-    kept |= {"image sizes": _sizes(scene.train_cameras, scene.eval_cameras)}
-    found |= {"image sizes": _sizes(datamanager.train_cameras, datamanager.eval_cameras)}
-    differing = differences(kept, found)
+    sizes, other_sizes = (_sizes(x.train_cameras, x.eval_cameras) for x in (scene, datamanager))
+    kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary), "image sizes": sizes}
+    found = {**datamanager.metadata(), "scene_box": other_box, **datamanager.identity(datamanager.summary())}
+    differing = differences(kept, {**found, "image sizes": other_sizes})
     if differing:
         raise RunError(
             f"the scene at {datamanager.data} is not the one that {run.path} was trained on: "
@@ -112,7 +110,7 @@ def _check_frames(record: SceneRecord) -> None:
     if not isinstance(frames, list) or len(set(map(str, frames))) != len(frames):
         raise ValueError("frames must be a list of different names")
     for name in frames:
-        if not _is_plain_name(name):
+        if not isinstance(name, str) or name != safe_name(name, NOT_PORTABLE):
             raise ValueError(f"{name!r} can't be the name of a frame: it is not a plain file name")
     for split, cameras in (("train", record.train_cameras), ("eval", record.eval_cameras)):
         indices = summary.get(f"{split}_indices", [])
@@ -122,17 +120,8 @@ def _check_frames(record: SceneRecord) -> None:
             raise ValueError(f"{split}_indices must count from 0 to {len(frames) - 1}")
 
 
-def _is_plain_name(name: Any) -> bool:
-    """Whether `name` is text that names a file in a folder on any system, and never one elsewhere."""
-    return isinstance(name, str) and name == safe_name(name, NOT_PORTABLE)
-
-
 _RELATIVE_TOLERANCE = 1e-4
 """Of numbers, against the greatest of the list that they are in."""
-
-
-_MOST_NAMED = 5
-"""Differences that a message names."""
 
 
 def differences(expected: Any, found: Any, name: str = "") -> list[str]:
@@ -146,16 +135,11 @@ def differences(expected: Any, found: Any, name: str = "") -> list[str]:
     ['size']
     """
     if isinstance(expected, Mapping) and isinstance(found, Mapping):
-        keys = dict.fromkeys([*expected, *found])
-        return [
-            place
-            for key in keys
-            for place in (
-                differences(expected[key], found[key], f"{name}.{key}" if name else str(key))
-                if key in expected and key in found
-                else [f"{name}.{key}" if name else str(key)]
-            )
-        ]
+        places: list[str] = []
+        for key in dict.fromkeys([*expected, *found]):
+            place, both = f"{name}.{key}" if name else str(key), key in expected and key in found
+            places += differences(expected[key], found[key], place) if both else [place]
+        return places
     return [] if _agree(expected, found) else [name]
 
 
@@ -165,8 +149,7 @@ def name_differences(places: list[str]) -> str:
     >>> name_differences(["cameras", "frames"])
     'cameras, frames differ'
     """
-    hidden = len(places) - _MOST_NAMED
-    return ", ".join(places[:_MOST_NAMED]) + (f" and {hidden} more differ" if hidden > 0 else " differ")
+    return name_some(places, most=5) + " differ"
 
 
 def _agree(expected: Any, found: Any) -> bool:
