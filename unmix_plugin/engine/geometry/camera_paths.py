@@ -50,8 +50,8 @@ def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
     angles = _swing(np.arctan2(away @ second, away @ first), num_frames)
     outward = np.cos(elevation) * (np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second)
     distance = np.median(np.linalg.norm(away, axis=1))
-    positions = centre + distance * (outward + np.sin(elevation) * up)
-    return _with_lens(cameras, np.stack([_look_at(position, centre, up) for position in positions]))
+    backs = outward + np.sin(elevation) * up
+    return _with_lens(cameras, _upright(centre + distance * backs, _unit(backs), up))
 
 
 def interpolated(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
@@ -123,13 +123,12 @@ def _swing(angles: Float64[np.ndarray, "N"], num_frames: int) -> Float64[np.ndar
     return start + (2 * np.pi - gaps[widest]) / 2 + half * np.sin(turn)
 
 
-def _look_at(
-    position: Float64[np.ndarray, "3"], target: Float64[np.ndarray, "3"], up: Float64[np.ndarray, "3"]
-) -> Float64[np.ndarray, "3 4"]:
-    back = (position - target) / np.linalg.norm(position - target)
-    right = np.cross(up, back)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back, position], axis=1)
+def _upright(
+    positions: Float64[np.ndarray, "F 3"], backs: Float64[np.ndarray, "F 3"], ups: Float64[np.ndarray, "*F 3"]
+) -> Float64[np.ndarray, "F 3 4"]:
+    """Poses at these positions that look against unit vectors, tilted so that right is square to up."""
+    rights = _unit(np.cross(ups, backs))
+    return np.stack([rights, np.cross(backs, rights), backs, positions], axis=2)
 
 
 def _path_around(
@@ -150,15 +149,11 @@ def _path_around(
     if np.linalg.norm(outward, axis=1).min() < _NEAR * distances.min():
         return None
     positions = CubicSpline(along, distances)(at)[:, None] * _unit(outward)
-    backs = positions - gazes
-    rights = np.cross(_unit(ups), _unit(backs))
-    if (
-        np.linalg.norm(backs, axis=1).min() < _NEAR * ahead.min()
-        or np.linalg.norm(rights, axis=1).min() < _NEAR
-    ):
+    backs, ups = positions - gazes, _unit(ups)
+    is_close = np.linalg.norm(backs, axis=1).min() < _NEAR * ahead.min()
+    if is_close or np.linalg.norm(np.cross(ups, _unit(backs)), axis=1).min() < _NEAR:
         return None
-    backs, rights = _unit(backs), _unit(rights)
-    return np.stack([rights, np.cross(backs, rights), backs, positions + centre], axis=2)
+    return _upright(positions + centre, _unit(backs), ups)
 
 
 def _straight_path(
@@ -197,16 +192,18 @@ def _tour(
 
 def _with_lens(cameras: Cameras, poses: Float[np.ndarray, "F 3 4"]) -> Cameras:
     """Pinhole cameras at these poses, with the middle lens of `cameras`."""
-    cameras, count = cameras.one_size(), len(poses)
-    middle = torch.tensor([[cameras.width / 2, cameras.height / 2]])
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        cameras.focal_px.cpu().median(dim=0).values.expand(count, 2).contiguous(),
-        middle.expand(count, 2).contiguous(),
-        torch.zeros(count, 4),
-        cameras.width,
-        cameras.height,
-    )
+    cameras = cameras.one_size()
+    return _pinholes(poses, cameras.focal_px.cpu().median(dim=0).values, cameras.width, cameras.height)
+
+
+def _pinholes(
+    poses: Float[np.ndarray, "F 3 4"], focal_px: Float[torch.Tensor, "2"], width: int, height: int
+) -> Cameras:
+    """Cameras of one lens whose axis meets the middle of the picture."""
+    ones = torch.ones(len(poses), 1)
+    middle = torch.tensor([width / 2, height / 2])
+    matrices = torch.tensor(poses, dtype=torch.float32)
+    return Cameras(matrices, ones * focal_px, ones * middle, ones * torch.zeros(4), width, height)
 
 
 _LEAST_CONVERGENCE = 1e-3
@@ -216,7 +213,6 @@ the nearest point is fixed at all."""
 
 _LEAST_SPREAD_DEG = 6.0
 """Root mean square of that angle for cameras turned about a subject; a flight whose camera sways has less."""
-
 
 _MOST_MISSED = 0.25
 """By how much half of the axes may miss the point, over their depth there."""
@@ -272,15 +268,5 @@ def upright_cameras(
         size: Rows and columns of all pictures.
         angle: Between the left and right edge of a picture, radians, below pi.
     """
-    views = len(positions)
-    right = np.cross([0.0, 0.0, 1.0], backward)
-    right /= np.linalg.norm(right, axis=1, keepdims=True)
-    poses = np.stack([right, np.cross(backward, right), backward, positions], axis=2)
-    return Cameras(
-        torch.tensor(poses, dtype=torch.float32),
-        torch.full((views, 2), float(size / 2 / np.tan(angle / 2))),
-        torch.full((views, 2), size / 2),
-        torch.zeros(views, 4),
-        size,
-        size,
-    )
+    focal_px = torch.full((2,), float(size / 2 / np.tan(angle / 2)))
+    return _pinholes(_upright(positions, backward, np.array([0.0, 0.0, 1.0])), focal_px, size, size)

@@ -181,15 +181,13 @@ class Cameras:
             subpixel_offset: Where in a pixel the ray passes, x, y in [0, 1].
         """
         device = self.camera_to_world.device
-        width, height = self.size(index)
-        rows, columns = torch.meshgrid(
-            torch.arange(height, device=device, dtype=torch.float32),
-            torch.arange(width, device=device, dtype=torch.float32),
-            indexing="ij",
+        x, y = (
+            torch.arange(count, device=device, dtype=torch.float32) + offset
+            for count, offset in zip(self.size(index), subpixel_offset, strict=True)
         )
-        pixel_coords = torch.stack([columns + subpixel_offset[0], rows + subpixel_offset[1]], dim=-1)
-        indices = torch.full((height * width,), index, dtype=torch.int64, device=device)
-        return self.generate_rays(indices, pixel_coords.reshape(-1, 2))
+        pixel_coords = torch.cartesian_prod(y, x).flip(-1)
+        indices = torch.full((len(pixel_coords),), index, dtype=torch.int64, device=device)
+        return self.generate_rays(indices, pixel_coords)
 
     def project(
         self, points: Float[Tensor, "P 3"], index: int
@@ -200,30 +198,23 @@ class Cameras:
             Pixel coordinates x, y (meaningless where the depth is not positive) and depths along the optical axis in
             scene units, positive in front of the camera. What no row of a line camera sees has depth -1.
         """
-        if self.is_line_camera(index):
-            return self._project_to_rows(points, index)
-        pose = self.camera_to_world[index]
-        local = (points - pose[:, 3]) @ pose[:, :3]
+        rows: Tensor | None = None
+        if self.key_poses is not None and self.is_line_camera(index):
+            rows, local = project_by_row(points, self.key_poses.of(index), self.size(index)[1])
+            local = local * local.new_tensor([1.0, 0.0, 1.0])  # each row is looked at along its own axis
+        else:
+            pose = self.camera_to_world[index]
+            local = (points - pose[:, 3]) @ pose[:, :3]
         depths = -local[:, 2]
         # Points on the camera plane have no image; any finite number does, since the caller looks at the depth.
         divisor = torch.where(depths.abs() < 1e-12, torch.full_like(depths, 1e-12), depths)
         coords = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / divisor[:, None]
         if self.is_distorted:
             coords = distort(coords, self.distortion[index])
-        return coords * self.focal_px[index] + self.center_px[index], depths
-
-    def _project_to_rows(
-        self, points: Float[Tensor, "P 3"], index: int
-    ) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"]]:
-        assert self.key_poses is not None
-        y, local = project_by_row(points, self.key_poses.of(index), self.size(index)[1])
-        depths = -local[:, 2]
-        across = local[:, 0] / depths.clamp(min=1e-12)
-        coords = torch.stack([across, torch.zeros_like(across)], dim=-1)
-        if self.is_distorted:
-            coords = distort(coords, self.distortion[index])
-        x = coords[:, 0] * self.focal_px[index, 0] + self.center_px[index, 0]
-        return torch.stack([x, y], dim=-1), torch.where(depths > 0, depths, -1.0)
+        pixels = coords * self.focal_px[index] + self.center_px[index]
+        if rows is None:
+            return pixels, depths
+        return torch.stack([pixels[:, 0], rows], dim=-1), torch.where(depths > 0, depths, -1.0)
 
     def to_json(self) -> dict[str, Any]:
         """The cameras as numbers and lists; `from_json` restores the same bits."""
@@ -248,12 +239,10 @@ class Cameras:
         count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
         sizes = [tuple(size) for size in values.get("sizes", [])]
         for size in ((width, height), *sizes):
-            if len(size) != 2 or not all(
-                type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size
-            ):
-                raise ValueError(
-                    f"an image of {' x '.join(map(str, size))} pixels; edges have 1 to {_LONGEST_EDGE_PX}"
-                )
+            are_edges = all(type(edge) is int and 1 <= edge <= _LONGEST_EDGE_PX for edge in size)
+            if len(size) != 2 or not are_edges:
+                shown = " x ".join(map(str, size))
+                raise ValueError(f"an image of {shown} pixels; edges have 1 to {_LONGEST_EDGE_PX}")
         if sizes and len(sizes) != count:
             raise ValueError(f"{len(sizes)} image sizes for {count} cameras")
         cameras = Cameras(
@@ -268,12 +257,8 @@ class Cameras:
         )
         if cameras.distortion.shape[1] not in (4, 6):
             raise ValueError(f"{cameras.distortion.shape[1]} coefficients of distortion; expected 4 or 6")
-        numbers = torch.cat(
-            [part.flatten() for part in (cameras.camera_to_world, cameras.center_px, cameras.distortion)]
-        )
-        if not (
-            numbers.isfinite().all() and (cameras.focal_px > 0).all() and cameras.focal_px.isfinite().all()
-        ):
+        parts = (cameras.camera_to_world, cameras.center_px, cameras.distortion, cameras.focal_px)
+        if not (all(part.isfinite().all() for part in parts) and (cameras.focal_px > 0).all()):
             raise ValueError("poses, centres and distortion must be finite, focal lengths above 0")
         return cameras
 
