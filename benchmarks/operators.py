@@ -66,9 +66,13 @@ class Operators:
     accumulate: Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
+def _march(*rays_and_grid: Any) -> PackedSamples:
+    return marching.rays_in_box(*rays_and_grid).samples()
+
+
 IMPLEMENTATIONS = {
     "kernel": Operators(
-        marching.march, hash_encoding.hash_encode, compositing.volume_weights, compositing.accumulate
+        _march, hash_encoding.hash_encode, compositing.volume_weights, compositing.accumulate
     ),
     "twin": Operators(
         marching.march_twin,
@@ -97,7 +101,7 @@ class TrainingState:
         self.device = t_near.device
         jitter = torch.rand(len(t_near), generator=generator).to(self.device)
         self.marched = (origins, directions, t_near, t_far, jitter, renderer.skips, renderer.step)
-        self.samples = marching.march(*self.marched)
+        self.samples = _march(*self.marched)
         rays = self.samples.ray_indices
         self.positions = origins[rays] + self.samples.t[:, None] * directions[rays]
         self.layout = field.layout

@@ -16,7 +16,7 @@ from unmix_plugin.sensors.batches import from_batch
 
 def naive_spectra(model: UnmixModel, rays) -> torch.Tensor:
     """The paper's sum: a spectrum of B bands at every sample, composited ray by ray."""
-    samples = model.renderer._march(rays, None)
+    samples = model.renderer.march(rays.origins, rays.directions, torch.zeros(len(rays))).samples()
     positions, along = _points_of(samples, rays)
     densities, features = model.field.get_density(positions)
     outputs = model.field.get_outputs(positions, along, features)

@@ -13,7 +13,7 @@ from torch.testing import assert_close
 from unmix_plugin.operators.compositing import accumulate, volume_weights
 from unmix_plugin.operators.hash_encoding import HashGridLayout, hash_encode
 from unmix_plugin.operators.launching import as_warp, launch, vector_type
-from unmix_plugin.operators.marching import march
+from unmix_plugin.operators.marching import rays_in_box
 from unmix_plugin.operators.occupancy import skip_distances
 
 
@@ -104,7 +104,7 @@ def everything_from(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
     directions = torch.rand(num_rays, 3, generator=generator) - origins
     skips = skip_distances(torch.rand(8, 8, 8, generator=generator) < 0.5)
     zeros, ones = torch.zeros(num_rays), torch.ones(num_rays)
-    samples = march(origins, directions, zeros, ones, 0.5 * ones, skips, 0.05)
+    samples = rays_in_box(origins, directions, zeros, ones, 0.5 * ones, skips, 0.05).samples()
     positions = origins[samples.ray_indices] + samples.t[:, None] * directions[samples.ray_indices]
     table = torch.randn(layout.num_rows, 4, generator=generator).requires_grad_()
     encoded = hash_encode(positions, table, layout)

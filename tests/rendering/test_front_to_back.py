@@ -44,7 +44,7 @@ def test_what_is_left_out_costs_no_more_than_the_careful_way_and_a_few_smallest_
 ):
     """Light behind the end, samples that carry too little, and the bend of a network within merged samples; as many
     samples of a ray at once as on the CPU, and as on a GPU."""
-    monkeypatch.setattr("unmix_plugin.rendering.renderer.FEWEST_SAMPLES", at_once)
+    monkeypatch.setattr("unmix_plugin.rendering.front_to_back.FEWEST_SAMPLES", at_once)
     renderer, field = textured(smallest_weight, opacity)
     bundle = rays(80)
     with torch.no_grad():

@@ -14,6 +14,7 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import volume_weights
+from unmix_plugin.operators.marching import PackedSamples
 from unmix_plugin.operators.occupancy import skip_distances
 from unmix_plugin.presets import WITH_ALPHA, WITHOUT_ALPHA
 from unmix_plugin.rendering.renderer import (
@@ -48,6 +49,10 @@ def rays(num_rays: int) -> RayBundle:
     origins = torch.tensor([0.0, 0.0, 3.0]).repeat(num_rays, 1)
     directions = torch.nn.functional.normalize(targets - origins, dim=-1)
     return RayBundle(origins, directions, torch.zeros(num_rays, dtype=torch.int64))
+
+
+def samples_of(renderer: VolumeRenderer, bundle: RayBundle) -> PackedSamples:
+    return renderer.march(bundle.origins, bundle.directions, torch.zeros(len(bundle))).samples()
 
 
 def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
@@ -166,16 +171,16 @@ def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_wei
     with torch.no_grad():
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
         field.log_initial_density = math.log(-math.log1p(-opacity) / step)
-        samples = renderer._march(bundle, None)
+        samples = samples_of(renderer, bundle)
         found = _visible_samples(field, samples, bundle, step, smallest_weight)
         encoded = field.encode(_points_of(samples, bundle)[0])
         densities, features = field.density_of(encoded)
         keep = volume_weights(densities * step, samples.packed_info) > smallest_weight
     assert torch.equal(found.samples.t, samples.t[keep])
     assert torch.equal(found.samples.packed_info, samples.select(keep).packed_info)
-    assert torch.equal(found.encoded(), encoded[keep])
-    assert_close(found.densities(), densities[keep])
-    assert_close(found.features(), features[keep])
+    assert torch.equal(found.of("encoded"), encoded[keep])
+    assert_close(found.of("densities"), densities[keep])
+    assert_close(found.of("features"), features[keep])
     assert found.num_evaluated <= len(samples)
 
 
@@ -185,14 +190,14 @@ def test_what_lies_behind_an_opaque_front_is_not_evaluated_and_rays_that_miss_ha
     with torch.no_grad():
         field.table.zero_()
         field.log_initial_density = math.log(10 / renderer.step)
-        samples = renderer._march(bundle, None)
+        samples = samples_of(renderer, bundle)
         found = _visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
     assert found.num_evaluated == 30 * 8
     assert len(samples) > 10 * found.num_evaluated
     assert len(found.samples) == 30
     away = replace(bundle, directions=-bundle.directions)
-    found = _visible_samples(field, renderer._march(away, None), away, renderer.step, 0.1)
-    assert (len(found.samples), len(found.encoded()), found.num_evaluated) == (0, 0, 0)
+    found = _visible_samples(field, samples_of(renderer, away), away, renderer.step, 0.1)
+    assert (len(found.samples), len(found.of("encoded")), found.num_evaluated) == (0, 0, 0)
 
 
 def test_a_picture_without_gradients_is_that_with_them():

@@ -21,78 +21,46 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.space import contracted_unit
-from unmix_plugin.operators.launching import KernelArray, as_warp, vector_type
-from unmix_plugin.operators.marching import FirstSamples, PackedSamples, check_step, take_all, take_first
+from unmix_plugin.operators.marching import GridRays, PackedSamples, check_step, packed_where
 from unmix_plugin.operators.occupancy import cells_at
 
 FAR_RADIUS = 512.0
 LINEAR_RADIUS = 2.0
 
 
-def march_contracted(
+def rays_in_world(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
     jitter: Float[Tensor, "R"],
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
-) -> PackedSamples:
-    """Samples of each ray from its origin to r = 512, in occupied cells of contracted space.
+) -> GridRays:
+    """Rays whose samples go up to r = 512, as far as they lie in occupied cells of contracted space.
 
     Args:
         origins, directions: Rays in units of the inner cube's half edge.
+        t_start: 0, or the `ends` of the samples before.
         jitter: Where in its interval a ray's samples lie, [0, 1).
         skips: 0 in occupied cells of the cube from -2 to 2, as `skip_distances` says.
         step: Distance of samples in the inner cube, in the ray parameter, > 0.
     Raises:
         ValueError: step isn't positive.
     """
-    rays = _rays(origins, directions, torch.zeros_like(jitter), jitter, skips, step)
-    return take_all(_write_kernel, rays, origins)
-
-
-def march_contracted_first(
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    t_start: Float[Tensor, "R"],
-    skips: UInt8[Tensor, "X Y Z"],
-    step: float,
-    most: int,
-) -> FirstSamples:
-    """The first samples that `march_contracted` takes of each ray in the middles of intervals, at most `most`.
-
-    Args:
-        t_start: 0, or the `ends` of the samples before.
-    """
-    rays = _rays(origins, directions, t_start, torch.full_like(t_start, 0.5), skips, step)
-    return take_first(_write_kernel, rays, origins, most)
-
-
-def _rays(
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    t_start: Float[Tensor, "R"],
-    jitter: Float[Tensor, "R"],
-    skips: UInt8[Tensor, "X Y Z"],
-    step: float,
-) -> list[KernelArray | float]:
-    """The first arguments of the kernel."""
-    check_step(step)
-    point = vector_type(3, torch.float32)
-    lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
-    numbers = [as_warp(values.contiguous()) for values in (t_start, jitter)]
-    return [*lines, *numbers, step, as_warp(skips.contiguous())]
+    return GridRays.of(_write_kernel, (origins, directions), (t_start, jitter), skips, step)
 
 
 def march_contracted_twin(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
+    t_start: Float[Tensor, "R"],
     jitter: Float[Tensor, "R"],
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
-    """The same as `march_contracted` in plain PyTorch: walks all rays at once."""
+    """`rays_in_world(...).samples()` in plain PyTorch: walks all rays at once."""
     check_step(step)
-    t = torch.zeros_like(jitter)
+    t = t_start
     found: list[tuple[Tensor, Tensor]] = []
     while True:
         radius = (origins + t[:, None] * directions).abs().amax(dim=-1)
@@ -107,14 +75,8 @@ def march_contracted_twin(
         found.append((hit, at))
         t = torch.where(is_inside, t + stride, t)
     nothing = torch.zeros(len(origins), 0, device=origins.device)
-    hit, t_samples = (
-        (torch.stack(values, dim=1) for values in zip(*found, strict=True))
-        if found
-        else (nothing > 0, nothing)
-    )
-    counts = hit.sum(dim=1)
-    packed_info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
-    return PackedSamples(t_samples[hit], hit.nonzero()[:, 0], packed_info)
+    columns = [torch.stack(values, dim=1) for values in zip(*found, strict=True)]
+    return packed_where(*columns) if found else packed_where(nothing > 0, nothing)
 
 
 @wp.func
@@ -167,15 +129,13 @@ def _write_kernel(
     jitter: wp.array(dtype=float),
     step: float,
     skips: wp.array3d(dtype=wp.uint8),
-    room: wp.array2d(dtype=wp.int64),
-    t_samples: wp.array(dtype=float),
+    t_samples: wp.array2d(dtype=float),
     counts: wp.array(dtype=wp.int64),
     ends: wp.array(dtype=float),
 ):
     index = first + wp.tid()
     while index < end:
-        start = int(room[index, 0])
-        own = t_samples[start : start + int(room[index, 1])]
+        own = t_samples[index]
         slot = int(0)  # noqa: RUF046, UP018
         t = t_start[index]
         origin, direction = origins[index], directions[index]

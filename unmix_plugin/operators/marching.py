@@ -62,7 +62,72 @@ class FirstSamples:
     """From where to march on for more; anything if there are none."""
 
 
-def march(
+@dataclass(frozen=True)
+class GridRays:
+    """Rays through a grid, as a kernel takes them."""
+
+    origins: Float[Tensor, "R 3"]
+    kernel: Any
+    arguments: list[KernelArray | float]
+    """Its first ones."""
+
+    @staticmethod
+    def of(
+        kernel: Any,
+        lines: Sequence[Float[Tensor, "R 3"]],
+        numbers: Sequence[Float[Tensor, "R"]],
+        skips: UInt8[Tensor, "X Y Z"],
+        step: float,
+    ) -> "GridRays":
+        """Rays of origins and directions, with what else the kernel takes of each ray, in float32.
+
+        Raises:
+            ValueError: step isn't positive.
+        """
+        check_step(step)
+        point = vector_type(3, torch.float32)
+        arrays = [as_warp(values.contiguous(), point) for values in lines]
+        arrays += [as_warp(values.contiguous()) for values in numbers]
+        return GridRays(lines[0], kernel, [*arrays, step, as_warp(skips.contiguous())])
+
+    def first_samples(self, most: int) -> FirstSamples:
+        """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
+        num_rays = len(self.origins)
+        t = self.origins.new_empty(num_rays, most, dtype=torch.float32)
+        ends = self.origins.new_empty(num_rays, dtype=torch.float32)
+        counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
+        launch(self.kernel, num_rays, [*self.arguments, *map(as_warp, (t, counts, ends))], t.device)
+        return FirstSamples(t, counts, ends)
+
+    def samples(self) -> PackedSamples:
+        """All samples by one launch, and another with twice the room for each ray where one may have more."""
+        most = max(1, min(_ROOM // max(len(self.origins), 1), _MOST_SAMPLES))
+        found = self.first_samples(most)
+        while len(self.origins) and int(found.counts.max()) == most:
+            most *= 2
+            found = self.first_samples(most)
+        starts = most * torch.arange(len(found.counts), device=found.counts.device)
+        rays, rows, packed_info = packed_rows(starts, found.counts)
+        return PackedSamples(found.t.view(-1).index_select(0, rows), rays, packed_info)
+
+
+_ROOM, _MOST_SAMPLES = 1 << 22, 1024
+"""Samples of all rays, and of one, that there is room for at first."""
+
+
+def packed_rows(
+    starts: Int[Tensor, "R"], counts: Int[Tensor, "R"]
+) -> tuple[Int[Tensor, "S"], Int[Tensor, "S"], Int[Tensor, "R 2"]]:
+    """Of so many rows from each ray's first on: which ray each is of, the rows, and where they lie when packed."""
+    ends = counts.cumsum(0)
+    total = int(ends[-1]) if len(ends) else 0
+    rays = torch.repeat_interleave(counts, output_size=total)
+    shifts = (starts - ends + counts).index_select(0, rays)
+    rows = shifts.add_(torch.arange(total, device=counts.device))
+    return rays, rows, torch.stack([ends - counts, counts], dim=-1)
+
+
+def rays_in_box(
     origins: Float[Tensor, "R 3"],
     directions: Float[Tensor, "R 3"],
     t_near: Float[Tensor, "R"],
@@ -70,8 +135,8 @@ def march(
     jitter: Float[Tensor, "R"],
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
-) -> PackedSamples:
-    """Samples at t_near + (i + jitter) step that lie in occupied cells.
+) -> GridRays:
+    """Rays whose samples are at t_near + (i + jitter) step, as far as that lies in occupied cells.
 
     Args:
         origins, directions: Rays in unit-cube coordinates; directions need not have unit length.
@@ -82,95 +147,7 @@ def march(
     Raises:
         ValueError: step isn't positive.
     """
-    rays = _rays(origins, directions, t_near, t_far, jitter, skips, step)
-    return take_all(_write_kernel, rays, origins)
-
-
-def march_first(
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    t_near: Float[Tensor, "R"],
-    t_far: Float[Tensor, "R"],
-    skips: UInt8[Tensor, "X Y Z"],
-    step: float,
-    most: int,
-) -> FirstSamples:
-    """The first samples that `march` takes of each ray at t_near + (i + 1/2) step, at most `most`."""
-    rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), skips, step)
-    return take_first(_write_kernel, rays, origins, most)
-
-
-def count_samples(
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    t_near: Float[Tensor, "R"],
-    t_far: Float[Tensor, "R"],
-    skips: UInt8[Tensor, "X Y Z"],
-    step: float,
-) -> Int[Tensor, "R"]:
-    """How many samples of each ray `march` takes at t_near + (i + 1/2) step."""
-    rays = _rays(origins, directions, t_near, t_far, torch.full_like(t_near, 0.5), skips, step)
-    counts = torch.empty(len(origins), dtype=torch.int64, device=origins.device)
-    launch(_count_kernel, len(origins), [*rays, as_warp(counts)], origins.device)
-    return counts
-
-
-def _rays(
-    origins: Float[Tensor, "R 3"],
-    directions: Float[Tensor, "R 3"],
-    t_near: Float[Tensor, "R"],
-    t_far: Float[Tensor, "R"],
-    jitter: Float[Tensor, "R"],
-    skips: UInt8[Tensor, "X Y Z"],
-    step: float,
-) -> list[KernelArray | float]:
-    """The arguments that both kernels share."""
-    check_step(step)
-    point = vector_type(3, torch.float32)
-    lines = [as_warp(values.contiguous(), point) for values in (origins, directions)]
-    numbers = [as_warp(values.contiguous()) for values in (t_near, t_far, jitter)]
-    return [*lines, *numbers, step, as_warp(skips.contiguous())]
-
-
-_ROOM, _MOST_SAMPLES = 1 << 22, 1024
-"""Samples of all rays, and of one, that there is room for at first."""
-
-
-def take_all(
-    write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"]
-) -> PackedSamples:
-    """Samples of rays by one launch, and another with twice the room for each where a ray may have more.
-
-    Args:
-        rays: The first arguments of the kernel.
-        origins: Of the rays.
-    """
-    most = max(1, min(_ROOM // max(len(origins), 1), _MOST_SAMPLES))
-    found = take_first(write_kernel, rays, origins, most)
-    while len(origins) and int(found.counts.max()) == most:
-        most *= 2
-        found = take_first(write_kernel, rays, origins, most)
-    counts = found.counts
-    ends = counts.cumsum(0)
-    starts = ends - counts
-    total = int(ends[-1]) if len(ends) else 0
-    indices = torch.arange(max(total, len(counts)), device=counts.device)
-    ray_indices = torch.repeat_interleave(counts, output_size=total)
-    shifts = most * indices[: len(counts)] - starts
-    t = found.t.view(-1).index_select(0, shifts.index_select(0, ray_indices).add_(indices[:total]))
-    return PackedSamples(t, ray_indices, torch.stack([starts, counts], dim=-1))
-
-
-def take_first(
-    write_kernel: Any, rays: Sequence[KernelArray | float], origins: Float[Tensor, "R 3"], most: int
-) -> FirstSamples:
-    """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
-    starts = most * torch.arange(len(origins), device=origins.device)
-    room = torch.stack([starts, torch.full_like(starts, most)], dim=-1)
-    t, ends = (origins.new_empty(size, dtype=torch.float32) for size in (most * len(origins), len(origins)))
-    counts = torch.empty_like(starts)
-    launch(write_kernel, len(origins), [*rays, *map(as_warp, (room, t, counts, ends))], origins.device)
-    return FirstSamples(t.view(len(origins), most), counts, ends)
+    return GridRays.of(_write_kernel, (origins, directions), (t_near, t_far, jitter), skips, step)
 
 
 def march_twin(
@@ -182,7 +159,7 @@ def march_twin(
     skips: UInt8[Tensor, "X Y Z"],
     step: float,
 ) -> PackedSamples:
-    """The same as `march` in plain PyTorch: tests every lattice point of every ray."""
+    """`rays_in_box(...).samples()` in plain PyTorch: tests every lattice point of every ray."""
     check_step(step)
     t_first = t_near + jitter * step
     longest = float((t_far - t_first).max()) if len(t_far) else 0.0
@@ -191,10 +168,14 @@ def march_twin(
     points = origins[:, None] + t[..., None] * directions[:, None]
     cells = cells_at(points, skips.shape)
     hit = (t < t_far[:, None]) & (skips[tuple(cells.unbind(-1))] == 0)
+    return packed_where(hit, t)
+
+
+def packed_where(hit: Bool[Tensor, "R M"], t: Float[Tensor, "R M"]) -> PackedSamples:
+    """The samples that are marked."""
     counts = hit.sum(dim=1)
-    starts = counts.cumsum(0) - counts
-    ray_indices, _ = hit.nonzero(as_tuple=True)
-    return PackedSamples(t[hit], ray_indices, torch.stack([starts, counts], dim=-1))
+    info = torch.stack([counts.cumsum(0) - counts, counts], dim=-1)
+    return PackedSamples(t[hit], hit.nonzero()[:, 0], info)
 
 
 def check_step(step: float) -> None:
@@ -273,38 +254,6 @@ def _points_to_next(ray: _Ray, clear: int):
 
 @wp.kernel(enable_backward=False)
 @no_type_check
-def _count_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    t_near: wp.array(dtype=float),
-    t_far: wp.array(dtype=float),
-    jitter: wp.array(dtype=float),
-    step: float,
-    skips: wp.array3d(dtype=wp.uint8),
-    counts: wp.array(dtype=wp.int64),
-):
-    index = first + wp.tid()
-    while index < end:
-        ray = _ray_at(index, origins, directions, t_near, t_far, jitter, step, skips)
-        count = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
-        i = int(0)  # noqa: RUF046, UP018
-        while i < ray.num_points:
-            clear = _skip_at(ray, _point_at(ray, step, i), skips)
-            if clear <= _NEAR:
-                for k in range(8):
-                    clear = _skip_at(ray, _point_at(ray, step, i + k), skips)
-                    count += int(clear == 0 and i + k < ray.num_points)
-                i += 7
-            i += _points_to_next(ray, clear)
-        counts[index] = wp.int64(count)
-        index += stride
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
 def _write_kernel(
     first: int,
     end: int,
@@ -316,17 +265,15 @@ def _write_kernel(
     jitter: wp.array(dtype=float),
     step: float,
     skips: wp.array3d(dtype=wp.uint8),
-    room: wp.array2d(dtype=wp.int64),
-    t_samples: wp.array(dtype=float),
+    t_samples: wp.array2d(dtype=float),
     counts: wp.array(dtype=wp.int64),
     ends: wp.array(dtype=float),
 ):
     index = first + wp.tid()
     while index < end:
         ray = _ray_at(index, origins, directions, t_near, t_far, jitter, step, skips)
-        start = int(room[index, 0])
-        own = t_samples[start : start + int(room[index, 1])]
-        slot = int(0)  # noqa: RUF046, UP018
+        own = t_samples[index]
+        slot = int(0)  # noqa: RUF046, UP018 - Warp takes a bare literal for a constant
         i = int(0)  # noqa: RUF046, UP018
         last = ray.t_first
         while slot < own.shape[0] and i < ray.num_points:

@@ -5,8 +5,7 @@ carry a few hundredths of the light each, and differ little. A sample that carri
 
 Notation: `S` samples, `R` rays, `G` groups, `F` features; weights as in compositing.py.
 
-Of the kernels a work item is a ray. Counting and writing walk the same samples with the same arithmetic, so that the
-second pass fills what the first one counted.
+Of the kernel a work item is a ray, whose groups it writes where the ray's samples are: there are no more of them.
 """
 
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from unmix_plugin.operators.launching import as_warp, launch
+from unmix_plugin.operators.marching import packed_rows
 
 _GAP = 1.5
 """Distance of neighbouring samples in steps from which they don't belong together: there is empty space between."""
@@ -70,30 +70,17 @@ def merge_samples(
         left: Share of its light that each ray has before its samples.
         limits: Which samples are left out and which are merged.
     """
-    device, num_rays = t.device, len(packed_info)
-    behind, weights = left.clone(), torch.empty_like(t)
-    counts = torch.empty(num_rays, dtype=torch.int64, device=device)
-    info, places = as_warp(packed_info), as_warp(t)
+    num_rays, behind = len(packed_info), left.clone()
+    weights, places = torch.empty_like(t), torch.empty_like(t)
+    means = torch.empty_like(features, memory_format=torch.contiguous_format)
+    counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
+    inputs = [optical_depths.contiguous(), t, features.contiguous(), packed_info]
     numbers = [limits.smallest_weight, limits.most_weight, _GAP * limits.step]
-    depths = as_warp(optical_depths.contiguous())
-    outputs = [as_warp(values) for values in (behind, weights, counts)]
-    launch(_count_kernel, num_rays, [depths, places, info, *numbers, *outputs], device)
-    ends = counts.cumsum(0)
-    group_info = torch.stack([ends - counts, counts], dim=-1)
-    total = int(ends[-1]) if num_rays else 0
-    merged = MergedSamples(
-        t.new_empty(total),
-        t.new_empty(total),
-        t.new_empty(total, features.shape[1]),
-        counts.new_empty(total),
-        group_info,
-        behind,
-    )
-    found = (merged.packed_info, merged.ray_indices, merged.weights, merged.t, merged.features)
-    if total:
-        samples = [as_warp(weights), places, as_warp(features.contiguous()), info]
-        launch(_write_kernel, num_rays, [*samples, *numbers, *map(as_warp, found)], device)
-    return merged
+    outputs = [as_warp(values) for values in (behind, counts, weights, places, means)]
+    launch(_merge_kernel, num_rays, [*map(as_warp, inputs), *numbers, *outputs], t.device)
+    rays, rows, group_info = packed_rows(packed_info[:, 0], counts)
+    weights, places, means = (values.index_select(0, rows) for values in (weights, places, means))
+    return MergedSamples(weights, places, means, rays, group_info, behind)
 
 
 def merge_samples_twin(
@@ -134,70 +121,21 @@ def merge_samples_twin(
     return MergedSamples(sums, means @ t, means @ features, rays, info, behind)
 
 
-@wp.func
-@no_type_check
-def _starts_group(weight: float, t: float, total: float, last: float, most: float, gap: float):
-    """1 where a sample doesn't belong to the group that is open, whose weight is `total` and whose end is `last`."""
-    return int(total == 0.0 or total + weight > most or t - last > gap)
-
-
 @wp.kernel(enable_backward=False)
 @no_type_check
-def _count_kernel(
+def _merge_kernel(
     first: int,
     end: int,
     stride: int,
     depths: wp.array(dtype=float),
-    t_samples: wp.array(dtype=float),
-    packed_info: wp.array2d(dtype=wp.int64),
-    smallest: float,
-    most: float,
-    gap: float,
-    left: wp.array(dtype=float),
-    weights: wp.array(dtype=float),
-    counts: wp.array(dtype=wp.int64),
-):
-    ray = first + wp.tid()
-    while ray < end:
-        sample = int(packed_info[ray, 0])
-        stop = sample + int(packed_info[ray, 1])
-        transmittance = left[ray]
-        total = float(0.0)  # noqa: UP018 - Warp takes a bare literal for a constant
-        last = float(0.0)  # noqa: UP018
-        count = int(0)  # noqa: RUF046, UP018
-        while sample < stop:
-            passed = transmittance * wp.exp(-depths[sample])
-            weight = transmittance - passed
-            weights[sample] = weight
-            if weight > smallest:
-                transmittance = passed
-                t = t_samples[sample]
-                if _starts_group(weight, t, total, last, most, gap) == 1:
-                    count += 1
-                    total = float(0.0)  # noqa: UP018
-                total += weight
-                last = t
-            sample += 1
-        left[ray] = transmittance
-        counts[ray] = wp.int64(count)
-        ray += stride
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
-def _write_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    weights: wp.array(dtype=float),
     t_samples: wp.array(dtype=float),
     features: wp.array2d(dtype=float),
     packed_info: wp.array2d(dtype=wp.int64),
     smallest: float,
     most: float,
     gap: float,
-    group_info: wp.array2d(dtype=wp.int64),
-    group_rays: wp.array(dtype=wp.int64),
+    left: wp.array(dtype=float),
+    counts: wp.array(dtype=wp.int64),
     group_weights: wp.array(dtype=float),
     group_t: wp.array(dtype=float),
     group_features: wp.array2d(dtype=float),
@@ -205,23 +143,26 @@ def _write_kernel(
     ray = first + wp.tid()
     width = features.shape[1]
     while ray < end:
-        sample = int(packed_info[ray, 0])
-        stop = sample + int(packed_info[ray, 1])
-        group = int(group_info[ray, 0]) - 1
-        total = float(0.0)  # noqa: UP018
+        start = int(packed_info[ray, 0])
+        sample = start
+        stop = start + int(packed_info[ray, 1])
+        group = start - 1
+        transmittance = left[ray]
+        total = float(0.0)  # noqa: UP018 - Warp takes a bare literal for a constant
         last = float(0.0)  # noqa: UP018
         while sample < stop:
-            weight = weights[sample]
+            passed = transmittance * wp.exp(-depths[sample])
+            weight = transmittance - passed
             if weight > smallest:
+                transmittance = passed
                 t = t_samples[sample]
                 own = features[sample]
-                if _starts_group(weight, t, total, last, most, gap) == 1:
+                channel = int(0)  # noqa: RUF046, UP018
+                if total == 0.0 or total + weight > most or t - last > gap:
                     group += 1
                     total = weight
-                    group_rays[group] = wp.int64(ray)
                     group_t[group] = t
                     mean = group_features[group]
-                    channel = int(0)  # noqa: RUF046, UP018
                     while channel < width:
                         mean[channel] = own[channel]
                         channel += 1
@@ -230,11 +171,12 @@ def _write_kernel(
                     share = weight / total
                     group_t[group] = group_t[group] + share * (t - group_t[group])
                     mean = group_features[group]
-                    channel = int(0)  # noqa: RUF046, UP018
                     while channel < width:
                         mean[channel] = mean[channel] + share * (own[channel] - mean[channel])
                         channel += 1
                 group_weights[group] = total
                 last = t
             sample += 1
+        left[ray] = transmittance
+        counts[ray] = wp.int64(group + 1 - start)
         ray += stride

@@ -34,6 +34,12 @@ def cells_at(points: Float[Tensor, "*points 3"], shape: Sequence[int]) -> Int[Te
     return torch.minimum((points * sides).floor().long().clamp(min=0), sides - 1)
 
 
+def flat_cells_at(points: Float[Tensor, "S 3"], shape: Sequence[int]) -> Int[Tensor, "S"]:
+    """The same by the numbers of the cells in memory."""
+    x, y, z = cells_at(points, shape).unbind(-1)
+    return (x * shape[1] + y) * shape[2] + z
+
+
 def skip_distances(occupied: Bool[Tensor, "X Y Z"]) -> UInt8[Tensor, "X Y Z"]:
     """How many cells the nearest occupied cell is away at least, along the axis on which it is farthest.
 
@@ -92,9 +98,7 @@ class _VisibleCells(nn.Module):
             seen: Samples that send enough of their ray's light to the camera.
             num_rays: Rays that the samples are of; of all processes, where several train together.
         """
-        _, side_y, side_z = self.visible.shape
-        x, y, z = cells_at(points, self.visible.shape).unbind(-1)
-        cells = (x * side_y + y) * side_z + z
+        cells = flat_cells_at(points, self.visible.shape)
         ids = (views % _NO_VIEW).to(torch.uint8)
         # Unseen samples take part with a number that changes nothing: to choose would be to wait for the device.
         self.lowest_view.view(-1).scatter_reduce_(0, cells, ids.masked_fill(~seen, _NO_VIEW), "amin")
@@ -200,8 +204,9 @@ class OccupancyGrid(nn.Module):
         """
         cells = self._choose_cells(num_cells, generator)
         sides = torch.tensor(self.occupied.shape, device=cells.device)
+        corners = torch.stack(torch.unravel_index(cells, self.occupied.shape), dim=-1).float()
         offsets = torch.rand(len(cells), 3, generator=generator).to(cells.device)
-        densities = density_fn((self._coordinates(cells) + offsets) / sides)
+        densities = density_fn((corners + offsets) / sides)
         self._update_peaks(cells, densities, decay, block)
         peaks = self.peak_densities.view(-1)
         reachable_peaks = peaks[self.reachable_cells]
@@ -230,9 +235,8 @@ class OccupancyGrid(nn.Module):
     def record_observed(self, points: Float[Tensor, "S 3"], densities: Float[Tensor, "S"]) -> None:
         """Note the densities of points in the unit cube, as far as this grid records what rays meet."""
         if self.observed is not None:
-            _, side_y, side_z = self.observed.shape
-            x, y, z = cells_at(points, self.observed.shape).unbind(-1)
-            self.observed.view(-1).scatter_reduce_(0, (x * side_y + y) * side_z + z, densities, "amax")
+            cells = flat_cells_at(points, self.observed.shape)
+            self.observed.view(-1).scatter_reduce_(0, cells, densities, "amax")
 
     def _update_peaks(
         self, cells: Int[Tensor, "N"], densities: Float[Tensor, "N"], decay: float, block: int
@@ -243,7 +247,8 @@ class OccupancyGrid(nn.Module):
         found.view(-1)[cells] = torch.maximum(found.view(-1)[cells], densities)
         if block > 1:
             found = _block_maxima(found, block)
-        peaks.copy_(torch.where(found > _NOT_OBSERVED, torch.maximum(_decayed(peaks, decay), found), peaks))
+        remembered = torch.where(torch.isinf(peaks), 0.0, peaks * decay)  # infinite where nothing was known
+        peaks.copy_(torch.where(found > _NOT_OBSERVED, torch.maximum(remembered, found), peaks))
         if self.observed is not None:
             self.observed.fill_(_NOT_OBSERVED)
 
@@ -265,16 +270,6 @@ class OccupancyGrid(nn.Module):
         self.reachable_cells = _flat_indices(self.reachable)
         self.skips = skip_distances(self.occupied != 0)
         self.opaque_skips = _skips(self.opaque)
-
-    def _coordinates(self, cells: Int[Tensor, "N"]) -> Float[Tensor, "N 3"]:
-        _, side_y, side_z = self.occupied.shape
-        x, rest = cells // (side_y * side_z), cells % (side_y * side_z)
-        return torch.stack([x, rest // side_z, rest % side_z], dim=-1).float()
-
-
-def _decayed(peaks: Float[Tensor, "*cells"], decay: float) -> Float[Tensor, "*cells"]:
-    """Remembered maxima of cells that are looked at once more; 0 where nothing was known."""
-    return torch.where(torch.isinf(peaks), 0.0, peaks * decay)
 
 
 def _block_maxima(values: Float[Tensor, "X Y Z"], block: int) -> Float[Tensor, "X Y Z"]:

@@ -11,8 +11,9 @@ Notation: `R` rays, `A` of them that are under way, `M` samples of each that are
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float, Int
@@ -20,11 +21,13 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.operators.compositing import accumulate
-from unmix_plugin.operators.marching import FirstSamples
+from unmix_plugin.operators.marching import packed_rows
 from unmix_plugin.operators.merging import MergedSamples, MergeLimits, merge_samples
 from unmix_plugin.spectral.materials import Coefficients
+
+if TYPE_CHECKING:
+    from unmix_plugin.rendering.renderer import VolumeRenderer
 
 _ENDING_LIGHT = 3.0
 """Share of its light at which a ray ends, in multiples of the smallest weight of a sample."""
@@ -37,31 +40,6 @@ SAMPLES_MARCHED = 16
 """Of each ray, before it is known whether light gets behind them."""
 _DENSER = 2.0
 """How many times denser what follows is taken to be than what was looked at: most rays have just entered a surface."""
-
-_March = Callable[[Float[Tensor, "A 3"], Float[Tensor, "A 3"], Float[Tensor, "A"], int], FirstSamples]
-_LightAt = Callable[[Float[Tensor, "S 3"], Float[Tensor, "S 3"]], Lamplight | None]
-
-
-@dataclass(frozen=True)
-class FrontToBack:
-    """How rays are looked at."""
-
-    march: _March
-    """From origins, directions, distances and a number: the first so many samples behind the distances, at first 0."""
-    step: float
-    """Distance of samples, for which each counts."""
-    smallest_weight: float
-    """Samples that contribute no more of their ray's light are left out."""
-    light_at: _LightAt
-    """From origins of rays and positions on them to what of a moving lamp's light reaches them, as
-    `CoefficientField.get_outputs` takes it."""
-    residual_on_last_sample: bool = False
-    """Whether the last sample of a ray takes all the light that is left."""
-    rays_at_once: int = 32_768
-    """Rays under way."""
-    samples_at_once: int = FEWEST_SAMPLES
-    """Samples of each ray that are looked at together at first; with as many as are marched always that many, since a
-    GPU computes more of them in less time than the processor takes to ask again."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +63,11 @@ class _Front:
     """The next of them."""
 
     @classmethod
-    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"], samples_at_once: int) -> _Front:
+    def before(cls, rays: Int[Tensor, "A"], like: Float[Tensor, "_ _"]) -> _Front:
         """Rays before they are marched."""
         none, numbers = torch.zeros_like(rays), like.new_zeros(len(rays))
         t = like.new_zeros(len(rays), SAMPLES_MARCHED)
-        return cls(rays, numbers + 1, none + samples_at_once, none, numbers, t, none, none)
+        return cls(rays, numbers + 1, none + _samples_at_once(like), none, numbers, t, none, none)
 
     def __len__(self) -> int:
         return len(self.rays)
@@ -103,9 +81,10 @@ class _Front:
         pairs = ((getattr(self, each.name), getattr(more, each.name)) for each in fields(self))
         return _Front(*map(torch.cat, pairs))
 
-    def marched(self, ray_bundle: RayBundle, march: _March) -> _Front:
+    def marched(self, ray_bundle: RayBundle, renderer: VolumeRenderer) -> _Front:
         """With the next samples of each ray that has some."""
-        found = march(*_lines(ray_bundle, self.rays), self.ends, SAMPLES_MARCHED)
+        lines = _lines(ray_bundle, self.rays)
+        found = renderer.march(*lines, self.ends).first_samples(SAMPLES_MARCHED)
         marched = replace(self, t=found.t, counts=found.counts, ends=found.ends, at=torch.zeros_like(self.at))
         return marched.select(found.counts.nonzero()[:, 0])
 
@@ -113,14 +92,15 @@ class _Front:
         """How many samples of each are looked at next."""
         return torch.minimum(self.wanted, self.counts - self.at)
 
-    def after(self, left: Float[Tensor, "A"], how: FrontToBack, ending_light: float) -> tuple[_Front, _Front]:
+    def after(self, left: Float[Tensor, "A"], ending_light: float) -> tuple[_Front, _Front]:
         """Behind these samples: rays with enough light of which there are more, and those to be marched on."""
         looked = self.next_counts()
         at, num_seen = self.at + looked, self.num_seen + looked
         enough = looked / _DENSER * (left / ending_light).log() / (self.left / left).log()
         enough = enough.ceil().nan_to_num(nan=torch.inf)  # no number if both logarithms are infinite
-        fewest = 1 if how.samples_at_once < SAMPLES_MARCHED else SAMPLES_MARCHED
-        wanted = torch.minimum(enough, num_seen.clamp(min=how.samples_at_once)).clamp(min=fewest).long()
+        at_first = _samples_at_once(left)
+        fewest = 1 if at_first < SAMPLES_MARCHED else SAMPLES_MARCHED
+        wanted = torch.minimum(enough, num_seen.clamp(min=at_first)).clamp(min=fewest).long()
         front = replace(self, left=left, wanted=wanted, num_seen=num_seen, at=at)
         is_lit, has_more = left > ending_light, at < self.counts
         may_have_more = ~has_more & (self.counts == SAMPLES_MARCHED)
@@ -129,35 +109,44 @@ class _Front:
         return going, waiting
 
 
+def _samples_at_once(like: Tensor) -> int:
+    """Samples of each ray to look at together at first; on a GPU always as many as are marched, since it computes more
+    of them in less time than the processor takes to ask again."""
+    return FEWEST_SAMPLES if like.device.type == "cpu" else SAMPLES_MARCHED
+
+
 @torch.no_grad()
-def composite_front_to_back(field: CoefficientField, ray_bundle: RayBundle, how: FrontToBack) -> Coefficients:
-    """Coefficients (R, ...) of each ray of a field."""
-    origins, ending_light = ray_bundle.origins, _ENDING_LIGHT * how.smallest_weight
-    limits = MergeLimits(how.step, how.smallest_weight, _MERGED_WEIGHT * how.smallest_weight)
+def composite_front_to_back(
+    renderer: VolumeRenderer, field: CoefficientField, ray_bundle: RayBundle
+) -> Coefficients:
+    """Coefficients (R, ...) of each ray of a field, before any sky."""
+    origins, smallest = ray_bundle.origins, renderer.smallest_weight
+    ending_light = _ENDING_LIGHT * smallest
+    limits = MergeLimits(renderer.step, smallest, _MERGED_WEIGHT * smallest)
     left = torch.ones_like(origins[:, 0])
     all_rays = torch.arange(len(left), device=left.device)
-    going = waiting = _Front.before(all_rays[:0], origins, how.samples_at_once)
+    going = waiting = _Front.before(all_rays[:0], origins)
     num_begun, totals, last = 0, None, None
     while True:
-        new = all_rays[num_begun : num_begun + max(how.rays_at_once - len(going) - len(waiting), 0)]
-        num_begun += len(new)
-        begun = _Front.before(new, origins, how.samples_at_once)
-        marched = waiting.join(begun).marched(ray_bundle, how.march)
+        room = max(renderer.rays_per_chunk - len(going) - len(waiting), 0)
+        begun = _Front.before(all_rays[num_begun : num_begun + room], origins)
+        num_begun += len(begun)
+        marched = waiting.join(begun).marched(ray_bundle, renderer)
         front = going.join(marched)
         merged = _look(field, ray_bundle, front, limits)
-        values = _values(field, ray_bundle, front.rays, merged, how.light_at)
+        values = _values(renderer, field, ray_bundle, front.rays, merged)
         if totals is None or last is None:
             totals = values.packed.new_zeros(len(left), values.packed.shape[1])
-            last = torch.zeros_like(totals) if how.residual_on_last_sample else totals[:0]
+            last = torch.zeros_like(totals) if renderer.residual_on_last_sample else totals[:0]
         totals.index_add_(0, front.rays, accumulate(merged.weights, values.packed, merged.packed_info))
-        if how.residual_on_last_sample:
+        if renderer.residual_on_last_sample:
             found = merged.packed_info[:, 1].nonzero()[:, 0]
             last[front.rays[found]] = values.packed[merged.packed_info[found].sum(dim=1) - 1]
         left[front.rays] = merged.left
-        going, waiting = front.after(merged.left, how, ending_light)
+        going, waiting = front.after(merged.left, ending_light)
         if num_begun == len(left) and len(going) == len(waiting) == 0:
             break
-    if how.residual_on_last_sample:
+    if renderer.residual_on_last_sample:
         totals = totals + (1 - totals[:, :1]) * last
     else:
         totals *= torch.where(left > ending_light, 1.0, 1 / (1 - left))[:, None]
@@ -168,38 +157,32 @@ def _look(
     field: CoefficientField, ray_bundle: RayBundle, front: _Front, limits: MergeLimits
 ) -> MergedSamples:
     """The next samples of rays, merged."""
-    counts = front.next_counts()
-    ends = counts.cumsum(0)
-    size = int(ends[-1]) if len(ends) else 0
-    starts = ends - counts
-    owners = torch.repeat_interleave(counts, output_size=size)
-    firsts = torch.arange(len(front), device=ends.device) * SAMPLES_MARCHED + front.at
-    chosen = (firsts - starts).index_select(0, owners).add_(torch.arange(size, device=ends.device))
-    t = front.t.view(-1).index_select(0, chosen)
+    firsts = torch.arange(len(front), device=front.at.device) * SAMPLES_MARCHED + front.at
+    owners, rows, info = packed_rows(firsts, front.next_counts())
+    t = front.t.view(-1).index_select(0, rows)
     origins, along = _lines(ray_bundle, front.rays.index_select(0, owners))
     densities, features = field.density_of(field.encode(torch.addcmul(origins, along, t[:, None])))
-    info = torch.stack([starts, counts], dim=-1)
     return merge_samples(densities * limits.step, t, features, info, front.left, limits)
 
 
 def _values(
+    renderer: VolumeRenderer,
     field: CoefficientField,
     ray_bundle: RayBundle,
     rays: Int[Tensor, "A"],
     merged: MergedSamples,
-    light_at: _LightAt,
 ) -> Coefficients:
     """What groups of samples look like."""
     origins, along = _lines(ray_bundle, rays.index_select(0, merged.ray_indices))
     positions = torch.addcmul(origins, along, merged.t[:, None])
-    outputs = field.get_outputs(positions, along, merged.features, light_at(origins, positions))
-    return Coefficients.of(
-        torch.ones_like(merged.t),
-        merged.t,
-        outputs["abundances"],
-        outputs["scaled_abundances"],
-        outputs["specular_coefficients"],
-    )
+    light = renderer.lamplight(field, origins, positions)
+    return coefficients_of(merged.t, field.get_outputs(positions, along, merged.features, light))
+
+
+def coefficients_of(t: Float[Tensor, "S"], outputs: Mapping[str, Tensor]) -> Coefficients:
+    """Those of opaque samples at these distances, of which a field says this."""
+    names = ("abundances", "scaled_abundances", "specular_coefficients")
+    return Coefficients.of(torch.ones_like(t), t, *(outputs[name] for name in names))
 
 
 def _lines(

@@ -10,7 +10,7 @@ w_i = T_i (1 - exp(-sigma_i delta)).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -22,15 +22,10 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, lamplight
 from unmix_plugin.operators.compositing import accumulate, scale_gradient, volume_weights
-from unmix_plugin.operators.contracted_marching import march_contracted, march_contracted_first
-from unmix_plugin.operators.marching import FirstSamples, PackedSamples, march, march_first
+from unmix_plugin.operators.contracted_marching import rays_in_world
+from unmix_plugin.operators.marching import GridRays, PackedSamples, packed_rows, rays_in_box
 from unmix_plugin.operators.occupancy import cells_at
-from unmix_plugin.rendering.front_to_back import (
-    FEWEST_SAMPLES,
-    SAMPLES_MARCHED,
-    FrontToBack,
-    composite_front_to_back,
-)
+from unmix_plugin.rendering.front_to_back import coefficients_of, composite_front_to_back
 from unmix_plugin.spectral.materials import Coefficients
 
 _SMALLEST_SHARE = 1e-30
@@ -48,30 +43,17 @@ class _VisibleSamples:
     """N."""
     rows: Int[Tensor, "S"]
     """Of each, among the samples evaluated."""
-    all_encoded: Sequence[Float[Tensor, "_ LF"]]
-    """Encodings of the samples evaluated, in parts."""
-    all_features: Sequence[Float[Tensor, "_ G"]]
-    """Their geometry features."""
-    all_positions: Sequence[Float[Tensor, "_ 3"]]
-    """Where they lie, model space."""
-    all_densities: Sequence[Float[Tensor, "_"]]
-    """Their densities."""
+    evaluated: Mapping[str, list[Tensor]]
+    """Of the samples evaluated, in parts: their `positions` (3) in model space, how these are `encoded` (LF), and their
+    `densities` and geometry `features` (G)."""
 
-    def densities(self) -> Float[Tensor, "S"]:
-        """Densities of the samples."""
-        return torch.cat(list(self.all_densities)).index_select(0, self.rows)
+    def all_of(self, name: str) -> Float[Tensor, "N *_"]:
+        """Of all samples evaluated."""
+        return torch.cat(self.evaluated[name])
 
-    def encoded(self) -> Float[Tensor, "S LF"]:
-        """Encodings of the samples."""
-        return torch.cat(list(self.all_encoded)).index_select(0, self.rows)
-
-    def features(self) -> Float[Tensor, "S G"]:
-        """Geometry features of the samples."""
-        return torch.cat(list(self.all_features)).index_select(0, self.rows)
-
-    def observed(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"]]:
-        """Positions, model space, and densities of all samples that were evaluated."""
-        return torch.cat(list(self.all_positions)).detach(), torch.cat(list(self.all_densities))
+    def of(self, name: str) -> Float[Tensor, "S *_"]:
+        """Of the samples that contribute enough."""
+        return self.all_of(name).index_select(0, self.rows)
 
 
 @torch.no_grad()
@@ -93,40 +75,29 @@ def _visible_samples(
     """
     starts, counts = samples.packed_info.unbind(-1)
     depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
-    all_encoded: list[Tensor] = []
-    all_features: list[Tensor] = []
-    all_positions: list[Tensor] = []
-    all_densities: list[Tensor] = []
+    evaluated: dict[str, list[Tensor]] = {
+        name: [] for name in ("positions", "encoded", "densities", "features")
+    }
     first, num_seen, left = 0, 0, torch.ones_like(counts, dtype=samples.t.dtype)
     at_first = _FIRST_SAMPLES if depths.device.type == "cpu" else _FIRST_ON_GPU
     while True:
         wanted = (counts - first).clamp(0, max(first, at_first)) * (left > smallest_weight)
-        ends = wanted.cumsum(0)
-        size = int(ends[-1]) if len(ends) else 0
-        if size == 0 and all_encoded:
+        rays, chosen, _ = packed_rows(starts + first, wanted)
+        if len(chosen) == 0 and evaluated["positions"]:
             break
-        shifts = torch.repeat_interleave(starts + first - ends + wanted, wanted, output_size=size)
-        chosen = shifts + torch.arange(size, device=shifts.device)
         part = samples.rows(chosen)
-        all_positions.append(_points_of(part, ray_bundle)[0])
-        all_encoded.append(field.encode(all_positions[-1]))
-        densities, features = field.density_of(all_encoded[-1])
-        all_features.append(features)
-        all_densities.append(densities)
+        positions = _points_of(part, ray_bundle)[0]
+        encoded = field.encode(positions)
+        densities, features = field.density_of(encoded)
+        found = {"positions": positions, "encoded": encoded, "densities": densities, "features": features}
+        for name, values in found.items():
+            evaluated[name].append(values)
         depths[chosen] = densities * step
-        rows[chosen] = torch.arange(num_seen, num_seen + size, device=rows.device)
-        left = left * torch.exp(-torch.zeros_like(left).index_add_(0, part.ray_indices, densities * step))
-        first, num_seen = first + max(first, at_first), num_seen + size
+        rows[chosen] = torch.arange(num_seen, num_seen + len(chosen), device=rows.device)
+        left = left * torch.exp(-torch.zeros_like(left).index_add_(0, rays, densities * step))
+        first, num_seen = first + max(first, at_first), num_seen + len(chosen)
     keep = volume_weights(depths, samples.packed_info) > smallest_weight
-    return _VisibleSamples(
-        samples.select(keep),
-        num_seen,
-        rows[keep],
-        all_encoded,
-        all_features,
-        all_positions,
-        all_densities,
-    )
+    return _VisibleSamples(samples.select(keep), num_seen, rows[keep], evaluated)
 
 
 def _mean_log(shares: Float[Tensor, "S K"]) -> Float[Tensor, "S"]:
@@ -209,16 +180,17 @@ class VolumeRenderer:
             ray_bundle: R rays.
             generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
         """
-        samples = self._march(ray_bundle, generator)
+        origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
+        samples = self.march(origins, directions, torch.zeros_like(origins[:, 0]), generator).samples()
         seen = _visible_samples(field, samples, ray_bundle, self.step, self.smallest_weight)
         kept = seen.samples
         positions, along = _points_of(kept, ray_bundle)
         if torch.is_grad_enabled():
-            densities, features = field.density_of(field.encode(positions, seen.encoded()))
+            densities, features = field.density_of(field.encode(positions, seen.of("encoded")))
         else:
-            densities, features = seen.densities(), seen.features()
+            densities, features = seen.of("densities"), seen.of("features")
         origins = ray_bundle.origins.index_select(0, kept.ray_indices)
-        light = self._lamplight(field, origins, positions, generator)
+        light = self.lamplight(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, light)
         if self.is_unbounded:
             near = self._near_cameras(kept.t)
@@ -226,14 +198,7 @@ class VolumeRenderer:
             outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
         depths = densities * self.step
         weights = volume_weights(depths, kept.packed_info)
-        ones = torch.ones_like(kept.t)
-        values = Coefficients.of(
-            ones,
-            kept.t,
-            outputs["abundances"],
-            outputs["scaled_abundances"],
-            outputs["specular_coefficients"],
-        )
+        values = coefficients_of(kept.t, outputs)
         totals = accumulate(weights, values.packed, kept.packed_info)
         if self.residual_on_last_sample:
             totals = totals + _residual_transmittance(totals[:, 0], values.packed, kept)
@@ -257,16 +222,7 @@ class VolumeRenderer:
 
         Those of `render` but for what front_to_back.py says, in less time.
         """
-        how = FrontToBack(
-            self._march_first,
-            self.step,
-            self.smallest_weight,
-            lambda starts, positions: self._lamplight(field, starts, positions),
-            self.residual_on_last_sample,
-            self.rays_per_chunk,
-            FEWEST_SAMPLES if self.skips.device.type == "cpu" else SAMPLES_MARCHED,
-        )
-        found = composite_front_to_back(field, ray_bundle, how)
+        found = composite_front_to_back(self, field, ray_bundle)
         chunk = self.rays_per_chunk
         parts = [field.sky(ray_bundle[first : first + chunk]) for first in range(0, len(ray_bundle), chunk)]
         skies = [sky for sky in parts if sky is not None]
@@ -330,52 +286,40 @@ class VolumeRenderer:
         """
         return (t / self.space.half_edge).square().clamp(max=1.0)
 
-    def _lamplight(
+    def lamplight(
         self,
         field: CoefficientField,
         origins: Float[Tensor, "S 3"],
         positions: Float[Tensor, "S 3"],
         generator: torch.Generator | None = None,
     ) -> Lamplight | None:
+        """What of a moving lamp's light reaches positions on rays, as `CoefficientField.get_outputs` takes it."""
         if field.moving_lamp is None or self.opaque_skips is None:
             return None
         lamp, skips = field.moving_lamp, self.opaque_skips
         return lamplight(lamp, origins, positions, self.box, skips, self.shadow_detail, generator)
 
-    def _march(self, ray_bundle: RayBundle, generator: torch.Generator | None) -> PackedSamples:
-        """All samples of rays; a generator shifts those of each ray at random."""
-        origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
-        jitter = torch.full_like(origins[:, 0], 0.5)
-        if generator is not None:
-            jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
-        starts, along = self._in_grid(origins, directions)
-        if self.is_unbounded:
-            return march_contracted(starts, along, jitter, self.skips, self.step)
-        t_near, t_far = self.box.intersect(origins, directions)
-        return march(starts, along, t_near, t_far, jitter, self.skips, self.step)
-
-    def _march_first(
+    def march(
         self,
         origins: Float[Tensor, "R 3"],
         directions: Float[Tensor, "R 3"],
         behind: Float[Tensor, "R"],
-        most: int,
-    ) -> FirstSamples:
-        """The first samples of rays behind these distances, at most so many of each."""
-        starts, along = self._in_grid(origins, directions)
-        if self.is_unbounded:
-            return march_contracted_first(starts, along, behind, self.skips, self.step, most)
-        t_near, t_far = self.box.intersect(origins, directions)
-        t_near = torch.maximum(t_near, behind)
-        return march_first(starts, along, t_near, t_far, self.skips, self.step, most)
+        generator: torch.Generator | None = None,
+    ) -> GridRays:
+        """Rays through the grid, which give their samples behind these distances, at first 0.
 
-    def _in_grid(
-        self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
-    ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R 3"]]:
-        """Rays in the coordinates that they are marched in."""
+        Args:
+            generator: Shifts the samples of each ray at random; None: they lie in the middles of intervals.
+        """
+        jitter = torch.full_like(behind, 0.5)
+        if generator is not None:
+            jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)
         if self.is_unbounded:
-            return self.space.centred(origins), directions / self.space.half_edge
-        return self.box.normalise(origins), directions / self.box.size
+            starts, along = self.space.centred(origins), directions / self.space.half_edge
+            return rays_in_world(starts, along, behind, jitter, self.skips, self.step)
+        t_near, t_far = self.box.intersect(origins, directions)
+        starts, along = self.box.normalise(origins), directions / self.box.size
+        return rays_in_box(starts, along, torch.maximum(t_near, behind), t_far, jitter, self.skips, self.step)
 
 
 def _before_sky(
