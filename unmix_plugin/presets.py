@@ -17,66 +17,41 @@ Auto = Literal["auto"]
 
 @dataclass(frozen=True)
 class AlphaPreset:
-    """Values of the settings that are left at `auto`, by their names."""
+    """Values of the settings that are left at `auto`, by their names; by default those of scenes with alpha."""
 
-    single_ray_until: float
-    initial_opacity: float
+    single_ray_until: float = 0.4
+    initial_opacity: float = 0.05
     """Empty space between cameras and walls must start almost clear."""
-    smallest_weight: float
+    smallest_weight: float = 4e-3
     """Lighter samples have no gradient, so that haze which they are made of fades."""
-    first_smallest_weight: float
+    first_smallest_weight: float = 4e-3
     """The same at the start: surfaces far behind semi-transparent density must be able to grow."""
-    visible_weight: float
+    visible_weight: float = 0.05
     """1: nothing is left out. In rooms, walls must be found behind semi-transparent density."""
-    background: Literal["random", "black"]
+    background: Literal["random", "black"] = "random"
     """Random greys would reward floaters before the cameras where alpha is unknown."""
-    rgb_loss_weight: float
-    opacity_loss_weight: float
-    sparsity_loss_weight: float
-    surface_loss_weight: float
-    coarse_samples: int
-    specular_endmembers: bool
+    rgb_loss_weight: float = 0.2
+    opacity_loss_weight: float = 0.0
+    sparsity_loss_weight: float = 0.0
+    surface_loss_weight: float = 0.0
+    coarse_samples: int = 256
+    specular_endmembers: bool = False
     """Whether the specular dictionary has the endmembers' spectra too: in rooms, walls colour the light."""
 
 
-WITH_ALPHA = AlphaPreset(
-    single_ray_until=0.4,
-    initial_opacity=0.05,
-    smallest_weight=4e-3,
-    first_smallest_weight=4e-3,
-    visible_weight=0.05,
-    background="random",
-    rgb_loss_weight=0.2,
-    opacity_loss_weight=0.0,
-    sparsity_loss_weight=0.0,
-    surface_loss_weight=0.0,
-    coarse_samples=256,
-    specular_endmembers=False,
-)
+WITH_ALPHA = AlphaPreset()
 WITHOUT_ALPHA = AlphaPreset(
     single_ray_until=0.8,
     initial_opacity=0.01,
-    smallest_weight=4e-3,
     first_smallest_weight=1e-3,
     visible_weight=1.0,
     background="black",
     rgb_loss_weight=0.0,
     opacity_loss_weight=0.01,
     sparsity_loss_weight=1e-3,
-    surface_loss_weight=0.0,
-    coarse_samples=256,
     specular_endmembers=True,
 )
-
-
-UNBOUNDED = replace(
-    WITHOUT_ALPHA,
-    initial_opacity=0.005,
-    surface_loss_weight=0.3,
-    coarse_samples=64,
-)
-
-
+UNBOUNDED = replace(WITHOUT_ALPHA, initial_opacity=0.005, surface_loss_weight=0.3, coarse_samples=64)
 BEFORE_BACKDROP = replace(WITH_ALPHA, background="black")
 
 

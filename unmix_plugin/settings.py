@@ -45,6 +45,11 @@ _WHERE_LAMP = {
 }
 
 
+def _within(value: float | str, low: float, high: float = math.inf) -> bool:
+    """Whether a setting is a word such as `auto`, or a number from `low` to `high`."""
+    return isinstance(value, str) or low <= value <= high
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """How to read a scene."""
@@ -100,13 +105,11 @@ class HyperspectralDataManagerConfig(DataManagerConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         rules = {
-            "memory-gb of at least 0.01 or auto": self.memory_gb == "auto" or self.memory_gb >= 0.01,
-            "subpixels of 1 to 8 or auto": self.subpixels == "auto" or 1 <= self.subpixels <= 8,
-            "single-ray-until in [0, 1] or auto": self.single_ray_until == "auto"
-            or 0 <= self.single_ray_until <= 1,
-            "grid-resolution of 8 to 512": 8 <= self.grid_resolution <= 512,
-            "target-components of at least 1, auto or none": isinstance(self.target_components, str)
-            or self.target_components >= 1,
+            "memory-gb of at least 0.01 or auto": _within(self.memory_gb, 0.01),
+            "subpixels of 1 to 8 or auto": _within(self.subpixels, 1, 8),
+            "single-ray-until in [0, 1] or auto": _within(self.single_ray_until, 0, 1),
+            "grid-resolution of 8 to 512": _within(self.grid_resolution, 8, 512),
+            "target-components of at least 1, auto or none": _within(self.target_components, 1),
         }
         require("the data manager", self, rules)
 
@@ -137,16 +140,16 @@ class UnmixFieldConfig:
     """One brightness a point, or one a point and endmember, as published."""
 
     def __post_init__(self) -> None:
-        finest, rows = self.finest_resolution, self.log2_rows_per_level
+        finest = self.finest_resolution
         rules = {
-            "num-levels of 1 to 32": 1 <= self.num_levels <= 32,
-            "features-per-level of 1 to 8": 1 <= self.features_per_level <= 8,
-            "coarsest-resolution of 2 to 4096": 2 <= self.coarsest_resolution <= LARGEST_RESOLUTION,
-            "finest-resolution of 2 to 4096 or auto": finest == "auto" or 2 <= finest <= LARGEST_RESOLUTION,
-            "cells-per-pixel of 0.001 to 100": 0.001 <= self.cells_per_pixel <= 100,
-            "log2-rows-per-level of 4 to 24 or auto": rows == "auto" or 4 <= rows <= 24,
-            "hidden-width of 1 to 1024": 1 <= self.hidden_width <= 1024,
-            "a temperature of 0.01 to 100": 0.01 <= self.temperature <= 100,
+            "num-levels of 1 to 32": _within(self.num_levels, 1, 32),
+            "features-per-level of 1 to 8": _within(self.features_per_level, 1, 8),
+            "coarsest-resolution of 2 to 4096": _within(self.coarsest_resolution, 2, LARGEST_RESOLUTION),
+            "finest-resolution of 2 to 4096 or auto": _within(finest, 2, LARGEST_RESOLUTION),
+            "cells-per-pixel of 0.001 to 100": _within(self.cells_per_pixel, 0.001, 100),
+            "log2-rows-per-level of 4 to 24 or auto": _within(self.log2_rows_per_level, 4, 24),
+            "hidden-width of 1 to 1024": _within(self.hidden_width, 1, 1024),
+            "a temperature of 0.01 to 100": _within(self.temperature, 0.01, 100),
         }
         require("the field", self, rules)
 
@@ -171,9 +174,8 @@ class RendererConfig:
 
     def __post_init__(self) -> None:
         rules = {
-            "samples-per-pixel of 0.01 to 100 or auto": self.samples_per_pixel == "auto"
-            or 0.01 <= self.samples_per_pixel <= 100,
-            "coarse-samples of at least 1 or auto": self.coarse_samples == "auto" or self.coarse_samples >= 1,
+            "samples-per-pixel of 0.01 to 100 or auto": _within(self.samples_per_pixel, 0.01, 100),
+            "coarse-samples of at least 1 or auto": _within(self.coarse_samples, 1),
             "smallest-weight in [0, 1) or auto": self.smallest_weight == "auto"
             or 0 <= self.smallest_weight < 1,
             "visible-weight in (0, 1] or auto": self.visible_weight == "auto" or 0 < self.visible_weight <= 1,
@@ -223,13 +225,13 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         rules = {
-            "spectral of at least 0": self.spectral >= 0,
-            "rgb of at least 0": self.rgb == "auto" or self.rgb >= 0,
-            "abundances of at least 0": self.abundances >= 0,
+            "spectral of at least 0": _within(self.spectral, 0),
+            "rgb of at least 0": _within(self.rgb, 0),
+            "abundances of at least 0": _within(self.abundances, 0),
             "band-weights above 0, auto or none": self.band_weights == "auto"
             or all(weight > 0 for weight in self.band_weights),
             "an exposure above 0 or auto": self.exposure == "auto" or self.exposure > 0,
-            "relative in [0, 2] or auto": self.relative == "auto" or 0 <= self.relative <= 2,
+            "relative in [0, 2] or auto": _within(self.relative, 0, 2),
         }
         require("the losses", self, rules)
 
@@ -321,24 +323,20 @@ class UnmixModelConfig(ModelConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        count, opacity = self.num_endmembers, self.initial_opacity
+        count, opacity, ours = self.num_endmembers, self.initial_opacity, not self.as_published
+        has_lamp, has_file = self.lamp not in ("auto", ()), self.endmember_file is not None
+        is_lamp = len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)
         rules = {
-            "num-endmembers of 1 to 255 or auto": count in (None, "auto") or 1 <= int(count) <= 255,
-            "num-specular-spectra of 1 to 256 or auto": self.num_specular_spectra == "auto"
-            or 1 <= self.num_specular_spectra <= 256,
-            "samples-per-step of 1 to 100 million or auto": self.samples_per_step == "auto"
-            or 1 <= self.samples_per_step <= 100_000_000,
+            "num-endmembers of 1 to 255 or auto": count is None or _within(count, 1, 255),
+            "num-specular-spectra of 1 to 256 or auto": _within(self.num_specular_spectra, 1, 256),
+            "samples-per-step of 1 to 100 million or auto": _within(self.samples_per_step, 1, 100_000_000),
             "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
-            "a lamp of no or ten numbers, the first 0 or 1, or auto": self.lamp in ("auto", ())
-            or (len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)),
-            "light camera where numbers of a lamp are given": self.lamp in ("auto", ())
-            or self.light == "camera",
-            "light fixed or per-view: the field as published has no shading": not self.as_published
-            or self.light != "camera",
-            "a scale per-endmember: the method as published has no shared one": not self.as_published
+            "a lamp of no or ten numbers, the first 0 or 1, or auto": not has_lamp or is_lamp,
+            "light camera where numbers of a lamp are given": not has_lamp or self.light == "camera",
+            "light fixed or per-view: the field as published has no shading": ours or self.light != "camera",
+            "a scale per-endmember: the method as published has no shared one": ours
             or self.field.scale == "per-endmember",
-            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file")
-            == (self.endmember_file is not None),
+            "endmember-file exactly when endmember-init is file": (self.endmember_init == "file") == has_file,
         }
         require("the model", self, rules)
 
