@@ -8,7 +8,8 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CONFIG
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.field import UnmixField, _cells_of_finest_level, _rows_of_level, direction_features
+from unmix_plugin.field import UnmixField, _cells_of_finest_level, _rows_of_level
+from unmix_plugin.light.shading import direction_features
 from unmix_plugin.settings import UnmixFieldConfig
 
 PIXELS = (0.02, 0.01, 0.006, 0.0045, 0.003, 0.001)

@@ -60,7 +60,7 @@ class CoefficientField(Field):
 
     @property
     def has_sky(self) -> bool:
-        """Whether something is behind all that is rendered."""
+        """Whether something is behind all that is rendered: the sky of an unbounded world, or a backdrop."""
         return False
 
     @abstractmethod
@@ -97,7 +97,6 @@ class CoefficientField(Field):
         return None
 
     def get_density(self, positions: Float[Tensor, "S 3"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit and geometry features."""
         return self.density_of(self.encode(positions))
 
 
@@ -180,28 +179,23 @@ class UnmixField(CoefficientField):
 
     @property
     def moving_lamp(self) -> MovingLamp | None:
-        """The lamp that moves with the camera; None where light is fixed or its place is not known."""
         return self.lamp
 
     @property
     def has_sky(self) -> bool:
-        """Whether something is behind all that is rendered: the sky of an unbounded world, or a backdrop."""
         return hasattr(self, "sky_network")
 
     def encode(
         self, positions: Float[Tensor, "S 3"], known: Float[Tensor, "S LF"] | None = None
     ) -> Float[Tensor, "S LF"]:
-        """The hash grid's encoding of positions; `known` as `hash_encode` takes it."""
-        return hash_encode(self._to_unit(positions), self.table, self.layout, known)
-
-    def _to_unit(self, positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 3"]:
         low, high = self.aabb
-        if not self.is_unbounded:
-            return (positions - low) / (high - low)
-        return contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
+        if self.is_unbounded:
+            unit = contracted_unit((positions - (low + high) / 2) / ((high - low).max() / 2))
+        else:
+            unit = (positions - low) / (high - low)
+        return hash_encode(unit, self.table, self.layout, known)
 
     def sky(self, rays: RayBundle) -> Float[Tensor, "R C"] | None:
-        """Abundances and brightness of what is infinitely far away, or of a backdrop; None if nothing."""
         if not self.has_sky:
             return None
         features = sky_features(rays.directions) if self.is_unbounded else backdrop_features(rays)
@@ -211,7 +205,6 @@ class UnmixField(CoefficientField):
         return torch.cat([shares, brightness], dim=-1)
 
     def density_of(self, encoded: Float[Tensor, "S LF"]) -> tuple[Float[Tensor, "S"], Float[Tensor, "S G"]]:
-        """Density per scene unit and geometry features where the encoding is `encoded`."""
         if self.level_weights is not None:
             encoded = encoded * self.level_weights.repeat_interleave(self.config.features_per_level)
         features = in_parts(self.density_network, encoded)
@@ -224,7 +217,6 @@ class UnmixField(CoefficientField):
         features: Float[Tensor, "S G"],
         light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
-        """`abundances` (S, K), `scaled_abundances` S a (S, K) and `specular_coefficients` h u (S, J)."""
         shading = self.lamp_shading
         lit = None if light is None or shading is None else shading(features, directions, light)
         abundances, scales = self._material(features, directions, lit)
@@ -235,7 +227,6 @@ class UnmixField(CoefficientField):
         }
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
-        """Abundances a of points with these geometry features, summing to 1."""
         return self._material(features)[0]
 
     def _material(

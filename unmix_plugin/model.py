@@ -285,8 +285,8 @@ class UnmixModel(Model):
             self.grid, step.rendered, step.corrected.rays.camera_indices, visible_weight, self.processes
         )
         if self.grid.observed is not None:
-            positions, densities = step.rendered.visible.observed()
-            self.grid.record_observed(self.renderer.space.to_unit(positions), densities)
+            positions, densities = map(step.rendered.visible.all_of, ("positions", "densities"))
+            self.grid.record_observed(self.renderer.space.to_unit(positions.detach()), densities)
         self.comparison.observe(step.compared)
         self._pose_training.observe(step.compared, step.corrected)
 
@@ -420,7 +420,7 @@ class UnmixModel(Model):
                 self.metadata.get("num_train_pixels", 0),
             )
             self._occupied_share = self.grid.occupied.float().mean()
-            self.processes.mean(self.guide.margin_variance)
+            self.processes.reduce(self.guide.margin_variance, "mean")
             self._pose_training.update_weights(self.processes)
 
     @torch.no_grad()

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
@@ -62,7 +62,8 @@ class AbundanceGuide(nn.Module):
         self.register_buffer("endmembers", torch.zeros(num_endmembers, num_bands))
         self.register_buffer("penalty", torch.zeros(()))
         self.register_buffer("margin_variance", torch.full((), torch.inf))
-        self._cache: _MixtureCache | None = None
+        self._keys = torch.zeros(0, dtype=torch.int64)
+        self._mixtures = torch.zeros(0, num_endmembers, dtype=torch.float16)
 
     @property
     def margin_error(self) -> Float[Tensor, ""]:
@@ -84,7 +85,7 @@ class AbundanceGuide(nn.Module):
         Args:
             endmembers: The guide's, as the sensor of these pixels sees them.
         """
-        mixtures = measured.alpha[:, None] * self._mixtures(measured, endmembers)
+        mixtures = measured.alpha[:, None] * self._mixtures_of(measured, endmembers)
         distances = (abundances - mixtures).square().sum(dim=1)
         return torch.where(_is_informative(measured), distances, 0.0).mean()
 
@@ -96,7 +97,7 @@ class AbundanceGuide(nn.Module):
             return
         few = measured.first(_OBSERVED_PIXELS)
         counts = _is_informative(few) & (few.alpha > OPAQUE_ALPHA)
-        own, mixtures = abundances[:_OBSERVED_PIXELS].detach(), self._mixtures(few, endmembers)
+        own, mixtures = abundances[:_OBSERVED_PIXELS].detach(), self._mixtures_of(few, endmembers)
         largest = own.topk(2, dim=1)
         margins = largest.values[:, 0] - largest.values[:, 1]
         first, second = mixtures.gather(1, largest.indices).unbind(1)
@@ -107,10 +108,32 @@ class AbundanceGuide(nn.Module):
         # Without any such pixel, or where the field is not finite, it stays as it is.
         self.margin_variance.copy_(torch.where((counts.sum() > 0) & variance.isfinite(), moved, before))
 
-    def _mixtures(self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]) -> Float[Tensor, "R K"]:
-        if self._cache is None:
-            self._cache = _MixtureCache(len(self.endmembers), self.endmembers.device)
-        return self._cache.mixtures(measured.pixels, measured.spectra, endmembers, self.penalty)
+    @torch.no_grad()
+    def _mixtures_of(
+        self, measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
+    ) -> Float[Tensor, "R K"]:
+        """Abundances of measured spectra, summing to 1, as mixtures of few endmembers; a spectrum's brightness does
+        not matter.
+
+        A mixture depends on the pixel alone, and pixels come again, so those that were unmixed recently are kept: in a
+        fixed number of slots, whatever the size of the scene. Values are kept, and given even the first time, in half
+        precision, so that a resumed training sees the same ones.
+        """
+        pixels, spectra, num_endmembers = measured.pixels, measured.spectra, len(self.endmembers)
+        if len(self._keys) == 0:
+            num_slots, device = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers)), self.endmembers.device
+            self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
+            self._mixtures = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
+        slots = pixels % len(self._keys)
+        is_new = (self._keys[slots] != pixels).nonzero()[:, 0]
+        values = self._mixtures[slots]
+        if len(is_new):
+            values[is_new] = sparse_abundances(spectra[is_new], endmembers, self.penalty).to(values)
+            self._keys[slots[is_new]] = pixels[is_new]
+            # Two pixels of a batch may share a slot; only one of them has it in the end.
+            kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
+            self._mixtures[slots[kept]] = values[kept]
+        return values.to(spectra)
 
 
 def _is_informative(measured: MeasuredPixels) -> Bool[Tensor, "R"]:
@@ -134,46 +157,6 @@ def mixing_penalty(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"
     return _RELATIVE_PENALTY * min(gain / _CLEAR_GAIN, 1.0) * gain
 
 
-class _MixtureCache:
-    """Mixtures of pixels that were unmixed recently: a mixture depends on the pixel alone, and pixels come again.
-
-    A fixed number of slots, whatever the size of the scene; values are kept, and given even the first time, in half
-    precision, so that a resumed training sees the same ones.
-    """
-
-    def __init__(self, num_endmembers: int, device: torch.device) -> None:
-        num_slots = min(1 << 20, _CACHE_BYTES // (2 * num_endmembers))
-        self._keys = torch.full((num_slots,), -1, dtype=torch.int64, device=device)
-        self._values = torch.zeros(num_slots, num_endmembers, dtype=torch.float16, device=device)
-
-    @torch.no_grad()
-    def mixtures(
-        self,
-        pixels: Int[Tensor, "R"],
-        spectra: Float[Tensor, "R B"],
-        endmembers: Float[Tensor, "K B"],
-        penalty: Tensor,
-    ) -> Float[Tensor, "R K"]:
-        """Abundances of measured spectra, summing to 1, as mixtures of few endmembers.
-
-        Args:
-            pixels: Number of each pixel, which stands for its spectrum.
-            spectra: Their spectra; premultiplied ones too, since brightness does not matter.
-            endmembers, penalty: As `sparse_abundances` takes them; the same in each call.
-        """
-        slots = pixels % len(self._keys)
-        is_new = (self._keys[slots] != pixels).nonzero()[:, 0]
-        values = self._values[slots]
-        if len(is_new):
-            found = sparse_abundances(spectra[is_new], endmembers, penalty).to(values)
-            values[is_new] = found
-            self._keys[slots[is_new]] = pixels[is_new]
-            # Two pixels of a batch may share a slot; only one of them has it in the end.
-            kept = is_new[self._keys[slots[is_new]] == pixels[is_new]]
-            self._values[slots[kept]] = values[kept]
-        return values.to(spectra)
-
-
 def first_endmembers(
     config: UnmixModelConfig,
     count: int,
@@ -184,14 +167,8 @@ def first_endmembers(
     initial_data: Mapping[str, np.ndarray],
     generator: torch.Generator,
 ) -> Float[Tensor, "K B"]:
-    """The first endmembers, on all bands.
+    """The first K = `count` endmembers, on all bands; reflectances of a file are multiplied by the lamp's spectrum.
 
-    Args:
-        count: K.
-        balance: What each band counts where pixels are compared.
-        sensors: What the sensors of a rig see.
-        lamp: Spectrum of the light, which reflectances of a file are multiplied by.
-        initial_data: The data manager's summary of the training pixels.
     Raises:
         SpectrumError: more endmembers than distinct pixels, or spectra that don't cover the bands.
         ConfigError: the file has another number of spectra.

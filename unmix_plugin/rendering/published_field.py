@@ -15,13 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.field import (
+from unmix_plugin.field import NUM_FEATURES, UnmixField
+from unmix_plugin.light.shading import (
     NUM_DIRECTION_FEATURES,
-    NUM_FEATURES,
-    UnmixField,
+    Lamplight,
+    bias_free_network,
     direction_features,
 )
-from unmix_plugin.light.shading import Lamplight, bias_free_network
 
 _NUM_FREQUENCIES = 2
 _NUM_POSITION_FEATURES = 3 * 2 * _NUM_FREQUENCIES
@@ -58,27 +58,19 @@ class PublishedField(UnmixField):
         features: Float[Tensor, "S G"],
         light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
-        """As `UnmixField.get_outputs`, with the tint from the network of the abundances."""
+        """With the tint from the network of the abundances."""
         logits = self.material_network(features)
         abundances = torch.softmax(logits[:, :-1] / self.config.temperature, dim=-1)
-        return {
-            "abundances": abundances,
-            "scaled_abundances": torch.sigmoid(self.scale_network(features)) * abundances,
-            "specular_coefficients": self._tinted(directions, features, torch.sigmoid(logits[:, -1:])),
-        }
+        scaled = torch.sigmoid(self.scale_network(features)) * abundances
+        tinted = features.new_zeros(len(features), 0)
+        if self.num_specular:
+            tint, places = torch.sigmoid(logits[:, -1:]), features[:, -_NUM_POSITION_FEATURES:]
+            seen = [torch.ones_like(tint), direction_features(directions), places]
+            tinted = tint * torch.sigmoid(self.specular_network(torch.cat(seen, dim=-1)))
+        return {"abundances": abundances, "scaled_abundances": scaled, "specular_coefficients": tinted}
 
     def abundances_of(self, features: Float[Tensor, "S G"]) -> Float[Tensor, "S K"]:
-        """Abundances a of points with these features, summing to 1."""
         return torch.softmax(self.material_network(features)[:, :-1] / self.config.temperature, dim=-1)
-
-    def _tinted(
-        self, directions: Float[Tensor, "S 3"], features: Float[Tensor, "S G"], tint: Float[Tensor, "S 1"]
-    ) -> Float[Tensor, "S B"]:
-        if self.num_specular == 0:
-            return features.new_zeros(len(features), 0)
-        places = features[:, -_NUM_POSITION_FEATURES:]
-        seen = [torch.ones_like(tint), direction_features(directions), places]
-        return tint * torch.sigmoid(self.specular_network(torch.cat(seen, dim=-1)))
 
 
 def _position_features(positions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 12"]:
