@@ -27,13 +27,11 @@ from unmix_plugin.errors import ConfigError
 
 
 class DataManager(ABC):
-    """Reads one scene and serves batches of it.
+    """Reads one scene and serves batches of it: dictionaries of tensors with one row a ray (`next_train`), or with
+    leading axes (height, width) for a whole image (`eval_image`).
 
     Sampling is a pure function of (seed, step): a step makes its own generator with `step_generator(seed, step)`, so
     that a resumed run sees the batches of a straight one.
-
-    A batch is a dictionary of tensors with one row a ray (`next_train`), or with leading axes (height, width) for a
-    whole image (`eval_image`).
     """
 
     train_cameras: Cameras
@@ -44,15 +42,9 @@ class DataManager(ABC):
     """What the scene fits in, model space."""
 
     def __init__(self, config: DataManagerConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
-        """Keep what every data manager needs; subclasses then read `data` and set cameras and scene box.
-
-        Raises:
-            SceneError: the scene is missing or malformed (raised by subclasses).
-        """
-        self.config = config
-        self.data = data
-        self.device = device
-        self.seed = seed
+        """Keep what every data manager needs; subclasses then read `data` and set cameras and scene box, or raise
+        `SceneError`."""
+        self.config, self.data, self.device, self.seed = config, data, device, seed
 
     @abstractmethod
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
@@ -146,9 +138,7 @@ class Model(nn.Module, ABC):
     def __init__(self, config: ModelConfig, *, scene_box: SceneBox, metadata: Mapping[str, Any]) -> None:
         """Keep the arguments, then call `populate_modules`."""
         super().__init__()
-        self.config = config
-        self.scene_box = scene_box
-        self.metadata = metadata
+        self.config, self.scene_box, self.metadata = config, scene_box, metadata
         self.generator: torch.Generator | None = None
         """Source of every random draw of a training step, on the model's device, seeded by the trainer from (seed,
         step); None is torch's global one."""
@@ -282,16 +272,11 @@ class Model(nn.Module, ABC):
         Raises:
             ConfigError: a name that `get_outputs` does not give.
         """
-        ray_bundle = camera.to(self.device).image_rays(0)
-        chunk = self.rays_per_chunk
-        parts = [
-            self._ray_outputs(ray_bundle[i : i + chunk], outputs) for i in range(0, len(ray_bundle), chunk)
-        ]
+        rays, chunk = camera.to(self.device).image_rays(0), self.rays_per_chunk
+        parts = [self._ray_outputs(rays[i : i + chunk], outputs) for i in range(0, len(rays), chunk)]
         names = [name for name in parts[0] if all(name in part for part in parts)]
-        return {
-            name: torch.cat([part[name] for part in parts]).unflatten(0, (camera.height, camera.width))
-            for name in names
-        }
+        size = (camera.height, camera.width)
+        return {name: torch.cat([part[name] for part in parts]).unflatten(0, size) for name in names}
 
     def _ray_outputs(self, ray_bundle: RayBundle, names: Collection[str] | None) -> dict[str, Tensor]:
         found = {
