@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64
 
-from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers, read_within
 
 _TRANSFORM_KEY, _SCALE_KEY, _OFFSET_KEY = "applied_transform", "applied_scale", "offset"
 METRES_KEY, METRES_RANGE = "metres_per_unit", (1e-9, 1e9)
@@ -115,59 +115,35 @@ def read_placement(content: dict[str, Any], faults: Faults, where: str) -> Place
 
     `offset` counts beside one of the other two only, and not in files of instant-ngp, where it means something else.
     """
-    transform = _numbers(content.get(_TRANSFORM_KEY), (3, 4))
-    if content.get(_TRANSFORM_KEY) is None:
-        transform = np.eye(3, 4)
-    elif transform is None or not _is_rotation(transform[:, :3]):
+    given = content.get(_TRANSFORM_KEY)
+    rows = given[:3] if isinstance(given, list) and given[3:] == [[0, 0, 0, 1]] else given
+    transform = np.eye(3, 4) if given is None else read_numbers(rows, 3, 4)
+    if transform is None or not _is_rotation(transform[:, :3]):
         faults.add(
             where,
-            f"'{_TRANSFORM_KEY}' is {describe(content[_TRANSFORM_KEY])}; expected 3 rows of 4 numbers, a rotation and "
-            "a translation; put scale into 'applied_scale', or drop the key",
+            f"'{_TRANSFORM_KEY}' is {describe(given)}; expected 3 rows of 4 numbers, a rotation and a translation; put "
+            "scale into 'applied_scale', or drop the key",
         )
         transform = np.eye(3, 4)
-    scale = 1.0 if content.get(_SCALE_KEY) is None else read_number(content[_SCALE_KEY])
-    if scale is None or not _SCALE_RANGE[0] <= scale <= _SCALE_RANGE[1]:
-        faults.add(where, f"'{_SCALE_KEY}' is {describe(content[_SCALE_KEY])}; expected a number above 0")
-        scale = 1.0
-    is_ours = any(content.get(key) is not None for key in (_TRANSFORM_KEY, _SCALE_KEY)) and not any(
-        key in content for key in _OTHER_OFFSETS
+    scale = read_within(content, _SCALE_KEY, *_SCALE_RANGE, "a number above 0", where, faults)
+    is_ours = any(content.get(key) is not None for key in (_TRANSFORM_KEY, _SCALE_KEY))
+    offset = (
+        content.get(_OFFSET_KEY) if is_ours and not any(key in content for key in _OTHER_OFFSETS) else None
     )
-    has_offset = is_ours and content.get(_OFFSET_KEY) is not None
-    offset = _numbers(content[_OFFSET_KEY], (3,)) if has_offset else np.zeros(3)
-    if offset is None:
-        faults.add(where, f"'{_OFFSET_KEY}' is {describe(content[_OFFSET_KEY])}; expected 3 finite numbers")
-        offset = np.zeros(3)
-    return Placement(transform[:, :3], transform[:, 3], scale, offset)
+    shift = np.zeros(3) if offset is None else read_numbers(offset, 3)
+    if shift is None:
+        faults.add(where, f"'{_OFFSET_KEY}' is {describe(offset)}; expected 3 finite numbers")
+        shift = np.zeros(3)
+    return Placement(transform[:, :3], transform[:, 3], 1.0 if scale is None else scale, shift)
 
 
 def read_metres_per_unit(content: dict[str, Any], faults: Faults, where: str) -> float | None:
     """Metres in a unit of the source's world, as transforms.json may say; with a noted fault where that is wrong."""
-    metres = None if content.get(METRES_KEY) is None else read_number(content[METRES_KEY])
-    if content.get(METRES_KEY) is None:
-        return None
-    if metres is None or not METRES_RANGE[0] <= metres <= METRES_RANGE[1]:
-        faults.add(
-            where,
-            f"'{METRES_KEY}' is {describe(content[METRES_KEY])}; expected 1e-9 to 1e9, such as 0.001 for mm",
-        )
-        return None
-    return metres
+    expected = "1e-9 to 1e9, such as 0.001 for mm"
+    return read_within(content, METRES_KEY, *METRES_RANGE, expected, where, faults)
 
 
 def _is_rotation(matrix: Float64[np.ndarray, "3 3"]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         is_orthonormal = np.abs(matrix.T @ matrix - np.eye(3)).max() <= _ROTATION_TOLERANCE
     return bool(is_orthonormal) and float(np.linalg.det(matrix)) > 0
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Lists of finite numbers as an array; of a 4 x 4 matrix the last row is left out. None if it is anything else."""
-    if isinstance(value, list) and shape == (3, 4) and len(value) == 4 and value[3] == [0, 0, 0, 1]:
-        value = value[:3]
-    if not isinstance(value, list) or len(value) != shape[0]:
-        return None
-    if len(shape) > 1:
-        rows = [_numbers(row, shape[1:]) for row in value]
-        return None if any(row is None for row in rows) else np.array(rows)
-    numbers = [read_number(number) for number in value]
-    return None if any(number is None for number in numbers) else np.array(numbers, dtype=np.float64)

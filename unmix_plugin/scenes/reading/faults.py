@@ -10,10 +10,13 @@ import json
 import math
 import re
 import unicodedata
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
+
+import numpy as np
 
 from unmix_plugin.errors import SceneError, name_some
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
@@ -38,7 +41,7 @@ class Faults:
         return str(self._root) if self._root.suffix == ".json" else FILE_NAME
 
     def add(self, where: str, message: str) -> None:
-        """Note a fault.
+        """Note a fault; a reader returns this None in place of a value.
 
         Args:
             where: File, frame or key that has it.
@@ -51,8 +54,6 @@ class Faults:
 
     def raise_if_any(self) -> None:
         """End here if anything is wrong. Raises SceneError: one or more faults were noted; its message lists them."""
-        if not self._places:
-            return
         lines = [
             message if places == [str(self._root)] else f"{name_some(places)}: {message}"
             for message, places in self._places.items()
@@ -62,7 +63,8 @@ class Faults:
         listed = [f"  {number}. {line}" for number, line in enumerate(lines[:MAX_LISTED], start=1)]
         if len(lines) > MAX_LISTED:
             listed.append(f"  and {len(lines) - MAX_LISTED} more")
-        raise SceneError("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
+        if lines:
+            raise SceneError("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
 
 
 class UnreadableJsonError(ValueError):
@@ -108,6 +110,32 @@ def read_number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
+def read_numbers(value: Any, *shape: int) -> np.ndarray | None:
+    """A list of so many finite numbers, or of so many such lists, as an array; None if it is anything else."""
+    if not isinstance(value, list) or len(value) != shape[0]:
+        return None
+    parts = [read_numbers(part, *shape[1:]) if shape[1:] else read_number(part) for part in value]
+    return None if any(part is None for part in parts) else np.array(parts, dtype=np.float64)
+
+
+def read_within(
+    content: Mapping[str, Any],
+    key: str,
+    low: float,
+    high: float,
+    expected: str,
+    where: str,
+    faults: Faults,
+    is_whole: bool = False,
+) -> float | None:
+    """The number of a key; None if it is absent, and with a noted fault if it is none from `low` to `high`."""
+    value = content.get(key)
+    number = read_number(value)
+    if value is None or (number is not None and low <= number <= high and not (is_whole and number % 1)):
+        return number
+    return faults.add(where, f"'{key}' is {describe(value)}; expected {expected}")
+
+
 _MOST_FOLDERS = 32
 """In a path; each is where it may go on in another folder."""
 _DRIVE = re.compile(r"[A-Za-z]:/")
@@ -130,26 +158,21 @@ def find_named(root: Path, text: str, least_parts: int = 1) -> Path | None:
     tails = [parts[start:] for start in range(1, len(parts) - least_parts + 1)] if is_absolute else []
     candidates = [parts, *tails]
     candidates += [[unquote(part) for part in tail] for tail in candidates if "%" in text]
-    followed = (_follow(root, tail) for tail in candidates)
-    return next((path for path in followed if path is not None), None)
-
-
-def _follow(root: Path, parts: list[str]) -> Path | None:
-    """The file in a folder, its names in any case; None where a name is missing, fits several or leads out of it."""
-    with suppress(OSError, RuntimeError, ValueError):
-        path = _in_any_case(root, parts)
-        if path is not None and path.is_file() and path.resolve().is_relative_to(root.resolve()):
-            return path
+    for candidate in candidates:
+        with suppress(OSError, RuntimeError, ValueError):
+            found = _in_any_case(root, candidate)
+            if found is not None and found.is_file() and found.resolve().is_relative_to(root.resolve()):
+                return found
     return None
 
 
 def _in_any_case(root: Path, parts: list[str]) -> Path | None:
+    """The path in a folder, its names in any case; None where one is missing or fits several."""
     path = root
     for part in parts:
         if not (path / part).exists() and part != "..":
-            wanted = _plain(part)
             entries = path.iterdir() if path.is_dir() else ()
-            alike = [entry.name for entry in entries if _plain(entry.name) == wanted]
+            alike = [entry.name for entry in entries if _plain(entry.name) == _plain(part)]
             if len(alike) != 1:
                 return None
             part = alike[0]
@@ -166,31 +189,26 @@ def resolve_path(
 ) -> Path | None:
     """Find the file a scene names; None and a noted fault if it is missing, no plain file, or out of bounds.
 
-    Paths of other systems are followed as `find_named` does.
-
     A path is out of bounds if it is absolute or if it leads out of the scene folder, be it by `..` or through a
     symbolic link. Such a path is followed with `allow_outside`; None is for those who can't be asked to, to whom the
-    setting is not named.
+    setting is not named. Paths of other systems are followed as `find_named` does.
     """
     path = root / text
     try:
         inside = path.resolve().is_relative_to(root.resolve()) and not Path(text).is_absolute()
         is_file = path.is_file()
     except (OSError, RuntimeError, ValueError) as error:  # a name too long, a loop of links, a zero byte
-        faults.add(where, f"{text!r} cannot be followed ({type(error).__name__})")
-        return None
-    if not (is_file and (inside or allow_outside)) and (found := find_named(root, text, least_parts)):
+        return faults.add(where, f"{text!r} cannot be followed ({type(error).__name__})")
+    if is_file and (inside or allow_outside):
+        return path
+    if found := find_named(root, text, least_parts):
         return found
     if not inside and not allow_outside:
         or_allow = ", or allow it with --allow-outside-paths if you trust this scene"
         advice = f"copy the file into it{'' if allow_outside is None else or_allow}"
-        faults.add(where, f"{text!r} leaves the scene folder; {advice}")
-        return None
-    if not is_file:
-        state = "is not a plain file" if path.exists() else "is missing"
-        faults.add(where, f"{text!r} {state}; add the file or drop the entry")
-        return None
-    return path
+        return faults.add(where, f"{text!r} leaves the scene folder; {advice}")
+    state = "is not a plain file" if path.exists() else "is missing"
+    return faults.add(where, f"{text!r} {state}; add the file or drop the entry")
 
 
 def sha256_of(path: Path) -> str:

@@ -13,18 +13,23 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.limits import GREATEST_PX
-from unmix_plugin.scenes.reading.faults import Faults, describe, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers, read_within
 from unmix_plugin.scenes.reading.foreign_keys import refused_keys
 
 _SUPPORTED_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV")
-_SMALLEST_ANGLE = 1e-6
-"""Field of view in radians that is still one, and how much less than pi it must be."""
 _BENDING_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Also the order of nerfstudio's `distortion_params`."""
 _FOCAL_KEYS = ("fl_x", "fl_y")
 _ANGLES = (("camera_angle_x", "x_fov"), ("camera_angle_y", "y_fov"))
 """Keys of the field of view along x and along y, in radians and in degrees."""
-_A_NUMBER = "a finite number, at most 1e9"
+_RANGES = (
+    (("w", "h"), 1.0, GREATEST_PX, "a whole number of pixels"),
+    (_FOCAL_KEYS, 1 / GREATEST_PX, GREATEST_PX, "a focal length above 0 in pixels"),
+    (("camera_angle_x", "camera_angle_y"), 1e-6, math.pi - 1e-6, "radians between 0 and pi"),
+    (("x_fov", "y_fov"), 1e-4, 180 - 1e-4, "degrees between 0 and 180"),
+    (("cx", "cy", *_BENDING_KEYS), -GREATEST_PX, GREATEST_PX, "a finite number, at most 1e9"),
+)
+"""Keys of numbers, the least and the greatest, and what messages call them."""
 
 
 @dataclass(frozen=True)
@@ -86,41 +91,29 @@ def read_lens(
     for message in refused_keys(common, own, is_scene):
         faults.add(where, message)
     common = _not_overridden(common, own)
-
-    def read(key: str, low: float, high: float, expected: str, is_whole: bool = False) -> float | None:
-        source = own if key in own else common
-        value = source.get(key)
-        number, owner = read_number(value), faults.file if source is common else where
-        if value is not None and (number is None or abs(number) > GREATEST_PX):
-            faults.add(owner, f"'{key}' is {describe(value)}; expected {_A_NUMBER}")
-        elif number is not None and (not low <= number <= high or (is_whole and number != int(number))):
-            faults.add(owner, f"'{key}' is {number:g}; expected {expected}")
-        return number
-
-    sides = [read(key, 1.0, GREATEST_PX, "a whole number of pixels", is_whole=True) for key in ("w", "h")]
-    focal_px, angles, center_px = (
-        (read(f"{key}x", low, high, expected), read(f"{key}y", low, high, expected))
-        for key, low, high, expected in (
-            ("fl_", 1 / GREATEST_PX, GREATEST_PX, "a focal length above 0 in pixels"),
-            ("camera_angle_", _SMALLEST_ANGLE, math.pi - _SMALLEST_ANGLE, "radians between 0 and pi"),
-            ("c", -GREATEST_PX, GREATEST_PX, _A_NUMBER),
-        )
-    )
-    fields = [read(key, 1e-4, 180 - 1e-4, "degrees between 0 and 180") for key in ("x_fov", "y_fov")]
-    angles = tuple(
-        angle if angle is not None or field is None else math.radians(field)
-        for angle, field in zip(angles, fields, strict=True)
-    )
-    bending = [read(key, -GREATEST_PX, GREATEST_PX, _A_NUMBER) for key in _BENDING_KEYS]
-    if faults.noted > noted_before:
-        return None
-    width, height = (None if side is None else int(side) for side in sides)
-    k1, k2, k3, k4, p1, p2 = (number or 0.0 for number in bending)
+    numbers: dict[str, float | None] = {}
+    for keys, low, high, expected in _RANGES:
+        for key in keys:
+            source, owner = (own, where) if key in own else (common, faults.file)
+            is_whole = key in ("w", "h")
+            numbers[key] = read_within(source, key, low, high, expected, owner, faults, is_whole)
     model = _read_model(common | own, where, faults)
     if faults.noted > noted_before:
         return None
+    width, height = (None if side is None else int(side) for side in (numbers["w"], numbers["h"]))
+    x_fov, y_fov = (
+        None if field is None else math.radians(field) for field in (numbers["x_fov"], numbers["y_fov"])
+    )
+    k1, k2, k3, k4, p1, p2 = (numbers[key] or 0.0 for key in _BENDING_KEYS)
     return Intrinsics(
-        model, width, height, focal_px, (angles[0], angles[1]), center_px, (k1, k2, p1, p2), (k3, k4)
+        model,
+        width,
+        height,
+        focal_px=(numbers["fl_x"], numbers["fl_y"]),
+        angles=(numbers["camera_angle_x"] or x_fov, numbers["camera_angle_y"] or y_fov),
+        center_px=(numbers["cx"], numbers["cy"]),
+        distortion=(k1, k2, p1, p2),
+        higher_radial=(k3, k4),
     )
 
 
@@ -157,12 +150,12 @@ def _read_intrinsic_matrix(matrix: Any, where: str, faults: Faults) -> dict[str,
     """Focal lengths and principal point of NeuS2's `intrinsic_matrix`, by our keys; none where there is no matrix."""
     if matrix is None:
         return {}
-    rows = [row[:3] for row in matrix[:3] if isinstance(row, list)] if isinstance(matrix, list) else []
-    numbers = [[read_number(value) for value in row] for row in rows]
-    if [len(row) for row in numbers] != [3, 3, 3] or any(None in row for row in numbers):
+    rows = matrix[:3] if isinstance(matrix, list) else []
+    numbers = read_numbers([row[:3] if isinstance(row, list) else row for row in rows], 3, 3)
+    if numbers is None:
         faults.add(where, f"'intrinsic_matrix' is {describe(matrix)}; expected 3 rows of 3 numbers in pixels")
         return {}
-    ((fx, skew, cx), (_, fy, cy), _) = np.array(numbers, dtype=np.float64).tolist()
+    (fx, skew, cx), (_, fy, cy), _ = numbers.tolist()
     if min(fx, fy) <= 0 or abs(skew) > 1e-6 * fx:
         found = f"focal lengths {fx:g}, {fy:g} and skew {skew:g}"
         faults.add(where, f"'intrinsic_matrix' has {found}; expected focal lengths above 0 and no skew")
@@ -174,13 +167,12 @@ def _read_distortion_list(listed: Any, where: str, faults: Faults) -> dict[str, 
     """The terms of `distortion_params` by our keys; none where there is no list."""
     if listed is None:
         return {}
-    numbers = [read_number(value) for value in listed] if isinstance(listed, list) else []
-    terms = [number for number in numbers if number is not None and abs(number) <= GREATEST_PX]
-    if len(numbers) != len(_BENDING_KEYS) or len(terms) != len(numbers):
+    numbers = read_numbers(listed, len(_BENDING_KEYS))
+    if numbers is None or np.abs(numbers).max() > GREATEST_PX:
         names = ", ".join(_BENDING_KEYS)
         faults.add(where, f"'distortion_params' is {describe(listed)}; expected the numbers {names}")
         return {}
-    return dict(zip(_BENDING_KEYS, terms, strict=True))
+    return dict(zip(_BENDING_KEYS, numbers.tolist(), strict=True))
 
 
 def read_intrinsics(

@@ -7,7 +7,7 @@ a frame come before those of the whole scene.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float64
 
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
-from unmix_plugin.errors import SpectrumError
+from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.faults import (
     Faults,
@@ -25,6 +25,8 @@ from unmix_plugin.scenes.reading.faults import (
     describe,
     read_json_file,
     read_number,
+    read_numbers,
+    read_within,
 )
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, keys_to_say
 from unmix_plugin.scenes.reading.lenses import Intrinsics, read_intrinsics
@@ -32,9 +34,11 @@ from unmix_plugin.spectral.bands import require_nanometres
 
 Size = tuple[int, int]
 """Height and width in pixels."""
-_FILE_KEYS = tuple(f"{key}_path" for key in ("file", "hyperspectral_file", "seg_file", "mask"))
-_FILE_KEYS += ("abundance_file_path", "responses_path")
-_SPLIT_KEYS = ("train_filenames", "val_filenames", "test_filenames")
+CUBE_KEY = "hyperspectral_file_path"
+_FILE_KEYS = tuple(
+    f"{what}_path"
+    for what in ("file", "hyperspectral_file", "seg_file", "mask", "abundance_file", "responses")
+)
 
 _RIGID_TOLERANCE = 5e-3
 """Largest element of R^T R - 1 that passes as rounding of printed digits; the rotation nearest to R is then taken."""
@@ -53,50 +57,41 @@ def read_pose(
     Args:
         name: What messages call it.
     """
-    rows = _read_rows(matrix)
+    rows = read_numbers(matrix, 4, 4)
+    rows = read_numbers(matrix, 3, 4) if rows is None else rows
     if rows is None:
         found = "is absent" if matrix is None else f"is {_found(matrix)}"
-        faults.add(where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world")
-        return None
-    if len(rows) == 4 and np.abs(rows[3] - np.array([0.0, 0.0, 0.0, 1.0])).max() > 1e-6:
+        return faults.add(
+            where, f"{name} {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world"
+        )
+    if len(rows) == 4 and np.abs(rows[3] - (0, 0, 0, 1)).max() > 1e-6:
         last = ", ".join(f"{value:g}" for value in rows[3])
-        faults.add(where, f"{name} is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
-        return None
+        return faults.add(where, f"{name} is not rigid: its last row is ({last}); expected (0, 0, 0, 1)")
     rotation, position = rows[:3, :3], rows[:3, 3]
     with np.errstate(over="ignore", invalid="ignore"):
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= _RIGID_TOLERANCE:
         lengths = ", ".join(f"{math.hypot(*axis):.4g}" for axis in rotation.T)  # hypot does not overflow
         message = f"{name} is not rigid: its axes have lengths ({lengths}) and R^T R is off the identity"
-        faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
-        return None
+        return faults.add(where, f"{message} by {deviation:.3g}; expected a rotation without scale or shear")
     if np.linalg.det(rotation) < 0.0:
-        faults.add(where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis")
-        return None
+        return faults.add(
+            where, f"{name} is a reflection (determinant -1); expected a rotation, flip one axis"
+        )
     if np.abs(position).max() > _MAX_DISTANCE:
-        faults.add(where, f"{name} puts the camera at {position.tolist()}; expected less than 1e9 units away")
-        return None
+        found = f"puts the camera at {position.tolist()}"
+        return faults.add(where, f"{name} {found}; expected less than 1e9 units away")
     u, _, vt = np.linalg.svd(rotation)
     return np.concatenate([u @ vt, position[:, None]], axis=1)
 
 
-def _read_rows(matrix: Any) -> Float64[np.ndarray, "rows 4"] | None:
-    is_matrix = isinstance(matrix, list) and len(matrix) in (3, 4)
-    if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in matrix):
-        return None
-    numbers = [[read_number(value) for value in row] for row in matrix]
-    return None if any(None in row for row in numbers) else np.array(numbers, dtype=np.float64)
-
-
 def _found(matrix: Any) -> str:
     """What stands in place of rows of numbers: a value that is no number, or else the whole."""
-    if isinstance(matrix, list):
-        for number, row in enumerate(matrix):
-            if not isinstance(row, list) or len(row) != 4:
-                return f"{describe(matrix)} whose row {number} is {describe(row)}"
-            for value in row:
-                if read_number(value) is None:
-                    return f"{describe(matrix)} rows with {describe(value)} in row {number}"
+    for number, row in enumerate(matrix if isinstance(matrix, list) else []):
+        values = row if isinstance(row, list) and len(row) == 4 else [row]
+        for value in values:
+            if read_number(value) is None:
+                return f"{describe(matrix)} with {describe(value)} in row {number}"
     return describe(matrix)
 
 
@@ -119,50 +114,36 @@ class _LinePoses:
 
     def fault(self, num_rows: int) -> str | None:
         """Why the poses don't fit an image of so many rows; None if they do."""
-        if self.is_by_row:
-            if len(self.rows) == num_rows:
-                return None
+        first, last = float(self.rows[0]), float(self.rows[-1])
+        if self.is_by_row and len(self.rows) != num_rows:
             found = f"'{_ROW_POSES}' has {len(self.rows)} poses, but the image has {num_rows} rows"
             return f"{found}; expected one pose a row"
-        first, last = float(self.rows[0]), float(self.rows[-1])
-        if first <= 0 and last >= num_rows - 1:
-            return None
-        return (
-            f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}, but the image has rows 0 to {num_rows - 1}; "
-            "expected the first key pose at row 0 or before it, and the last at the last row or after it"
-        )
+        if first > 0 or last < num_rows - 1:
+            found = f"'{_KEY_POSES}' reach from row {first:g} to row {last:g}"
+            return f"{found}, but the image has rows 0 to {num_rows - 1}; expected key poses at both ends or beyond"
+        return None
 
 
 def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LinePoses | None:
     """The poses of a line camera; None for a frame camera, and with a noted fault where they are wrong."""
-    given = [key for key in (_ROW_POSES, _KEY_POSES) if frame.get(key) is not None]
-    if not given:
+    given = [key for key in (_ROW_POSES, _KEY_POSES, "transform_matrix") if frame.get(key) is not None]
+    if given in ([], ["transform_matrix"]):
         return None
-    if len(given) == 2 or frame.get("transform_matrix") is not None:
-        named = [*given, *(["transform_matrix"] if frame.get("transform_matrix") is not None else [])]
-        faults.add(where, f"has {' and '.join(repr(key) for key in named)}; expected one of them")
-        return None
-    entries = frame[given[0]]
+    if len(given) > 1:
+        return faults.add(where, f"has {' and '.join(repr(key) for key in given)}; expected one of them")
+    [key] = given
+    entries = frame[key]
     if not isinstance(entries, list) or len(entries) < 2:
-        faults.add(where, f"'{given[0]}' is {describe(entries)}; expected a list of at least two poses")
-        return None
+        return faults.add(where, f"'{key}' is {describe(entries)}; expected a list of at least two poses")
     rows, poses = [], []
     for index, entry in enumerate(entries):
-        here, name, matrix, row = f"{where} '{given[0]}'[{index}]", "the pose", entry, float(index)
-        if given[0] == _KEY_POSES:
-            keys = entry if isinstance(entry, dict) else {}
-            name, matrix = "'transform_matrix'", keys.get("transform_matrix")
-            if (number := read_number(keys.get("row"))) is None:
-                found = f"has the row {describe(keys.get('row'))}" if keys else f"is {describe(entry)}"
-                faults.add(here, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
-                return None
-            row = number
-        pose = read_pose(matrix, here, faults, name)
-        if pose is None:  # one is enough: a list of a thousand rows has them all wrong in one way
+        row, pose = _read_line_pose(entry, index, key == _KEY_POSES, f"{where} '{key}'[{index}]", faults)
+        if (
+            row is None or pose is None
+        ):  # one is enough: a list of a thousand rows has them all wrong in one way
             return None
         if rows and row <= rows[-1]:
-            faults.add(where, f"the rows of '{_KEY_POSES}' must increase; got {rows[-1]:g} then {row:g}")
-            return None
+            return faults.add(where, f"the rows of '{key}' must increase; got {rows[-1]:g} then {row:g}")
         rows.append(row)
         poses.append(pose)
     stacked = np.stack(poses)
@@ -170,11 +151,25 @@ def read_line_poses(frame: dict[str, Any], where: str, faults: Faults) -> _LineP
     turns = np.rad2deg(np.arccos(np.clip((products - 1) / 2, -1, 1)))
     largest = int(turns.argmax())
     if turns[largest] > _GREATEST_TURN_DEG:
-        turn = f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row"
+        found = f"the camera turns by {turns[largest]:.0f} degrees from row {rows[largest]:g} to row"
         most = f"expected at most {_GREATEST_TURN_DEG:g}, give more key poses"
-        faults.add(where, f"{turn} {rows[largest + 1]:g}; {most}")
-        return None
-    return _LinePoses(np.array(rows), stacked, given[0] == _ROW_POSES)
+        return faults.add(where, f"{found} {rows[largest + 1]:g}; {most}")
+    return _LinePoses(np.array(rows), stacked, key == _ROW_POSES)
+
+
+def _read_line_pose(
+    entry: Any, index: int, is_key_pose: bool, where: str, faults: Faults
+) -> tuple[float | None, Float64[np.ndarray, "3 4"] | None]:
+    """Row and pose; None with a noted fault where one is wrong."""
+    if not is_key_pose:
+        return float(index), read_pose(entry, where, faults, "the pose")
+    keys = entry if isinstance(entry, dict) else {}
+    row = read_number(keys.get("row"))
+    if row is None:
+        found = f"has the row {describe(keys.get('row'))}" if keys else f"is {describe(entry)}"
+        faults.add(where, f"{found}; expected an object with 'row' (a number) and 'transform_matrix'")
+        return None, None
+    return row, read_pose(keys.get("transform_matrix"), where, faults)
 
 
 @dataclass(frozen=True)
@@ -223,6 +218,8 @@ class FrameEntry:
     """Poses by row, where it was taken by a line camera."""
     shot: str | None = None
     """Name of the shot; the lenses of a rig take one together."""
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Where `paths` lead, as far as they were followed."""
 
     def name_of(self, key: str) -> str:
         """One of its files, for messages."""
@@ -265,9 +262,7 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
     frames = content.get("frames")
     if not isinstance(frames, list):
         found = "is absent" if frames is None else f"is {describe(frames)}"
-        faults.add(FILE_NAME, f"'frames' {found}; expected a list with one object a view")
-        faults.raise_if_any()
-    frames = frames if isinstance(frames, list) else []
+        raise SceneError(f"{root}: {FILE_NAME}: 'frames' {found}; expected a list with one object a view")
     if not frames:
         faults.add(FILE_NAME, "'frames' is empty; a scene needs frames to train on and to evaluate")
     said = keys_to_say(content, [frame for frame in frames if isinstance(frame, dict)])
@@ -287,23 +282,22 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
 
 
 def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
+    content: Any = None
     if not path.parent.is_dir():
         found = "is a file, not a scene folder" if path.parent.is_file() else "the scene folder is not there"
         faults.add(str(path.parent), f"{found}; give the folder that holds transforms.json with --data")
     elif not path.is_file():
         faults.add(FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README)")
+    else:
+        try:
+            content = read_json_file(path)
+            if not isinstance(content, dict):
+                faults.add(FILE_NAME, f"holds {describe(content)}; expected an object with 'frames'")
+        except OSError as error:
+            faults.add(FILE_NAME, f"cannot be read ({error.strerror})")
+        except UnreadableJsonError as error:
+            faults.add(FILE_NAME, str(error))
     faults.raise_if_any()
-    content: Any = None
-    try:
-        content = read_json_file(path)
-    except OSError as error:
-        faults.add(FILE_NAME, f"cannot be read ({error.strerror})")
-    except UnreadableJsonError as error:
-        faults.add(FILE_NAME, str(error))
-    faults.raise_if_any()
-    if not isinstance(content, dict):
-        faults.add(FILE_NAME, f"holds {describe(content)}; expected an object with 'frames'")
-        faults.raise_if_any()
     return content
 
 
@@ -315,18 +309,22 @@ def _read_frame(
         faults.add(where, f"is {describe(frame)}; expected an object")
         return FrameEntry(where, {}, None, None)
     paths = {key: _read_text(frame, key, where, faults) for key in _FILE_KEYS}
-    if needs_cube and frame.get("hyperspectral_file_path") is None:
-        faults.add(where, "has no 'hyperspectral_file_path'; expected the path of its (H, W, B) .npy cube")
-    if frame.get("hyperspectral_file_path") is None and frame.get("file_path") is None and not needs_cube:
+    if needs_cube and frame.get(CUBE_KEY) is None:
+        faults.add(where, f"has no '{CUBE_KEY}'; expected the path of its (H, W, B) .npy cube")
+    elif frame.get(CUBE_KEY) is None and frame.get("file_path") is None:
         faults.add(where, "has no 'file_path'; expected the path of its picture")
     noted = faults.noted
     lines = read_line_poses(frame, where, faults)
     is_frame_camera = lines is None and faults.noted == noted
-    pose = read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None
-    lens, sensor = read_intrinsics(content, frame, where, faults), read_sensor_entry(frame, where, faults)
-    named = {key: path for key, path in paths.items() if path is not None}
-    shot = frame["capture"] if isinstance(frame.get("capture"), str) else None
-    return FrameEntry(where, named, pose, lens, sensor, lines, shot)
+    return FrameEntry(
+        where,
+        {key: path for key, path in paths.items() if path is not None},
+        read_pose(frame.get("transform_matrix"), where, faults) if is_frame_camera else None,
+        read_intrinsics(content, frame, where, faults),
+        read_sensor_entry(frame, where, faults),
+        lines,
+        frame["capture"] if isinstance(frame.get("capture"), str) else None,
+    )
 
 
 def at_sizes(entry: SceneEntry, sizes: Sequence[Size], faults: Faults) -> SceneEntry:
@@ -350,8 +348,7 @@ def _read_text(content: dict[str, Any], key: str, where: str, faults: Faults) ->
     if value is None:
         return None
     if not isinstance(value, str) or not value or any(character < " " for character in value):
-        faults.add(where, f"'{key}' is {describe(value)}; expected a path")
-        return None
+        return faults.add(where, f"'{key}' is {describe(value)}; expected a path")
     return value.replace("\\", "/")
 
 
@@ -360,13 +357,12 @@ def read_widths(content: dict[str, Any], faults: Faults) -> Float64[np.ndarray, 
     values, centers = content.get("fwhm"), content.get("wavelengths")
     if values is None or not isinstance(centers, list):
         return None
-    values = [0.0 if value is None else value for value in values] if isinstance(values, list) else []
-    numbers = [number for value in values if (number := read_number(value)) is not None and number >= 0]
-    if len(numbers) != len(centers) or len(values) != len(centers):
+    known = [0.0 if value is None else value for value in values] if isinstance(values, list) else None
+    widths = read_numbers(known, len(centers))
+    if widths is None or (widths < 0).any():
         expected = "a width in nm above 0 for each of the wavelengths (0 or null where it is unknown)"
-        faults.add(FILE_NAME, f"'fwhm' must have {expected}, or be left out")
-        return None
-    return np.array([number or np.nan for number in numbers])
+        return faults.add(FILE_NAME, f"'fwhm' must have {expected}, or be left out")
+    return np.where(widths == 0, np.nan, widths)
 
 
 def _read_wavelengths(
@@ -375,41 +371,30 @@ def _read_wavelengths(
     values = content.get("wavelengths")
     if values is None and not is_needed:
         return None
-    if values is None:
-        faults.add(FILE_NAME, "'wavelengths' is absent; expected a list with the centre of each band in nm")
-        return None
     if not isinstance(values, list) or not values:
-        faults.add(FILE_NAME, f"'wavelengths' is {describe(values)}; expected a list of numbers in nm")
-        return None
-    numbers = [read_number(value) for value in values]
-    for band, number in enumerate(numbers):
-        if number is None or number <= 0.0:
-            found = f"'wavelengths' has {describe(values[band])} at band {band}"
-            faults.add(FILE_NAME, f"{found}; expected a positive number in nm")
-            return None
+        found = "is absent" if values is None else f"is {describe(values)}"
+        return faults.add(FILE_NAME, f"'wavelengths' {found}; expected a list of the bands' centres in nm")
+    numbers = [read_number(value) or -1.0 for value in values]
+    if min(numbers) <= 0:
+        band = next(band for band, number in enumerate(numbers) if number <= 0)
+        found = f"'wavelengths' has {describe(values[band])} at band {band}"
+        return faults.add(FILE_NAME, f"{found}; expected a positive number in nm")
     wavelengths = np.array(numbers, dtype=np.float64)
     drops = np.flatnonzero(np.diff(wavelengths) <= 0.0)
     if drops.size:
         a, b = wavelengths[drops[0]], wavelengths[drops[0] + 1]
         message = f"'wavelengths' must increase; got {a:g} nm then {b:g} nm at band {drops[0] + 1}"
-        faults.add(FILE_NAME, message + "; sort the bands of wavelengths and cubes alike")
-        return None
+        return faults.add(FILE_NAME, message + "; sort the bands of wavelengths and cubes alike")
     try:
         require_nanometres(wavelengths)
     except SpectrumError as error:
-        faults.add(FILE_NAME, f"'wavelengths': {error}")
-        return None
+        return faults.add(FILE_NAME, f"'wavelengths': {error}")
     return wavelengths
 
 
 def read_value_scale(content: dict[str, Any], faults: Faults) -> float | None:
     """The stored number that stands for 1; None if it is absent, and with a noted fault if it is wrong."""
-    value = content.get("value_scale")
-    scale = read_number(value)
-    if value is not None and (scale is None or not 1e-30 <= scale <= 1e30):
-        faults.add(FILE_NAME, f"'value_scale' is {describe(value)}; expected what stands for 1, above 0")
-        return None
-    return scale
+    return read_within(content, "value_scale", 1e-30, 1e30, "what stands for 1, above 0", FILE_NAME, faults)
 
 
 def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] | None:
@@ -419,19 +404,16 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
     names = values if isinstance(values, list) else [None]
     are_names = names and all(isinstance(v, str) and v.strip() and v.isprintable() for v in names)
     if not are_names or len(set(values)) != len(values):
-        faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
-        return None
+        return faults.add(FILE_NAME, f"'materials' is {describe(values)}; expected a list of different names")
     return tuple(values)
 
 
 def _read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tuple[str, ...]]:
     lists: dict[str, tuple[str, ...]] = {}
-    for key in _SPLIT_KEYS:
-        values = content.get(key)
-        if values is None:
-            continue
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            faults.add(FILE_NAME, f"'{key}' is {describe(values)}; expected a list of file paths")
-            continue
-        lists[key.removesuffix("_filenames")] = tuple(value.replace("\\", "/") for value in values)
+    for name in ("train", "val", "test"):
+        values = content.get(f"{name}_filenames")
+        if isinstance(values, list) and all(isinstance(value, str) for value in values):
+            lists[name] = tuple(value.replace("\\", "/") for value in values)
+        elif values is not None:
+            faults.add(FILE_NAME, f"'{name}_filenames' is {describe(values)}; expected a list of file paths")
     return lists
