@@ -17,7 +17,7 @@ from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, scene_record_to_json
 from unmix_plugin.errors import ConfigError, RunError, SceneError
-from unmix_plugin.scenes import pixel_block, pixel_table
+from unmix_plugin.scenes import pixel_pool, pixel_table
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.evidence import relative_power
 from unmix_plugin.settings import HyperspectralDataManagerConfig, SceneOptions
@@ -61,8 +61,8 @@ def test_the_rays_of_a_pixel_lie_within_it_one_in_each_cell(scene_folder):
 
 
 def test_batches_from_disk_depend_on_seed_and_step_and_hold_what_was_measured(scene_folder, monkeypatch):
-    monkeypatch.setattr(pixel_block, "_CHUNK_BYTES", 12 * 40)
-    monkeypatch.setattr(pixel_block, "_PIXELS_PER_STEP", 8)
+    monkeypatch.setattr(pixel_pool, "_CHUNK_BYTES", 12 * 40)
+    monkeypatch.setattr(pixel_pool, "_PIXELS_PER_STEP", 8)
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 4000)
     going_on, resumed = make(scene_folder), make(scene_folder)
     assert any("stay on disk" in warning for warning in going_on.warnings())
@@ -123,7 +123,7 @@ def test_errors_are_relative_where_alpha_is_known_and_some_pixels_are_much_brigh
     scene_folder, has_alpha, power
 ):
     scene = replace(make(scene_folder).scene, has_alpha=has_alpha)
-    pixels = np.full((100, 6), 0.05, dtype=np.float32)
+    pixels = torch.full((100, 6), 0.05)
     pixels[:20] = 0.5
     assert relative_power(scene, pixels) == power
     assert make(scene_folder).initial_data()["relative"] == 0.0  # as it is lit evenly

@@ -184,7 +184,7 @@ class HyperspectralDataManager(DataManager):
         opaque = self._pixels.sample_opaque(chosen, most, seed)
         found = {
             "knots": self._knots.positions(self.train_cameras).numpy(),
-            "pixels": opaque,
+            "pixels": opaque.numpy(),
             "exposure": np.array(self._exposure(chosen, opaque)),
             "relative": np.array(relative_power(self.scene, opaque)),
             "reachable": reachable,
@@ -193,7 +193,7 @@ class HyperspectralDataManager(DataManager):
         }
         if not self.scene.is_rig:
             return found
-        pixels = [torch.from_numpy(self._pixels.sample_opaque(sensor, most, seed)) for sensor in shares]
+        pixels = [self._pixels.sample_opaque(sensor, most, seed) for sensor in shares]
         means = [seen.mean(dim=0) if len(seen) else seen.new_zeros(seen.shape[1]) for seen in pixels]
         matrices = [torch.from_numpy(sensors[sensor].matrix).float() for sensor in shares]
         return {**found, "sensor": np.array(chosen), "typical": typical_spectrum(means, matrices).numpy()}
@@ -310,14 +310,13 @@ class HyperspectralDataManager(DataManager):
         sizes = [self.train_cameras.size(index) for index in range(len(self.train_cameras))]
         return sum(width * height for width, height in sizes)
 
-    def _exposure(self, sensor: int, opaque: Float[np.ndarray, "P b"]) -> float:
+    def _exposure(self, sensor: int, opaque: Float[Tensor, "P b"]) -> float:
         """By opaque pixels of a sensor, but not by those that show a backdrop."""
         if self.scene.before_backdrop is not None:
-            kept = np.concatenate([mask.reshape(-1) for mask in self.scene.before_backdrop.masks()])
-            opaque = self._pixels.sample_opaque(
-                sensor, _MOST_INITIAL_PIXELS, self.seed, torch.from_numpy(kept)
-            )
-        return exposure_of(torch.from_numpy(opaque))
+            masks = self.scene.before_backdrop.masks()
+            kept = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks]))
+            opaque = self._pixels.sample_opaque(sensor, _MOST_INITIAL_PIXELS, self.seed, kept)
+        return exposure_of(opaque)
 
     def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
         """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""

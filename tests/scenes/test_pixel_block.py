@@ -16,8 +16,7 @@ CPU = torch.device("cpu")
 
 
 def read_block(scene, views: tuple[int, ...]) -> PixelBlock:
-    block = PixelBlock(scene, views, tuple(range(len(views))))
-    block.read_alpha(CPU)
+    block = PixelBlock(scene, views, tuple(range(len(views))), CPU)
     block.hold()
     return block
 
@@ -72,8 +71,7 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, s
         lambda cube: np.asarray((cube.astype(np.float64) * (scale or 1.0)).round(5), stored, order=order)
     )
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
-    held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2))
-    mapped.read_alpha(CPU)
+    held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2), CPU)
     mapped.hold_part(1)
     assert held._values is not None
     assert torch.equal(mapped._read_range(250, 700), held._values[250:700])
@@ -175,8 +173,7 @@ def test_views_are_never_read_whole_and_bad_values_at_the_edges_of_parts_are_fou
 def test_a_cube_that_is_cut_short_while_training_goes_on_is_named(tmp_path):
     folder = make_scene(tmp_path / "scene")
     scene = load_scene(folder.root)
-    block = PixelBlock(scene, (1, 3), (0, 1))
-    block.read_alpha(CPU)
+    block = PixelBlock(scene, (1, 3), (0, 1), CPU)
     block.hold_part(1)
     path = folder.root / "cubes/view_3.npy"
     path.write_bytes(path.read_bytes()[:-100])

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from unmix_plugin.scenes import pixel_block
-from unmix_plugin.scenes.pixel_block import _PixelPool
+from unmix_plugin.scenes import pixel_pool
+from unmix_plugin.scenes.pixel_pool import PixelPool
 
 PIXELS = 1000
 
@@ -12,11 +12,11 @@ PIXELS = 1000
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """Chunks of 40 pixels of 4 bytes, each of two steps."""
-    monkeypatch.setattr(pixel_block, "_CHUNK_BYTES", 160)
-    monkeypatch.setattr(pixel_block, "_PIXELS_PER_STEP", 20)
+    monkeypatch.setattr(pixel_pool, "_CHUNK_BYTES", 160)
+    monkeypatch.setattr(pixel_pool, "_PIXELS_PER_STEP", 20)
 
 
-def make_pool(valid=None, num_bytes=800, reads=None) -> _PixelPool:
+def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:
     values = torch.arange(PIXELS, dtype=torch.int32)[:, None]
 
     def read(first: int, last: int) -> torch.Tensor:
@@ -24,10 +24,10 @@ def make_pool(valid=None, num_bytes=800, reads=None) -> _PixelPool:
             reads.append((first, last))
         return values[first:last]
 
-    return _PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
+    return PixelPool(torch.ones(PIXELS, dtype=torch.bool) if valid is None else valid, 4, num_bytes, read)
 
 
-def draw(pool: _PixelPool, step: int, count: int = 20) -> torch.Tensor:
+def draw(pool: PixelPool, step: int, count: int = 20) -> torch.Tensor:
     pixels, values = pool.draw(count, step, torch.Generator().manual_seed(step))
     assert torch.equal(values[:, 0].long(), pixels)
     return pixels
@@ -75,6 +75,6 @@ def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
     def fail(first: int, last: int) -> torch.Tensor:
         raise OSError(f"the disk is gone: {first} to {last}")
 
-    pool = _PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
+    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
     with pytest.raises(OSError, match="the disk is gone"):
         draw(pool, 0)

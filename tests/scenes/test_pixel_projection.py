@@ -7,7 +7,7 @@ import torch
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes import pixel_table
-from unmix_plugin.scenes.pixel_block import Projection, _ProjectedPixels
+from unmix_plugin.scenes.pixel_projection import ProjectedPixels, Projection
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
@@ -54,7 +54,7 @@ def test_odd_and_saturated_pixels_are_kept_whole():
     pixels = torch.rand(2000, 3, generator=generator) @ smooth / 3
     subspace = find_subspace(pixels[:1000], 3)
     pixels[700], pixels[1700, 4:7] = torch.rand(BANDS, generator=generator), 1.0
-    held = _ProjectedPixels(subspace, 2000, BANDS, CPU)
+    held = ProjectedPixels(Projection(subspace, 0.0, 0.0), 2000, CPU)
     for first in (0, 1000):
         held.put(first, pixels[first : first + 1000])
     assert torch.equal(held.spectra(torch.tensor([1700, 3, 700]))[[0, 2]], pixels[[1700, 700]].half().float())

@@ -154,8 +154,7 @@ def judge_sensors(scene: Scene, table: PixelTable, seed: int) -> dict[int, BandN
     found = {}
     for sensor in table.shares:
         if scene.sensors[sensor].bands is not None:
-            pixels = torch.from_numpy(table.sample_opaque(sensor, _PIXELS_TO_JUDGE_BY, seed))
-            found[sensor] = judge_bands(pixels)
+            found[sensor] = judge_bands(table.sample_opaque(sensor, _PIXELS_TO_JUDGE_BY, seed))
     return found
 
 
@@ -168,13 +167,13 @@ def band_weights(scene: Scene, noise: dict[int, BandNoise]) -> Float[np.ndarray,
     return np.where(np.isfinite(weights), weights, 1.0).astype(np.float32)
 
 
-def relative_power(scene: Scene, opaque: Float[np.ndarray, "R B"]) -> float:
+def relative_power(scene: Scene, opaque: Float[Tensor, "R B"]) -> float:
     """Of brightness, by which squared errors are divided.
 
     Without alpha black may be nothing at all, so that errors of dark pixels must not count more: 0.
     """
     knows_empty = scene.has_alpha and not scene.is_unbounded
-    return relative_power_of(torch.from_numpy(opaque)) if knows_empty else 0.0
+    return relative_power_of(opaque) if knows_empty else 0.0
 
 
 def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) -> list[str]:

@@ -16,7 +16,6 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -26,7 +25,8 @@ from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.machine import step_generator
 from unmix_plugin.engine.processes import processes_here
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.scenes.pixel_block import FEWEST_CHANNELS, DrawnPixels, PixelBlock, Projection
+from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
+from unmix_plugin.scenes.pixel_projection import FEWEST_CHANNELS, Projection
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import FEWEST_BANDS, deviation_limits, deviations
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -62,32 +62,13 @@ def available_bytes(device: torch.device) -> int | None:
 
 
 def _budget_bytes(device: torch.device, memory_gb: float | None) -> int | None:
-    """Memory that pixels may take; None where nothing limits it.
-
-    Args:
-        memory_gb: In GiB; None: most of what the device has left.
-    """
+    """Memory that pixels may take, by default most of what the device has left; None where nothing limits it."""
     if memory_gb is not None:
         return int(memory_gb * _GIB)
     available = available_bytes(device)
     if available is not None and device.type == "cpu":
         available //= processes_here()
     return None if available is None else int(_USABLE_SHARE * available)
-
-
-def _pool_bytes(budget: int, memory_gb: float | None) -> int:
-    """How much of pixels on disk to hold at a time; arguments as above."""
-    return budget if memory_gb is not None else min(_LARGEST_POOL, budget)
-
-
-def _describe_pool(blocks: tuple[PixelBlock, ...]) -> str:
-    """What stays on disk, in words."""
-    held = sum(block.pool.num_bytes for block in blocks if block.pool is not None)
-    what, needed = " and ".join(block.description for block in blocks), sum(b.num_bytes for b in blocks)
-    return (
-        f"the training pixels stay on disk: {what} are {needed / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are in "
-        "memory at a time, and others are read while training goes on (memory-gb)"
-    )
 
 
 Components: TypeAlias = int | Literal["auto", "none"]
@@ -120,62 +101,72 @@ class PixelTable:
         cameras_of: dict[int, list[int]] = {}
         for camera, view in enumerate(views):
             cameras_of.setdefault(scene.frames[view].sensor, []).append(camera)
-        self.blocks = tuple(
-            PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras))
+        self.blocks: tuple[PixelBlock, ...] = tuple(
+            PixelBlock(scene, tuple(views[camera] for camera in cameras), tuple(cameras), device)
             for _, cameras in sorted(cameras_of.items())
         )
         self._firsts = list(accumulate((len(block) for block in self.blocks), initial=0))
-        for block in self.blocks:
-            block.read_alpha(device)
         if not any(bool(block.valid.any()) for block in self.blocks):
             raise ConfigError("no valid pixel is left in the training views: masks leave out every one")
         self._scene, self._seed, self._mends = scene, seed, mends
-        self.notes = self._read(_budget_bytes(device, memory_gb), memory_gb, components)
+        self.notes = self._read(_budget_bytes(device, memory_gb), memory_gb is None, components)
         """What a user should know of pixels that are not held as they were stored."""
 
-    def _read(self, budget: int | None, memory_gb: float | None, components: Components) -> list[str]:
-        needed = {block.sensor: block.num_bytes for block in self.blocks}
-        fits = budget is None or sum(needed.values()) <= budget
+    def _read(self, budget: int | None, is_automatic: bool, components: Components) -> list[str]:
+        total = sum(block.num_bytes for block in self.blocks)
+        fits = budget is None or total <= budget
         found = {} if components == "none" or (components == "auto" and fits) else self._projected(components)
-        for sensor, (projection, block) in found.items():
-            needed[sensor] = int(len(block) * (5 + projection.pixel_bytes(block.num_channels)))
-        if budget is not None and sum(needed.values()) > budget:
-            held, total = _pool_bytes(budget, memory_gb), sum(block.num_bytes for block in self.blocks)
+        needed = total
+        for block in self.blocks:
+            if block.sensor in found:
+                needed += int(len(block) * (5 + found[block.sensor].pixel_bytes)) - block.num_bytes
+        if budget is not None and needed > budget:
+            held = min(_LARGEST_POOL, budget) if is_automatic else budget
             for block in self.blocks:
                 block.hold_part(held * block.num_bytes // total)
-            notes = [_describe_pool(self.blocks)]
-            if not isinstance(components, str):
-                notes.append(
-                    f"target-components {components} has no effect: even as so many numbers each the training pixels "
-                    f"need {sum(needed.values()) / _GIB:.3g} GiB, and pixels on disk keep all their bands; choose "
-                    "fewer, or more memory (memory-gb)"
-                )
-            return notes
+            return self._pool_notes(total, needed, components)
         for block in self.blocks:
             limits = self._limits(block)
             if block.sensor in found:
-                block.hold_projected(found[block.sensor][0], limits)
+                block.hold_projected(found[block.sensor], limits)
                 continue
             block.hold()
             if limits is not None:
                 block.mend(limits)
-        return [projection.describe(block.num_channels) for projection, block in found.values()]
+        return [projection.describe() for projection in found.values()]
 
-    def _projected(self, components: Components) -> dict[int, tuple[Projection, PixelBlock]]:
+    def _pool_notes(self, total: int, needed: int, components: Components) -> list[str]:
+        """What stays on disk, in words, and that components which need so many bytes don't help."""
+        held = sum(block.pool.num_bytes for block in self.blocks if block.pool is not None)
+        what = " and ".join(block.description for block in self.blocks)
+        said = (
+            f"the training pixels stay on disk: {what} are {total / _GIB:.3g} GiB; {held / _GIB:.3g} GiB of them are "
+            "in memory at a time, and others are read while training goes on (memory-gb)"
+        )
+        if isinstance(components, str):
+            return [said]
+        no_effect = (
+            f"target-components {components} has no effect: even as so many numbers each the training pixels need "
+            f"{needed / _GIB:.3g} GiB, and pixels on disk keep all bands; choose fewer, or more memory (memory-gb)"
+        )
+        return [said, no_effect]
+
+    def _projected(self, components: Components) -> dict[int, Projection]:
         """By sensor, of blocks whose pixels are to be kept as components."""
         number = None if isinstance(components, str) else components
         found = {}
         for block in self.blocks:
-            if block.num_channels > (number or FEWEST_CHANNELS - 1):
-                pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed))
-                limits = self._limits(block)
-                if limits is not None:
-                    pixels = pixels[(deviations(pixels).abs() <= limits).all(dim=1)]
-                if number is None and len(pixels) < 2 * (block.num_channels + 1):
-                    continue
-                projection = Projection.of(pixels, number)
-                if number is not None or projection.pays(block.num_channels * block.value_bytes):
-                    found[block.sensor] = projection, block
+            if block.num_channels < (FEWEST_CHANNELS if number is None else number + 1):
+                continue
+            pixels = self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed)
+            limits = self._limits(block)
+            if limits is not None:
+                pixels = pixels[(deviations(pixels).abs() <= limits).all(dim=1)]
+            if number is None and len(pixels) < 2 * (block.num_channels + 1):
+                continue
+            projection = Projection.of(pixels, number)
+            if number is not None or projection.pays(block.pixel_bytes):
+                found[block.sensor] = projection
         return found
 
     def _limits(self, block: PixelBlock) -> Float[Tensor, " b"] | None:
@@ -183,15 +174,14 @@ class PixelTable:
         bands = self._scene.sensors[block.sensor].bands
         if not self._mends or bands is None or len(bands) < FEWEST_BANDS or list(bands) != sorted(bands):
             return None
-        pixels = torch.from_numpy(self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed))
+        pixels = self.sample_opaque(block.sensor, _PIXELS_TO_JUDGE_BY, self._seed)
         return deviation_limits(pixels) if len(pixels) else None
 
     @property
     def bad_share(self) -> float:
         """Share of the values in memory that were replaced by what is around them."""
-        return sum(block.num_bad for block in self.blocks) / sum(
-            len(block) * block.num_channels for block in self.blocks
-        )
+        num_values = sum(len(block) * block.num_channels for block in self.blocks)
+        return sum(block.num_bad for block in self.blocks) / num_values
 
     def __len__(self) -> int:
         return self._firsts[-1]
@@ -220,18 +210,17 @@ class PixelTable:
             step: Of the training; what pixels on disk are drawn from moves on with it.
             shares: Of the pixels drawn, by sensor; None draws all valid ones evenly.
         """
-        is_held = all(block.pool is None for block in self.blocks)
-        if is_held and len(self.blocks) == 1:
-            return (self.blocks[0].take(self._drawn(0, count, generator), 0),)
-        counts = self._counts(count, generator, self.shares if shares is None else shares)
+        counts = [count]
+        if len(self.blocks) > 1 or self.blocks[0].pool is not None:
+            counts = self._counts(count, generator, self.shares if shares is None else shares)
         groups = []
         for index, (block, number) in enumerate(zip(self.blocks, counts, strict=True)):
-            if number == 0:
-                continue
-            if is_held:
-                groups.append(block.take(self._drawn(index, number, generator), self._firsts[index]))
-            elif block.pool is not None:
-                pixels, stored = block.pool.draw(number, step, generator)
+            if number:
+                pixels, stored = (
+                    (self._drawn(index, number, generator), None)
+                    if block.pool is None
+                    else block.pool.draw(number, step, generator)
+                )
                 groups.append(block.take(pixels, self._firsts[index], stored))
         return tuple(groups)
 
@@ -251,7 +240,7 @@ class PixelTable:
 
     def sample_opaque(
         self, sensor: int, count: int, seed: int, kept: Bool[Tensor, " pixels"] | None = None
-    ) -> Float[np.ndarray, "_ b"]:
+    ) -> Float[Tensor, "_ b"]:
         """Spectra of at most `count` random valid pixels of a sensor that are opaque, and `kept` if that is given."""
         block = next(block for block in self.blocks if block.sensor == sensor)
         pool: Int[Tensor, " pool"]
@@ -264,7 +253,7 @@ class PixelTable:
         pool = pool if kept is None else pool[kept[pool]]
         opaque = pool[block.alpha.cpu()[pool] > OPAQUE_ALPHA]
         chosen = opaque[torch.randperm(len(opaque), generator=step_generator(seed, 0))[:count]]
-        return block.spectra(chosen.to(block.alpha.device)).cpu().numpy()
+        return block.spectra(chosen.to(block.alpha.device)).cpu()
 
 
 class PixelRays:
@@ -298,14 +287,11 @@ class PixelRays:
         return {sensor: area / sum(areas.values()) for sensor, area in areas.items()}
 
     def through(self, pixels: DrawnPixels, subpixels: int, generator: torch.Generator) -> RayBundle:
-        """Rays scattered over pixels of one sensor, those of a pixel one after the other."""
-        offsets = _scattered_offsets(len(pixels.cameras), subpixels, generator).to(pixels.corners.device)
+        """Rays through pixels of one sensor, those of a pixel one after the other: a random one in each cell of a
+        `subpixels` x `subpixels` grid on it."""
+        cells = torch.arange(subpixels)
+        grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
+        within = torch.rand(len(pixels.cameras), subpixels**2, 2, generator=generator)
+        offsets = ((grid + within) / subpixels).to(pixels.corners.device)
         points = (pixels.corners[:, None] + offsets).flatten(0, 1)
         return self._device_cameras.generate_rays(pixels.cameras.repeat_interleave(subpixels**2), points)
-
-
-def _scattered_offsets(num_pixels: int, subpixels: int, generator: torch.Generator) -> Float[Tensor, "R P 2"]:
-    """One random point in each cell of a subpixels x subpixels grid on every pixel, (x, y) in [0, 1)."""
-    cells = torch.arange(subpixels)
-    grid = torch.stack(torch.meshgrid(cells, cells, indexing="xy"), dim=-1).reshape(1, -1, 2)
-    return (grid + torch.rand(num_pixels, subpixels**2, 2, generator=generator)) / subpixels

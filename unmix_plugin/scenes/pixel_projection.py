@@ -1,0 +1,124 @@
+"""Pixels of many bands kept as a few numbers each, their components in a subspace.
+
+A pixel that the subspace misses by more than noise can explain, or that is saturated in some band, is kept whole: it
+may show what no other shows, and of a saturated value one must know that it is.
+
+Notation: `R` pixels, `b` channels of the sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
+
+FEWEST_CHANNELS = 100
+"""Of a sensor whose pixels are projected without being asked for."""
+_LARGEST_SHARE = 0.25
+"""Of the memory of whole pixels that projected ones may take for that."""
+_LARGEST_RESIDUAL = 2.0
+"""In multiples of the noise; of a pixel that is kept whole it is more. Noise alone makes about 1."""
+_UNSATURATED = 0.9999
+"""Largest value of a pixel that isn't kept whole: 1 stands for a saturated one."""
+_WHOLE_RESERVE = 1.2
+"""Room for pixels that are kept whole, in multiples of what some pixels let expect."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """How pixels are projected, and what that leaves."""
+
+    subspace: SpectralSubspace
+    residual: float
+    """Root mean square over some pixels that are not kept whole, in multiples of the noise."""
+    whole_share: float
+    """Of the pixels, that are kept whole."""
+
+    @staticmethod
+    def of(pixels: Float[Tensor, "N b"], num_components: int | None) -> Projection:
+        """Judged by the even ones of some pixels, of a subspace that the odd ones are in.
+
+        Args:
+            num_components: None finds how many are needed.
+        Raises:
+            SpectrumError: too few pixels, or too many components.
+        """
+        subspace = find_subspace(pixels[1::2], num_components)
+        seen = pixels[::2]
+        residuals = subspace.residuals(seen, subspace.components(seen))
+        is_whole = _must_stay_whole(seen, residuals)
+        kept = residuals[~is_whole]
+        residual = float(kept.square().mean().sqrt()) if len(kept) else float("inf")
+        return Projection(subspace, residual, float(is_whole.float().mean()))
+
+    @property
+    def num_channels(self) -> int:
+        """b."""
+        return self.subspace.basis.shape[1]
+
+    @property
+    def pixel_bytes(self) -> float:
+        """Memory that a pixel takes in the mean."""
+        return 2 * len(self.subspace) + self.whole_share * (2 * self.num_channels + 8)
+
+    def pays(self, whole_bytes: int) -> bool:
+        """Whether results stay what they are and pixels need much less memory than `whole_bytes` each."""
+        return self.residual <= 1 and self.pixel_bytes <= _LARGEST_SHARE * whole_bytes
+
+    def describe(self) -> str:
+        """What a user should know."""
+        return (
+            f"training pixels are kept as {len(self.subspace)} numbers instead of {self.num_channels} "
+            f"(target-components): what they leave out is {self.residual:.2g} of the noise; {self.whole_share:.2%} of "
+            "the pixels, where it would be more or which are saturated, are kept whole"
+        )
+
+
+class ProjectedPixels:
+    """Spectra of a block's pixels by the components that they have in a subspace."""
+
+    def __init__(self, projection: Projection, num_pixels: int, device: torch.device) -> None:
+        self._subspace = projection.subspace.to(device)
+        halves = torch.empty(0, dtype=torch.float16, device=device)
+        self._components = halves.new_empty(num_pixels, len(self._subspace))
+        num_whole = int(_WHOLE_RESERVE * projection.whole_share * num_pixels)
+        self._room = halves.new_empty(num_whole, projection.num_channels)
+        """For spectra kept whole. The first rows are in use; what isn't takes no memory on a CPU."""
+        self._whole = torch.zeros(0, dtype=torch.int64, device=device)
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory that the values take."""
+        held = (self._components, self._whole, self._room[: len(self._whole)])
+        return sum(values.numel() * values.element_size() for values in held)
+
+    def put(self, first: int, spectra: Float[Tensor, "R b"]) -> None:
+        """Keep pixels that follow each other, the first of which has the number `first`; later ones later."""
+        spectra = spectra.to(self._components.device)
+        components = self._subspace.components(spectra).half()
+        self._components[first : first + len(spectra)] = components
+        residuals = self._subspace.residuals(spectra, components.float())
+        whole = _must_stay_whole(spectra, residuals).nonzero()[:, 0]
+        before, self._whole = len(self._whole), torch.cat([self._whole, first + whole])
+        if len(self._whole) > len(self._room):
+            room = self._room.new_empty(len(self._whole) * 5 // 4, self._room.shape[1])
+            room[:before] = self._room[:before]
+            self._room = room
+        self._room[before : len(self._whole)] = spectra[whole].half()
+
+    def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
+        """Spectra of some pixels in [0, 1]."""
+        found = self._subspace.spectra(self._components[pixels].float()).clamp_(0, _UNSATURATED)
+        if len(self._whole):
+            places = torch.searchsorted(self._whole, pixels.contiguous()).clamp_(max=len(self._whole) - 1)
+            rows = (self._whole[places] == pixels).nonzero()[:, 0]
+            found[rows] = self._room[places[rows]].float()
+        return found
+
+
+def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
+    return (residuals > _LARGEST_RESIDUAL) | (spectra.amax(dim=-1) > _UNSATURATED)
