@@ -335,6 +335,6 @@ def test_light_without_alpha_is_judged_by_the_pixels_that_masks_leave(tmp_path, 
     Image.fromarray(np.tri(height, width) > 0).save(folder.root / "mask.png")
     folder.edit(lambda content: [frame.update(mask_path="mask.png") for frame in content["frames"]])
     asked = []
-    monkeypatch.setattr(datamanager, "find_matched_points", lambda *given: asked.append(given[2](0)))
+    monkeypatch.setattr(datamanager, "find_matched_points", lambda views: asked.append(views.valid(0)))
     assert make(folder.root)._judge_matched() == "fixed"
     assert np.array_equal(asked[0], np.tri(height, width) > 0)

@@ -35,7 +35,8 @@ from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_expl
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, commonest, parallax_warning
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning
+from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
@@ -332,17 +333,11 @@ class HyperspectralDataManager(DataManager):
 
     def _judge_matched(self) -> Literal["fixed", "per-view"]:
         """Of views without alpha: whether matched places say that they differ in exposure."""
-        train = self.scene.train_indices
-        alike = commonest([self.scene.frames[view].sensor for view in train])
-        cameras = self.train_cameras[alike]
-        points = find_matched_points(
-            cameras,
-            lambda row, part: self.scene.cube(train[alike[row]], part),
-            lambda row: self.scene.valid_mask(train[alike[row]]),
-        )
+        views = Views.of(self.scene)
+        points = find_matched_points(views)
         if points is None:
             return "fixed"
-        return judge_exposure(cameras, points.places, points.seen_by(len(alike)))
+        return judge_exposure(views.cameras, points.places, points.seen_by(len(views.cameras)))
 
 
 def _scene_folder(data: Path) -> Path:

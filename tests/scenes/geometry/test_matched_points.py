@@ -20,11 +20,14 @@ from tests.scenes.geometry.ground_views import (
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.lighting import judge_exposure
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
 
 
-def read_from(views):
-    return lambda view, part: views[view][part]
+def views_of(cameras, pictures=None, valid=None):
+    """What the cameras see of the ground, or other pictures."""
+    pictures = ground_views(cameras) if pictures is None else pictures
+    return Views(cameras, lambda view, part: pictures[view][part], valid)
 
 
 def above_ground(places):
@@ -36,7 +39,7 @@ def above_ground(places):
     "cameras", [flight_cameras(flight_poses()), strip_cameras()], ids=["frames", "lines"]
 )
 def test_matched_places_lie_on_the_ground_at_the_depths_of_their_cameras(cameras):
-    found = find_matched_points(cameras, read_from(ground_views(cameras)))
+    found = find_matched_points(views_of(cameras))
     assert found is not None
     assert above_ground(found.places).abs().quantile(0.9) < 0.05
     assert found.are_equally_far
@@ -51,7 +54,7 @@ def test_matched_places_lie_on_the_ground_at_the_depths_of_their_cameras(cameras
 def test_large_views_are_thinned_out_and_their_places_stay_where_they_are(monkeypatch):
     cameras = flight_cameras(flight_poses())
     monkeypatch.setattr("unmix_plugin.scenes.geometry.matched_points.LONGEST_SIDE_PX", WIDTH // 2)
-    found = find_matched_points(cameras, read_from(ground_views(cameras)))
+    found = find_matched_points(views_of(cameras))
     assert found is not None
     assert above_ground(found.places).mean().abs() < 0.02
 
@@ -62,7 +65,7 @@ def test_pixels_that_are_not_valid_are_no_features():
     for view in views:
         view[::31, ::29] = np.nan
         view[150:, 160:] = np.inf
-    found = find_matched_points(cameras, read_from(views))
+    found = find_matched_points(views_of(cameras, views))
     assert found is not None
     assert above_ground(found.places).abs().quantile(0.9) < 0.1
 
@@ -76,28 +79,28 @@ def test_what_masks_leave_out_is_no_feature_and_does_not_tell_exposures():
     views = ground_views(cameras)
     for view, gain in zip(views, gains, strict=True):
         view[~valid] *= gain
-    everything = find_matched_points(cameras, read_from(views))
+    everything = find_matched_points(views_of(cameras, views))
     assert everything is not None
     assert judge_exposure(cameras, everything.places, everything.seen_by(16)) == "per-view"
     valid[::31, ::29] = False  # dead pixels spoil no feature
-    found = find_matched_points(cameras, read_from(views), lambda _: valid)
+    found = find_matched_points(views_of(cameras, views, lambda _: valid))
     assert found is not None
     assert judge_exposure(cameras, found.places, found.seen_by(16)) == "fixed"
     for end in (0, 1):
         for view in found.pairs[:, end].unique().tolist():
             coords, _ = cameras.project(found.places[found.pairs[:, end] == view], view)
             assert float(coords[:, 0].max()) < WIDTH * 2 // 5 - 7.5
-    assert find_matched_points(cameras, read_from(views), lambda _: valid & False) is None
+    assert find_matched_points(views_of(cameras, views, lambda _: valid & False)) is None
 
 
 def test_views_that_share_nothing_show_one_colour_or_stand_at_one_place_have_no_matched_places():
     cameras = flight_cameras(flight_poses())
     unrelated = [np.random.default_rng(view).random((HEIGHT, WIDTH, 1), np.float32) for view in range(5)]
     plain = [np.full((HEIGHT, WIDTH, 1), 0.5, np.float32)] * 5
-    assert find_matched_points(cameras, read_from(unrelated)) is None
-    assert find_matched_points(cameras, read_from(plain)) is None
+    assert find_matched_points(views_of(cameras, unrelated)) is None
+    assert find_matched_points(views_of(cameras, plain)) is None
     turning = flight_cameras(flight_poses(5, spacing=0.0, sway=0.1))
-    assert find_matched_points(turning, read_from(ground_views(turning))) is None
+    assert find_matched_points(views_of(turning)) is None
 
 
 @pytest.mark.parametrize(("spread", "light"), [(0.0, "fixed"), (0.15, "per-view")])
@@ -105,7 +108,7 @@ def test_exposures_that_differ_are_told_by_matched_places(spread, light):
     cameras = flight_cameras(flight_poses(16))
     gains = np.exp(np.random.default_rng(2).normal(size=16) * spread).astype(np.float32)
     views = [view * gain for view, gain in zip(ground_views(cameras), gains, strict=True)]
-    found = find_matched_points(cameras, read_from(views))
+    found = find_matched_points(views_of(cameras, views))
     assert found is not None
     assert judge_exposure(cameras, found.places, found.seen_by(16)) == light
 
@@ -113,7 +116,7 @@ def test_exposures_that_differ_are_told_by_matched_places(spread, light):
 @pytest.mark.parametrize("count", [5, 12])
 def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen(tmp_path, count):
     cameras = flight_cameras(flight_poses(count))
-    points = find_matched_points(cameras, read_from(ground_views(cameras)))
+    points = find_matched_points(views_of(cameras))
     box = find_bounds(tmp_path, cameras, None, points)
     for index in range(len(cameras)):
         rays = cameras.image_rays(index)
@@ -128,11 +131,11 @@ def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen
 def test_a_flight_is_read_as_a_bounded_scene_on_the_ground_by_what_its_masks_leave(tmp_path, monkeypatch):
     asked = []
 
-    def find(cameras, read_view, read_valid):
-        asked.append(read_valid(0))
-        return find_matched_points(cameras, read_view, read_valid)
+    def find(views):
+        asked.append(views.valid(0))
+        return find_matched_points(views)
 
-    monkeypatch.setattr("unmix_plugin.scenes.reading.loader.find_matched_points", find)
+    monkeypatch.setattr("unmix_plugin.scenes.reading.model_space.find_matched_points", find)
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:20, :30] = False
     Image.fromarray(valid).save(tmp_path / "mask.png")

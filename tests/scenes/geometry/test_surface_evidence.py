@@ -21,6 +21,7 @@ from unmix_plugin.scenes.geometry.surface_evidence import (
     _sweep_depths,
     _SweptDepths,
 )
+from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -115,7 +116,7 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
         )
         return (gains[view] * cube + noise)[part]
 
-    depths = _sweep_depths(large, scene.scene_box, read_view)
+    depths = _sweep_depths(Views(large, read_view), scene.scene_box)
     assert depths is not None
     assert depths.stride == 2 * (1 if edge == 1 else 3)
     share, right = share_right(scene, large, [0, 5, 10], depths)
@@ -130,9 +131,8 @@ def test_the_distances_of_what_masks_leave_out_stay_unknown(scene):
     valid[:, : cameras.width // 2] = False
 
     def swept(read_valid):
-        depths = _sweep_depths(
-            cameras, scene.scene_box, lambda view, part: scene.cube(train[view], part), read_valid
-        )
+        views = Views(cameras, lambda view, part: scene.cube(train[view], part), read_valid)
+        depths = _sweep_depths(views, scene.scene_box)
         assert depths is not None
         return depths.distances
 
@@ -175,9 +175,9 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
     def noisy(view, part):
         return np.random.default_rng(view).random(size, np.float32)[part]
 
-    assert _sweep_depths(cameras, BOX, plain) is None
-    assert _sweep_depths(cameras[[0, 1, 2]], BOX, noisy) is None
-    unrelated = _sweep_depths(cameras, BOX, noisy)
+    assert _sweep_depths(Views(cameras, plain), BOX) is None
+    assert _sweep_depths(Views(cameras[[0, 1, 2]], noisy), BOX) is None
+    unrelated = _sweep_depths(Views(cameras, noisy), BOX)
     assert unrelated is not None
     assert torch.isfinite(unrelated.distances).float().mean() < 0.05
 
@@ -190,7 +190,7 @@ def test_views_of_a_pixel_or_a_row_are_too_small_to_be_swept(scene, size):
         cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion, width, height
     )
     pixels = np.random.default_rng(0).random((*size, 3), np.float32)
-    assert _sweep_depths(small, BOX, lambda view, part: (pixels + 0.01 * view)[part]) is None
+    assert _sweep_depths(Views(small, lambda view, part: (pixels + 0.01 * view)[part]), BOX) is None
 
 
 @pytest.mark.parametrize("num_views", [2, 3])

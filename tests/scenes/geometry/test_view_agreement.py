@@ -19,6 +19,7 @@ from unmix_plugin.scenes.geometry.view_agreement import (
     compare_conventions,
     parallax_warning,
 )
+from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import HyperspectralDataManagerConfig
 
@@ -96,8 +97,8 @@ def test_views_that_show_nothing_give_no_verdict(demo):
     scene = load_scene(demo)
     poses = scene.cameras.camera_to_world.double().numpy()
     grey = np.full((64, 64, 8), 0.5, np.float32)
-    assert compare_conventions(poses, scene.cameras, lambda _, part: grey[part]) == {}
-    assert compare_conventions(poses[:3], scene.cameras[[0, 1, 2]], scene.cube) == {}
+    assert compare_conventions(poses, Views(scene.cameras, lambda _, part: grey[part])) == {}
+    assert compare_conventions(poses[:3], Views(scene.cameras[[0, 1, 2]], scene.cube)) == {}
 
 
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness
-from unmix_plugin.scenes.geometry.view_agreement import ReadValid, ReadView, Thinning
+from unmix_plugin.scenes.geometry.views import ThinnedViews, Views
 
 LONGEST_SIDE_PX = 320
 """Of the views that are compared."""
@@ -85,23 +85,17 @@ class MatchedPoints:
         return MatchedPoints(*(values[kept] for values in vars(self).values()))
 
 
-def find_matched_points(
-    cameras: Cameras, read_view: ReadView, read_valid: ReadValid | None = None
-) -> MatchedPoints | None:
-    """Places that the views agree on; None if those are too few to say anything.
+def find_matched_points(views: Views) -> MatchedPoints | None:
+    """Places that views of one size agree on; None if those are too few to say anything.
 
-    Args:
-        cameras: Of views that show the same bands. All have one size; line cameras may be among them.
-        read_view: Reads a part of a view.
-        read_valid: Says which pixels of a view count; None where all do. Others have no feature and no brightness.
+    Line cameras may be among them. Pixels that don't count have no feature and no brightness.
     """
-    thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
+    cameras, thinned = views.cameras, ThinnedViews(views, LONGEST_SIDE_PX)
     pairs = _choose_pairs(cameras.camera_to_world[:, :, 3])
-    features = {}
-    for view in sorted({*sum(pairs, ())}):
-        share = None if read_valid is None else thinning.valid_share(read_valid(view))
-        features[view] = _features_of(thinning.read(read_view, view), thinning, share)
-    found = [_triangulate(cameras, thinning, pair, features[pair[0]], features[pair[1]]) for pair in pairs]
+    features = {view: _features_of(thinned, view) for view in sorted({*sum(pairs, ())})}
+    found = [
+        _triangulate(cameras, thinned.stride, pair, features[pair[0]], features[pair[1]]) for pair in pairs
+    ]
     if sum(len(points.depths) for points in found) < _LEAST_POINTS:
         return None
     return MatchedPoints(*map(torch.cat, zip(*(vars(points).values() for points in found), strict=True)))
@@ -130,14 +124,12 @@ def _choose_pairs(positions: Float[Tensor, "N 3"]) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def _features_of(
-    image: Float[Tensor, "h w B"], thinning: Thinning, valid_share: Float[Tensor, "h w"] | None
-) -> _Features:
-    """What stands out in a view thinned out; `valid_share` as `Thinning` tells it, None where all is valid."""
+def _features_of(thinned: ThinnedViews, view: int) -> _Features:
     from skimage.feature import SIFT  # slow to import
 
-    brightness = image.mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
-    counts = torch.ones_like(brightness, dtype=torch.bool) if valid_share is None else valid_share == 1
+    brightness = thinned.read(view).mean(dim=-1).nan_to_num(0.0, 0.0, 0.0)
+    share = thinned.valid_share(view)
+    counts = torch.ones_like(brightness, dtype=torch.bool) if share is None else share == 1
     sift = SIFT(upsampling=1)
     try:
         dark, bright = brightness[counts].quantile(torch.tensor([1 - _BRIGHT, _BRIGHT]))
@@ -153,7 +145,7 @@ def _features_of(
         coords, rows, columns = (values[kept] for values in (coords, rows, columns))
         descriptors = descriptors[kept.numpy()]
     seen = local_log_brightness(torch.where(counts, brightness, 0.0))
-    return _Features(thinning.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
+    return _Features(thinned.whole(coords), descriptors, torch.from_numpy(seen).float()[rows, columns])
 
 
 def _away_from_invalid(counts: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
@@ -167,9 +159,9 @@ def _away_from_invalid(counts: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
 
 
 def _triangulate(
-    cameras: Cameras, thinning: Thinning, pair: tuple[int, int], one: _Features, other: _Features
+    cameras: Cameras, stride: int, pair: tuple[int, int], one: _Features, other: _Features
 ) -> MatchedPoints:
-    """Of each match whose rays meet, the place where they pass each other."""
+    """Of each match whose rays meet, the place where they pass each other; in views thinned out by `stride`."""
     from skimage.feature import match_descriptors
 
     chosen = torch.zeros(0, 2, dtype=torch.int64)
@@ -190,7 +182,7 @@ def _triangulate(
     first = ((between * along).sum(dim=-1) - cosine * (between * across).sum(dim=-1)) / sine
     second = (cosine * (between * along).sum(dim=-1) - (between * across).sum(dim=-1)) / sine
     gaps = (first[:, None] * along - between - second[:, None] * across).norm(dim=-1)
-    pixel = thinning.stride / cameras.focal_px[pair[0]].min().double()
+    pixel = stride / cameras.focal_px[pair[0]].min().double()
     meets = (first > 0) & (second > 0) & (gaps < _MOST_APART_PX * pixel * torch.minimum(first, second))
     meets &= sine.sqrt() > np.sin(np.radians(_SMALLEST_ANGLE_DEG))
     reached = (first[:, None] * along)[meets].float()

@@ -23,14 +23,12 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
-from unmix_plugin.scenes.geometry.view_agreement import (
-    LONGEST_SIDE_PX,
+from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
-    ReadValid,
-    ReadView,
-    Thinning,
+    ThinnedViews,
+    Views,
+    best_agreement,
     choose_neighbours,
-    thinned_lenses,
     view_differences,
     view_features,
 )
@@ -79,37 +77,34 @@ class _SweptDepths:
     """Pixels of the whole view from one that is asked to the next; the first stands at `stride` / 2."""
 
 
-def _sweep_depths(
-    cameras: Cameras, box: SceneBox, read_view: ReadView, read_valid: ReadValid | None = None
-) -> _SweptDepths | None:
+def _sweep_depths(views: Views, box: SceneBox) -> _SweptDepths | None:
     """Distances of the pixels of all views, or of `_MOST_VIEWS`; None if views are too few, too small or too plain.
 
     Args:
-        cameras: Of the training views, all of one size, each with one pose.
+        views: All of one size, each with one pose. The distances of pixels that don't count stay unknown.
         box: In the cameras' space.
-        read_view: Reads a part of a view.
-        read_valid: Says which pixels of a view count, None where all do: the distances of others stay unknown.
     """
-    count = min(len(cameras), _MOST_VIEWS)
-    views = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
+    cameras, count = views.cameras, min(len(views.cameras), _MOST_VIEWS)
+    chosen = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
     if count < NUM_AGREEING + 1:
         return None
-    thinning = Thinning.to(LONGEST_SIDE_PX, cameras, read_view)
-    if min(cameras.width, cameras.height) // thinning.stride < _PIXEL_STRIDE:
+    thinned = ThinnedViews(views)
+    if min(cameras.width, cameras.height) // thinned.stride < _PIXEL_STRIDE:
         return None
-    images = [thinning.read(read_view, view) for view in views]
-    lenses = thinned_lenses(cameras[views], images[0], thinning.stride, thinning.first)
+    images = [thinned.read(view) for view in chosen]
+    lenses = thinned.cameras(images[0])[chosen]
     found = _sweep_all(images, lenses, box)
     if found is None:
         return None
     if torch.isfinite(found).float().mean() < _LEAST_KNOWN:
         relative = _sweep_all([_over_surroundings(image) for image in images], lenses, box)
         found = found if relative is None else torch.where(torch.isfinite(found), found, relative)
-    if read_valid is not None:
-        every = slice(_PIXEL_STRIDE // 2, None, _PIXEL_STRIDE)
-        shares = torch.stack([thinning.valid_share(read_valid(view))[every, every] for view in views])
-        found = found.masked_fill(shares < 1, torch.inf)
-    return _SweptDepths(tuple(views), found, thinning.stride * _PIXEL_STRIDE)
+    every = slice(_PIXEL_STRIDE // 2, None, _PIXEL_STRIDE)
+    for view, distances in zip(chosen, found, strict=True):
+        share = thinned.valid_share(view)
+        if share is not None:
+            distances.masked_fill_(share[every, every] < 1, torch.inf)
+    return _SweptDepths(tuple(chosen), found, thinned.stride * _PIXEL_STRIDE)
 
 
 def _over_surroundings(image: Float[Tensor, "H W B"]) -> Float[Tensor, "H W B"]:
@@ -154,12 +149,13 @@ def _sweep(
     pose = cameras.camera_to_world[view]
     along = rays.directions @ -pose[:, 2]
     distances = _planes(box, pose[:, 3], -pose[:, 2]) / along[:, None]
-    points = (rays.origins[:, None] + rays.directions[:, None] * distances[..., None]).flatten(0, 1)
     seen = [
-        _patch_means(view_differences(points, own.flatten(0, 1), features[other], cameras, other), own)
+        _patch_means(
+            view_differences(rays, distances, own.flatten(0, 1), features[other], cameras, other), own
+        )
         for other in others
     ]
-    costs = torch.stack(seen, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING].mean(dim=-1) / chance
+    costs = best_agreement(seen) / chance
     least, plane = costs.min(dim=1)
     is_beside = (torch.arange(costs.shape[1]) - plane[:, None]).abs() <= _BESIDE
     next_best = costs.masked_fill(is_beside, torch.inf).min(dim=1).values
@@ -232,18 +228,11 @@ class SurfaceEvidence:
 
     def __init__(self, scene: Scene) -> None:
         """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known."""
-        self._cameras = scene.cameras[list(scene.train_indices)]
-        self._box = scene.scene_box
-        self._depths: _SweptDepths | None = None
+        views = Views.of(scene)
+        self._cameras, self._box = views.cameras, scene.scene_box
         self._placed: tuple[Cameras, Tensor, Tensor] | None = None
-        if scene.is_unbounded and not scene.is_rig and self._cameras.key_poses is None:
-            train = scene.train_indices
-            self._depths = _sweep_depths(
-                self._cameras,
-                self._box,
-                lambda view, part: scene.cube(train[view], part),
-                lambda view: scene.valid_mask(train[view]),
-            )
+        is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
+        self._depths = _sweep_depths(views, scene.scene_box) if is_compared else None
 
     @property
     def is_known(self) -> bool:
