@@ -18,14 +18,13 @@ from unmix_plugin.captures.header_values import parse_wavelengths
 from unmix_plugin.captures.poses.turntable_evidence import parse_angles
 from unmix_plugin.errors import ConfigError, SceneError, SpectrumError
 from unmix_plugin.formats.libraries import read_library
+from unmix_plugin.scenes.reading.checks import locate_files
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, _measure_cube, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_labels, read_mask
-from unmix_plugin.scenes.reading.loader import _locate_files
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation
-from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.maps.indices import parse_formula
@@ -100,7 +99,7 @@ def transforms_reader() -> Reader:
 def _read_transforms(path: Path) -> None:
     faults = Faults(path.parent)
     entry = read_transforms(path.parent, faults)
-    _locate_files(path.parent, entry, SceneOptions(), faults)
+    locate_files(path.parent, entry, False, faults)
     for method in ("auto", "filename", "interval"):
         split_frames(entry, method, 2, faults)
     for frame in entry.frames:

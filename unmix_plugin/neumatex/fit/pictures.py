@@ -19,7 +19,8 @@ from unmix_plugin.neumatex.fit.tone import ToneMapping
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
-from unmix_plugin.scenes.reading.loader import distinct_names, make_cameras
+from unmix_plugin.scenes.reading.loader import distinct_names
+from unmix_plugin.scenes.reading.model_space import make_cameras
 from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, at_sizes
 from unmix_plugin.scenes.scene import Normalisation
 

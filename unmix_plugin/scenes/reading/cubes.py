@@ -7,9 +7,8 @@ that share a fault.
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import prod
@@ -21,8 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.errors import name_some
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry, Size
+from unmix_plugin.scenes.reading.faults import Faults, sha256_of
+from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, FrameEntry, Size
 
 READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _ONE_PARSER = Lock()
@@ -38,14 +37,22 @@ _NOISE = 0.1
 """Negative values above minus this may be noise around black."""
 _EXCESS_SHARE_SCALED = 0.5
 """Share of values above 1 at which a scale that was given must be wrong."""
-_SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Of cameras; the greatest number of each stands for 1."""
-_REFLECTANCE_SCALE = 10000.0
-"""Of reflectances kept as integers, as satellites deliver them."""
-_FLOAT_SCALES = (100.0, 255.0, _REFLECTANCE_SCALE, 65535.0)
+_OR_REFLECTANCE = "; reflectances times 10000 need 10000"
+_INTEGER_SCALES = {
+    255.0: "8 bits",
+    1023.0: f"10 bits{_OR_REFLECTANCE}",
+    4095.0: f"12 bits{_OR_REFLECTANCE}",
+    10000.0: "reflectances times 10000; 14 bits need 16383",
+    16383.0: f"14 bits{_OR_REFLECTANCE}",
+    65535.0: "16 bits",
+}
+"""What may stand for 1 in integers, and where."""
+_FLOAT_SCALES = (100.0, 255.0, 10000.0, 65535.0)
 """Per cent, or integers kept as floats."""
 _MOST_READERS = 8
 """Cubes read at once: hashing and comparing take longer than a disk, and don't hold each other up."""
+Part = tuple[slice | np.ndarray, ...]
+"""What to read of an array, as NumPy indexes it; all if it is empty."""
 
 
 class UnreadableArrayError(ValueError):
@@ -111,6 +118,8 @@ InvalidPixels = Literal["refuse", "mask", "clip"]
 class _CubeValues:
     """What one cube holds; counts are of single values unless they say pixels."""
 
+    where: str
+    """How messages call it."""
     sha256: str
     """Of the whole file."""
     num_values: int
@@ -136,31 +145,27 @@ class _CubeValues:
         return self.num_far_negative <= _EXCESS_SHARE * self.num_values
 
     @property
+    def share_above_one(self) -> float:
+        """Of the values."""
+        return self.num_above_one / self.num_values
+
+    @property
     def num_invalid_pixels(self) -> int:
         """How many pixels are invalid."""
         return 0 if self.invalid is None else int(self.invalid.sum())
 
 
-def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: InvalidPixels) -> _CubeValues:
-    """What a checked (H, W, B) cube holds, read once; whatever `read_cube` would make of it."""
+def _measure_cube(
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, where: str = ""
+) -> _CubeValues:
+    """What a checked (H, W, B) cube holds; whatever `read_cube` would make of it."""
     cube = map_array(path)
-    height, width, bands = cube.shape
-    rows = max(1, _BLOCK_VALUES // max(1, width * bands))
     scale = np.float32(1.0 if value_scale is None else value_scale)
-    digest, is_in_file_order = hashlib.sha256(), cube.flags.c_contiguous
-    head, end = (cube.offset, cube.offset + cube.nbytes) if is_in_file_order else (-1, 0)  # type: ignore[attr-defined]
-    digest.update(_read_bytes(path, 0, head))
     totals = np.zeros(5, dtype=np.int64)  # NaN, infinite, negative, further below 0 than noise, above 1
-    greatest, least = 0.0, 0.0
-    invalid = np.zeros((height, width), bool)
-    for first in range(0, height, rows):
-        raw = cube[first : first + rows]
-        if is_in_file_order:
-            digest.update(raw.view(np.uint8).data)
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # beyond float32 is infinite; both are counted as such
-            compared = raw if cube.dtype.kind in "iu" else np.asarray(raw, dtype=np.float32)
+    greatest, least, invalid = 0.0, 0.0, np.zeros(cube.shape[:2], bool)
+    for rows in _row_blocks(cube):
+        with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, and counted as such
+            compared = cube[rows] if cube.dtype.kind in "iu" else np.asarray(cube[rows], dtype=np.float32)
             low, high = np.float32(compared.min()), np.float32(compared.max())
             if low >= 0.0 and high <= scale:  # false with any NaN; most blocks of a sound scene end here
                 greatest = max(greatest, float(high))
@@ -175,40 +180,33 @@ def _measure_cube(path: Path, value_scale: float | None, invalid_pixels: Invalid
             ((block < -_NOISE) & finite).sum(),
             ((block > 1.0) & finite).sum(),
         )
-        invalid[first : first + rows] = _find_invalid(block, invalid_pixels)
+        invalid[rows] = _find_invalid(block, invalid_pixels)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
-    if is_in_file_order:
-        digest.update(_read_bytes(path, end))
     return _CubeValues(
-        digest.hexdigest(),
+        where,
+        sha256_of(path),
         cube.size,
-        height * width,
+        invalid.size,
         cube.dtype.kind in "iu",
         greatest,
         least,
-        *(int(total) for total in totals),
+        *totals.tolist(),
         invalid=invalid if invalid.any() else None,
     )
 
 
-def _read_bytes(path: Path, start: int, count: int = -1) -> bytes:
-    with path.open("rb") as file:
-        file.seek(start)
-        return file.read(count)
+def _row_blocks(cube: np.ndarray) -> Iterator[slice]:
+    """Rows that are looked at together."""
+    height, width, bands = cube.shape
+    step = max(1, _BLOCK_VALUES // max(1, width * bands))
+    return (slice(first, first + step) for first in range(0, height, step))
 
 
 def read_cube(
-    path: Path,
-    value_scale: float | None,
-    invalid_pixels: InvalidPixels,
-    part: tuple[slice | np.ndarray, ...] = (),
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: Part = ()
 ) -> Float32[np.ndarray, "*pixels B"]:
-    """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0.
-
-    Args:
-        part: What to read, as NumPy indexes it; all by default.
-    """
+    """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0."""
     values = _read_scaled(path, value_scale, part)
     if invalid_pixels != "refuse":
         values[_find_invalid(values, invalid_pixels)] = 0.0
@@ -216,25 +214,16 @@ def read_cube(
 
 
 def read_invalid(
-    path: Path,
-    value_scale: float | None,
-    invalid_pixels: InvalidPixels,
-    part: tuple[slice | np.ndarray, ...] = (),
+    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: Part = ()
 ) -> Bool[np.ndarray, "*pixels"]:
     """Pixels that `read_cube` sets to 0."""
-    if part:
-        return _find_invalid(_read_scaled(path, value_scale, part), invalid_pixels)
-    height, width, bands = map_array(path).shape
-    rows, invalid = max(1, _BLOCK_VALUES // max(1, width * bands)), np.empty((height, width), bool)
-    for first in range(0, height, rows):
-        part = (slice(first, first + rows),)
-        invalid[first : first + rows] = _find_invalid(_read_scaled(path, value_scale, part), invalid_pixels)
-    return invalid
+    parts = [part] if part else [(rows,) for rows in _row_blocks(map_array(path))]
+    return np.concatenate(
+        [_find_invalid(_read_scaled(path, value_scale, one), invalid_pixels) for one in parts]
+    )
 
 
-def _read_scaled(
-    path: Path, value_scale: float | None, part: tuple[slice | np.ndarray, ...] = ()
-) -> Float32[np.ndarray, "*pixels B"]:
+def _read_scaled(path: Path, value_scale: float | None, part: Part) -> Float32[np.ndarray, "*pixels B"]:
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, hence invalid as NaN is
         values = np.array(map_array(path)[part], dtype=np.float32, order="C")
     return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
@@ -249,224 +238,186 @@ def _find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.
     return ~np.all(sound if invalid_pixels == "clip" else sound & (values >= 0.0), axis=-1)
 
 
-def _is_far_out_of_range(values: _CubeValues, value_scale: float | None) -> bool:
-    """Whether values can't be meant as [0, 1]; saturated highlights in a few places can."""
-    share = values.num_above_one / values.num_values
-    if value_scale is None:
-        return share > _EXCESS_SHARE or values.greatest > _EXCESS_VALUE
-    return share > _EXCESS_SHARE_SCALED
-
-
-def _propose_scale(greatest: float, is_integer: bool) -> float:
-    """The `value_scale` that most likely brings stored values up to `greatest` into [0, 1].
-
-    >>> [_propose_scale(greatest, True) for greatest in (243.0, 4000.0, 9100.0, 12000.0, 40000.0)]
-    [255.0, 4095.0, 10000.0, 16383.0, 65535.0]
-    >>> _propose_scale(87.0, False), _propose_scale(3.14, False)
-    (100.0, 3.2)
-    """
-    bits = sorted([float(2**bits - 1) for bits in _SENSOR_BITS] + [_REFLECTANCE_SCALE])
-    for scale in bits if is_integer else _FLOAT_SCALES:
+def _propose_scale(cubes: Sequence[_CubeValues]) -> float:
+    """The `value_scale` that most likely brings the stored values of some cubes into [0, 1]."""
+    greatest = max(cube.greatest for cube in cubes)
+    is_integer = all(cube.is_integer for cube in cubes)
+    for scale in _INTEGER_SCALES if is_integer else _FLOAT_SCALES:
         if greatest <= scale and (is_integer or greatest > _EXCESS_VALUE):
             return scale
     digits = int(np.floor(np.log10(max(greatest, 1e-30)))) - 1
     return float(np.round(np.ceil(greatest / 10.0**digits) * 10.0**digits, max(0, -digits)))
 
 
-def _describe_scale(scale: float) -> str:
-    """What a scale stands for, for messages; empty for one that nothing is known of.
-
-    >>> _describe_scale(4095.0), _describe_scale(3.2)
-    (' (12 bits; reflectances times 10000 need 10000)', '')
-    """
-    bits = {float(2**bits - 1): bits for bits in _SENSOR_BITS}.get(scale)
-    if bits is None:
-        return " (reflectances times 10000; 14 bits need 16383)" if scale == _REFLECTANCE_SCALE else ""
-    return f" ({bits} bits{'; reflectances times 10000 need 10000' if 8 < bits < 16 else ''})"
-
-
-def check_cube_headers(
-    entry: SceneEntry,
-    located: tuple[dict[str, Path], ...],
+def check_cubes(
+    frames: Sequence[FrameEntry],
     operators: Sequence[np.ndarray | None],
+    value_scale: float | None,
+    invalid_pixels: InvalidPixels,
     faults: Faults,
-) -> tuple[list[Size | None], list[_ArrayHeader | None]]:
-    """Check shapes and types against sizes and sensors.
+) -> tuple[list[Size | None], list[_CubeValues | None]]:
+    """Check shapes and types against sizes and sensors, then every value.
 
     Args:
         operators: Of each frame, (channels, B); None where unknown.
     Returns:
-        Sizes of the frames' images, None where nothing tells one, and the sound headers.
+        Sizes of the frames' images, None where nothing tells one, and what sound cubes hold.
     """
-    shared: tuple[Size, str] | None = None
-    bands: tuple[int, str] | None = None
     sizes: list[Size | None] = []
-    headers: list[_ArrayHeader | None] = []
-    for frame, paths, operator in zip(entry.frames, located, operators, strict=True):
-        path = paths.get("hyperspectral_file_path")
-        where = frame.name_of("hyperspectral_file_path")
-        header = None if path is None else _read_header(path, "(H, W, B)", where, faults)
-        lens, expected = frame.intrinsics, shared
+    sound: list[Path | None] = []
+    shared: tuple[Size, str] | None = None
+    for frame, operator in zip(frames, operators, strict=True):
+        where, path, lens = frame.name_of(CUBE_KEY), frame.files.get(CUBE_KEY), frame.intrinsics
+        shape = _read_shape(path, "(H, W, B)", where, faults)
+        expected = shared
         if lens is not None and lens.width is not None and lens.height is not None:
             expected = (lens.height, lens.width), "as 'w' and 'h' say"
-        headers.append(header)
-        if header is not None:
-            found = header.shape[0], header.shape[1]
-            if expected is None:
-                expected = shared = found, f"as {where} has"
-            if found != expected[0]:
-                wide = f"{found[1]} x {found[0]} pixels (width x height)"
-                message = f"expected {expected[0][1]} x {expected[0][0]}, {expected[1]}"
-                faults.add(where, f"the cube has {wide}; {message}")
-                headers[-1] = None
-            wanted = bands
-            if operator is not None and "responses_path" in frame.paths:
-                wanted = len(operator), "as its responses have"
-            elif operator is not None:
-                listed = "'wavelengths' lists" if frame.sensor.bands is None else "its 'bands' list"
-                wanted = len(operator), f"as {listed}"
-            if wanted is None:
-                wanted = bands = header.shape[2], f"as {where} has"
-            if header.shape[2] != wanted[0]:
-                faults.add(where, f"the cube has {header.shape[2]} bands; expected {wanted[0]}, {wanted[1]}")
+        elif expected is None and shape is not None:
+            expected = shared = shape[:2], f"as {where} has"
+        if shape is not None and expected is not None and shape[:2] != expected[0]:
+            wide = f"{shape[1]} x {shape[0]} pixels (width x height)"
+            (height, width), reason = expected
+            faults.add(where, f"the cube has {wide}; expected {width} x {height}, {reason}")
+            path = None
+        elif shape is not None and operator is not None and shape[2] != len(operator):
+            listed = "'wavelengths' lists" if frame.sensor.bands is None else "its 'bands' list"
+            listed = "its responses have" if "responses_path" in frame.paths else listed
+            faults.add(where, f"the cube has {shape[2]} bands; expected {len(operator)}, as {listed}")
         sizes.append(None if expected is None else expected[0])
-    return sizes, headers
+        sound.append(None if shape is None else path)
+    return sizes, _check_values(frames, sound, value_scale, invalid_pixels, faults)
 
 
-def check_cube_values(
-    entry: SceneEntry,
-    located: tuple[dict[str, Path], ...],
-    headers: list[_ArrayHeader | None],
+def _check_values(
+    frames: Sequence[FrameEntry],
+    paths: Sequence[Path | None],
     value_scale: float | None,
     invalid_pixels: InvalidPixels,
     faults: Faults,
 ) -> list[_CubeValues | None]:
-    """Read and check every value of the cubes that have a header; returns what each frame's cube holds."""
+    """Read and check every value of the cubes that have a path."""
 
-    def measure(paths: dict[str, Path], header: _ArrayHeader | None) -> _CubeValues | None:
-        if header is None:
+    def measure(frame: FrameEntry, path: Path | None) -> _CubeValues | None:
+        if path is None:
             return None
-        return _measure_cube(paths["hyperspectral_file_path"], value_scale, invalid_pixels)
+        return _measure_cube(path, value_scale, invalid_pixels, frame.name_of(CUBE_KEY))
 
     with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
-        measured = list(readers.map(measure, located, headers))
-    named = [
-        (frame.name_of("hyperspectral_file_path"), values)
-        for frame, values in zip(entry.frames, measured, strict=True)
-        if values is not None
-    ]
-    scaled = [(w, v) for w, v in named if value_scale is not None or not v.is_integer]
-    _note_invalid(scaled, invalid_pixels, faults)
-    _note_scales(named, value_scale, faults)
+        measured = list(readers.map(measure, frames, paths))
+    cubes = [cube for cube in measured if cube is not None]
+    unscaled = [cube for cube in cubes if cube.is_integer and value_scale is None]
+    judged = [cube for cube in cubes if not (cube.is_integer and value_scale is None)]
+    _note_invalid(judged, invalid_pixels, faults)
+    _note_integers(unscaled, faults)
+    _note_far_off(judged, value_scale, faults)
     return measured
 
 
-def say_clipped(named: Sequence[tuple[str, _CubeValues]], value_scale: float | None) -> tuple[str, ...]:
-    """Warnings of a given scale that makes more than highlights brighter than 1.
-
-    Args:
-        named: What each cube holds, and how messages call it.
-    """
-    shares = {where: values.num_above_one / values.num_values for where, values in named}
-    clipped = {where: share for where, share in shares.items() if share > _EXCESS_SHARE}
+def say_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tuple[str, ...]:
+    """Warnings of a given scale that makes more than highlights brighter than 1."""
+    clipped = [cube for cube in cubes if cube.share_above_one > _EXCESS_SHARE]
     if value_scale is None or not clipped:
         return ()
-    stored = [values for where, values in named if where in clipped]
-    share, greatest = max(clipped.values()), max(values.greatest for values in stored)
-    proposal = _propose_scale(greatest, all(values.is_integer for values in stored))
+    share, greatest = (
+        max(getattr(cube, name) for cube in clipped) for name in ("share_above_one", "greatest")
+    )
     found = f"up to {share:.0%} of the values are above 1 after division by the value scale {value_scale:g}"
     stored_as = f"and count as 1 (up to {greatest:g} as stored)"
-    advice = f"if they are no highlights, give --value-scale {proposal:g}"
-    return (f"{name_some(list(clipped))}: {found} {stored_as}; {advice}",)
+    advice = f"if they are no highlights, give --value-scale {_propose_scale(clipped):g}"
+    return (f"{name_some([cube.where for cube in clipped])}: {found} {stored_as}; {advice}",)
 
 
-def _read_header(path: Path, layout: str, where: str, faults: Faults) -> _ArrayHeader | None:
-    """The header of an array of three axes, none of length 0; None and a noted fault otherwise."""
+def _read_shape(path: Path | None, layout: str, where: str, faults: Faults) -> tuple[int, int, int] | None:
+    """Of an array of three axes, none of length 0; None without a path, and with a noted fault for other files."""
+    if path is None:
+        return None
     try:
-        header = read_array_header(path)
+        shape = read_array_header(path).shape
     except UnreadableArrayError as error:
-        faults.add(where, str(error))
-        return None
+        return faults.add(where, str(error))
     except OSError as error:
-        faults.add(where, f"cannot be opened ({error.strerror})")
-        return None
-    if len(header.shape) != 3 or 0 in header.shape:
-        faults.add(where, f"has shape {header.shape}; expected {layout}")
-        return None
-    return header
+        return faults.add(where, f"cannot be opened ({error.strerror})")
+    if len(shape) != 3 or 0 in shape:
+        return faults.add(where, f"has shape {shape}; expected {layout}")
+    height, width, depth = shape
+    return height, width, depth
 
 
 def check_abundances(
-    path: Path, size: Size | None, num_materials: int | None, where: str, faults: Faults
+    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], num_materials: int | None, faults: Faults
 ) -> None:
-    """Check one frame's true abundances."""
-    header = _read_header(path, "(H, W, K)", where, faults)
-    if header is None:
-        return
-    found = header.shape[0], header.shape[1]
-    if size is not None and found != size:
-        expected = f"{size[1]} x {size[0]} as the cubes have"
-        faults.add(where, f"has {found[1]} x {found[0]} pixels (width x height); expected {expected}")
-    if num_materials is not None and header.shape[2] != num_materials:
-        abundances = f"has {header.shape[2]} abundances a pixel"
-        faults.add(where, f"{abundances}; expected {num_materials}, one a material")
-    values = map_array(path)
-    if not (values.min() >= -0.01 and values.max() <= 1.01):  # false with any NaN
-        faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
+    """Check the true abundances of all frames."""
+    for frame, size in zip(frames, sizes, strict=True):
+        path, where = frame.files.get("abundance_file_path"), frame.name_of("abundance_file_path")
+        shape = _read_shape(path, "(H, W, K)", where, faults)
+        if path is None or shape is None:
+            continue
+        if size is not None and shape[:2] != size:
+            expected = f"{size[1]} x {size[0]} as the cubes have"
+            faults.add(where, f"has {shape[1]} x {shape[0]} pixels (width x height); expected {expected}")
+        if num_materials is not None and shape[2] != num_materials:
+            expected = f"{num_materials}, one a material"
+            faults.add(where, f"has {shape[2]} abundances a pixel; expected {expected}")
+        values = map_array(path)
+        if not (values.min() >= -0.01 and values.max() <= 1.01):  # false with any NaN
+            faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
 
 
-def _note_invalid(
-    named: list[tuple[str, _CubeValues]], invalid_pixels: InvalidPixels, faults: Faults
-) -> None:
+def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: InvalidPixels, faults: Faults) -> None:
     """Unusable pixels; counts are summed over the frames, so that one message serves them all."""
-    usable = []
-    for where, values in named:
-        if values.num_invalid_pixels == values.num_pixels and invalid_pixels != "refuse":
-            faults.add(where, "every pixel of the cube has a NaN, infinite or negative value; drop the frame")
-        elif invalid_pixels == "clip" and not values.is_noise:
-            found = f"the cube has {values.num_far_negative} values far below 0"
-            faults.add(where, f"{found}, which is not noise; check its dark frame")
-        elif values.num_invalid_pixels:
-            usable.append((where, values))
-    if invalid_pixels != "refuse" or not usable:
+    refused = []
+    for cube in cubes:
+        if invalid_pixels == "refuse" and cube.num_invalid_pixels:
+            refused.append(cube)
+        elif invalid_pixels != "refuse" and cube.num_invalid_pixels == cube.num_pixels:
+            faults.add(
+                cube.where, "every pixel of the cube has a NaN, infinite or negative value; drop the frame"
+            )
+        elif invalid_pixels == "clip" and not cube.is_noise:
+            found = f"the cube has {cube.num_far_negative} values far below 0"
+            faults.add(cube.where, f"{found}, which is not noise; check its dark frame")
+    if not refused:
         return
-    cubes = [values for _, values in usable]
     nan, infinite, negative, invalid, pixels = (
-        sum(getattr(values, name) for values in cubes)
+        sum(getattr(cube, name) for cube in refused)
         for name in ("num_nan", "num_infinite", "num_negative", "num_invalid_pixels", "num_pixels")
     )
-    least = min(values.least for values in cubes)
     counts = ((nan, "NaN"), (infinite, "infinite"), (negative, "negative"))
     found = ", ".join(f"{count} {kind}" for count, kind in counts if count)
     remedy = "mend it, or leave these out with --invalid-pixels mask"
-    if negative and all(values.is_noise for values in cubes):
+    if negative and all(cube.is_noise for cube in refused):
         remedy += "; for noise around black --invalid-pixels clip, which sets negative values to 0"
-    lowest = f", down to {least:.3g}" if negative else ""
-    cube = "the cube has" if len(cubes) == 1 else "their cubes have"
-    for where, _ in usable:
-        faults.add(where, f"{cube} {found} values in {invalid} of {pixels} pixels{lowest}; {remedy}")
+    lowest = f", down to {min(cube.least for cube in refused):.3g}" if negative else ""
+    subject = "the cube has" if len(refused) == 1 else "their cubes have"
+    for cube in refused:
+        faults.add(cube.where, f"{subject} {found} values in {invalid} of {pixels} pixels{lowest}; {remedy}")
 
 
-def _note_scales(measured: list[tuple[str, _CubeValues]], scale: float | None, faults: Faults) -> None:
-    """Integer cubes and cubes in other units; one proposal serves the whole scene, from its greatest value."""
-    integers = [(where, values) for where, values in measured if values.is_integer]
-    if integers and scale is None:
-        greatest = max(values.greatest for _, values in integers)
-        proposal = _propose_scale(greatest, is_integer=True)
-        holds = f"the cube holds integers (up to {greatest:g} in this scene)"
-        meant = f"the number that stands for 1{_describe_scale(proposal)}"
-        for where, _ in integers:
-            faults.add(where, f"{holds}; give --value-scale {proposal:g}, {meant}")
-    is_judged = [(w, v) for w, v in measured if not (v.is_integer and scale is None)]
-    far = [(where, values) for where, values in is_judged if _is_far_out_of_range(values, scale)]
+def _note_integers(cubes: Sequence[_CubeValues], faults: Faults) -> None:
+    """Integers without a scale; one proposal serves the whole scene, from its greatest value."""
+    if not cubes:
+        return
+    greatest, scale = max(cube.greatest for cube in cubes), _propose_scale(cubes)
+    meaning = f" ({_INTEGER_SCALES[scale]})" if scale in _INTEGER_SCALES else ""
+    holds = f"the cube holds integers (up to {greatest:g} in this scene)"
+    for cube in cubes:
+        faults.add(
+            cube.where, f"{holds}; give --value-scale {scale:g}, the number that stands for 1{meaning}"
+        )
+
+
+def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Faults) -> None:
+    """Values that can't be meant as [0, 1], as saturated highlights in a few places can."""
+    most_share = _EXCESS_SHARE if scale is None else _EXCESS_SHARE_SCALED
+    most = _EXCESS_VALUE if scale is None else np.inf
+    far = [cube for cube in cubes if cube.share_above_one > most_share or cube.greatest > most]
     if not far:
         return
-    greatest = max(values.greatest for _, values in far)
-    proposal = _propose_scale(greatest, all(values.is_integer for _, values in far))
     given = "" if scale is None else f" after division by --value-scale {scale:g}"
-    advice = f"give --value-scale {proposal:g}"
-    if scale is None:
-        advice += ", or to 1 to clip highlights at 1"
+    advice = (
+        f"give --value-scale {_propose_scale(far):g}{', or to 1 to clip highlights at 1' * (scale is None)}"
+    )
+    greatest = max(cube.greatest for cube in far)
     found = f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene)"
-    for where, _ in far:
-        faults.add(where, f"{found}; {advice}")
+    for cube in far:
+        faults.add(cube.where, f"{found}; {advice}")

@@ -15,7 +15,7 @@ from jaxtyping import Bool, UInt8
 from unmix_plugin.errors import SceneError
 from unmix_plugin.limits import allow_decoded
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import FrameEntry, SceneEntry, Size
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, Size
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -129,54 +129,49 @@ _Pictures = list[Bool[np.ndarray, "_ _"] | None]
 
 
 def check_colours(
-    entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
+    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faults: Faults
 ) -> _Pictures | None:
     """Check all pictures; returns where each is not fully transparent, or None if the scene has no alpha.
 
     It has if some pixel of a picture is not opaque; then every frame must have a picture with an alpha channel.
     """
     seen: _Pictures = []
-    is_readable = []
-    example = None
-    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        noted = faults.noted
-        pixels = _checked(frame, paths, "file_path", read_colour, size, faults)
-        is_readable.append(faults.noted == noted and ("file_path" in paths) == ("file_path" in frame.paths))
+    transparent, without = None, list[FrameEntry]()
+    for frame, size in zip(frames, sizes, strict=True):
+        pixels = _checked(frame, "file_path", read_colour, size, faults)
         alpha = pixels[..., 3] if pixels is not None and pixels.shape[2] == 4 else None
         seen.append(None if alpha is None else alpha > 0)
-        if alpha is not None and example is None and (alpha < 255).any():
-            example = frame.where
-    if example is None:
+        if transparent is None and alpha is not None and (alpha < 255).any():
+            transparent = frame
+        if alpha is None and (
+            pixels is not None or "file_path" not in frame.paths
+        ):  # others have their own fault
+            without.append(frame)
+    if transparent is None:
         return None
-    for frame, mask, is_fine in zip(entry.frames, seen, is_readable, strict=True):
-        if mask is None and is_fine:  # a picture that is missing or can't be read has its own fault already
-            message = f"has no picture with alpha, while {example} is transparent in places"
-            faults.add(frame.name_of("file_path"), f"{message}; give alpha to all or to none")
+    for frame in without:
+        message = f"has no picture with alpha, while {transparent.where} is transparent in places"
+        faults.add(frame.name_of("file_path"), f"{message}; give alpha to all or to none")
     return seen
 
 
-def check_masks(
-    entry: SceneEntry, located: tuple[dict[str, Path], ...], sizes: Sequence[Size | None], faults: Faults
-) -> _Pictures:
+def check_masks(frames: Sequence[FrameEntry], sizes: Sequence[Size | None], faults: Faults) -> _Pictures:
     """Check all masks; returns which pixels they keep."""
     masks: _Pictures = []
-    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        masks.append(_checked(frame, paths, "mask_path", read_mask, size, faults))
-        if masks[-1] is not None and not masks[-1].any():
+    for frame, size in zip(frames, sizes, strict=True):
+        mask = _checked(frame, "mask_path", read_mask, size, faults)
+        if mask is not None and not mask.any():
             faults.add(frame.name_of("mask_path"), "the mask is black everywhere; drop the frame")
+        masks.append(mask)
     return masks
 
 
 def check_labels(
-    entry: SceneEntry,
-    located: tuple[dict[str, Path], ...],
-    sizes: Sequence[Size | None],
-    num_materials: int | None,
-    faults: Faults,
+    frames: Sequence[FrameEntry], sizes: Sequence[Size | None], num_materials: int | None, faults: Faults
 ) -> None:
     """Check the true materials of all frames."""
-    for frame, paths, size in zip(entry.frames, located, sizes, strict=True):
-        labels = _checked(frame, paths, "seg_file_path", read_labels, size, faults)
+    for frame, size in zip(frames, sizes, strict=True):
+        labels = _checked(frame, "seg_file_path", read_labels, size, faults)
         greatest = 0 if labels is None else int(labels.max(where=labels != UNLABELLED, initial=0))
         if num_materials is not None and greatest >= num_materials:
             expected = f"expected 0 to {num_materials - 1} for the materials, or {UNLABELLED}"
@@ -184,18 +179,12 @@ def check_labels(
 
 
 def _checked(
-    frame: FrameEntry,
-    paths: dict[str, Path],
-    key: str,
-    read: Callable[[Path, Size], np.ndarray],
-    size: Size | None,
-    faults: Faults,
+    frame: FrameEntry, key: str, read: Callable[[Path, Size], np.ndarray], size: Size | None, faults: Faults
 ) -> np.ndarray | None:
     """One picture; None if there is none, or if its size can't be judged because no cube told it."""
-    if key not in paths or size is None:
+    if key not in frame.files or size is None:
         return None
     try:
-        return read(paths[key], size)
+        return read(frame.files[key], size)
     except UnreadableImageError as error:
-        faults.add(frame.name_of(key), str(error))
-        return None
+        return faults.add(frame.name_of(key), str(error))

@@ -5,6 +5,7 @@ Notation: `B` bands of the scene, `b` channels of a frame's cube.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,67 +13,63 @@ from jaxtyping import Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.transforms_json import SensorEntry, Size
+from unmix_plugin.scenes.reading.transforms_json import FrameEntry, Size
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.sensor import SceneSensor, read_sensor
 
 
 def read_operators(
-    entries: list[tuple[str, SensorEntry, Path | None]],
-    wavelengths_nm: Float64[np.ndarray, " B"] | None,
-    faults: Faults,
+    frames: Sequence[FrameEntry], wavelengths_nm: Float64[np.ndarray, " B"] | None, faults: Faults
 ) -> list[Float64[np.ndarray, "_ _"] | None]:
-    """The operator of each frame, as `SceneSensor.matrix`; None where it can't be told.
-
-    Args:
-        entries: For each frame how messages call it, its entry and its table of responses.
-        wavelengths_nm: Of the scene; None where they are faulty.
-    """
+    """The operator of each frame, as `SceneSensor.matrix`; None where it can't be told, as without wavelengths."""
     if wavelengths_nm is None:
-        return [None] * len(entries)
+        return [None] * len(frames)
     tables: dict[Path, Float64[np.ndarray, "_ _"] | None] = {}
     operators: list[Float64[np.ndarray, "_ _"] | None] = []
-    for where, entry, path in entries:
+    for frame in frames:
+        path = frame.files.get("responses_path")
         if path is not None:
             if path not in tables:
-                tables[path] = _read_responses(path, Bands(wavelengths_nm), where, faults)
+                tables[path] = _read_responses(path, Bands(wavelengths_nm), frame.where, faults)
             operators.append(tables[path])
-        else:
-            rows, last = np.eye(len(wavelengths_nm)), len(wavelengths_nm) - 1
-            chosen = tuple(range(len(rows))) if entry.bands is None else entry.bands
-            outside = next((band for band in chosen if not 0 <= band <= last), None)
-            if outside is not None:
-                message = f"'bands' has {outside}; expected 0 to {last}, indices into 'wavelengths'"
-                faults.add(where, message)
-            operators.append(rows[list(chosen)] if outside is None else None)
+            continue
+        rows, last = np.eye(len(wavelengths_nm)), len(wavelengths_nm) - 1
+        chosen = range(last + 1) if frame.sensor.bands is None else frame.sensor.bands
+        outside = [band for band in chosen if not 0 <= band <= last]
+        if outside:
+            expected = f"expected 0 to {last}, indices into 'wavelengths'"
+            faults.add(frame.where, f"'bands' has {outside[0]}; {expected}")
+        operators.append(None if outside else rows[list(chosen)])
     return operators
 
 
 def group_by_sensor(
-    entries: list[tuple[str, SensorEntry, Path | None]],
-    operators: list[Float64[np.ndarray, "_ _"]],
-    sizes: list[Size],
+    frames: Sequence[FrameEntry],
+    operators: Sequence[Float64[np.ndarray, "_ _"]],
+    sizes: Sequence[Size],
     faults: Faults,
 ) -> tuple[tuple[SceneSensor, ...], tuple[int, ...]]:
     """The sensors in the order in which they appear, and the index of each frame's.
 
     Frames without a name are of one sensor if their bands and sizes are the same.
     """
-    known: dict[str | tuple[bytes, Size], tuple[int, bytes, Size]] = {}
+    known: dict[str | tuple[bytes, Size], tuple[int, Size]] = {}
     sensors: list[SceneSensor] = []
     indices = []
-    for (where, entry, _), matrix, size in zip(entries, operators, sizes, strict=True):
-        key = (matrix.tobytes(), size) if entry.name is None else entry.name
+    for frame, matrix, size in zip(frames, operators, sizes, strict=True):
+        name = frame.sensor.name
+        key = (matrix.tobytes(), size) if name is None else name
         if key not in known:
-            known[key] = (len(sensors), matrix.tobytes(), size)
-            sensors.append(SceneSensor(entry.name or _new_name(matrix, size, sensors), matrix))
-        index, first_matrix, first_size = known[key]
+            known[key] = (len(sensors), size)
+            sensors.append(SceneSensor(name or _new_name(matrix, size, sensors), matrix))
+        index, first_size = known[key]
         if first_size != size:
             found, expected = (f"{wide} x {high}" for high, wide in (size, first_size))
-            others = f"others of sensor {entry.name!r} {expected}"
-            faults.add(where, f"has {found} pixels, {others}; name it otherwise")
-        elif first_matrix != matrix.tobytes():
-            faults.add(where, f"has other bands than others of sensor {entry.name!r}; name it otherwise")
+            faults.add(
+                frame.where, f"has {found} pixels, others of sensor {name!r} {expected}; name it otherwise"
+            )
+        elif not np.array_equal(sensors[index].matrix, matrix):
+            faults.add(frame.where, f"has other bands than others of sensor {name!r}; name it otherwise")
         indices.append(index)
     return tuple(sensors), tuple(indices)
 
@@ -92,12 +89,9 @@ def check_coverage(
 
 def lonely_sensors(sensors: tuple[SceneSensor, ...], train_sensors: set[int]) -> list[str]:
     """Names of sensors of the training frames whose bands no other sensor of them sees."""
-    used = sorted(train_sensors)
-    counts = np.sum([sensors[index].seen_bands for index in used], axis=0)
-    alone = [not (sensors[index].seen_bands & (counts > 1)).any() for index in used]
-    return [
-        sensors[index].name for index, is_alone in zip(used, alone, strict=True) if is_alone and len(used) > 1
-    ]
+    used = [sensors[index] for index in sorted(train_sensors)]
+    is_shared = np.sum([sensor.seen_bands for sensor in used], axis=0) > 1
+    return [sensor.name for sensor in used if len(used) > 1 and not (sensor.seen_bands & is_shared).any()]
 
 
 def _read_responses(
@@ -108,11 +102,10 @@ def _read_responses(
         sensor = read_sensor(path)
         seen = sensor.seen_by(bands)
     except SpectrumError as error:
-        faults.add(where, str(error))
-        return None
+        return faults.add(where, str(error))
     if seen.notes:
-        faults.add(where, f"{path}: " + "; ".join(seen.notes) + "; 'wavelengths' must cover all channels")
-        return None
+        found = "; ".join(seen.notes)
+        return faults.add(where, f"{path}: {found}; 'wavelengths' must cover all channels")
     columns = [seen.names.index(name) for name in sensor.column_names]
     return np.ascontiguousarray(seen.matrix.T[columns])
 
@@ -120,5 +113,5 @@ def _read_responses(
 def _new_name(matrix: Float64[np.ndarray, "_ _"], size: Size, sensors: list[SceneSensor]) -> str:
     """Such as `12-bands-24x24`, with a number behind it where another sensor has that name."""
     name = f"{len(matrix)}-band{'s' * (len(matrix) > 1)}-{size[1]}x{size[0]}"
-    names = {sensor.name for sensor in sensors}
-    return next(n for n in (name, *(f"{name}-{i}" for i in range(2, len(sensors) + 3))) if n not in names)
+    candidates = [name, *(f"{name}-{number}" for number in range(2, len(sensors) + 3))]
+    return next(each for each in candidates if each not in {sensor.name for sensor in sensors})

@@ -1,0 +1,177 @@
+"""From the space of transforms.json to model space: which box the training views show, and whether the world goes on
+behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64
+
+from unmix_plugin.engine.geometry.camera_paths import meeting_point
+from unmix_plugin.engine.geometry.cameras import Cameras
+from unmix_plugin.engine.geometry.key_poses import KeyPoses
+from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.errors import SceneError
+from unmix_plugin.scenes.backdrops import BeforeBackdrop, find_before_backdrop
+from unmix_plugin.scenes.geometry.bounds import find_bounds
+from unmix_plugin.scenes.geometry.matched_points import find_matched_points
+from unmix_plugin.scenes.geometry.view_agreement import compare_conventions, describe, find_world_evidence
+from unmix_plugin.scenes.geometry.views import Views, commonest
+from unmix_plugin.scenes.placement import Normalisation
+from unmix_plugin.scenes.reading.checks import CheckedFiles
+from unmix_plugin.scenes.reading.cubes import read_cube
+from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry, Size
+from unmix_plugin.settings import SceneOptions
+
+_FAR_OFF, _MOST_FAR_OFF = 20.0, 0.1
+"""Distance of a camera from the others' middle, in the distance within which most others are, from which on its pose is
+taken for wrong; and the largest share of the views that this may hold for."""
+_LEAST_PLACES = 10
+"""Of cameras; among fewer none is called far off."""
+
+
+def make_cameras(entry: SceneEntry, sizes: Sequence[Size], normalisation: Normalisation) -> Cameras:
+    """Cameras of all frames.
+
+    Args:
+        entry: Without faults.
+        sizes: Height and width of each frame's image.
+        normalisation: From the space of transforms.json to that of the cameras.
+    """
+    lenses = [frame.intrinsics for frame in entry.frames if frame.intrinsics is not None]
+    assert len(lenses) == len(entry.frames)
+    centers = [
+        [0.5 * side if at is None else at for at, side in zip(lens.center_px, size[::-1], strict=True)]
+        for lens, size in zip(lenses, sizes, strict=True)
+    ]
+    count = max(len(lens.coefficients) for lens in lenses)  # 6 where any has higher radial terms, or 4
+    distortion = [(*lens.distortion, *lens.higher_radial)[:count] for lens in lenses]
+    focal_px = [
+        lens.focal_at(width, height, frame.line_poses is not None)
+        for lens, (height, width), frame in zip(lenses, sizes, entry.frames, strict=True)
+    ]
+    poses = _world_poses(entry)
+    keys = []
+    for frame, pose in zip(entry.frames, poses, strict=True):  # row r is taken at r + 0.5
+        lines = frame.line_poses
+        rows, own = (np.zeros(1), pose[None]) if lines is None else (lines.rows, lines.poses)
+        heights = torch.from_numpy(rows + 0.5).float()
+        keys.append(KeyPoses(_model_poses(own, normalisation), heights, (len(rows),)))
+    return Cameras.of_sizes(
+        camera_to_world=_model_poses(poses, normalisation),
+        focal_px=torch.tensor(focal_px, dtype=torch.float32),
+        center_px=torch.tensor(centers, dtype=torch.float32),
+        distortion=torch.tensor(distortion, dtype=torch.float32),
+        sizes=[(width, height) for height, width in sizes],
+        key_poses=KeyPoses.join(keys),
+    )
+
+
+def _world_poses(entry: SceneEntry) -> Float64[np.ndarray, "N 3 4"]:
+    """One pose a frame, as transforms.json has it."""
+    poses = [frame.pose for frame in entry.frames if frame.pose is not None]
+    assert len(poses) == len(entry.frames)
+    return np.stack(poses)
+
+
+def _model_poses(
+    poses: Float64[np.ndarray, "n 3 4"], normalisation: Normalisation
+) -> Float[torch.Tensor, "n 3 4"]:
+    rotations = normalisation.rotation @ poses[:, :, :3]
+    positions = normalisation.to_model(poses[:, :, 3])
+    return torch.from_numpy(np.concatenate([rotations, positions[:, :, None]], axis=-1)).float()
+
+
+def without_far_off(entry: SceneEntry, train: tuple[int, ...]) -> tuple[tuple[int, ...], str | None]:
+    """Training views without those whose cameras are so far off that only a wrong pose explains it, and what to say."""
+    if any(frame.pose is None for frame in entry.frames):
+        return train, None
+    positions = _world_poses(entry)[list(train), :, 3]
+    shots = [entry.frames[view].shot or place.tobytes() for view, place in zip(train, positions, strict=True)]
+    places = np.stack(list(dict(zip(shots, positions, strict=True)).values()))  # a rig's lenses share one
+    middle = np.median(places, axis=0)
+    usual = float(np.quantile(np.linalg.norm(places - middle, axis=1), 1 - _MOST_FAR_OFF, method="lower"))
+    distances = np.linalg.norm(positions - middle, axis=1)
+    is_off = (distances > _FAR_OFF * usual) & (usual > 0) & (len(places) >= _LEAST_PLACES)
+    if not is_off.any():
+        return train, None
+    names = ", ".join(entry.frames[train[row]].files[CUBE_KEY].name for row in np.flatnonzero(is_off))
+    said = (
+        f"left out of training: {names}, {distances.max() / usual:.0f} times as far from the middle of the cameras as "
+        "nearly all others: its pose must be wrong"
+    )
+    return tuple(view for view, off in zip(train, is_off, strict=True) if not off), said
+
+
+@dataclass(frozen=True)
+class ModelSpace:
+    """What is modelled, as `Scene` has it; the similarity starts from the space of transforms.json."""
+
+    normalisation: Normalisation
+    scene_box: SceneBox
+    is_unbounded: bool
+    before_backdrop: BeforeBackdrop | None
+    world_reason: str | None
+
+
+def find_model_space(
+    root: Path, entry: SceneEntry, checked: CheckedFiles, train: tuple[int, ...], options: SceneOptions
+) -> ModelSpace:
+    """The box that the training views show, how its longest edge becomes [-1, 1], and what lies behind it.
+
+    The box is found in a space centred on the training cameras, where coordinates are of order 1. Raises SceneError:
+    alpha and poses contradict.
+    """
+    views = [checked.frames[index] for index in train]
+    poses = _world_poses(entry)[list(train)]
+    middle = poses[:, :, 3].mean(axis=0)
+    radius = float(np.linalg.norm(poses[:, :, 3] - middle, axis=-1).max())
+    first = Normalisation(np.eye(3), -middle, 1.0 / radius if radius > 0.0 else 1.0)
+    cameras = make_cameras(entry, checked.sizes, first)[list(train)]
+    foreground = [view.foreground for view in views if view.foreground is not None] or None
+    alike = commonest([view.sensor for view in views])
+
+    def read_view(row: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
+        return read_cube(views[alike[row]].cube, options.value_scale, options.invalid_pixels, part)
+
+    def read_valid(row: int) -> Bool[np.ndarray, "H W"]:
+        view = views[alike[row]]
+        return np.ones(view.size, dtype=bool) if view.unknown is None else ~view.unknown
+
+    compared = Views(cameras[alike], read_view, read_valid)
+    before = box = points = None
+    if foreground is None and options.world == "auto" and len(alike) == len(train):
+        sizes = [cameras.size(row) for row in alike]
+        before = find_before_backdrop(sizes, read_view, [view.unknown for view in views])
+    if before is not None and before.shows_matter:
+        try:
+            box = find_bounds(root, cameras, before.masks())
+        except SceneError:  # poses contradict it
+            before = None
+    has_masks = box is not None or foreground is not None
+    if not has_masks and meeting_point(cameras.camera_to_world.double().numpy()) is None:
+        points = find_matched_points(compared)
+        points = None if points is None else replace(points, pairs=torch.tensor(alike)[points.pairs])
+    try:
+        box = box or find_bounds(root, cameras, foreground, points)
+    except SceneError as error:
+        hint = describe(compare_conventions(poses[alike], compared))
+        raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
+    is_unbounded, reason = options.world == "unbounded", None
+    if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
+        evidence = find_world_evidence(box, compared)
+        if not evidence.goes_on:
+            places = points or find_matched_points(compared)
+            evidence = evidence if places is None else evidence.with_places(box, places.places)
+        is_unbounded, reason = evidence.goes_on, evidence.in_words()
+    low, high = box.aabb.double().numpy()
+    scale = float(2.0 / (high - low).max())
+    half = 0.5 * scale * (high - low)
+    translation = first.translation - 0.5 * (low + high) / first.scale
+    normalisation = Normalisation(first.rotation, translation, first.scale * scale)
+    own_box = SceneBox(torch.from_numpy(np.stack([-half, half])).float())
+    return ModelSpace(normalisation, own_box, is_unbounded, before, reason)
