@@ -211,7 +211,7 @@ class PixelTable:
             shares: Of the pixels drawn, by sensor; None draws all valid ones evenly.
         """
         counts = [count]
-        if len(self.blocks) > 1 or self.blocks[0].pool is not None:
+        if len(self.blocks) != 1 or self.blocks[0].pool is not None:
             counts = self._counts(count, generator, self.shares if shares is None else shares)
         groups = []
         for index, (block, number) in enumerate(zip(self.blocks, counts, strict=True)):
