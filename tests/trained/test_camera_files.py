@@ -199,7 +199,7 @@ BAD = {
         path_of([*(1.1 * POSE[:3]).ravel(), 0, 0, 0, 1]),
         r"camera_path\[0\]: .* not rigid: .* \(1.1, 1.1",
     ),
-    "15 numbers": (path_of([1.0] * 15), "'camera_to_world' is a list of 15 whose row 0 is 1.0; expected 4"),
+    "15 numbers": (path_of([1.0] * 15), "'camera_to_world' is a list of 15 with 1.0 in row 0; expected 4"),
     "mirrored": (
         frame_of(POSE @ np.diag([1, 1, -1, 1.0])),
         r"frames\[0\]: 'transform_matrix' is a reflection",

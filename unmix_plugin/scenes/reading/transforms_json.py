@@ -88,10 +88,10 @@ def read_pose(
 def _found(matrix: Any) -> str:
     """What stands in place of rows of numbers: a value that is no number, or else the whole."""
     for number, row in enumerate(matrix if isinstance(matrix, list) else []):
-        values = row if isinstance(row, list) and len(row) == 4 else [row]
-        for value in values:
-            if read_number(value) is None:
-                return f"{describe(matrix)} with {describe(value)} in row {number}"
+        is_row = isinstance(row, list) and len(row) == 4
+        wrong = [value for value in row if read_number(value) is None] if is_row else [row]
+        if wrong:
+            return f"{describe(matrix)} with {describe(wrong[0])} in row {number}"
     return describe(matrix)
 
 
