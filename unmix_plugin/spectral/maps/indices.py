@@ -1,9 +1,8 @@
 """Spectral indices: one number a pixel from its reflectance at a few wavelengths, by name or by formula.
 
 A formula such as `(r800-r670)/(r800+r670)` is written in numbers, wavelengths (`r800`, `r800.5`: the reflectance
-there), operators that bind as in Python, and six functions, upper and lower case alike. Each token is checked and
-written again with names of our own for its operands before Python parses it to a tree, of which only the nodes of
-these operations are evaluated: nothing that a user wrote is executed.
+there), operators that bind as in Python, and six functions, upper and lower case alike. Python parses it to a tree, of
+which only the nodes of these operations are evaluated: nothing that a user wrote is executed.
 
 Notation: `B` bands, `*rays` any leading axes. Reflectance is what an index is defined on; ratios alone take radiance in
 a light of equal power just as well. Between two band centres reflectance is interpolated linearly, in the outer half of
@@ -14,12 +13,10 @@ from __future__ import annotations
 
 import ast
 import difflib
-import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import NoReturn
 
 import torch
 from jaxtyping import Float
@@ -30,26 +27,19 @@ from unmix_plugin.spectral.bands import Bands
 
 _MAX_LENGTH = 500
 """Characters of a formula."""
-_MAX_NESTING = 50
-"""Parentheses, minus signs and exponents within one another."""
 
-_ALLOWED = "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs min max"
+_ALLOWED = (
+    "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs of one value, "
+    "min max of several"
+)
 
 _TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?)"
-    r"|(?P<word>[a-z_][a-z0-9_.]*)|(?P<sign>\*\*|[-+*/^(),])|(?P<end>\Z)|(?P<other>.))",
-    re.IGNORECASE | re.DOTALL,
+    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?)|r(?P<nm>[0-9]+(?:\.[0-9]+)?)(?![\w.])"
+    r"|(?P<word>[a-z_][\w.]*)|(?P<other>[^\s\w.+*/^(),-])",
+    re.ASCII,
 )
-_WAVELENGTH = re.compile(r"r([0-9]+(?:\.[0-9]+)?)")
-_FUNCTIONS: dict[str, tuple[Callable[..., Tensor], int, float]] = {
-    "sqrt": (torch.sqrt, 1, 1),
-    "log": (torch.log, 1, 1),
-    "exp": (torch.exp, 1, 1),
-    "abs": (torch.abs, 1, 1),
-    "min": (lambda *values: reduce(torch.minimum, values), 2, math.inf),
-    "max": (lambda *values: reduce(torch.maximum, values), 2, math.inf),
-}
-"""With the least and the greatest number of arguments."""
+_FUNCTIONS = {"sqrt": torch.sqrt, "log": torch.log, "exp": torch.exp, "abs": torch.abs}
+_FUNCTIONS_OF_SEVERAL = {"min": torch.minimum, "max": torch.maximum}
 
 
 def _power(base: Tensor, exponent: Tensor) -> Tensor:
@@ -57,13 +47,12 @@ def _power(base: Tensor, exponent: Tensor) -> Tensor:
     return base**exponent + 0 * base + 0 * exponent
 
 
-_OPERATORS: dict[type[ast.AST], Callable[..., Tensor]] = {
+_OPERATORS: dict[type[ast.AST], Callable[[Tensor, Tensor], Tensor]] = {
     ast.Add: torch.add,
     ast.Sub: torch.sub,
     ast.Mult: torch.mul,
     ast.Div: torch.div,
     ast.Pow: _power,
-    ast.USub: torch.neg,
 }
 
 
@@ -72,9 +61,7 @@ class _Formula:
     """A formula that was read: over at least one wavelength."""
 
     text: str
-    """As it was written, without blanks around it."""
-    numbers: dict[str, float]
-    """Numbers by their name in the tree."""
+    """In lower case, with single blanks."""
     wavelengths: dict[str, float]
     """Wavelengths in nm by their name in the tree."""
     tree: ast.expr = field(compare=False, repr=False)
@@ -92,23 +79,28 @@ class _Formula:
         Args:
             at: Reflectance at one of `wavelengths_nm`; asked again at each mention, so that few are held at a time.
             like: Of the type and on the device to compute with.
+        Raises:
+            ConfigError: an operation that is not allowed.
         """
 
-        def value(node: ast.expr) -> Tensor:
+        def value(node: ast.AST) -> Tensor:
             match node:
                 case ast.Name(id=name) if name in self.wavelengths:
                     found = at(self.wavelengths[name])
-                case ast.Name(id=name):  # a number too large for the type is refused by PyTorch
-                    number = self.numbers[name]
+                case ast.Constant(value=int() | float() as number):  # PyTorch refuses numbers beyond its type
                     found = like.new_full((), number if number <= torch.finfo(like.dtype).max else torch.nan)
-                case ast.UnaryOp(op=sign, operand=operand):
-                    found = _OPERATORS[type(sign)](value(operand))
-                case ast.BinOp(left=left, op=sign, right=right):
+                case ast.UnaryOp(op=ast.USub(), operand=operand):
+                    found = -value(operand)
+                case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _OPERATORS:
                     found = _OPERATORS[type(sign)](value(left), value(right))
-                case ast.Call(func=ast.Name(id=name), args=args):
-                    found = _FUNCTIONS[name][0](*map(value, args))
+                case ast.Call(func=ast.Name(id=name), args=[only], keywords=[]) if name in _FUNCTIONS:
+                    found = _FUNCTIONS[name](value(only))
+                case ast.Call(
+                    func=ast.Name(id="min" | "max" as name), args=[_, _, *_] as several, keywords=[]
+                ):
+                    found = reduce(_FUNCTIONS_OF_SEVERAL[name], map(value, several))
                 case _:
-                    raise ConfigError(f"index formula {self.text!r}: allowed are {_ALLOWED}")
+                    raise _fault(self.text, getattr(node, "col_offset", 0))
             # At every step, or 1 / (1 / 0) would be 0.
             return found.masked_fill(~found.isfinite(), torch.nan)
 
@@ -124,107 +116,41 @@ def parse_formula(text: str) -> _Formula:
     >>> parse_formula("r800 / r670").wavelengths_nm
     (670.0, 800.0)
     """
-    text = text.strip()
-    if len(text) > _MAX_LENGTH:
-        raise ConfigError(f"an index formula has at most {_MAX_LENGTH} characters; this one has {len(text)}")
-    reader = _Reader(text)
+    if len(text.strip()) > _MAX_LENGTH:
+        raise ConfigError(
+            f"an index formula has at most {_MAX_LENGTH} characters; this one has {len(text.strip())}"
+        )
+    text = " ".join(text.lower().replace("^", "**").split())
+    wavelengths: dict[str, float] = {}
+    expression = text
     for match in _TOKEN.finditer(text):
-        reader.take(match)
-    if not reader.wavelengths:
+        if match["nm"]:  # a name of as many characters, so that places stay
+            name = match[0].replace(".", "_")
+            wavelengths[name] = float(match["nm"])
+            expression = expression[: match.start()] + name + expression[match.end() :]
+        elif match["other"] or (
+            match["word"] and match["word"] not in {**_FUNCTIONS, **_FUNCTIONS_OF_SEVERAL}
+        ):
+            raise _fault(text, match.start())
+    try:
+        formula = _Formula(text, wavelengths, ast.parse(expression, mode="eval").body)
+        formula.evaluate(lambda _: torch.zeros(()), torch.zeros(()))  # which refuses what is not allowed
+    except SyntaxError as error:
+        raise _fault(text, (error.offset or 1) - 1) from error
+    except (RecursionError, MemoryError) as error:
+        raise ConfigError(f"the index formula {text!r} is nested too deep") from error
+    if not wavelengths:
         raise ConfigError(
             f"the index formula {text!r} takes no wavelength; write r800 for the reflectance at 800 nm"
         )
-    tree = ast.parse("".join(reader.expression), mode="eval").body
-    return _Formula(text, reader.numbers, reader.wavelengths, tree)
+    return formula
 
 
-@dataclass
-class _Level:
-    """What stands between two parentheses, or all of a formula."""
-
-    function: str = ""
-    place: int = 0
-    num_arguments: int = 1
-    chain: int = 0
-    """Minus signs and exponents that the next operand stands within."""
-
-
-class _Reader:
-    """Token by token, what may follow is checked and `expression` grows: Python over names of our own only."""
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self.expression: list[str] = []
-        self.numbers: dict[str, float] = {}
-        self.wavelengths: dict[str, float] = {}
-        self.levels = [_Level()]
-        self.called: _Level | None = None
-        self.needs_operand = True
-
-    def take(self, match: re.Match[str]) -> None:
-        kind = match.lastgroup or "end"
-        token, place = match[kind].lower(), match.start(kind)
-        if self.called is not None and token != "(":
-            self.fail(f"expected ( after {self.called.function}", place, match[kind])
-        problem = self.operand(kind, token, place) if self.needs_operand else self.operator(kind, token)
-        if problem:
-            self.fail(problem, place, match[kind])
-
-    def operand(self, kind: str, token: str, place: int) -> str | None:
-        """Takes what starts or is an operand; returns what is wrong."""
-        wavelength = _WAVELENGTH.fullmatch(token)
-        if sum(1 + level.chain for level in self.levels) > _MAX_NESTING:
-            return f"nested deeper than {_MAX_NESTING}"
-        if kind == "number" or wavelength:
-            name = f"v{len(self.expression)}"
-            values = self.wavelengths if wavelength else self.numbers
-            values[name] = float(wavelength[1] if wavelength else token)
-            token, self.needs_operand = name, False
-        elif token == "-":
-            self.levels[-1].chain += 1
-        elif token == "(":
-            self.levels.append(self.called or _Level())
-            self.called = None
-        elif token in _FUNCTIONS:
-            self.called = _Level(token, place)
-        else:
-            return "expected a number, a wavelength, a function or ("
-        self.expression.append(token)
-        return None
-
-    def operator(self, kind: str, token: str) -> str | None:
-        """Takes what may follow an operand; returns what is wrong."""
-        level = self.levels[-1]
-        if token in ("**", "^"):
-            level.chain += 1
-            token = "**"
-        elif token in ("+", "-", "*", "/") or (token == "," and level.function):
-            level.chain = 0
-            level.num_arguments += token == ","
-        elif token == ")" and len(self.levels) > 1:
-            self.close(self.levels.pop())
-        elif len(self.levels) > 1:
-            return "expected )"
-        elif kind != "end":
-            return "expected an operator or the end"
-        self.expression.append(token)
-        self.needs_operand = token not in (")", "")
-        return None
-
-    def close(self, level: _Level) -> None:
-        if level.function:
-            _, least, most = _FUNCTIONS[level.function]
-            if not least <= level.num_arguments <= most:
-                takes = "one argument" if most == 1 else f"at least {least} arguments"
-                self.fail(f"{level.function} takes {takes}, not {level.num_arguments}", level.place)
-
-    def fail(self, problem: str, place: int, token: str | None = None) -> NoReturn:
-        found = "" if token is None else f", found {token!r}" if token else ", found the end"
-        shown = " ".join(self.text.splitlines())  # one line, so that the caret is below its column
-        raise ConfigError(
-            f"index formula, column {place + 1}: {problem}{found}\n  {shown}\n  {' ' * place}^\n"
-            f"allowed are {_ALLOWED}"
-        )
+def _fault(text: str, place: int) -> ConfigError:
+    """What is wrong at a place of a formula."""
+    return ConfigError(
+        f"index formula, column {place + 1}: can't be read here\n  {text}\n  {' ' * place}^\nallowed are {_ALLOWED}"
+    )
 
 
 @dataclass(frozen=True)
