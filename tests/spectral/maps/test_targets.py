@@ -222,8 +222,6 @@ def test_a_target_says_what_its_numbers_are(gold):
     )
     assert ace.what.startswith("adaptive coherence with 'gold' (gold.csv): 1 = ")
     assert [one.usual_range for one in (angle, mf, ace)] == [(0, 0.5), (0, 1), (0, 1)]
-    pixels = image()[0].reshape(-1, 5)
-    assert [one.fit(pixels).background is None for one in (angle, mf, ace)] == [True, False, False]
     below = parse_target(f"{gold}<0.1", BANDS)
     assert below.what == "spectral angle in radians to 'gold' (gold.csv) below 0.1: 1 = yes, 0 = no"
     assert below.usual_range == (0, 1)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -153,9 +152,13 @@ class _Target:
         """What pictures show."""
         return _USUAL[self.method] if self.threshold is None else (0.0, 1.0)
 
-    def fit(self, background: Float[Tensor, "N B"]) -> _TargetScore:
-        """The score, judged against a sample of the scene's reflectances; the angle ignores it.
+    def fit(
+        self, background: Float[Tensor, "N B"]
+    ) -> Callable[[Float[Tensor, "*rays B"]], Float[Tensor, "*rays"]]:
+        """From reflectances to scores, or to 1 and 0 with a threshold: of the spectra's type and on their device.
 
+        Args:
+            background: A sample of the scene's reflectances to judge against; the angle ignores it.
         Raises:
             SpectrumError: another number of bands than the target's; fewer than two pixels in which something is; all
                 are equal; their mean is the target.
@@ -164,39 +167,27 @@ class _Target:
             raise SpectrumError(
                 f"the target '{self.name}' has {len(self.reflectance)} bands, the background {background.shape[1]}"
             )
-        if self.method == "angle":
-            return _TargetScore(self, None)
-        found = Background.fit(background)
-        target = self.reflectance.to(found.mean)
-        if not found._whiten(target).norm() > _LEAST_DISTANCE:
+        around = None if self.method == "angle" else Background.fit(background)
+        if around and not around._whiten(self.reflectance.to(around.mean)).norm() > _LEAST_DISTANCE:
             raise SpectrumError(
                 f"the target '{self.name}' ({self.file}) is the mean of the background, so nothing tells them apart; "
                 "choose views that show more than the target, or the spectral angle"
             )
-        return _TargetScore(self, found)
 
+        def score(reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
+            spectra, target = reflectance.double(), self.reflectance.to(reflectance.device)
+            if around is None:
+                scores = spectral_angle(spectra, target)
+            else:
+                detect = matched_filter if self.method == "mf" else adaptive_coherence
+                here = Background(around.mean.to(target), around.whitening.to(target))
+                scores = detect(spectra, target, here)
+            if self.threshold is not None:
+                passes = scores < self.threshold if self.method == "angle" else scores > self.threshold
+                scores = torch.where(scores.isnan(), scores, passes.double())
+            return torch.where(_is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
 
-@dataclass(frozen=True)
-class _TargetScore:
-    """From reflectances to scores, or to 1 and 0 with a threshold."""
-
-    target: _Target
-    background: Background | None
-    """None for the spectral angle."""
-
-    def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
-        """Scores, of the spectra's type and on their device; computed in float64."""
-        spectra, target = reflectance.double(), self.target.reflectance.to(reflectance.device)
-        if self.background is None:
-            scores = spectral_angle(spectra, target)
-        else:
-            detect = matched_filter if self.target.method == "mf" else adaptive_coherence
-            here = Background(self.background.mean.to(target), self.background.whitening.to(target))
-            scores = detect(spectra, target, here)
-        if (limit := self.target.threshold) is not None:
-            passes = scores < limit if self.target.method == "angle" else scores > limit
-            scores = torch.where(scores.isnan(), scores, passes.double())
-        return torch.where(_is_defined(reflectance), scores, torch.nan).to(reflectance.dtype)
+        return score
 
 
 def parse_target(text: str, bands: Bands, read: Callable[[Path], Sequence[LibraryMaterial]]) -> _Target:
@@ -221,13 +212,19 @@ def parse_target(text: str, bands: Bands, read: Callable[[Path], Sequence[Librar
     file = match["file"] if named or not prefix else f"{prefix}:{match['file']}"
     method: _DetectionMethod = "angle" if named is None else named
     threshold = None if match["limit"] is None else _threshold(method, match["side"], float(match["limit"]))
-    library = _found(file, read)
+    library = _library(file, read)
     name = _chosen(match["name"], library.names, file)
     try:
         reflectance = library.reflectance(name, bands)
     except SpectrumError as error:
         raise SpectrumError(f"{file}: {error}") from error
-    _validate(reflectance, method, f"'{name}' ({file})")
+    what = f"the target '{name}' ({file})"
+    if method == "angle" and not reflectance.any():
+        raise SpectrumError(f"{what} is zero in all bands: no angle to it is defined; choose mf or ace")
+    if method != "angle":
+        require_reflectance(reflectance, what)
+    if method != "mf" and len(reflectance) < 2:
+        raise SpectrumError(f"{method} compares spectra of two bands or more; found 1 band")
     return _Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
 
 
@@ -246,8 +243,7 @@ def _threshold(method: _DetectionMethod, side: str, limit: float) -> float:
     return limit
 
 
-def _found(file: str, read: Callable[[Path], Sequence[LibraryMaterial]]) -> MaterialLibrary:
-    """The file's spectra."""
+def _library(file: str, read: Callable[[Path], Sequence[LibraryMaterial]]) -> MaterialLibrary:
     if not Path(file).exists():
         prefix, colon, _ = file.partition(":")
         near = difflib.get_close_matches(prefix.lower(), _SIDES, n=1, cutoff=0.6) if colon else []
@@ -257,7 +253,6 @@ def _found(file: str, read: Callable[[Path], Sequence[LibraryMaterial]]) -> Mate
 
 
 def _chosen(name: str | None, names: Sequence[str], file: str) -> str:
-    """The spectrum that is meant."""
     listed = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     if name is None:
         if len(names) == 1:
@@ -267,14 +262,3 @@ def _chosen(name: str | None, names: Sequence[str], file: str) -> str:
         return name
     hint = did_you_mean(name, names, form="{} ")
     raise ConfigError(f"{file} has no spectrum {name!r}; {hint}it has {listed}")
-
-
-def _validate(reflectance: np.ndarray, method: _DetectionMethod, what: str) -> None:
-    if method != "angle":
-        require_reflectance(reflectance, f"the target {what}")
-    if method == "angle" and not reflectance.any():
-        raise SpectrumError(
-            f"the target {what} is zero in all bands: no angle to it is defined; choose mf or ace"
-        )
-    if method != "mf" and len(reflectance) < 2:
-        raise SpectrumError(f"{method} compares spectra of two bands or more; found 1 band")
