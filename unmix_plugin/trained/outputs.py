@@ -148,138 +148,97 @@ def _scores(view: MaterialView) -> Tensor:
 
 
 _UNIT = (0.0, 1.0)
-_TABLE = (
-    MaterialOutput(
-        "rgb",
-        "srgb",
-        "colour",
-        "sRGB on black, 0 to 1",
-        compute=lambda view: linear_to_srgb(_linear_rgb(view)),
-    ),
-    MaterialOutput(
-        "linear_rgb",
-        "linear",
-        "linear colour",
-        "linear light in sRGB primaries on black, 0 to 1",
-        compute=_linear_rgb,
-    ),
-    MaterialOutput(
-        "spectral",
-        "channels",
+_DESCRIPTIONS = (
+    Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),
+    Output("linear_rgb", "linear", "linear colour", "linear light in sRGB primaries on black, 0 to 1"),
+    Output("spectral", "channels", "spectra", "radiance on black, 1 = full scale"),
+    Output("diffuse", "channels", "diffuse part", "radiance without the view-dependent part, 1 = full scale"),
+    Output("specular", "channels", "specular part", "view-dependent part of the radiance, 1 = full scale"),
+    Output(
+        "reflectance",
         "spectra",
-        "radiance on black, 1 = full scale",
-        compute=lambda view: view.spectra,
+        "reflectance",
+        "radiance over the scene's light, 1 = as bright as white, shading included; NaN where nothing is",
     ),
-    MaterialOutput(
-        "diffuse",
-        "channels",
-        "diffuse part",
-        "radiance without the view-dependent part, 1 = full scale",
-        compute=lambda view: view.materials.diffuse(view.coefficients),
+    Output(
+        "continuum",
+        "spectra",
+        "continuum removed",
+        "reflectance over its continuum, the upper convex hull, at most 1; NaN where nothing is",
     ),
-    MaterialOutput(
-        "specular",
-        "channels",
-        "specular part",
-        "view-dependent part of the radiance, 1 = full scale",
-        compute=lambda view: view.materials.specular(view.coefficients),
+    Output(
+        "derivative",
+        "spectra",
+        "derivative",
+        "derivative of the reflectance by wavelength, 1/nm; NaN where nothing is",
     ),
-    *(
-        MaterialOutput(name, "spectra", title, f"{what}; NaN where nothing is", compute=compute)
-        for name, title, what, compute in (
-            (
-                "reflectance",
-                "reflectance",
-                "radiance over the scene's light, 1 = as bright as white, shading included",
-                _reflectance,
-            ),
-            (
-                "continuum",
-                "continuum removed",
-                "reflectance over its continuum, the upper convex hull, at most 1",
-                _of_lit_bands(continuum_removed),
-            ),
-            ("derivative", "derivative", "derivative of the reflectance by wavelength, 1/nm", _derivative(1)),
-            (
-                "second_derivative",
-                "second derivative",
-                "second derivative of the reflectance by wavelength, 1/nm^2",
-                _derivative(2),
-            ),
-        )
+    Output(
+        "second_derivative",
+        "spectra",
+        "second derivative",
+        "second derivative of the reflectance by wavelength, 1/nm^2; NaN where nothing is",
     ),
-    MaterialOutput(
-        "abundances",
-        "shares",
-        "all abundances",
-        "abundances, summing to the opacity",
-        _UNIT,
-        compute=lambda view: view.coefficients.abundances,
-    ),
-    MaterialOutput(
-        "segmentation",
-        "labels",
-        "segmentation",
-        "index of the material, 255 where nothing is",
-        compute=lambda view: view.materials.ids(view.coefficients),
-    ),
-    MaterialOutput(
+    Output("abundances", "shares", "all abundances", "abundances, summing to the opacity", _UNIT),
+    Output("segmentation", "labels", "segmentation", "index of the material, 255 where nothing is"),
+    Output(
         "confidence",
         "map",
         "segmentation confidence",
         "estimated probability that the material is right",
         _UNIT,
-        compute=lambda view: view.materials.confidence(view.coefficients),
     ),
-    MaterialOutput(
+    Output(
         "material_scores",
         "shares",
         "similarity to each endmember",
         "cosine of the spectrum to each endmember",
         _UNIT,
-        compute=_scores,
     ),
-    MaterialOutput(
+    Output(
         "probe_probabilities",
         "shares",
         "probabilities of the probe",
         "softmax over the endmembers of the cosine of the spectrum to each, as published",
         _UNIT,
-        compute=lambda view: torch.softmax(_scores(view), dim=-1),
     ),
-    MaterialOutput(
+    Output(
         "pca",
         "picture",
         "principal components",
         "three principal components of the spectra, each stretched from its 1st to its 99th percentile",
-        compute=_pca,
     ),
-    MaterialOutput(
-        "depth",
-        "map",
-        "depth",
-        "distance along the viewing axis in world units, 0 where nothing is",
-        compute=lambda view: view.depth,
-    ),
-    MaterialOutput(
+    Output("depth", "map", "depth", "distance along the viewing axis in world units, 0 where nothing is"),
+    Output(
         "ray_distance",
         "map",
         "distance along the ray",
         "distance along the ray in world units, 0 where nothing is",
-        compute=lambda view: view.ray_distance,
     ),
-    MaterialOutput(
-        "accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray", compute=lambda view: view.opacity
-    ),
-    MaterialOutput(
-        "normals",
-        "vectors",
-        "normals",
-        "unit normals in world axes, 0 where nothing is",
-        compute=lambda view: view.normals,
-    ),
+    Output("accumulation", "map", "opacity", "opacity, 0 to 1", _UNIT, "gray"),
+    Output("normals", "vectors", "normals", "unit normals in world axes, 0 where nothing is"),
 )
-OUTPUTS = {output.name: output for output in _TABLE}
+_COMPUTE: dict[str, Callable[[MaterialView], Tensor]] = {
+    "rgb": lambda view: linear_to_srgb(_linear_rgb(view)),
+    "linear_rgb": _linear_rgb,
+    "spectral": lambda view: view.spectra,
+    "diffuse": lambda view: view.materials.diffuse(view.coefficients),
+    "specular": lambda view: view.materials.specular(view.coefficients),
+    "reflectance": _reflectance,
+    "continuum": _of_lit_bands(continuum_removed),
+    "derivative": _derivative(1),
+    "second_derivative": _derivative(2),
+    "abundances": lambda view: view.coefficients.abundances,
+    "segmentation": lambda view: view.materials.ids(view.coefficients),
+    "confidence": lambda view: view.materials.confidence(view.coefficients),
+    "material_scores": _scores,
+    "probe_probabilities": lambda view: torch.softmax(_scores(view), dim=-1),
+    "pca": _pca,
+    "depth": lambda view: view.depth,
+    "ray_distance": lambda view: view.ray_distance,
+    "accumulation": lambda view: view.opacity,
+    "normals": lambda view: view.normals,
+}
+OUTPUTS = {one.name: MaterialOutput(**vars(one), compute=_COMPUTE[one.name]) for one in _DESCRIPTIONS}
 """All outputs that take no argument, in the order in which they are offered."""
 
 
