@@ -84,11 +84,7 @@ class ModelScene:
         return self.model.device
 
     def output(self, name: str) -> Output:
-        """An output by its name.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """As the protocol has it."""
         return named_output(self.outputs, name)
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
@@ -97,20 +93,12 @@ class ModelScene:
         return ModelView(camera, self.model.get_outputs_for_camera(camera, names))
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
-        """Outputs of a view by name, (H, W, ...).
-
-        Raises:
-            ConfigError: an unknown name.
-        """
+        """Outputs of a view by name, (H, W, ...)."""
         known = [self.output(name).name for name in names]
         return self.model.get_outputs_for_camera(camera, known)
 
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
-        """All outputs in one pixel.
-
-        Raises:
-            ConfigError: the pixel is outside the image.
-        """
+        """All outputs in one pixel."""
         view = self.look(one_pixel(camera, column, row))
         values = {
             name: tensor.detach().reshape(-1).double().cpu().numpy() for name, tensor in view.tensors.items()
@@ -170,7 +158,6 @@ class RelightableScene(RenderableScene, Protocol):
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the lights that it has; the first is that of its pictures."""
-        ...
 
     def with_light(self, choice: LightChoice) -> RelightableScene:
         """The same scene under another light.
@@ -179,7 +166,6 @@ class RelightableScene(RenderableScene, Protocol):
             ConfigError: there is no such light.
             SceneError: the file of an environment map is missing, damaged or unusable.
         """
-        ...
 
 
 @runtime_checkable
@@ -189,20 +175,13 @@ class EstimatedScene(RenderableScene, Protocol):
     @property
     def num_estimates(self) -> int:
         """How many of them a finished picture takes."""
-        ...
 
     def estimate(self, camera: Cameras, subpixels: int, number: int) -> ModelView:
         """A view with few samples; those of other numbers, from 0, are independent of it."""
-        ...
 
 
 def relit(scene: RenderableScene, choice: LightChoice, method_name: str) -> RelightableScene:
-    """A scene under another light.
-
-    Raises:
-        ConfigError: its method has no light from far away, or there is no such light.
-        SceneError: the file of an environment map is missing, damaged or unusable.
-    """
+    """A scene under another light, as its `with_light`; a ConfigError where its method has none from far away."""
     if not isinstance(scene, RelightableScene):
         raise ConfigError(
             f"the method {method_name} has no environment that could be exchanged: --environment needs a run of a "

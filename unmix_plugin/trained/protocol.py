@@ -55,17 +55,14 @@ class RenderedView(Protocol):
     @property
     def camera(self) -> Cameras:
         """One camera."""
-        ...
 
     @property
     def opacity(self) -> Tensor:
         """(H, W), [0, 1]."""
-        ...
 
     @property
     def coverage(self) -> Tensor:
         """(H, W), [0, 1]: how much of a pixel shows something, a sky included; nothing shines through that part."""
-        ...
 
     def __getitem__(self, name: str) -> Tensor:
         """An output by its name.
@@ -73,7 +70,6 @@ class RenderedView(Protocol):
         Raises:
             ConfigError: there is none.
         """
-        ...
 
 
 @runtime_checkable
@@ -83,32 +79,26 @@ class RenderableScene(Protocol):
     @property
     def scene_box(self) -> SceneBox:
         """What is modelled, model space."""
-        ...
 
     @property
     def frame(self) -> Normalisation:
         """From the world of the scene's transforms.json to model space."""
-        ...
 
     @property
     def views(self) -> tuple[RunView, ...]:
         """Training views, then evaluation views, with their cameras."""
-        ...
 
     @property
     def device(self) -> torch.device:
         """Where it is rendered."""
-        ...
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user has to be told of it."""
-        ...
 
     @property
     def outputs(self) -> tuple[Output, ...]:
         """All outputs that take no argument, in the order in which they are offered."""
-        ...
 
     def output(self, name: str) -> Output:
         """An output by its name, which may have an argument as in `band:650nm`.
@@ -117,15 +107,12 @@ class RenderableScene(Protocol):
             ConfigError: there is none, or its argument can't be read.
             SpectrumError: the bands don't cover what it needs.
         """
-        ...
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> RenderedView:
         """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
-        ...
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
         """Outputs of a view by name, (H, W, ...)."""
-        ...
 
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
         """What is seen in a pixel.
@@ -133,4 +120,3 @@ class RenderableScene(Protocol):
         Raises:
             ConfigError: the pixel is outside the image.
         """
-        ...

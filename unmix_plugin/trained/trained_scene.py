@@ -111,12 +111,7 @@ class TrainedScene:
         return available_outputs(self.materials)
 
     def output(self, name: str) -> MaterialOutput:
-        """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`.
-
-        Raises:
-            ConfigError: there is none, or its argument can't be read.
-            SpectrumError: the bands don't cover what it needs.
-        """
+        """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`; errors as those of `find_output`."""
         return find_output(name, self.materials)
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> MaterialView:
@@ -125,12 +120,7 @@ class TrainedScene:
         return MaterialView(self, camera, self.renderer.composite_view(self.field, camera, count))
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
-        """Outputs of a view by name, (H, W, ...).
-
-        Raises:
-            ConfigError: an unknown name, or an argument that can't be read; before anything is rendered.
-            SpectrumError: the bands don't cover what is asked for.
-        """
+        """Outputs of a view by name, (H, W, ...); an unknown one is refused before anything is rendered."""
         outputs = {name: self.output(name) for name in names}
         view = self.look(camera)
         with torch.no_grad():
@@ -138,11 +128,7 @@ class TrainedScene:
 
     @torch.no_grad()
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
-        """What is seen in a pixel: the same numbers as in a render of the whole view.
-
-        Raises:
-            ConfigError: the pixel is outside the image.
-        """
+        """What is seen in a pixel: the same numbers as in a render of the whole view."""
         one = one_pixel(camera, column, row).to(self.device)
         found, materials = self.look(one).coefficients.flatten(), self.materials
         opacity = float(found.accumulation)
