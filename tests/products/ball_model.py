@@ -85,11 +85,7 @@ def seen_surface(
     scene: TrainedScene, directions: list[tuple[float, float, float]], num_rays: int
 ) -> SeenSurface:
     """What the cameras along some directions see of a scene."""
-    cameras = cameras_around(directions)
-    surface = SeenSurface(scene, num_rays, cameras)
-    for camera in cameras:
-        surface.look(camera)
-    return surface
+    return SeenSurface(scene, num_rays, cameras_around(directions))
 
 
 ALL_ROUND = [(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.5, 1.5)]

@@ -27,7 +27,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Mesh
 from unmix_plugin.trained.measures import Scale
 from unmix_plugin.trained.run_views import world_up
-from unmix_plugin.trained.surface import GridPoints, sample_slice
+from unmix_plugin.trained.surface import GridPoints, sample_field
 from unmix_plugin.trained.surface_mesh import (
     TriangleMesh,
     _extract_mesh,
@@ -46,7 +46,9 @@ GRID = GridPoints.over(SCENE.scene_box.aabb, 48)
 
 @pytest.fixture(scope="module")
 def densities():
-    return np.stack([sample_slice(SCENE, GRID.slice_points(index))[0] for index in range(GRID.shape[0])])
+    return np.stack(
+        [sample_field(SCENE, GRID.slice_points(index))[0].numpy() for index in range(GRID.shape[0])]
+    )
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from tests.products.ball_model import INNER_RADIUS, RADIUS, ball_scene
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.products.volume import _write_volume
-from unmix_plugin.trained.surface import GridPoints, sample_densities, sample_slice
+from unmix_plugin.trained.surface import GridPoints, sample_field
 
 SCENE = ball_scene()
 GRID = GridPoints.over(SCENE.scene_box.aabb, 16)
@@ -61,16 +61,16 @@ def test_what_is_never_rendered_is_empty():
     scene = replace(scene, renderer=replace(scene.renderer, skips=skips))
     grid = GridPoints.over(scene.scene_box.aabb, 8)
     for index in range(grid.shape[0]):
-        density, abundances = sample_slice(scene, grid.slice_points(index))
+        density, abundances = sample_field(scene, grid.slice_points(index))
         if index < 4:
             assert density.min() > 0
-            np.testing.assert_allclose(abundances.sum(axis=-1), 1, atol=1e-5)
+            np.testing.assert_allclose(abundances.sum(dim=-1), 1, atol=1e-5)
         else:
             assert density.max() == 0
             assert abundances.max() == 0
     places = torch.tensor([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [-1.5, 0.0, 0.0], [-1.0, 1.0, -1.0]])
     assert scene.renderer.is_occupied(places).tolist() == [True, False, False, True]
-    assert (sample_densities(scene, places) > 0).tolist() == [True, False, False, True]
+    assert (sample_field(scene, places)[0] > 0).tolist() == [True, False, False, True]
 
 
 def test_a_grid_has_its_cells_along_the_longest_edge_and_stays_in_the_box():

@@ -182,9 +182,7 @@ def export(job: Job, asked: PointCloud) -> list[Path]:
     path = job.folder / "points.ply"
     job.claim([path])
     cameras = [view.camera for view in job.views("all")]
-    surface = SeenSurface(job.scene, _RAYS_PER_POINT * count, cameras)
-    for camera in job.follow("looking at the surface", cameras):
-        surface.look(camera)
+    surface = SeenSurface(job.scene, _RAYS_PER_POINT * count, cameras, job.follow)
     with job.working("cleaning and thinning the points"):
         written = _write_point_cloud(path, surface.points(), count, job.scene, job.frame, scores)
     job.say(counted(written, "point"))

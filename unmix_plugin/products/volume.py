@@ -16,7 +16,7 @@ from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import Volume
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import affine_to_world
-from unmix_plugin.trained.surface import GridPoints, sample_slice
+from unmix_plugin.trained.surface import GridPoints, sample_field
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _FASTEST = 1
@@ -61,9 +61,9 @@ def _write_volume(
                 stream, {"descr": "<f4", "fortran_order": False, "shape": shape}
             )
             for index in slices:
-                found, abundances = sample_slice(scene, grid.slice_points(index))
-                density[index] = found * np.float32(frame.scale)
-                stream.write(np.ascontiguousarray(abundances, dtype="<f4").tobytes())
+                found, abundances = sample_field(scene, grid.slice_points(index))
+                density[index] = found.numpy() * np.float32(frame.scale)
+                stream.write(np.ascontiguousarray(abundances.numpy(), dtype="<f4").tobytes())
         for name, values in {"density": density, **others}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, values, allow_pickle=False)

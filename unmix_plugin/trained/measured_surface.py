@@ -15,14 +15,14 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.measures import Scale, describe_area
 from unmix_plugin.trained.regions import Box, InView, OfMaterial, Region
-from unmix_plugin.trained.surface import SeenSurface, SurfaceAppearance, look_from_above
-from unmix_plugin.trained.surface_mesh import Follow, TriangleMesh, Working, surface_of
+from unmix_plugin.trained.surface import Follow, SeenSurface, SurfaceAppearance, in_image, look_from_above
+from unmix_plugin.trained.surface_mesh import TriangleMesh, Working, surface_of
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _CELLS_PER_PIXEL, _RESOLUTIONS = 2, (48, 256)
@@ -94,9 +94,11 @@ class MeasuredSurface:
 
     def shares(self, region: Region) -> Float64[np.ndarray, "F 3"]:
         """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""
-        faces = self.mesh.faces
+        faces, names = self.mesh.faces, self.scene.materials.names
         if isinstance(region, OfMaterial):
-            return _in_material(self.scene, region, self._materials)[faces].astype(np.float64)
+            if region.material >= len(names):
+                raise ConfigError(f"the scene has no material {region.material}; it has {len(names)}")
+            return (self._materials == region.material)[faces].astype(np.float64)
         corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
         points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
         inside = points_in(self.scene, region, torch.from_numpy(points).float())
@@ -143,26 +145,13 @@ def points_in(
     if isinstance(region, Box):
         world = scene.frame.to_world(positions.double().numpy())
         return np.all((world >= region.low) & (world <= region.high), axis=1, keepdims=False)
-    camera = region.camera.to("cpu")
-    coords, depths = camera.project(positions, 0)
-    mask = region.mask()
-    height, width = mask.shape
-    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < torch.tensor([width, height])).all(dim=-1)
-    columns, rows = coords[inside].long().numpy().T
+    camera, mask = region.camera.to("cpu"), region.mask()
+    inside, coords, _ = in_image(camera, positions)
+    columns, rows = coords.long().numpy().T
     inside[inside.clone()] = torch.from_numpy(mask[rows, columns])
     if bool(inside.any()):
         rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
         height, width = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
         part = camera.crop(int(columns[0]), int(rows[0]), width, height)
-        seen = SeenSurface(scene, width * height, [part])
-        seen.look(part)
-        inside[inside.clone()] = seen.shows(positions[inside])
+        inside[inside.clone()] = SeenSurface(scene, width * height, [part]).shows(positions[inside])
     return inside.numpy()
-
-
-def _in_material(
-    scene: TrainedScene, region: OfMaterial, materials: UInt8[np.ndarray, " V"]
-) -> Bool[np.ndarray, " V"]:
-    if region.material >= len(scene.materials.names):
-        raise ConfigError(f"the scene has no material {region.material}; it has {len(scene.materials.names)}")
-    return np.asarray(materials == region.material)

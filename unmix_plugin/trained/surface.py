@@ -11,8 +11,9 @@ Notation: `P` points, `X x Y x Z` grid points, `B` bands, `K` endmembers. Model 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -63,27 +64,29 @@ class SurfacePoints:
 
     def select(self, chosen: Bool[Tensor, " P"] | Int64[Tensor, " chosen"]) -> SurfacePoints:
         """Some of the points."""
-        return SurfacePoints(*(getattr(self, name)[chosen] for name in _POINT_FIELDS))
+        return SurfacePoints(**{name: values[chosen] for name, values in vars(self).items()})
 
     @staticmethod
     def concatenate(parts: Sequence[SurfacePoints]) -> SurfacePoints:
         """The points of all parts, in order."""
-        return SurfacePoints(*(torch.cat([getattr(part, name) for part in parts]) for name in _POINT_FIELDS))
+        return SurfacePoints(*map(torch.cat, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-_POINT_FIELDS = ("positions", "directions", "abundances", "scaled_abundances")
+Follow: TypeAlias = Callable[[str, Sequence[Any]], Iterable[Any]]
+"""The items given, while it is shown how many are done of what is said."""
 
 
 class SeenSurface:
-    """What the cameras of a run see, fed camera by camera."""
+    """What the cameras of a run see."""
 
-    def __init__(self, scene: TrainedScene, num_rays: int, cameras: Sequence[Cameras]) -> None:
-        """
-        Args:
-            scene: What is looked at.
-            num_rays: Rays to cast in all, about: images get more or fewer pixels for it.
-            cameras: One camera each; what `look` is then called with, one after the other.
-        """
+    def __init__(
+        self,
+        scene: TrainedScene,
+        num_rays: int,
+        cameras: Sequence[Cameras],
+        follow: Follow = lambda _doing, items: items,
+    ) -> None:
+        """Look through single cameras, with about so many rays in all: images get more or fewer pixels for it."""
         self._scene = scene
         pixels = sum(camera.width * camera.height for camera in cameras)
         factor = min(max((num_rays / max(pixels, 1)) ** 0.5, _SCALE_BOUNDS[0]), _SCALE_BOUNDS[1])
@@ -91,9 +94,11 @@ class SeenSurface:
         self._factor = max(factor, min(_SIDE_PX / smallest, 1.0))
         self._views: list[tuple[Cameras, Float[Tensor, "H W"]]] = []
         self._points: list[SurfacePoints] = []
+        for camera in follow("looking at the surface", cameras):
+            self._look(camera)
 
     @torch.no_grad()
-    def look(self, camera: Cameras) -> None:
+    def _look(self, camera: Cameras) -> None:
         """Render what one camera sees."""
         width, height = (max(1, round(self._factor * side)) for side in (camera.width, camera.height))
         view = camera.resized(width, height).to("cpu")
@@ -107,13 +112,7 @@ class SeenSurface:
         solid = accumulation >= _SOLID_ACCUMULATION
         if self._scene.renderer.is_unbounded:  # a horizon would dwarf everything else
             solid &= self._scene.scene_box.to("cpu").contains(positions)
-        self._points.append(
-            SurfacePoints(
-                positions[solid],
-                rays.directions[solid],
-                *_shares(found, solid),
-            )
-        )
+        self._points.append(SurfacePoints(positions[solid], rays.directions[solid], *_shares(found, solid)))
 
     def points(self) -> SurfacePoints:
         """Ends of all rays on whose place the cameras agree."""
@@ -153,17 +152,25 @@ class SeenSurface:
         return confirmed, seen_through
 
 
+def in_image(
+    camera: Cameras, positions: Float[Tensor, "P 3"]
+) -> tuple[Bool[Tensor, " P"], Float[Tensor, "inside 2"], Float[Tensor, " inside"]]:
+    """Which points are in a camera's image; of these the places in it, pixels, and the depths."""
+    coords, depths = camera.project(positions, 0)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
+    return inside, coords[inside], depths[inside]
+
+
 def _excess_px(
     camera: Cameras, distances: Float[Tensor, "H W"], positions: Float[Tensor, "P 3"]
 ) -> tuple[Bool[Tensor, " P"], Float[Tensor, " inside"]]:
     """Which points are in the image, and by how many pixels, as large as they are there, it sees farther than each."""
-    coords, depths = camera.project(positions, 0)
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
-    columns, rows = coords[inside].long().unbind(-1)
-    places = camera.poses_at(torch.zeros_like(rows), coords[inside, 1])[:, :, 3]
+    inside, coords, depths = in_image(camera, positions)
+    columns, rows = coords.long().unbind(-1)
+    places = camera.poses_at(torch.zeros_like(rows), coords[:, 1])[:, :, 3]
     own = (positions[inside] - places).norm(dim=-1)
-    return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths[inside]
+    return inside, (distances[rows, columns] - own) * camera.focal_px[0].min() / depths
 
 
 @torch.no_grad()
@@ -242,33 +249,18 @@ class GridPoints:
 
 
 @torch.no_grad()
-def sample_slice(
-    scene: TrainedScene, points: Float[Tensor, "Y Z 3"]
-) -> tuple[Float32[np.ndarray, "Y Z"], Float32[np.ndarray, "Y Z K"]]:
-    """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered."""
-    flat = points.flatten(0, 1).to(scene.device)
+def sample_field(
+    scene: TrainedScene, points: Float[Tensor, "*grid 3"]
+) -> tuple[Float[Tensor, "*grid"], Float[Tensor, "*grid K"]]:
+    """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered. On the CPU."""
+    flat = points.flatten(0, -2).to(scene.device)
     densities = torch.zeros(len(flat), device=scene.device)
     abundances = torch.zeros(len(flat), len(scene.materials.names), device=scene.device)
     for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
         densities[chosen], features = scene.field.get_density(flat[chosen])
         abundances[chosen] = scene.field.abundances_of(features)
-    shape = points.shape[:2]
-    return densities.cpu().unflatten(0, shape).numpy(), abundances.cpu().unflatten(0, shape).numpy()
-
-
-@torch.no_grad()
-def sample_densities(scene: TrainedScene, positions: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """Densities per model unit of any points of the box, 0 in cells that are never rendered; on the CPU."""
-    flat = positions.to(scene.device)
-    densities = torch.zeros(len(flat), device=scene.device)
-    for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
-        densities[chosen] = scene.field.get_density(flat[chosen])[0]
-    return densities.cpu()
-
-
-def may_be_solid(scene: TrainedScene, points: Float[Tensor, "*grid 3"]) -> Bool[Tensor, "*grid"]:
-    """Which points lie where anything may be: not in the space that was found to be empty before training; CPU."""
-    return scene.renderer.is_reachable(points.to(scene.device)).cpu()
+    shape = points.shape[:-1]
+    return densities.cpu().view(shape), abundances.cpu().view(*shape, abundances.shape[1])
 
 
 @dataclass(frozen=True)

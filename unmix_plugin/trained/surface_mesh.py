@@ -10,10 +10,10 @@ Notation: `V` vertices, `F` faces.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -23,13 +23,12 @@ from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.run_views import views_of
 from unmix_plugin.trained.surface import (
+    Follow,
     GridPoints,
     SeenSurface,
     SurfacePoints,
     look_at,
-    may_be_solid,
-    sample_densities,
-    sample_slice,
+    sample_field,
 )
 from unmix_plugin.trained.trained_scene import TrainedScene
 
@@ -106,7 +105,7 @@ def vertex_areas(
 
 def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     """Density per model unit at which the surface lies, from the densities where rays end."""
-    densities = sample_densities(scene, ends.positions)
+    densities, _ = sample_field(scene, ends.positions)
     densities = densities[densities > 0]
     if len(densities) == 0:
         raise RunError(
@@ -155,7 +154,8 @@ def _filled(
     for index in range(len(result)):
         points = grid.slice_points(index)
         unknown = torch.from_numpy(result[index] == 0)
-        unknown[unknown.clone()] = may_be_solid(scene, points[unknown])
+        # Not in the space that was found to be empty before training.
+        unknown[unknown.clone()] = scene.renderer.is_reachable(points[unknown].to(scene.device)).cpu()
         unknown[unknown.clone()] = surface.hides(points[unknown])
         result[index][unknown.numpy()] = solid
     return result
@@ -218,8 +218,8 @@ _NUM_RAYS = 300_000
 """Rays that tell what of the surface is seen."""
 
 
-Follow: TypeAlias = Callable[[str, Sequence[Any]], Iterable[Any]]
 Working: TypeAlias = Callable[[str], AbstractContextManager[None]]
+"""A context that shows that something of unknown length is under way."""
 
 
 def surface_of(
@@ -239,19 +239,16 @@ def surface_of(
         density: Per world unit at which the surface lies; None: that at which rays end.
         smoothing: Standard deviation of the blur, cells.
         keeps_unseen: Whether surfaces that no camera sees stay.
-        follow: The items given, while it is shown how many are done.
-        working: Context that shows that something of unknown length is under way.
+        follow, working: Show how far it is.
     Raises:
         ConfigError: nothing is as dense as was asked for.
         RunError: no camera of the run sees a surface.
     """
     cameras = [view.camera for view in views_of(scene.views, "all")]
-    surface = SeenSurface(scene, _NUM_RAYS, cameras)
-    for camera in follow("looking at the surface", cameras):
-        surface.look(camera)
+    surface = SeenSurface(scene, _NUM_RAYS, cameras, follow)
     grid = GridPoints.over(scene.scene_box.aabb, resolution)
     slices = follow("sampling the density", range(grid.shape[0]))
-    densities = np.stack([sample_slice(scene, grid.slice_points(index))[0] for index in slices])
+    densities = np.stack([sample_field(scene, grid.slice_points(index))[0].numpy() for index in slices])
     with working("finding the surface"):
         ends = surface.points()
         threshold = _surface_density(scene, ends) if density is None else density / scene.frame.scale
