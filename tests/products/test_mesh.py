@@ -32,10 +32,10 @@ from unmix_plugin.trained.surface_mesh import (
     TriangleMesh,
     _extract_mesh,
     _filled,
-    _not_empty,
     _surface_density,
     _trim_unseen,
     _without_stray_pieces,
+    surface_of,
 )
 
 SCENE = ball_scene()
@@ -293,6 +293,5 @@ def test_impossible_settings_are_refused(density, smoothing, said):
 def test_a_surface_that_is_none_is_refused(densities):
     with pytest.raises(ConfigError, match=r"the density asked for; choose a lower --density"):
         _extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
-    empty = TriangleMesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):
-        _not_empty(empty)
+        surface_of(replace(SCENE, views=()), 16, THRESHOLD)

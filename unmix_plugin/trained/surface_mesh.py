@@ -22,14 +22,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int
 from unmix_plugin.errors import ConfigError, RunError
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.trained.run_views import views_of
-from unmix_plugin.trained.surface import (
-    Follow,
-    GridPoints,
-    SeenSurface,
-    SurfacePoints,
-    look_at,
-    sample_field,
-)
+from unmix_plugin.trained.surface import Follow, GridPoints, SeenSurface, SurfacePoints, look_at, sample_field
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _END_QUANTILE = 0.07
@@ -37,20 +30,14 @@ _END_QUANTILE = 0.07
 
 _MOST_MOVED = 3.0
 """Pixels that a vertex is moved at most: deeper, a ray from above went through a hole."""
-_RINGS = 3
-"""Neighbours over which the way that vertices are moved is smoothed."""
-
-_AREA_RINGS = 4
-"""The same of normals, along which areas are taken."""
-
+_RINGS, _AREA_RINGS = 3, 4
+"""Neighbours over which the way that vertices are moved, and normals along which areas are taken, are smoothed."""
 _HEALED_RINGS = 3
 """Gaps of this many vertices between what is seen are not cut: two cameras rarely agree at an edge."""
-
-_SMALLEST_PART = 0.01
-"""Pieces with fewer faces than this, relative to the largest, are stray."""
-
-_LEAST_FACES = 8
-"""So are pieces of fewer than these, where there is a larger one."""
+_SMALLEST_PART, _LEAST_FACES = 0.01, 8
+"""Pieces with fewer faces than this part of those of the largest, or than so many, are stray."""
+_NUM_RAYS = 300_000
+"""Rays that tell what of the surface is seen."""
 
 
 @dataclass(frozen=True)
@@ -214,10 +201,6 @@ def _where_rays_end(scene: TrainedScene, mesh: TriangleMesh) -> TriangleMesh:
     return TriangleMesh(mesh.vertices - moved[:, None] * normals, mesh.faces)
 
 
-_NUM_RAYS = 300_000
-"""Rays that tell what of the surface is seen."""
-
-
 Working: TypeAlias = Callable[[str], AbstractContextManager[None]]
 """A context that shows that something of unknown length is under way."""
 
@@ -250,20 +233,14 @@ def surface_of(
     slices = follow("sampling the density", range(grid.shape[0]))
     densities = np.stack([sample_field(scene, grid.slice_points(index))[0].numpy() for index in slices])
     with working("finding the surface"):
-        ends = surface.points()
-        threshold = _surface_density(scene, ends) if density is None else density / scene.frame.scale
+        found = _surface_density(scene, surface.points()) if density is None else density / scene.frame.scale
         solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
-        mesh = _extract_mesh(solid, grid, threshold, smoothing, scene.pixel_size)
+        mesh = _extract_mesh(solid, grid, found, smoothing, scene.pixel_size)
         if density is None:
             mesh = _where_rays_end(scene, mesh)
         mesh = _without_stray_pieces(mesh if keeps_unseen else _trim_unseen(mesh, surface))
-    return _not_empty(mesh), threshold
-
-
-def _not_empty(mesh: TriangleMesh) -> TriangleMesh:
-    """The mesh; a RunError where nothing is left of it."""
     if len(mesh.faces) == 0:
         raise RunError(
             "nothing is left of the surface: no camera of the run sees it; keep it with --unseen keep"
         )
-    return mesh
+    return mesh, found
