@@ -23,7 +23,6 @@ differences of renders, since one-sided ones stop early.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -51,11 +50,8 @@ def render_aligned(
     in as many rays a pixel as its sensor asks for.
 
     Args:
-        scene: What renders.
-        camera: Of the view.
-        measured: The scene that the view is of.
-        index: Of the view among its frames.
-        truth: What was measured of it.
+        scene, camera: What renders, and from where.
+        measured, index, truth: The scene that the view is of, which frame it is, and what was measured of it.
     """
     if "pose" in scene.fitted:
         align = align_rows if camera.is_line_camera(0) else align_pose
@@ -122,9 +118,6 @@ _DIFFERENCE_PX = 0.5
 _SMALLEST_STEP_PX = 0.05
 """Below which no further step is taken on a picture."""
 
-_Residuals = Callable[[Float[Tensor, "m 6"]], Float[Tensor, "m n"]]
-"""Of each of some steps."""
-
 
 @torch.no_grad()
 def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Cameras:
@@ -137,26 +130,21 @@ def align_pose(scene: TrainedScene, camera: Cameras, truth: ViewTruth) -> Camera
         comparison = _Comparison.of(scene, _shrunk(camera, side), truth, axes)
         if side == _SIDES_PX[0]:
             step = _best_start(comparison)
-        step = _fit(comparison.residuals, step, count, comparison.difference)
+        step = comparison.fit(step, count)
     return _moved(camera, step, scene)
 
 
 def _best_start(comparison: _Comparison) -> Float[Tensor, "6"]:
     """A few steps from the given pose, or from where coarse pictures lead if that is clearly better."""
 
-    def fit(start: Float[Tensor, "6"]) -> tuple[Float[Tensor, "6"], float]:
-        found = _fit(comparison.residuals, start, _FIRST_STEPS, comparison.difference)
-        return found, comparison.error(found)
-
     near = torch.zeros(6)
     for block, num_moves in _POOLED:
-        pooled = replace(comparison, block=block)
-        near = _fit(pooled.residuals, near, _POOLED_STEPS, pooled.difference, num_moves)
-    (stayed, error), apart = fit(torch.zeros(6)), _APART_PX / _DIFFERENCE_PX * comparison.difference
-    if float(near.norm()) < apart:
+        near = replace(comparison, block=block).fit(near, _POOLED_STEPS, num_moves)
+    stayed = comparison.fit(torch.zeros(6), _FIRST_STEPS)
+    if float(near.norm()) < _APART_PX / _DIFFERENCE_PX * comparison.difference:
         return stayed
-    found, other_error = fit(near)
-    return found if other_error < _CLEARLY_BETTER * error else stayed
+    found = comparison.fit(near, _FIRST_STEPS)
+    return found if comparison.error(found) < _CLEARLY_BETTER * comparison.error(stayed) else stayed
 
 
 @dataclass(frozen=True)
@@ -201,6 +189,32 @@ class _Comparison:
         """A turn that moves the picture by half a pixel, in radians."""
         return _DIFFERENCE_PX / float(self.camera.focal_px.mean())
 
+    def fit(self, start: Float[Tensor, "6"], count: int, num_moves: int = 6) -> Float[Tensor, "6"]:
+        """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`, in the
+        first numbers of a pose."""
+        best, found = start, self.residuals(start[None])[0]
+        axes = self.difference * torch.eye(6)[:num_moves]
+        damping = _DAMPING
+        for _ in range(count):
+            ahead, behind = self.residuals(best + torch.cat([axes, -axes])).double().chunk(2)
+            slopes = (ahead - behind).T / (2 * self.difference)
+            normal, pull = slopes.T @ slopes, slopes.T @ found.double()
+            for _ in range(_TRIES):
+                ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(num_moves).double()
+                tried = best - torch.linalg.solve(normal + ridge, pull).float() @ torch.eye(6)[:num_moves]
+                tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
+                seen = self.residuals(tried[None])[0]
+                if float(seen.square().sum()) < float(found.square().sum()):
+                    change = float((tried - best).norm()) / self.difference * _DIFFERENCE_PX
+                    best, found, damping = tried, seen, damping / 3
+                    if change < _SMALLEST_STEP_PX:
+                        return best
+                    break
+                damping *= 10
+            else:
+                return best
+        return best
+
     def residuals(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m n"]:
         """Shown less measured, of each pixel or block and channel, after each step."""
         seen = self._shown(steps)
@@ -229,10 +243,19 @@ class _Comparison:
         return _fitted_gain(power, agreement, self.terms)
 
     def _shown(self, steps: Float[Tensor, "m 6"]) -> Float[Tensor, "m P D"]:
+        """What the camera sees after each step: pictures rendered as one; all channels where a gain is fitted."""
         is_coarse = self.block == 1 and max(self.camera.width, self.camera.height) <= _SIDES_PX[0]
+        subpixels = 2 if is_coarse else 1
+        height, width = subpixels * self.camera.height, subpixels * self.camera.width
         cameras = [_moved(self.camera, step, self.scene) for step in steps]
-        axes = self.axes if self.terms is None else None
-        return _shown(self.scene, cameras, self.truth, axes, subpixels=2 if is_coarse else 1)
+        rays = [camera.resized(width, height).to(self.scene.device).image_rays(0) for camera in cameras]
+        found = self.scene.renderer.composite(self.scene.field, RayBundle.join(rays))
+        view = MaterialView(self.scene, cameras[0], found.unflatten(len(cameras) * height, width))
+        opacity = view.opacity if self.truth.alpha is not None else torch.ones_like(view.opacity)
+        seen = self.truth.seen(view["spectral"]).float()
+        seen = seen if self.terms is not None else seen @ self.axes.to(view.opacity)
+        values = torch.cat([seen, opacity[..., None]], dim=-1).unflatten(0, (len(cameras), height))
+        return torch.nn.functional.avg_pool2d(values.permute(0, 3, 1, 2), subpixels).flatten(2).mT.cpu()
 
     def _blocks(self, pixels: Float[Tensor, "m P x"]) -> Float[Tensor, "m n x"]:
         """Means over blocks of pixels."""
@@ -264,35 +287,6 @@ def _moved(camera: Cameras, step: Float[Tensor, "6"], scene: TrainedScene) -> Ca
     )
 
 
-def _fit(
-    residuals: _Residuals, start: Float[Tensor, "6"], count: int, difference: float, num_moves: int = 6
-) -> Float[Tensor, "6"]:
-    """Levenberg-Marquardt steps from `start` that each lower the sum of squares, within `LARGEST_STEP`, in the first
-    numbers of a pose."""
-    best, found = start, residuals(start[None])[0]
-    axes = torch.eye(6)[:num_moves]
-    damping = _DAMPING
-    for _ in range(count):
-        ahead, behind = residuals(best + torch.cat([difference * axes, -difference * axes])).double().chunk(2)
-        slopes = (ahead - behind).T / (2 * difference)
-        normal, pull = slopes.T @ slopes, slopes.T @ found.double()
-        for _ in range(_TRIES):
-            ridge = damping * normal.diagonal().mean().clamp(min=1e-12) * torch.eye(num_moves).double()
-            tried = best - torch.linalg.solve(normal + ridge, pull).float() @ axes
-            tried = tried.clamp(-LARGEST_STEP, LARGEST_STEP)
-            seen = residuals(tried[None])[0]
-            if float(seen.square().sum()) < float(found.square().sum()):
-                change = float((tried - best).norm()) / difference * _DIFFERENCE_PX
-                best, found, damping = tried, seen, damping / 3
-                if change < _SMALLEST_STEP_PX:
-                    return best
-                break
-            damping *= 10
-        else:
-            return best
-    return best
-
-
 def _shrunk(camera: Cameras, side: int) -> Cameras:
     """The same view in fewer pixels; both edges shrink by about as much."""
     share = min(1.0, side / max(camera.width, camera.height))
@@ -307,25 +301,6 @@ def _shrunk(camera: Cameras, side: int) -> Cameras:
         height=height,
         key_poses=None if keys is None else replace(keys, heights=keys.heights * scale[1]),
     )
-
-
-def _shown(
-    scene: TrainedScene,
-    cameras: list[Cameras],
-    truth: ViewTruth,
-    axes: Float[Tensor, "b C"] | None,
-    subpixels: int,
-) -> Float[Tensor, "m P D"]:
-    """What each camera sees: pictures of equal size, rendered as one; all channels without axes."""
-    height, width = subpixels * cameras[0].height, subpixels * cameras[0].width
-    rays = [camera.resized(width, height).to(scene.device).image_rays(0) for camera in cameras]
-    found = scene.renderer.composite(scene.field, RayBundle.join(rays))
-    view = MaterialView(scene, cameras[0], found.unflatten(len(cameras) * height, width))
-    opacity = view.opacity if truth.alpha is not None else torch.ones_like(view.opacity)
-    seen = truth.seen(view["spectral"]).float()
-    seen = seen if axes is None else seen @ axes.to(view.opacity)
-    values = torch.cat([seen, opacity[..., None]], dim=-1).unflatten(0, (len(cameras), height))
-    return torch.nn.functional.avg_pool2d(values.permute(0, 3, 1, 2), subpixels).flatten(2).mT.cpu()
 
 
 @torch.no_grad()
