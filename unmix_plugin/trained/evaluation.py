@@ -131,16 +131,8 @@ _HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
 
 _VIEW_FIGURES = (
-    "psnr",
-    "psnr_matter",
-    "psnr_unsaturated",
-    "psnr_matter_unsaturated",
-    "psnr_white",
-    "rmse",
-    "ssim",
-    "sam",
-    "rgb_psnr",
-    "abundance_rmse",
+    *("psnr", "psnr_matter", "psnr_unsaturated", "psnr_matter_unsaturated", "psnr_white"),
+    *("rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse"),
 )
 """Figures of every view, as far as there is truth for them."""
 
@@ -303,39 +295,35 @@ class Evaluation:
                 f"view {view.name} was measured with {measured[1]} x {measured[0]} pixels; its camera in the run has "
                 f"{rendered[1]} x {rendered[0]}; name the scene that the run was trained on with --data"
             )
-        valid = None if bool(view.valid.all()) else view.valid
-        spectra = view.shown(predicted)
-        blown_out = view.blown_out
-        fits_window = min(spectra.shape[:2]) >= SSIM_WINDOW_PX
-        figures = {
-            "psnr": psnr(spectra, view.spectra, valid),
-            "psnr_matter": psnr(spectra, view.spectra, view.shows_matter),
-            "psnr_unsaturated": psnr(spectra, view.spectra, view.valid & ~blown_out),
-            "psnr_matter_unsaturated": psnr(spectra, view.spectra, view.shows_matter & ~blown_out),
-            "psnr_white": math.nan
-            if view.alpha is None
-            else psnr_over_white(spectra, predicted.accumulation, view.spectra, view.alpha, valid),
-            "rmse": rmse(spectra, view.spectra, valid),
-            "ssim": ssim(spectra, view.spectra, valid) if fits_window else math.nan,
-            "sam": sam(spectra, view.spectra, view.shows_matter),
-            "rgb_psnr": psnr(self._srgb(spectra), self._srgb(view.spectra), valid)
-            if view.sensor is None
-            else math.nan,
+        spectra, target, valid, matter = view.shown(predicted), view.spectra, view.valid, view.shows_matter
+        exposed = ~view.blown_out
+        figures = dict.fromkeys(_VIEW_FIGURES, math.nan) | {
+            "psnr": psnr(spectra, target, valid),
+            "psnr_matter": psnr(spectra, target, matter),
+            "psnr_unsaturated": psnr(spectra, target, valid & exposed),
+            "psnr_matter_unsaturated": psnr(spectra, target, matter & exposed),
+            "rmse": rmse(spectra, target, valid),
+            "sam": sam(spectra, target, matter),
             "abundance_rmse": self._abundance_rmse(view, predicted),
         }
+        if view.alpha is not None:
+            figures["psnr_white"] = psnr_over_white(
+                spectra, predicted.accumulation, target, view.alpha, valid
+            )
+        if min(spectra.shape[:2]) >= SSIM_WINDOW_PX:
+            figures["ssim"] = ssim(spectra, target, valid)
+        if view.sensor is None:
+            figures["rgb_psnr"] = psnr(self._srgb(spectra), self._srgb(target), valid)
         if self._tally is not None and (labels := view.counted_labels) is not None:
             self._tally.add(predicted.segmentation, labels)
         self.per_view[view.name] = figures
         centers = torch.tensor(self.truth.bands.centers_nm)
-        measured, error = (
-            view.spectra[view.valid].double(),
-            spectra[view.valid].double().clamp(0, 1) - view.spectra[view.valid],
-        )
+        known = target[valid].double()
         self.bands[view.name] = BandErrors(
             as_numpy(view.seen(centers)),
-            as_numpy(measured.mean(dim=0)),
-            as_numpy(error.square().mean(dim=0)),
-            len(measured),
+            as_numpy(known.mean(dim=0)),
+            as_numpy((spectra[valid].double().clamp(0, 1) - known).square().mean(dim=0)),
+            len(known),
         )
         return figures
 
