@@ -187,7 +187,7 @@ def materials(run: Path, folder: Path) -> dict[str, float]:
     light, true, found, shaded, abundances = parts
     error = relative_error(found, true)
     return {
-        "endmember_angle": endmember_angle(endmembers, true_endmembers, torch.ones_like(lamp)),
+        "endmember_angle": endmember_angle(endmembers, true_endmembers),
         "error_correlation": correlation(error, light),
         "shaded_correlation": correlation(relative_error(shaded, true), light),
         "within_correlation": correlation(left_over(error, abundances), left_over(light, abundances)),

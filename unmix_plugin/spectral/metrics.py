@@ -157,18 +157,14 @@ def match_endmembers(
     )
 
 
-def endmember_angle(
-    pred_endmembers: Float[Tensor, "P B"],
-    true_reflectance: Float[Tensor, "K B"],
-    illuminant: Float[Tensor, " B"],
-) -> float:
-    """Mean angle in radians between true endmember radiance, reflectance x illuminant, and its match.
+def endmember_angle(pred_endmembers: Float[Tensor, "P B"], true_endmembers: Float[Tensor, "K B"]) -> float:
+    """Mean angle in radians between true endmembers, in the light that the predicted ones are seen in, and their matches.
 
     The mean is over true materials: one without a match counts pi/2, surplus predicted endmembers do not count.
     """
-    matching = match_endmembers(pred_endmembers, true_reflectance.double() * illuminant.double())
-    num_unmatched = len(true_reflectance) - len(matching.true_ids)
-    return (sum(matching.angles) + num_unmatched * math.pi / 2) / len(true_reflectance)
+    matching = match_endmembers(pred_endmembers, true_endmembers)
+    num_unmatched = len(true_endmembers) - len(matching.true_ids)
+    return (sum(matching.angles) + num_unmatched * math.pi / 2) / len(true_endmembers)
 
 
 def abundance_rmse(
@@ -179,8 +175,8 @@ def abundance_rmse(
 ) -> float:
     """Root mean squared error of abundances over pixels and true materials; NaN where no pixel counts.
 
-    A true material without a match is predicted as 0. A surplus predicted endmember has no column of its own: what it
-    takes is missing from the others. Without a mask, pixels count whose true abundances are not all zero.
+    A true material without a match is predicted as 0; what a surplus predicted endmember takes is missing from the
+    others. Without a mask, pixels count whose true abundances are not all zero.
     """
     if mask is None:
         mask = true_abundances.sum(dim=-1) > 0
@@ -195,11 +191,8 @@ def _rows(
     mask: Bool[Tensor, "H W"] | None,
     opacities: tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]] | None = None,
 ) -> Iterator[tuple[Float[Tensor, "h W C"], Float[Tensor, "h W C"], Bool[Tensor, "h W"]]]:
-    """A few rows at a time: prediction clamped and truth, both in float64, and the pixels that count.
-
-    Args:
-        opacities: Of both images, to lay them over white; None leaves them on black.
-    """
+    """A few rows at a time: prediction clamped and truth, both in float64, over white where `opacities` are given; and
+    the pixels that count."""
     height, width, channels = pred_image.shape
     if mask is None:
         mask = torch.ones(height, width, dtype=torch.bool, device=target_image.device)
@@ -232,6 +225,6 @@ def _root_mean_square(
 
 
 def _unit(spectra: Tensor) -> Tensor:
-    """Spectra of length 1; zero ones stay zero (dividing by 1, not by a tiny number, keeps their gradient finite)."""
+    # Zero spectra stay zero: dividing by 1, not by a tiny number, keeps their gradient finite.
     lengths = spectra.norm(dim=-1, keepdim=True)
     return spectra / torch.where(lengths > 0, lengths, 1.0)

@@ -356,8 +356,7 @@ class Evaluation:
         scores, truth = self.segmentation(), self.truth
         angle = math.nan
         if truth.endmembers is not None:
-            flat = torch.ones(len(truth.bands))  # the light is in the true spectra already
-            angle = endmember_angle(self.endmembers, truth.endmembers, flat)
+            angle = endmember_angle(self.endmembers, truth.endmembers)
         matched = {"miou": scores.miou, "macro_f1": scores.macro_f1, "accuracy": scores.accuracy}
         counts = {"views": len(self.per_view), "bands": len(truth.bands)}
         return {**means, **matched, "endmember_angle": angle, **counts}

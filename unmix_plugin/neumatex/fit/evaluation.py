@@ -118,12 +118,11 @@ def _material_metrics(
     reflectance = true_shares @ true_endmembers
     shares, endmembers = family.abundances(parameters), family.endmembers.detach()
     matching = match_endmembers(endmembers, true_endmembers)
-    flat = torch.ones_like(true_endmembers[0])  # both are reflectances
     return {
         "base_colour_psnr": float(psnr_db((base - reflectance).square())),
         "reflectance_angle": float(spectral_angle(base.double(), reflectance.double()).mean()),
         "abundance_rmse": abundance_rmse(shares[:, None], true_shares[:, None], matching),
-        "endmember_angle": endmember_angle(endmembers, true_endmembers, flat),
+        "endmember_angle": endmember_angle(endmembers, true_endmembers),
     }
 
 
