@@ -11,7 +11,8 @@ from torch import Tensor
 from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
 
-FEWEST_BANDS = 8
+FEWEST_BANDS, _PIXELS_PER_BAND = 8, 10
+"""Least number of bands, and of pixels for each, from which noise can be estimated."""
 _USUAL_SHARE, _USUAL_FACTOR = 0.95, 1.5
 """Deviations up to that multiple of what this share of the pixels has are usual."""
 _LEAST_DEVIATION = 0.3
@@ -24,8 +25,6 @@ REACH_PX = 2
 """Pixels around one that it is compared with."""
 _MOST_ALIKE = 5
 """Of these 24, so many may deviate like a bad value, as those of its line do; at the corner of a real thing, 8 do."""
-_FEWEST_JUDGED_BANDS, _PIXELS_PER_BAND = 8, 10
-"""Least number of bands, and of pixels for each, from which noise can be estimated."""
 _PLAIN_FACTOR = 3.0
 """Noise up to this multiple of the usual band's weighs nothing down."""
 _PLAIN_NOISE = 0.02
@@ -49,11 +48,7 @@ def deviations(spectra: Float[Tensor, "*pixels B"]) -> Float[Tensor, "*pixels B"
 
 
 def deviation_limits(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "B"]:
-    """Deviations from which a value may be bad.
-
-    Args:
-        pixels: Spectra of the scene, background left out; at least one.
-    """
+    """Deviations from which a value may be bad, from at least one of the scene's spectra, background left out."""
     rank = min(max(1, round(_USUAL_SHARE * len(pixels))), len(pixels))
     usual = deviations(pixels).abs().kthvalue(rank, dim=0).values
     floor = _LEAST_DEVIATION * pixels.square().mean(dim=1).sqrt().median()
@@ -91,10 +86,7 @@ def repaired(
 
 
 def _around(
-    found: Float[Tensor, "H W B"],
-    rows: Int[Tensor, " C"],
-    columns: Int[Tensor, " C"],
-    bands: Int[Tensor, " C"],
+    found: Float[Tensor, "H W B"], rows: Int[Tensor, " C"], columns: Tensor, bands: Tensor
 ) -> Float[Tensor, "C 24"]:
     """Deviations in the same band of the pixels around candidates."""
     reach = torch.arange(-REACH_PX, REACH_PX + 1)
@@ -132,19 +124,16 @@ class BandNoise:
 
 
 def judge_bands(pixels: Float[Tensor, "N B"]) -> BandNoise:
-    """Noise from what the other bands can't predict of a band, as HySime has it, but by median absolute deviations.
-
-    Args:
-        pixels: Spectra of a scene, background left out.
-    """
+    """Noise from what the other bands can't predict of a band, as HySime has it, but by median absolute deviations."""
     num_bands = pixels.shape[1]
-    if num_bands < _FEWEST_JUDGED_BANDS or len(pixels) < _PIXELS_PER_BAND * num_bands:
+    if num_bands < FEWEST_BANDS or len(pixels) < _PIXELS_PER_BAND * num_bands:
         return BandNoise.unknown(num_bands)
     dead = pixels.double().std(dim=0) <= _DEAD_SPREAD
-    if int((~dead).sum()) < _FEWEST_JUDGED_BANDS:
+    if int((~dead).sum()) < FEWEST_BANDS:
         return replace(BandNoise.unknown(num_bands), dead=dead)
     sigmas = pixels.new_zeros(num_bands)
-    sigmas[~dead] = _robust_spread(estimate_noise(pixels[:, ~dead]))
+    noise = estimate_noise(pixels[:, ~dead])
+    sigmas[~dead] = _SIGMA_OF_MAD * (noise - noise.median(dim=0).values).abs().median(dim=0).values
     usual = torch.maximum(sigmas[~dead].median(), _PLAIN_NOISE * brightness(pixels[:, ~dead]).median())
     weights = (_PLAIN_FACTOR * usual / sigmas.clamp(min=1e-12)).square().clamp(_LEAST_WEIGHT, 1.0)
     weights = torch.where(dead, _LEAST_WEIGHT, weights)
@@ -152,7 +141,3 @@ def judge_bands(pixels: Float[Tensor, "N B"]) -> BandNoise:
         weights = weights / weights.mean()
     is_noise = (sigmas > _NOISE_SHARE * pixels.std(dim=0)) & (weights < 1) & ~dead
     return BandNoise(sigmas, weights, is_noise, dead)
-
-
-def _robust_spread(values: Float[Tensor, "N B"]) -> Float[Tensor, "B"]:
-    return _SIGMA_OF_MAD * (values - values.median(dim=0).values).abs().median(dim=0).values

@@ -19,16 +19,12 @@ from unmix_plugin.errors import SpectrumError, counted, name_some
 
 VISIBLE_RANGE_NM = (380.0, 780.0)
 """What a band must lie in to count as visible: the range in which colour matching functions are noticeably non-zero."""
-
 _MEASURABLE_RANGE_NM = (20.0, 1e6)
 """Where optical sensors measure; numbers below are wavelengths in micrometres, numbers above are in no unit."""
-
 _LEAST_NM = 100.0
 """Smaller numbers are wavelengths of no camera in nm: whole ones in a list of bands are numbers of bands."""
-
 _LONE_BAND_WIDTH_NM = 10.0
 """Width given to a band that has no neighbour to tell its spacing."""
-
 _LEAST_GAP = 2.5
 """A step so many times the spacing beside it is a gap. Two bands missing from an even sampling leave one; a single one,
 or the uneven steps of a multispectral camera, do not."""
@@ -139,8 +135,7 @@ class Bands:
     @property
     def visible_mask(self) -> Bool[np.ndarray, " B"]:
         """Which bands have their centre inside `VISIBLE_RANGE_NM`, ends included."""
-        low, high = VISIBLE_RANGE_NM
-        return (self.centers_nm >= low) & (self.centers_nm <= high)
+        return (self.centers_nm >= VISIBLE_RANGE_NM[0]) & (self.centers_nm <= VISIBLE_RANGE_NM[1])
 
     def contains(self, wavelength_nm: float | int, up_to_nm: float | int | None = None) -> bool:
         """Whether a wavelength lies in some band's interval; or all that lies from it to another."""
@@ -232,9 +227,7 @@ def _require_increasing(centers: np.ndarray) -> None:
         if not holds.all():
             i = int(np.argmin(holds))
             raise SpectrumError(f"wavelengths must {rule}; found {centers[i]:g} nm at index {i}")
-    steps = np.diff(centers)
-    if (steps <= 0).any():
-        i = int(np.argmax(steps <= 0))
+    for i in np.flatnonzero(np.diff(centers) <= 0).tolist():
         raise SpectrumError(
             f"wavelengths must strictly increase; found {centers[i]:g} nm at index {i} "
             f"then {centers[i + 1]:g} nm at index {i + 1}; sort the bands and drop repeated ones"
@@ -246,12 +239,9 @@ def integrals_up_to(
     spectra: Float64[np.ndarray, "S N"],
     samples_nm: Float64[np.ndarray, " N"],
 ) -> Float64[np.ndarray, "S M"]:
-    """Integral of each spectrum from one common start to each wavelength: only differences between them mean anything.
+    """Integral of each spectrum, known at `samples_nm`, from one common start to each wavelength, both increasing.
 
-    Args:
-        wavelengths_nm: Increasing; beyond the samples the outermost values are held.
-        spectra: A spectrum a row.
-        samples_nm: Where their values are known, increasing.
+    Only differences between integrals mean anything. Beyond the samples the outermost values are held.
     """
     nodes = np.union1d(samples_nm, wavelengths_nm)
     values = np.stack([np.interp(nodes, samples_nm, spectrum) for spectrum in spectra])

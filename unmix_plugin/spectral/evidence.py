@@ -22,7 +22,6 @@ OPAQUE_ALPHA = 0.99
 _TRANSPARENT = 0.5 / 255
 """Largest alpha of a pixel that shows nothing."""
 _BLOWN_OUT = 0.9
-"""Value from which a band counts as saturated."""
 _SIGMAS = 6.0
 """Standard deviations of the background's noise above its median that still count as background."""
 _SIGMA_OF_MAD = 1.4826
@@ -51,10 +50,8 @@ def brightness(spectra: Float[Tensor, "R B"]) -> Float[Tensor, "R"]:
 
 
 def is_blown_out(spectra: Float[Tensor, "*pixels B"]) -> Bool[Tensor, "*pixels"]:
-    """Pixels with a band near the sensor's full scale of 1: the light was at least that strong.
-
-    From 0.9 on, since cameras, filters and codecs end a little below full scale.
-    """
+    """Pixels with a band above 0.9: cameras, filters and codecs end a little below full scale. The light was at least
+    so strong."""
     return (spectra > _BLOWN_OUT).any(dim=-1)
 
 
@@ -76,14 +73,10 @@ def background_level(spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"]) -
 def alpha_trust(
     spectra: Float[Tensor, "R B"], alpha: Float[Tensor, "R"], background: float | None
 ) -> Float[Tensor, "R"]:
-    """How far alpha can be trusted, 0 or 1.
+    """How far alpha can be trusted, 0 or 1; `background` is as `background_level` gives it.
 
     Not where a pixel sends more light than its alpha lets through, nor where alpha says that something is there and
     the light can't be told from the background's.
-
-    Args:
-        spectra, alpha: Of the pixels.
-        background: As `background_level` gives it.
     """
     if background is None:
         return torch.ones_like(alpha)
@@ -102,23 +95,16 @@ def may_show_matter(
 
 
 def exposure_of(pixels: Float[Tensor, "R B"]) -> float:
-    """Factor that makes dark spectra as bright as those of a well exposed scene, at least 1.
-
-    Args:
-        pixels: Of the whole scene, opaque ones.
-    """
+    """Factor that makes dark spectra as bright as those of a well exposed scene, by its opaque pixels; 1 to 100."""
     median = float(brightness(pixels).median()) if len(pixels) else _PLAIN_BRIGHTNESS
     return min(max(_PLAIN_BRIGHTNESS / max(median, 1e-9), 1.0), _LARGEST_EXPOSURE)
 
 
 def relative_power_of(pixels: Float[Tensor, "R B"]) -> float:
-    """Power of brightness by which squared errors should be divided, [0, 1.5], from how uneven the brightness is.
+    """Power of brightness by which squared errors should be divided, [0, 1.5], by how uneven its opaque pixels are.
 
     In most scenes the brighter tenth of the pixels is about twice as bright as the usual one, and absolute errors are
     right: 0. Where it is more than five times as bright, they would hardly tell of the dark rest: 1.5.
-
-    Args:
-        pixels: Of the whole scene, opaque ones.
     """
     seen = brightness(pixels)
     if len(seen) == 0 or (median := float(seen.median())) <= 0:
@@ -140,10 +126,7 @@ def over_background(
 def forgive_saturation(
     pred_spectra: Float[Tensor, "R B"], target_spectra: Float[Tensor, "R B"], measured: Float[Tensor, "R B"]
 ) -> Float[Tensor, "R B"]:
-    """The prediction, but the target itself where the sensor was saturated and the prediction is brighter still.
-
-    A measured 1 only says that the light was at least so strong.
-    """
+    """The prediction, but the target where it is brighter than a saturated sensor could measure."""
     return torch.where((measured >= 1) & (pred_spectra > target_spectra), target_spectra, pred_spectra)
 
 

@@ -84,9 +84,7 @@ def absorption(
     neighbours. Without an absorption depth and area are 0; one below `LEAST_DEPTH` has no centre, NaN.
 
     Args:
-        spectra: Of the bands looked at alone, three or more: what lies outside bears no continuum.
-        wavelengths_nm: Of these bands.
-        measure: Which of its numbers.
+        spectra, wavelengths_nm: Of the bands looked at alone, three or more: what lies outside bears no continuum.
     Source:
         Clark and Roush 1984; the parabola: Rodger et al. 2012, Remote Sensing of Environment 118.
     """

@@ -158,7 +158,7 @@ def match_endmembers(
 
 
 def endmember_angle(pred_endmembers: Float[Tensor, "P B"], true_endmembers: Float[Tensor, "K B"]) -> float:
-    """Mean angle in radians between true endmembers, in the light that the predicted ones are seen in, and their matches.
+    """Mean angle in radians between true endmembers, in the light that the predicted ones are in, and their matches.
 
     The mean is over true materials: one without a match counts pi/2, surplus predicted endmembers do not count.
     """

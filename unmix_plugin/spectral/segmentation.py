@@ -40,10 +40,7 @@ def material_scores(
 def material_ids(
     scores: Float[Tensor, "*rays K"], accumulations: Float[Tensor, "*rays"], threshold: float = 0.5
 ) -> UInt8[Tensor, "*rays"]:
-    """The best-scoring material of each ray, 255 where accumulation is below the threshold.
-
-    Raises:
-        SpectrumError: more than 255 materials, which ids of 8 bits can't tell apart from "nothing here".
+    """The best-scoring material of each ray, 255 where accumulation is below the threshold; of at most 255 materials.
 
     >>> material_ids(torch.tensor([[0.1, 0.9], [0.9, 0.1]]), torch.tensor([1.0, 0.2]))
     tensor([  1, 255], dtype=torch.uint8)
@@ -73,22 +70,14 @@ class SegmentationTally:
     """Confusion counts of a scene, fed view by view; memory does not grow with views."""
 
     def __init__(self, num_pred: int, num_true: int) -> None:
-        """Start with nothing counted, for K predicted and M true materials.
-
-        Raises:
-            SpectrumError: more than 255 of either, or none.
-        """
+        """Start with nothing counted, for 1 to 255 predicted and true materials."""
         _require_countable(num_pred)
         _require_countable(num_true)
         self.confusion: Int64[np.ndarray, "rows M"] = np.zeros((num_pred + 1, num_true), dtype=np.int64)
         """Pixels by predicted id and true label; the last row counts predictions of 255."""
 
     def add(self, pred_ids: UInt8[Tensor, "*pixels"], true_labels: UInt8[Tensor, "*pixels"]) -> None:
-        """Count one view.
-
-        Raises:
-            SpectrumError: an id or label that is neither below the declared number nor 255.
-        """
+        """Count one view; an id or label that is neither below the declared number nor 255 is refused."""
         num_pred, num_true = self.confusion.shape[0] - 1, self.confusion.shape[1]
         pred, true = (ids.detach().cpu().long().numpy().ravel() for ids in (pred_ids, true_labels))
         _require_known(pred, num_pred, "predicted ids")

@@ -25,7 +25,6 @@ from unmix_plugin.spectral.library.spectra_csv import SpectraTable, read_spectra
 
 _MOST_UNSEEN = 0.01
 """Largest part of a channel's response that may lie where there are no bands."""
-
 _CENTER_DECIMALS = 3
 """Digits of a centre in nm: more would be noise of the integration, and the names of files' channels have to differ."""
 
@@ -164,11 +163,6 @@ class SceneSensor:
     matrix: Float64[np.ndarray, "b B"]
     """A channel's value is its row times the spectrum. Rows are not negative and sum to 1."""
 
-    @staticmethod
-    def _of_bands(name: str, bands: tuple[int, ...], num_bands: int) -> SceneSensor:
-        """A sensor whose channels are some bands of the scene, in any order."""
-        return SceneSensor(name, np.eye(num_bands)[list(bands)])
-
     @cached_property
     def bands(self) -> tuple[int, ...] | None:
         """The band that each channel is; None where channels are means over several."""
@@ -215,7 +209,7 @@ class SceneSensor:
             KeyError, IndexError, TypeError, ValueError: no sensor of a scene with so many bands.
         """
         if "bands" in values:
-            return SceneSensor._of_bands(str(values["name"]), tuple(values["bands"]), num_bands)
+            return SceneSensor(str(values["name"]), np.eye(num_bands)[list(values["bands"])])
         matrix = np.array(values["responses"], dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[1] != num_bands or not matrix.min(initial=0.0) >= 0:
             raise ValueError(

@@ -20,8 +20,7 @@ from unmix_plugin.spectral.evidence import brightness
 from unmix_plugin.spectral.unmixing.num_materials import estimate_noise
 
 _FEWEST_SPECTRA = 4
-"""Spectra that three components need."""
-
+"""That three components need."""
 _STRETCH = (0.01, 0.99)
 """Quantiles of a component that become 0 and 1."""
 _LEAST_NOISE = 0.005
@@ -102,11 +101,10 @@ class SpectralSubspace:
 
 
 def find_subspace(pixels: Float[Tensor, "N B"], num_components: int | None = None) -> SpectralSubspace:
-    """The subspace of pixels; with the fewest components that miss no more than the noise, unless a number is given.
+    """The subspace of a scene's pixels, background left out.
 
     Args:
-        pixels: Spectra of a scene, background left out.
-        num_components: P; None finds it.
+        num_components: P; None takes the fewest components that miss no more than the noise.
     Raises:
         SpectrumError: not more pixels than bands, or more components than bands.
     """

@@ -30,10 +30,9 @@ _PIXELS_AT_A_TIME = 65_536
 
 _SUM_WEIGHT = 1e3
 """How much heavier than a spectrum of the endmembers' length the sum-to-one row of `fcls` weighs."""
-_MOST_MATERIALS = 3
+_MOST_MATERIALS, _SETS_KEPT = 3, 6
 _MOST_SEARCHED = 12
 """Endmembers up to which all choices are tried."""
-_SETS_KEPT = 6
 _NUMBERS_AT_A_TIME = 2_000_000
 """Bounds memory: spectra are taken in parts of so many candidate fits."""
 _RIDGE = 1e-13
@@ -143,9 +142,8 @@ def sparse_abundances(
 ) -> Float[Tensor, "N K"]:
     """Abundances of each spectrum, at least 0 with sum 1; zeros where a spectrum or what explains it is zero.
 
-    Args:
-        endmembers: Their brightness matters: a dark one must cover more than a bright one to send the same light.
-        mixing_penalty: Sine of the angle by which each material beyond the first must improve the fit.
+    A dark endmember must cover more than a bright one to send the same light. Each material beyond the first must
+    improve the fit by an angle of which `mixing_penalty` is the sine.
     """
     corners = normalize(endmembers.double(), dim=1)
     gram = corners @ corners.T + _RIDGE * torch.eye(len(corners), dtype=torch.float64, device=corners.device)
@@ -250,11 +248,8 @@ def _extended(
             1, sets[..., 0], ends.expand(len(sets), -1).to(loads)
         )
         misfits.masked_fill_(ranks[:, None] < ends[:, None], torch.inf)
-    best = (
-        misfits.nan_to_num_(nan=torch.inf, posinf=torch.inf)
-        .flatten(1)
-        .topk(num_kept, largest=False, sorted=True)
-    )
+    misfits.nan_to_num_(nan=torch.inf, posinf=torch.inf)
+    best = misfits.flatten(1).topk(num_kept, largest=False, sorted=True)
     parents, added = best.indices // len(gram), best.indices % len(gram)
     grown = torch.cat([sets.gather(1, parents[..., None].expand(-1, -1, size)), added[..., None]], dim=2)
     rows = torch.arange(len(loads), device=loads.device)

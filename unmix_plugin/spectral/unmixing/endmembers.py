@@ -68,7 +68,18 @@ def initialise_endmembers(
     usable = usable_pixels(pixels, num_endmembers, generator)
     if method == "kmeans" or num_endmembers == 1:
         return normalised_kmeans(usable, num_endmembers, generator)[0].clamp(0, 1)
-    return as_lit_pixels(_shapes(usable, num_endmembers, method, generator), usable)
+    if method == "vca":
+        draws = [vca(usable, num_endmembers, generator)[0].clamp(min=0) for _ in range(_VCA_DRAWS)]
+        found = max(draws, key=_log_volume)
+    elif method == "minimum-volume":
+        found = minimum_volume_simplex(usable, num_endmembers, generator)
+    elif method == "pooled":
+        found = pooled_search(usable, num_endmembers, generator).endmembers
+    elif method == "pairs":
+        found = two_material_endmembers(usable, num_endmembers, generator)
+    else:  # on spectra of one brightness, or the darkest pixels would be the corners of the largest simplex
+        found = usable[nfindr(usable / usable.sum(dim=1, keepdim=True), num_endmembers, generator)]
+    return as_lit_pixels(found, usable)
 
 
 def as_lit_pixels(spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"]) -> Float[Tensor, "K B"]:
@@ -78,11 +89,8 @@ def as_lit_pixels(spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"]) -
 
 
 def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "kept B"]:
-    """Pixels that show a spectral shape: neither dark nor saturated.
-
-    Dark: root mean square at most 0.005 or at most 3 % of that of the bright ones. Saturated: some band at 1 or above,
-    where the sensor clips; a lamp in view would otherwise become a material.
-    """
+    """Pixels that show a spectral shape: neither dark (root mean square at most 0.005 or 3 % of that of bright ones)
+    nor saturated (a band at 1 or above, where the sensor clips: a lamp in view would otherwise become a material)."""
     unsaturated = pixels[pixels.amax(dim=1) < 1]
     if len(unsaturated) == 0:
         return unsaturated
@@ -94,26 +102,6 @@ def drop_uninformative_pixels(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "ke
 def has_spectral_shape(pixels: Float[Tensor, "N B"]) -> Bool[Tensor, " N"]:
     """Where a pixel is neither black (root mean square over bands at most 0.005) nor saturated (1 or above)."""
     return (pixels.amax(dim=1) < 1) & (pixels.square().mean(dim=1).sqrt() > DARK_RMS)
-
-
-def _shapes(
-    usable: Float[Tensor, "N B"],
-    num_endmembers: int,
-    method: Literal["vca", "nfindr", "minimum-volume", "pairs", "pooled"],
-    generator: torch.Generator,
-) -> Float[Tensor, "K B"]:
-    """Endmembers of any brightness."""
-    if method == "vca":
-        draws = [vca(usable, num_endmembers, generator)[0].clamp(min=0) for _ in range(_VCA_DRAWS)]
-        return max(draws, key=_log_volume)
-    if method == "minimum-volume":
-        return minimum_volume_simplex(usable, num_endmembers, generator)
-    if method == "pooled":
-        return pooled_search(usable, num_endmembers, generator).endmembers
-    if method == "pairs":
-        return two_material_endmembers(usable, num_endmembers, generator)
-    # On spectra of one brightness: otherwise the darkest pixels are the corners of the largest simplex.
-    return usable[nfindr(usable / usable.sum(dim=1, keepdim=True), num_endmembers, generator)]
 
 
 def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
@@ -146,7 +134,7 @@ def usable_pixels(
     if len(usable) > _MOST_PIXELS:
         kept = torch.randperm(len(usable), generator=generator)[:_MOST_PIXELS]
         usable = usable[kept.to(usable.device)]
-    num_distinct = _count_distinct(usable, num_endmembers)
+    num_distinct = len(usable.unique(dim=0))
     if num_distinct < num_endmembers:
         advice = f"ask for at most {num_distinct}" if num_distinct else "check the scale of the cubes"
         raise SpectrumError(
@@ -156,25 +144,11 @@ def usable_pixels(
     return usable
 
 
-def _count_distinct(pixels: Tensor, enough: int) -> int:
-    """Number of distinct rows; counting stops at `enough`."""
-    count = 0
-    while count < enough and len(pixels) > 0:
-        pixels = pixels[(pixels != pixels[0]).any(dim=1)]
-        count += 1
-    return count
-
-
 def fill_bands(
     seen: Float[Tensor, "K b"], matrix: Float[Tensor, "b B"], typical: Float[Tensor, "B"]
 ) -> Float[Tensor, "K B"]:
-    """The spectra that a sensor saw as `seen`, their ratio to a typical spectrum as smooth over bands as may be.
-
-    Args:
-        seen: Values of the channels.
-        matrix: The sensor's operator.
-        typical: Of the scene, positive; what is not seen of a spectrum follows it.
-    """
+    """The spectra that a sensor with this matrix saw as `seen`, their ratio to a typical spectrum of the scene, which
+    is positive, as smooth over bands as may be."""
     operator = matrix.double() * typical.double()
     differences = torch.diff(torch.eye(len(typical), dtype=torch.float64), dim=0)
     square = operator.T @ operator
@@ -186,23 +160,14 @@ def fill_bands(
 def typical_spectrum(
     means: list[Float[Tensor, " _"]], matrices: list[Float[Tensor, "_ B"]]
 ) -> Float[Tensor, "B"]:
-    """A smooth positive spectrum that sensors see as the means of their pixels.
-
-    Args:
-        means: Of each sensor's channels.
-        matrices: The sensors' operators.
-    """
+    """A smooth positive spectrum that sensors with these matrices see as the means of their pixels."""
     seen, matrix = torch.cat(means)[None], torch.cat(matrices)
     filled = fill_bands(seen, matrix, torch.ones(matrix.shape[1], dtype=seen.dtype))[0]
     return filled.clamp(min=0.01 * float(filled.max().clamp(min=1e-6)))
 
 
 def distinct_spectra(typical: Float[Tensor, "B"], count: int) -> Float[Tensor, "K B"]:
-    """Spectra around a typical one that differ in shape, for scenes of which no sensor tells the materials.
-
-    Args:
-        count: At most as many as bands.
-    """
+    """At most as many spectra as bands around a typical one, of other shapes, where no sensor tells the materials."""
     bands = (torch.arange(len(typical)) + 0.5) / len(typical)
     middles = (torch.arange(count)[:, None] + 0.5) / count
     shapes = 1 - _CONTRAST + 2 * _CONTRAST * torch.exp(-0.5 * ((bands - middles) * count) ** 2)
@@ -217,20 +182,13 @@ def given_endmembers(
     pixels: Float[Tensor, "N B"],
     generator: torch.Generator,
 ) -> Float[Tensor, "K B"]:
-    """Radiance of the reflectances in a CSV (wavelength,name,...), as bright as the scene.
+    """Radiance of the reflectances in a CSV (wavelength,name,...) under the scene's lamp, as bright as the scene.
 
-    Reflectances times the lamp are as bright as a white surface in its brightest band; a scene's exposure is anything.
-    So all are multiplied by the one factor with which nearly every pixel is a mixture of amounts that sum to at most
-    0.75; ratios between them, which the file gives, stay.
+    A scene's exposure is anything. So all are multiplied by the one factor with which nearly every pixel, of at most
+    5000 that the generator chooses, is a mixture of amounts that sum to at most 0.75; ratios between spectra stay.
 
-    Args:
-        count: K, which must be the number of its spectra.
-        bands: To resample to.
-        lamp: Relative power of the scene's light.
-        pixels: Spectra of all training views.
-        generator: On the CPU; chooses at most 5000 of them.
     Raises:
-        ConfigError: another number of spectra.
+        ConfigError: another number of spectra than `count`.
         SpectrumError: they don't cover the bands, or explain no pixel.
     """
     table = read_spectra_csv(path).resampled(bands)
@@ -252,9 +210,7 @@ def comparable_brightness(endmembers: Float[Tensor, "K B"]) -> Float[Tensor, "K 
     """The endmembers; all with the largest peak of any if one is less than a quarter as long as the longest.
 
     Amounts are in units of their endmember. In units of one that is nearly black, such as water in the near infrared,
-    haze, glint and light from the neighbourhood become large amounts, so shares are then counted between spectra of
-    one peak. Of artificial landscapes those with so dark a material come no nearer to their areas with endmembers of
-    their own brightness, the others do (benchmarks/results/tried.md).
+    haze, glint and light from the neighbourhood become large amounts (benchmarks/results/tried.md).
     """
     lengths = endmembers.norm(dim=1)
     return endmembers if bool(lengths.min() >= _DARK_MATERIAL * lengths.max()) else equal_peaks(endmembers)

@@ -16,7 +16,6 @@ from unmix_plugin.errors import SpectrumError
 
 _SAME_SHAPE = 1e-10
 """Squared distance of unit spectra below which they are the same shape (an angle of 1e-5 rad, above float32 noise)."""
-
 _WELL_LIT = 0.95
 """Quantile of the lengths of a spectrum's pixels that becomes its own."""
 _SAMPLES_PER_PRODUCT = 65_536
@@ -35,11 +34,9 @@ def normalised_kmeans(
     Args:
         pixels: Spectra of non-zero length. Drop dark ones first: noise is all the shape they have.
         generator: On the CPU; the only source of randomness.
-
     Returns:
         The mean shape of each cluster at the brightness of its well-lit pixels, the largest cluster first, and the
         cluster of each pixel.
-
     Raises:
         SpectrumError: no pixels, a zero spectrum, or fewer distinct shapes than clusters.
     """
@@ -81,7 +78,10 @@ def _cluster(
     centres = _seed(shapes, num_clusters, generator)
     ids, distances = _assign(shapes, centres)
     for _ in range(max_iterations):
-        centres = _mean_shapes(shapes, ids, distances, centres)
+        # An empty cluster takes the shape that fits worst.
+        filled = _fill_empty(ids, distances, num_clusters)
+        sums = torch.zeros_like(centres).index_add_(0, filled, shapes)
+        centres = torch.nn.functional.normalize(sums, dim=1)
         new_ids, distances = _assign(shapes, centres)
         if torch.equal(new_ids, ids):
             break
@@ -113,12 +113,6 @@ def _assign(shapes: Tensor, centres: Tensor) -> tuple[Int[Tensor, " N"], Float[T
     best = [(part @ centres.T).max(dim=1) for part in shapes.split(_SAMPLES_PER_PRODUCT)]
     cosines = torch.cat([b.values for b in best])
     return torch.cat([b.indices for b in best]), (2 - 2 * cosines).clamp(min=0)
-
-
-def _mean_shapes(shapes: Tensor, ids: Tensor, distances: Tensor, centres: Tensor) -> Float[Tensor, "K B"]:
-    """Unit mean of each cluster, after an empty cluster has taken the shape that fits worst."""
-    ids = _fill_empty(ids, distances, len(centres))
-    return torch.nn.functional.normalize(torch.zeros_like(centres).index_add_(0, ids, shapes), dim=1)
 
 
 def _fill_empty(ids: Tensor, distances: Tensor, num_clusters: int) -> Int[Tensor, " N"]:

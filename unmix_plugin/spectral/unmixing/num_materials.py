@@ -23,11 +23,9 @@ from unmix_plugin.spectral.unmixing.two_material_mixtures import two_material_fi
 
 _MOST_MATERIALS = 12
 """Largest number tried."""
-_LEAST_SHARE = 0.2
-"""A further material must take away at least this share of the mean distance that is left."""
-
-_LEAST_FALL = 0.004
-"""And at least so much of it: about an angle in radians, a hundredth of that between common materials."""
+_LEAST_SHARE, _LEAST_FALL = 0.2, 0.004
+"""A further material must take away at least this share of the mean distance that is left, and at least so much of it:
+about an angle in radians, a hundredth of that between common materials."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +64,6 @@ def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generat
     Args:
         pixels: Spectra of a scene's training views, neither dark nor saturated, background left out.
         generator: On the CPU; the only source of randomness.
-    Raises:
-        SpectrumError: no pixels, or zero spectra.
     """
     num_pixels, num_bands = pixels.shape
     fits = two_material_fits(pixels, min(_MOST_MATERIALS, num_bands), generator)
@@ -79,10 +75,7 @@ def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generat
 
 
 def _elbow(mean_distances: tuple[float, ...]) -> int:
-    """The number of materials after which a further one helps little.
-
-    Args:
-        mean_distances: With 1, 2, ... materials; at least one.
+    """The number of materials after which a further one helps little, by the distances with 1, 2, ... of them.
 
     >>> _elbow((0.20, 0.08, 0.03, 0.027, 0.026))
     3
@@ -96,12 +89,9 @@ def _elbow(mean_distances: tuple[float, ...]) -> int:
 
 
 def hysime(pixels: Float[Tensor, "N B"]) -> int:
-    """Number of dimensions in which the pixels hold more signal than noise.
+    """Number of dimensions in which pixels of two bands or more, of which there are more than bands, hold more signal
+    than noise.
 
-    Args:
-        pixels: Spectra in any unit, more of them than bands.
-    Raises:
-        SpectrumError: not more pixels than bands, or fewer than two bands.
     Source:
         J. M. Bioucas-Dias and J. M. P. Nascimento, "Hyperspectral Subspace Identification", IEEE TGRS 46(8), 2008,
         algorithms 1 and 2.

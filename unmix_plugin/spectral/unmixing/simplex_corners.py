@@ -52,10 +52,8 @@ def vca(
         pixels: Spectra in any unit. Drop dark ones first: the scaling divides by brightness.
         generator: On the CPU; the only source of randomness.
         snr_db: Signal to noise ratio in dB; None estimates it.
-
     Returns:
         The pixels without most of their noise, and which they are, in the order of choice.
-
     Raises:
         SpectrumError: K below 2, above the bands or the pixels, or above the dimensions the pixels span.
     """
@@ -82,7 +80,6 @@ def nfindr(
     Args:
         pixels: Spectra in one unit. Brightness counts: scale spectra to one brightness to ignore shading.
         generator: On the CPU; seeds the start.
-
     Raises:
         SpectrumError: K below 2, above the bands or the pixels, or the pixels' simplex is flat in K - 1 dimensions.
     """
@@ -111,7 +108,6 @@ def minimum_volume_simplex(
     Args:
         pixels: Spectra of positive sum, in any unit. Drop dark ones first: noise is all the shape they have.
         generator: On the CPU; seeds the start, the only source of randomness.
-
     Raises:
         SpectrumError: as `nfindr`; pixels without light.
     """

@@ -27,13 +27,9 @@ from unmix_plugin.spectral.unmixing.kmeans_normalised import normalised_kmeans
 
 MOST_ENDMEMBERS = 64
 """More are not searched for: time and memory grow with the square of the candidates."""
-
-_NUM_CANDIDATES = 80
-_NUM_JUDGES = 3000
-
+_NUM_CANDIDATES, _NUM_JUDGES = 80, 3000
 _DISTINCT = 4e-10
 """Squared distance above which unit spectra are distinct; k-means then finds at least as many shapes."""
-
 _LEAST_GAIN = 1e-7
 """Least fall of the mean distance that counts: rounding errors must not swap forever."""
 
@@ -142,7 +138,9 @@ class PairSearch:
         """The best sets found of 1, 2, ... candidates."""
         sets: list[list[int]] = [[]]
         for _ in range(min(most, len(self._alone))):
-            sets.append(self._improved(self._grown(sets[-1])))
+            costs = self._costs_with_each(sets[-1])
+            costs[sets[-1]] = torch.inf
+            sets.append(self._improved([*sets[-1], int(costs.argmin())]))
         return sets[1:]
 
     def cost(self, chosen: list[int]) -> float:
@@ -153,12 +151,6 @@ class PairSearch:
     def _distances(self, chosen: list[int]) -> Float[Tensor, " N"]:
         """Of each pixel to the nearest pair."""
         return self._pairs[chosen][:, chosen].flatten(0, 1).amin(dim=0)
-
-    def _grown(self, chosen: list[int]) -> list[int]:
-        """With the candidate that helps most."""
-        costs = self._costs_with_each(chosen)
-        costs[chosen] = torch.inf
-        return [*chosen, int(costs.argmin())]
 
     def _improved(self, chosen: list[int]) -> list[int]:
         """Each member swapped for the best candidate in its place, until no swap helps."""
