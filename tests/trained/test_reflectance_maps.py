@@ -31,14 +31,14 @@ def target(tmp_path_factory):
 def test_reflectance_is_what_is_seen_over_the_light_and_nan_where_hardly_anything_or_no_light_is():
     spectra = torch.tensor([[0.2, 0.4], [0.1, 0.2], [0.1, 0.2]])
     opacity = torch.tensor([1.0, 0.5, 0.4])
-    found = seen_reflectance(spectra, opacity, torch.tensor([0.5, 1.0]), 0.5)
+    found = seen_reflectance(spectra, opacity, torch.tensor([0.5, 1.0]))
     assert_close(found[:2], torch.tensor([[0.4, 0.4], [0.4, 0.4]]))
     assert found[2].isnan().all()
     for dark in (0.0, 1e-4):
-        found = seen_reflectance(spectra[:1], torch.ones(1), torch.tensor([dark, 1.0]), 0.5)
+        found = seen_reflectance(spectra[:1], torch.ones(1), torch.tensor([dark, 1.0]))
         assert found[0].isnan().tolist() == [True, False]
     # Where the light is unknown, radiance stands for reflectance.
-    assert_close(seen_reflectance(spectra[:1], torch.ones(1), None, 0.5), spectra[:1])
+    assert_close(seen_reflectance(spectra[:1], torch.ones(1), None), spectra[:1])
 
 
 @pytest.mark.parametrize("dark", [0.0, 1e-4])
@@ -47,9 +47,7 @@ def test_a_library_map_leaves_out_the_bands_that_other_comparisons_leave_out(lib
     radiance = light * np.array([5e4, *WAVELENGTHS_NM[1:]]) / 1000  # noise, where there is hardly any light
     known = library_of([library], bands)
     [match] = known.nearest(radiance[None], bands, light, 1)[0]
-    reflectance = seen_reflectance(
-        torch.from_numpy(radiance)[None], torch.ones(1), torch.from_numpy(light), 0.5
-    )
+    reflectance = seen_reflectance(torch.from_numpy(radiance)[None], torch.ones(1), torch.from_numpy(light))
     asked = parse_reflectance_map(f"library:angle:{library}", bands, torch.from_numpy(light > 1e-3))
     [angle] = asked.fit(torch.zeros(0, len(bands)))(reflectance)
     assert float(angle) == pytest.approx(match.angle_rad, abs=1e-7)
@@ -60,7 +58,7 @@ def test_an_index_of_a_view_is_that_of_its_reflectance():
     scene = make_scene(light=LIGHT)
     view = scene.look(CAMERA)
     found = scene.render(CAMERA, [INDEX])[INDEX]
-    seen = seen_reflectance(view.spectra, view.opacity, scene.light, 0.5)
+    seen = seen_reflectance(view.spectra, view.opacity, scene.light)
     at_500, at_650 = (seen[..., WAVELENGTHS_NM.index(nm)] for nm in (500, 650))
     assert found.isfinite().sum() > 20
     assert_close(found, (at_650 - at_500) / (at_650 + at_500), equal_nan=True)
@@ -95,7 +93,7 @@ def test_a_target_threshold_gives_zeros_and_ones(target):
 def test_a_target_is_looked_for_in_the_bands_with_light(target, method, dark):
     spectra = torch.rand((20, 5), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     bands, light = Bands.of(WAVELENGTHS_NM), torch.tensor([0.5, dark, 1.0, 0.9, 0.6], dtype=torch.float64)
-    reflectance = seen_reflectance(spectra * light, torch.ones(20), light, 0.5)
+    reflectance = seen_reflectance(spectra * light, torch.ones(20), light)
     asked = parse_reflectance_map(f"target:{method}:{target}", bands, light > 1e-3)
     others = Bands(bands.centers_nm[[0, 2, 3, 4]])
     expected = parse_reflectance_map(f"target:{method}:{target}", others)
@@ -109,7 +107,7 @@ def test_an_absorption_is_that_of_the_bands_with_light():
     bands = Bands.of([400.0, 450.0, 500.0, 550.0, 600.0, 650.0])
     light = torch.tensor([0.0, 1.0, 1.0, 0.0, 1.0, 1.0])
     reflectance = seen_reflectance(
-        light * torch.tensor([[0.5, 0.5, 0.3, 0.9, 0.4, 0.5]]), torch.ones(1), light, 0.5
+        light * torch.tensor([[0.5, 0.5, 0.3, 0.9, 0.4, 0.5]]), torch.ones(1), light
     )
     asked = parse_reflectance_map("absorption:area:450-650", bands, light > 0)
     [area] = asked.fit(torch.zeros(0, 6))(reflectance)

@@ -121,7 +121,7 @@ class _PointScore:
     ) -> Float32[np.ndarray, " P"]:
         """The numbers, relative to all the points given where a target needs a background; NaN where undefined."""
         opaque = torch.ones(len(diffuse), dtype=diffuse.dtype)
-        reflectance = seen_reflectance(diffuse, opaque, light, 0.5)
+        reflectance = seen_reflectance(diffuse, opaque, light)
         return self.map.fit(reflectance)(reflectance).numpy().astype(np.float32)
 
     def comments(self, materials: Materials) -> list[str]:

@@ -113,20 +113,14 @@ class Coefficients:
 
 
 def seen_reflectance(
-    spectra: Float[Tensor, "*rays B"],
-    opacity: Float[Tensor, "*rays"],
-    light: Float[Tensor, "B"] | None,
-    smallest_opacity: float,
+    spectra: Float[Tensor, "*rays B"], opacity: Float[Tensor, "*rays"], light: Float[Tensor, "B"] | None
 ) -> Float[Tensor, "*rays B"]:
-    """Reflectance of what is seen.
+    """Reflectance of what is seen, from radiance on black times its opacity; radiance where the light is unknown.
 
-    Args:
-        spectra, opacity: Radiance on black, and the opacity in [0, 1] by which it is multiplied.
-        light: Relative power of the scene's light; None: unknown, so that radiance is returned. NaN in bands that it
-            leaves dark, as `DARK_LIGHT` says.
-        smallest_opacity: NaN where there is less.
+    NaN where less than `OCCUPIED_ACCUMULATION` is seen, and in bands that the light (relative power) leaves dark, as
+    `DARK_LIGHT` says.
     """
-    is_seen = (opacity >= smallest_opacity)[..., None]
+    is_seen = (opacity >= OCCUPIED_ACCUMULATION)[..., None]
     radiance = torch.where(is_seen, spectra / opacity.clamp(min=1e-6)[..., None], torch.nan)
     if light is None:
         return radiance
@@ -251,13 +245,13 @@ class Materials:
         self, spectra: Float[Tensor, "*rays B"], opacity: Float[Tensor, "*rays"]
     ) -> Float[Tensor, "*rays B"]:
         """The same of spectra on black that were computed before, on any device."""
-        return seen_reflectance(spectra, opacity, self.light, OCCUPIED_ACCUMULATION)
+        return seen_reflectance(spectra, opacity, self.light)
 
     def scores(self, coefficients: Coefficients) -> Float[Tensor, "*rays K"]:
         """What the material of a ray is chosen by: abundances, or cosines to the endmembers."""
         if self.segmentation == "abundances":
             return coefficients.abundances
-        return material_scores(self.spectra(coefficients), self.endmembers)
+        return self.scores_of(self.spectra(coefficients), coefficients.abundances)
 
     def scores_of(
         self, spectra: Float[Tensor, "*rays B"], abundances: Float[Tensor, "*rays K"]

@@ -24,6 +24,8 @@ from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.regions import MOST_REGIONS, Region, check_name, region_from_json, region_to_json
 
 _LONGEST_TEXT = 200
+_DAMAGE = (AttributeError, LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError)
+"""What reading a file that holds something else raises."""
 _CENTIMETRES_FROM_M, _METRES_FROM_M = 0.01, 1.0
 
 
@@ -104,52 +106,36 @@ def describe_area(square_units: float, scale: Scale | None) -> str:
 
 
 def recorded_scale(summary: Mapping[str, Any]) -> Scale | None:
-    """What the scene of a run said of its world's units; None where it did not.
-
-    Raises:
-        RunError: the record is damaged.
-    """
-    metres = summary.get(METRES_KEY)
-    if metres is None:
-        return None
-    if type(metres) is not float and type(metres) is not int:
-        raise RunError(f"the run's scene.json is damaged: its {METRES_KEY} is {str(metres)[:40]!r}")
+    """What the scene of a run said of its world's units; None where it did not, a RunError where that is damaged."""
     try:
-        return Scale(float(metres), "as the scene's poses say")
-    except ConfigError as error:
+        said = {"metres_per_unit": summary[METRES_KEY], "how": "as the scene's poses say"}
+        return None if said["metres_per_unit"] is None else _scale_from_json(said)
+    except KeyError:
+        return None
+    except (ConfigError, ValueError) as error:
         raise RunError(f"the run's scene.json is damaged: {error}") from error
 
 
 def read_measures(run: RunFolder) -> Measures:
-    """What is kept with a run; nothing where nothing was measured.
-
-    Raises:
-        RunError: the file is damaged.
-    """
+    """What is kept with a run, nothing where nothing was measured; a RunError where the file is damaged."""
     path = measures_path(run)
     if not path.exists() and not path.is_symlink():
         return Measures()
     values = read_run_json(path)
     try:
-        return Measures(_scale_from_json(values.get("scale")), _regions_from_json(values.get("regions", {})))
-    except (
-        AttributeError,
-        LookupError,
-        TypeError,
-        ValueError,
-        RuntimeError,
-        OverflowError,
-        ConfigError,
-    ) as error:
+        scale, regions = values.get("scale"), values.get("regions", {})
+        if len(regions) > MOST_REGIONS:
+            raise ValueError(f"{len(regions)} regions, more than {MOST_REGIONS}")
+        return Measures(
+            None if scale is None else _scale_from_json(scale),
+            {check_name(name, regions): region_from_json(region) for name, region in regions.items()},
+        )
+    except _DAMAGE as error:
         raise RunError(f"{path} is damaged: {error}; remove it, and measure again") from error
 
 
 def _write_measures(run: RunFolder, measures: Measures) -> Path:
-    """Keep measures with a run, in place of those before.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Keep measures with a run, in place of those before; the file."""
     scale = measures.scale
     kept = {} if scale is None else {"scale": {"metres_per_unit": scale.metres_per_unit, "how": scale.how}}
     regions = {name: region_to_json(region) for name, region in measures.regions.items()}
@@ -181,11 +167,8 @@ def keep_region(run: RunFolder, name: str, region: Region | None) -> Path:
 
 
 def scale_between(first: Sequence[float], second: Sequence[float], distance_m: float) -> Scale:
-    """The scale of a world in which two points are so far apart.
+    """The scale of a world in which two points (x, y, z) are so far apart.
 
-    Args:
-        first, second: x, y, z in the world.
-        distance_m: Metres.
     Raises:
         ConfigError: no distance, or no two points.
     """
@@ -203,11 +186,7 @@ _TOLERANCE_PX = 4.0
 
 
 def require_on_surface(scene: RenderableScene, point: Sequence[float]) -> None:
-    """Refuse a point of the world that lies on nothing that the scene's views show.
-
-    Raises:
-        ConfigError: no view sees a surface there.
-    """
+    """Refuse a point of the world that lies on nothing that the scene's views show."""
     import torch
 
     world = np.asarray(point, dtype=np.float64)
@@ -239,19 +218,11 @@ def _text(point: Float64[np.ndarray, "3"]) -> str:
     return " ".join(f"{value:.6g}" for value in point)
 
 
-def _scale_from_json(values: Any) -> Scale | None:
-    if values is None:
-        return None
+def _scale_from_json(values: Any) -> Scale:
     metres, how = values["metres_per_unit"], values["how"]
     if type(metres) not in (int, float) or not isinstance(how, str) or len(how) > _LONGEST_TEXT:
         raise ValueError(f"its scale is {str(values)[:80]}")
     return Scale(float(metres), "".join(letter for letter in how if letter.isprintable()))
-
-
-def _regions_from_json(values: Any) -> dict[str, Region]:
-    if len(values) > MOST_REGIONS:
-        raise ValueError(f"{len(values)} regions, more than {MOST_REGIONS}")
-    return {check_name(name, values): region_from_json(region) for name, region in values.items()}
 
 
 def measures_path(run: RunFolder) -> Path:

@@ -114,11 +114,7 @@ class ModelScene:
 def model_scene(
     model: Model, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
 ) -> ModelScene:
-    """The scene of a model as it is now; training that goes on does not change it.
-
-    Raises:
-        ConfigError: the model names no outputs.
-    """
+    """The scene of a model, which must name outputs, as it is now; training that goes on does not change it."""
     if not model.outputs:
         raise ConfigError(f"{type(model).__name__} names no outputs that could be shown")
     still = copy.deepcopy(model, frozen_parameters(model, averages)).eval()  # type: ignore[arg-type]
@@ -126,12 +122,8 @@ def model_scene(
 
 
 def frozen_parameters(model: Model, averages: Mapping[str, Tensor] | None) -> dict[int, nn.Parameter]:
-    """Copies of a model's parameters without gradients, by the parameters' ids, as `copy.deepcopy` takes them.
-
-    Args:
-        model: Stays as it is.
-        averages: Values to use instead of the parameters', by their names.
-    """
+    """Copies of a model's parameters without gradients, by the parameters' ids, as `copy.deepcopy` takes them; of
+    `averages`, by the parameters' names, where there are any."""
     values = dict(averages or {})
     return {
         id(param): nn.Parameter(values.get(name, param).detach().clone(), requires_grad=False)

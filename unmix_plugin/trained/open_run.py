@@ -36,12 +36,8 @@ def unmix_scene(
 ) -> TrainedScene:
     """The scene of a model as it is now; training that goes on does not change it.
 
-    Args:
-        model, averages: As `frozen_parameters` takes them.
-        record: Cameras and frame of its run; they are shown as they were corrected, those of evaluation views with the
-            corrected lens.
-    Raises:
-        RunError: the record is damaged.
+    Cameras of the record are shown as they were corrected, those of evaluation views with the corrected lens. Errors
+    are those of `world_frame` and `recorded_scale`.
     """
     frozen = frozen_parameters(model, averages)
     materials, renderer = model.materials, model.renderer
@@ -82,25 +78,15 @@ def unmix_scene(
 def snapshot(
     model: Model, method_name: str, record: SceneRecord, averages: Mapping[str, Tensor] | None = None
 ) -> RenderableScene:
-    """The scene of a model of any method, as its registration makes it.
-
-    Raises:
-        RunError: the record is damaged.
-        ConfigError: the method offers no scene.
-    """
-    make = find_method(method_name).scene or model_scene
-    return make(model, record, averages)
+    """The scene of a model of any method, as its registration makes it."""
+    return (find_method(method_name).scene or model_scene)(model, record, averages)
 
 
 def find_scene(summary: Mapping[str, Any], run: Path, data: Path | None) -> Scene | None:
-    """The scene of a run, if it is where it was and has not changed.
+    """The scene of a run by the summary of its record, if it is where it was and has not changed.
 
-    Args:
-        summary: What the run recorded of its scene.
-        run: Its folder.
-        data: Where the scene is now; then it has to be there. None: where it was.
     Raises:
-        SceneError: it is not at `data`, or malformed there.
+        SceneError: it has to be at `data`, and is not, or malformed there.
         RunError: `data` is another scene than the run's.
     """
     root = data or Path(str(summary.get("root", "")))
@@ -137,11 +123,7 @@ class LoadedRun:
 
     @property
     def scale(self) -> Scale | None:
-        """How long a unit of its world is, as it was set for the run, or else as its scene says; None where unknown.
-
-        Raises:
-            RunError: the record is damaged.
-        """
+        """How long a unit of its world is, as it was set for the run, or else as its scene says; None where unknown."""
         return self.measures.scale or recorded_scale(self.record.summary)
 
     @property
@@ -152,11 +134,7 @@ class LoadedRun:
 
     @property
     def materials_scene(self) -> TrainedScene:
-        """The scene, which must be one of mixed materials.
-
-        Raises:
-            ConfigError: its method does not unmix spectra.
-        """
+        """The scene, which must be one of mixed materials."""
         return require_materials(self.scene, self.config.method_name)
 
 
@@ -189,11 +167,7 @@ def open_run(path: str | Path, device: str = "auto") -> TrainedScene:
 
 
 def require_materials(scene: RenderableScene | None, method_name: str) -> TrainedScene:
-    """The scene, if it has endmembers; None stands for a method that makes none.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """The scene, if it has endmembers, otherwise a ConfigError; None stands for a method that makes none."""
     if not isinstance(scene, TrainedScene):
         own: list[str] = []
         with suppress(Exception):  # a third party's module may fail in any way at all

@@ -89,12 +89,7 @@ class MaterialView:
 
     @torch.no_grad()
     def __getitem__(self, name: str) -> Tensor:
-        """An output by its name.
-
-        Raises:
-            ConfigError: there is none, or its argument can't be read.
-            SpectrumError: the bands don't cover what it needs.
-        """
+        """An output by its name, as `find_output` takes it."""
         return self.scene.output(name).compute(self)
 
 

@@ -81,39 +81,28 @@ def check_name(name: str, others: Iterable[str] = ()) -> str:
     Raises:
         ConfigError: it can't be one, not that of a file, tables take it for a formula, or another differs in capitals.
     """
-    name = unicodedata.normalize("NFC", name.strip())
-    if (
-        not 0 < len(name) <= _LONGEST_NAME
-        or name != safe_name(name, NOT_PORTABLE)
-        or "," in name
-        or name[0] in "=+-@"
-    ):
+    name, refused = unicodedata.normalize("NFC", name.strip()), "can't be the name of a region"
+    is_safe = 0 < len(name) <= _LONGEST_NAME and name == safe_name(name, NOT_PORTABLE)
+    if not is_safe or "," in name or name[0] in "=+-@":
         raise ConfigError(
-            f"{name[:80]!r} can't be the name of a region; expected a name that a file can have on every system: 1 to "
-            f"{_LONGEST_NAME} letters, digits, spaces, - or _, the first a letter or digit"
+            f"{name[:80]!r} {refused}; expected a name that a file can have on every system: 1 to {_LONGEST_NAME} "
+            "letters, digits, spaces, - or _, the first a letter or digit"
         )
     for other in others:
         if other != name and other.casefold() == name.casefold():
             raise ConfigError(
-                f"{name!r} can't be the name of a region: {other!r} is one, and some systems take names of files that "
-                "differ in capitals for the same"
+                f"{name!r} {refused}: {other!r} is one, and files of both are one on some systems"
             )
     if name.startswith("material "):
-        raise ConfigError(
-            f"{name!r} can't be the name of a region: exports name areas of materials so; choose one that does not "
-            "begin with 'material '"
-        )
+        raise ConfigError(f"{name!r} {refused}: exports name areas of materials so; choose another beginning")
     return name
 
 
 def polygon_mask(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Pixels whose centres lie inside a polygon.
+    """Pixels of an image of this width and height whose centres lie inside a polygon.
 
     Args:
-        corners: x, y in pixels from the top left corner of the image, at least 3.
-        size: Width and height of the image.
-    Raises:
-        ConfigError: fewer corners, or no pixel inside.
+        corners: x, y in pixels from the top left corner of the image; fewer than 3 or no pixel inside are refused.
     """
     from skimage.draw import polygon2mask
 

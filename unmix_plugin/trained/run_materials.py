@@ -41,12 +41,8 @@ def relit(
     recorded: Sequence[float] | None,
     light: Float64[np.ndarray, " B"] | None,
 ) -> Float64[np.ndarray, "*pixels B"]:
-    """Radiance measured in one light as it is in another; 0 in bands that the first left dark.
-
-    Args:
-        measured, recorded: Radiance, and the light (relative power, None: flat) that it was measured in.
-        light: The other one; None for the same.
-    """
+    """Radiance measured in a recorded light (relative power; None: flat) as it is in another (None: the same); 0 in
+    bands that the first left dark."""
     if light is None:
         return measured.astype(np.float64)
     before = np.ones(len(light)) if recorded is None else np.asarray(recorded, dtype=np.float64)
@@ -72,8 +68,11 @@ def shown_matches(
 ) -> list[list[ShownMatch]]:
     """The three nearest materials of each spectrum, nearest first, in the light and brightness of the spectrum."""
     found = library.nearest(spectra, bands, light, 3, comparison)
+    known = dict(
+        zip(library.names, library.resampled(bands) * (1.0 if light is None else light), strict=True)
+    )
     return [
-        [ShownMatch(match, _as_seen(match, library, spectrum, bands, light)) for match in matches]
+        [ShownMatch(match, _as_bright(known[match.name], spectrum)) for match in matches]
         for spectrum, matches in zip(spectra, found, strict=True)
     ]
 
@@ -84,17 +83,9 @@ def match_json(match: LibraryMatch) -> dict[str, Any]:
     return {**given, "bands_compared": match.num_bands, "source": match.source}
 
 
-def _as_seen(
-    match: LibraryMatch,
-    library: MaterialLibrary,
-    spectrum: Float[np.ndarray, " B"],
-    bands: Bands,
-    light: Float64[np.ndarray, " B"] | None,
+def _as_bright(
+    lit: Float64[np.ndarray, " B"], spectrum: Float[np.ndarray, " B"]
 ) -> Float64[np.ndarray, " B"]:
-    material, unknown = library.find(match.name), np.nan
-    centers = material.bands.centers_nm
-    known = np.interp(bands.centers_nm, centers, material.reflectance, left=unknown, right=unknown)
-    lit = known if light is None else known * light
     shared = np.isfinite(lit)
     power = float(lit[shared] @ lit[shared])
     return lit * (float(lit[shared] @ spectrum[shared]) / power if power > 0 else 0.0)

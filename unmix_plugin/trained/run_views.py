@@ -42,11 +42,7 @@ def recorded_views(record: SceneRecord) -> tuple[RunView, ...]:
 
 
 def find_view(numbered: Sequence[RunView], wanted: str, others: Sequence[RunView] = ()) -> RunView:
-    """A view by its name, or by its number from 0 in `numbered`; `others` can be had by name only.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """A view by its name, or by its number from 0 in `numbered`; `others` can be had by name only."""
     by_name = {view.name: view for view in (*others, *numbered)}
     if wanted in by_name:
         return by_name[wanted]
@@ -90,10 +86,8 @@ _LEAST_UPWARD, _LOOKING_DOWN = 0.3, 0.8
 
 
 def up_direction(cameras: Cameras) -> tuple[float, float, float]:
-    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is.
-
-    Where cameras look down on average, as in flights, or upward axes cancel, it is +z.
-    """
+    """What is up in model space: the cameras' mean upward axis, or the axis of model space that it nearly is; +z where
+    cameras look down on average, as in flights, or upward axes cancel."""
     mean, back = (cameras.camera_to_world[:, :, axis].double().mean(dim=0) for axis in (1, 2))
     length = float(mean.norm())
     if length < _LEAST_UPWARD or abs(float(back[2])) > _LOOKING_DOWN:
@@ -124,11 +118,8 @@ _PRECISION = 1e-6
 
 
 def world_frame(scene: SceneRecord) -> Normalisation:
-    """How a run's world became its model space; one that changes nothing where the run has recorded none.
-
-    Raises:
-        RunError: the record is damaged.
-    """
+    """How a run's world became its model space; one that changes nothing where the run has recorded none. A RunError
+    where the record is damaged."""
     recorded = scene.summary.get("normalisation")
     if recorded is None:
         return Normalisation(np.eye(3), np.zeros(3), 1.0)
@@ -143,15 +134,11 @@ def world_frame(scene: SceneRecord) -> Normalisation:
 def positions_for_files(
     world: Float64[np.ndarray, "*points 3"],
 ) -> Float32[np.ndarray, "*points 3"] | Float64[np.ndarray, "*points 3"]:
-    """World positions in the type that files need: float32 where it keeps them to a millionth of their extent.
-
-    Others, such as geo-referenced ones, stay float64.
-    """
+    """World positions in the type that files need: float32 where it keeps them to a millionth of their extent; others,
+    such as geo-referenced ones, stay float64."""
     if world.size == 0:
         return world.astype(np.float32)
-    extent = float(
-        (world.max(axis=tuple(range(world.ndim - 1))) - world.min(axis=tuple(range(world.ndim - 1)))).max()
-    )
+    extent = float(np.ptp(world.reshape(-1, 3), axis=0).max())
     rounding = 0.5 * float(np.spacing(np.float32(np.abs(world).max())))
     return world if rounding > _PRECISION * extent else world.astype(np.float32)
 

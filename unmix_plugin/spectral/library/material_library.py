@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -27,20 +27,16 @@ from unmix_plugin.spectral.features import continuum_removed
 from unmix_plugin.spectral.library.spectra_csv import resample_spectra
 
 _CRI_NAMES = (
-    "light greyish red",
-    "dark greyish yellow",
-    "strong yellow green",
-    "moderate yellowish green",
-    "light bluish green",
-    "light blue",
-    "light violet",
-    "light reddish purple",
-    "strong red",
-    "strong yellow",
-    "strong green",
-    "strong blue",
-    "light yellowish pink",
-    "olive green leaf",
+    *("light greyish red", "dark greyish yellow", "strong yellow green", "moderate yellowish green"),
+    *(
+        "light bluish green",
+        "light blue",
+        "light violet",
+        "light reddish purple",
+        "strong red",
+        "strong yellow",
+    ),
+    *("strong green", "strong blue", "light yellowish pink", "olive green leaf"),
 )
 """Appearance under daylight of the test colour samples of CIE 13.3:1995, in their order."""
 
@@ -48,16 +44,8 @@ _LEFT_OUT = ("skin", "caucasian", "oriental", "south asian", "african", "pork", 
 """Of the built-in charts: skin, meat and figures of comics are no materials of scenes."""
 
 _HUES = (
-    "red",
-    "orange",
-    "yellow",
-    "yellow green",
-    "green",
-    "bluish green",
-    "blue",
-    "purplish blue",
-    "purple",
-    "magenta",
+    *("red", "orange", "yellow", "yellow green", "green"),
+    *("bluish green", "blue", "purplish blue", "purple", "magenta"),
 )
 _HUE_BOUNDS_DEG = (43.0, 76.0, 106.0, 140.0, 178.0, 215.0, 255.0, 295.0, 333.0, 368.0)
 """Where each hue ends in the plane of a* and b*, halfway between those of Munsell's at medium value and chroma."""
@@ -67,25 +55,17 @@ Comparison = Literal["scale", "continuum"]
 """What is taken out before angles are measured: the scale, or the convex hull above the spectrum as well, which leaves
 the absorptions."""
 
-_FEWEST_BANDS = 3
-"""Bands that a comparison takes at least: two positive numbers are always nearly parallel."""
-
-_LEAST_OVERLAP = 0.5
-"""Part of a spectrum's bands with light that a material must cover to be compared with it."""
-
+_FEWEST_BANDS, _LEAST_OVERLAP = 3, 0.5
+"""Bands that a comparison takes at least, since two positive numbers are always nearly parallel; and the part of a
+spectrum's bands with light that a material must cover to be compared with it."""
 _GREATEST_REFLECTANCE = 2.0
 """Values above it are not reflectances; glossy and fluorescent surfaces exceed 1."""
-
 DARK_LIGHT = 1e-3
 """Light at a band, relative to its greatest, below which nothing is known of the reflectance there."""
 
 
 def require_reflectance(values: Float[np.ndarray, " B"], what: str) -> None:
-    """Refuse percent and the like where the unit counts.
-
-    Raises:
-        SpectrumError: a value exceeds all that reflectances have.
-    """
+    """Refuse percent and the like where the unit counts."""
     if values.max() > _GREATEST_REFLECTANCE:
         raise SpectrumError(
             f"{what} must be in reflectances, 1 for white; found {values.max():g} (divide percent by 100)"
@@ -209,14 +189,9 @@ class MaterialLibrary:
     ) -> tuple[Float64[np.ndarray, "N M"], Int64[np.ndarray, " M"]]:
         """Angle in radians between each spectrum and each material, and over how many bands a material is compared.
 
-        Bands in which there is no light are passed over. So are materials that cover less than half of the others, or
-        less than three: NaN and 0. Spectra that are not finite, or black, have no angles, NaN.
-
-        Args:
-            spectra: Radiance under `light`, or reflectance.
-            bands: Of the spectra.
-            light: Relative power of the light at the bands; None for flat light.
-            comparison: What is taken out before angles are measured.
+        Spectra are radiance under a light of this relative power, or reflectance where it is None. Bands in which there
+        is no light are passed over. So are materials that cover less than half of the others, or less than three: NaN
+        and 0. Spectra that are not finite, or black, have no angles, NaN.
         """
         shared, known = self._compared_bands(bands, light), self.resampled(bands)
         power = np.ones(len(bands)) if light is None else np.where(light > 0, light, 1.0)
@@ -286,38 +261,39 @@ def measured_library() -> MaterialLibrary:
     known = SDS_TCS.get("CIE 2024", SDS_TCS)  # colour-science below 0.4.7 has the fourteen of 1995 alone
     samples: dict[str, Any] = dict(zip(_CRI_NAMES, known.values(), strict=False))
     table = load_TCS_CIE2017(SpectralShape(380, 780, 5))
-    bands, numbered = Bands.of(np.asarray(table.wavelengths)), {}
-    for number, values in enumerate(np.asarray(table.values, dtype=np.float64).T, 1):
-        numbered[f"{_colour_in_words(values, bands)} {number}"] = (bands, values)
-    saturated = {}
-    for number, sample in enumerate(SDS_VS["NIST CQS 9.0"].values(), 1):
-        own, values = _as_bands(sample)
-        saturated[f"{_colour_in_words(values, own)} {number}"] = (own, values)
-    cqs = _materials("CQS", saturated, "colour quality scale 9.0, NIST")
-    cie2017 = _materials("CIE 224", numbered, "test colour samples, CIE 224:2017")
+    numbered = _numbered("CIE 224", table.to_sds(), "test colour samples, CIE 224:2017")
+    saturated = _numbered("CQS", SDS_VS["NIST CQS 9.0"].values(), "colour quality scale 9.0, NIST")
     return MaterialLibrary(
         (
             *_materials("ColorChecker", SDS_COLOURCHECKERS["ColorChecker N Ohta"], "ColorChecker, Ohta 1997"),
             *_materials("memory colours", SDS_COLOURCHECKERS["PMC"], "Preferred Memory Color chart"),
             *_materials("CIE 13.3", samples, "test colour samples, CIE 13.3:1995"),
-            *map(_without_flat_ends, (*cqs, *cie2017)),
+            *map(_without_flat_ends, (*saturated, *numbered)),
         )
     )
 
 
-def _as_bands(sample: Any) -> tuple[Bands, Float64[np.ndarray, " B"]]:
-    return Bands.of(np.asarray(sample.wavelengths)), np.asarray(sample.values, dtype=np.float64)
+def _material(name: str, sample: Any, source: str) -> LibraryMaterial:
+    """A spectrum of colour-science."""
+    values = np.asarray(sample.values, dtype=np.float64)
+    return LibraryMaterial(name, Bands.of(np.asarray(sample.wavelengths)), values, source)
 
 
 def _materials(group: str, samples: Mapping[str, Any], source: str) -> list[LibraryMaterial]:
-    """A set of samples, spectra of colour-science or bands with values."""
-    found = []
-    for given, sample in samples.items():
-        name = given.partition(" (")[0].lower()
-        if not any(word in name for word in _LEFT_OUT):
-            bands, values = sample if isinstance(sample, tuple) else _as_bands(sample)
-            found.append(LibraryMaterial(f"{group}/{name}", bands, values, source))
-    return found
+    """A set of samples by their names."""
+    named = ((given.partition(" (")[0].lower(), sample) for given, sample in samples.items())
+    return [
+        _material(f"{group}/{name}", sample, source)
+        for name, sample in named
+        if not any(word in name for word in _LEFT_OUT)
+    ]
+
+
+def _numbered(group: str, samples: Iterable[Any], source: str) -> Iterator[LibraryMaterial]:
+    """A set of samples by their colours and numbers."""
+    for number, sample in enumerate(samples, 1):
+        found = _material("", sample, source)
+        yield replace(found, name=f"{group}/{_colour_in_words(found.reflectance, found.bands)} {number}")
 
 
 def _colour_in_words(reflectance: Float64[np.ndarray, " B"], bands: Bands) -> str:
