@@ -63,15 +63,12 @@ def materials(endmembers: torch.Tensor, names: tuple[str, ...] = ()) -> Material
     return Materials(BANDS, endmembers, torch.zeros(0, 5), names=names)
 
 
-def test_endmembers_are_numbered_unless_they_are_named():
+def test_endmembers_are_numbered_unless_they_are_named_and_each_needs_a_name_of_its_own():
     assert materials(torch.ones(2, 5)).names == default_names(2) == ("endmember_0", "endmember_1")
     assert materials(torch.ones(2, 5), ("clay", "leaf")).names == ("clay", "leaf")
-
-
-@pytest.mark.parametrize("names", [("clay",), ("clay", "clay"), ("clay", "leaf", "soil")])
-def test_each_endmember_needs_a_name_of_its_own(names):
-    with pytest.raises(SpectrumError, match="2 endmembers need 2 distinct names; found"):
-        materials(torch.ones(2, 5), names)
+    for names in (("clay",), ("clay", "clay"), ("clay", "leaf", "soil")):
+        with pytest.raises(SpectrumError, match="2 endmembers need 2 distinct names; found"):
+            materials(torch.ones(2, 5), names)
 
 
 def test_a_band_beyond_full_scale_counts_in_the_colour_with_all_that_it_has():
@@ -104,24 +101,16 @@ def test_confidence_is_how_probably_the_largest_share_is_so_in_truth():
     assert [lone.confidence(shared([1.0], opacity=opacity)).item() for opacity in (0.9, 0.4)] == [1, 0]
 
 
-def test_confidence_rates_the_material_that_the_segmentation_names():
+def test_confidence_rates_the_material_that_the_segmentation_names_as_probes_do():
     """By angle a ray can be of another material than that of its largest abundance, which then is not a sign for it."""
     bright_and_dark = torch.tensor([[0.9, 0.1, 0.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.0, 0.0]])
     seen = shared([0.2, 0.8])
-    by_abundance = materials(bright_and_dark)
-    by_angle = replace(by_abundance, segmentation="probe")
-    assert (by_abundance.ids(seen).tolist(), by_angle.ids(seen).tolist()) == ([1], [0])
-    assert by_abundance.confidence(seen).tolist() == pytest.approx([0.6])
-    assert by_angle.confidence(seen).tolist() == [0]
-
-
-def test_the_material_of_a_place_is_that_of_the_segmentation():
-    bright_and_dark = torch.tensor([[0.9, 0.1, 0.0, 0.0, 0.0], [0.0, 0.0, 0.01, 0.0, 0.0]])
-    seen = shared([0.2, 0.8])
-    for method, name in (("abundances", "leaf"), ("probe", "clay")):
+    for method, material, confidence in (("abundances", 1, 0.6), ("probe", 0, 0.0)):
         mixed = replace(materials(bright_and_dark, ("clay", "leaf")), segmentation=method)
+        assert mixed.ids(seen).tolist() == [material]
+        assert mixed.confidence(seen).tolist() == pytest.approx([confidence])
         place = mixed.spectra(seen)[0].double().numpy(), seen.abundances[0].double().numpy()
-        assert mixed.name_of(*place) == name == mixed.names[int(mixed.ids(seen))]
+        assert mixed.name_of(*place) == mixed.names[material]
 
 
 def test_a_linear_map_of_spectra_needs_no_spectra():

@@ -15,9 +15,11 @@ def labels(*values):
     return torch.tensor(values, dtype=torch.uint8)
 
 
-def scored(pred, true, num_pred, num_true):
+def scored(num_pred, num_true, *views):
+    """Scores of views, each of predicted and true labels."""
     tally = SegmentationTally(num_pred, num_true)
-    tally.add(pred, true)
+    for pred, true in views:
+        tally.add(pred, true)
     return tally.scores()
 
 
@@ -42,87 +44,49 @@ def test_ids_are_the_best_score_where_something_is():
 @given(st.permutations(range(4)), st.integers(0, 99))
 def test_renamed_labels_score_perfectly(order, seed):
     true = torch.randint(0, 4, (6, 7), generator=seeded(seed)).to(torch.uint8)
-    scores = scored(labels(*order)[true.long()], true, 4, 4)
+    scores = scored(4, 4, (labels(*order)[true.long()], true))
     assert (scores.miou, scores.macro_f1, scores.accuracy) == (1, 1, 1)
     present = true.unique().tolist()
     assert all(scores.matching[order[m]] == m for m in present)
 
 
-NAN = math.nan
-
-
 @pytest.mark.parametrize(
     ("pred", "true", "numbers", "matching", "iou", "macro_f1", "accuracy"),
     [
-        (
-            [1, 1, 1, 0, 0, 0, 0, 1],
-            [0, 0, 0, 0, 1, 1, 1, 1],
-            (2, 2),
-            {1: 0, 0: 1},
-            {0: 3 / 5, 1: 3 / 5},
-            6 / 8,
-            6 / 8,
-        ),
+        ("11100001", "00001111", (2, 2), {1: 0, 0: 1}, {0: 3 / 5, 1: 3 / 5}, 6 / 8, 6 / 8),
         # Materials count equally in means, pixels in accuracy.
-        (
-            [0] * 9 + [1],
-            [0] * 8 + [1, 1],
-            (2, 2),
-            {0: 0, 1: 1},
-            {0: 8 / 9, 1: 1 / 2},
-            (16 / 17 + 2 / 3) / 2,
-            0.9,
-        ),
+        ("0000000001", "0000000011", (2, 2), {0: 0, 1: 1}, {0: 8 / 9, 1: 1 / 2}, (16 / 17 + 2 / 3) / 2, 0.9),
         # Pixels without labels are ignored, missed ones are not.
-        (
-            [0, 255, 0, 1, 1, 1],
-            [0, 0, 255, 255, 1, 1],
-            (2, 2),
-            {0: 0, 1: 1},
-            {0: 1 / 2, 1: 1},
-            (2 / 3 + 1) / 2,
-            3 / 4,
-        ),
+        ("0.0111", "00..11", (2, 2), {0: 0, 1: 1}, {0: 1 / 2, 1: 1}, (2 / 3 + 1) / 2, 3 / 4),
         # A surplus id is a miss of the material that it covers.
-        (
-            [2, 0, 0, 0, 1, 1],
-            [0, 0, 0, 0, 1, 1],
-            (3, 2),
-            {0: 0, 1: 1},
-            {0: 3 / 4, 1: 1},
-            (6 / 7 + 1) / 2,
-            5 / 6,
-        ),
+        ("200011", "000011", (3, 2), {0: 0, 1: 1}, {0: 3 / 4, 1: 1}, (6 / 7 + 1) / 2, 5 / 6),
         # A material without an id scores 0: ids that share no pixel with it are not matched to it.
-        ([0, 0, 0, 2], [0, 0, 1, 255], (3, 2), {0: 0}, {0: 2 / 3, 1: 0}, (4 / 5) / 2, 2 / 3),
+        ("0002", "001.", (3, 2), {0: 0}, {0: 2 / 3, 1: 0}, (4 / 5) / 2, 2 / 3),
+        # Of two materials of one id the larger has it.
+        ("0011111", "0011122", (2, 3), {0: 0, 1: 1}, {0: 1, 1: 3 / 5, 2: 0}, (1 + 6 / 8) / 3, 5 / 7),
         # Materials that never occur are left out of means.
-        ([3, 3, 1], [5, 5, 2], (4, 9), {3: 5, 1: 2}, {5: 1, 2: 1}, 1, 1),
-        ([0, 1], [255, 255], (2, 2), {}, {}, NAN, NAN),
+        ("331", "552", (4, 9), {3: 5, 1: 2}, {5: 1, 2: 1}, 1, 1),
+        ("01", "..", (2, 2), {}, {}, math.nan, math.nan),
     ],
 )
 def test_figures_of_small_scenes_counted_by_hand(pred, true, numbers, matching, iou, macro_f1, accuracy):
-    scores = scored(labels(*pred), labels(*true), *numbers)
+    """A point is 255."""
+    views = (labels(*(255 if pixel == "." else int(pixel) for pixel in view)) for view in (pred, true))
+    scores = scored(*numbers, tuple(views))
     assert scores.matching == matching
     assert scores.iou == pytest.approx(iou)
-    mean = sum(iou.values()) / len(iou) if iou else NAN
+    mean = sum(iou.values()) / len(iou) if iou else math.nan
     figures = (scores.miou, scores.macro_f1, scores.accuracy)
     assert figures == pytest.approx((mean, macro_f1, accuracy), nan_ok=True)
 
 
-def test_of_two_materials_of_one_id_the_larger_has_it_and_the_other_scores_zero():
-    scores = scored(labels(0, 0, 1, 1, 1, 1), labels(0, 0, 1, 1, 2, 2), 2, 3)
-    assert sorted(scores.iou.values()) == [0, 0.5, 1]
-    assert scores.macro_f1 == pytest.approx((1 + 2 / 3) / 3)
-
-
 def test_matching_is_on_intersection_over_union_not_on_hits():
     # By hits 0-0 and 1-1 win (0 + 7 against 2 + 4 pixels); by IoU the other way round does.
-    tally = SegmentationTally(2, 2)
-    for pred, true, count in ((0, 1, 2), (1, 0, 4), (1, 1, 7)):
-        tally.add(
-            torch.full((count,), pred, dtype=torch.uint8), torch.full((count,), true, dtype=torch.uint8)
-        )
-    scores = tally.scores()
+    views = [
+        (labels(*[pred] * count), labels(*[true] * count))
+        for pred, true, count in ((0, 1, 2), (1, 0, 4), (1, 1, 7))
+    ]
+    scores = scored(2, 2, *views)
     straight, crossed = (0 + 7 / 13) / 2, (2 / 9 + 4 / 11) / 2
     assert crossed > straight
     assert scores.matching == {0: 1, 1: 0}
@@ -134,19 +98,13 @@ def test_views_fed_one_by_one_count_as_one_scene(seed):
     pred = torch.randint(0, 5, (4, 9), generator=seeded(seed)).to(torch.uint8)
     true = torch.randint(0, 4, (4, 9), generator=seeded(seed + 1)).to(torch.uint8)
     pred[pred == 4], true[:, 0] = 255, 255
-    tally = SegmentationTally(4, 4)
-    for view in range(4):
-        tally.add(pred[view], true[view])
-    assert tally.scores() == scored(pred, true, 4, 4)
-    assert int(tally.confusion.sum()) == int((true != 255).sum())
+    assert scored(4, 4, *zip(pred, true, strict=True)) == scored(4, 4, (pred, true))
 
 
 def test_one_matching_serves_all_views():
     # Each view alone would be perfect under its own matching; the scene as a whole is half wrong.
-    tally = SegmentationTally(2, 2)
-    tally.add(labels(0, 1, 1), labels(0, 1, 1))
-    tally.add(labels(1, 0, 0), labels(0, 1, 1))
-    assert tally.scores().accuracy == pytest.approx(0.5)
+    views = (labels(0, 1, 1), labels(0, 1, 1)), (labels(1, 0, 0), labels(0, 1, 1))
+    assert scored(2, 2, *views).accuracy == pytest.approx(0.5)
 
 
 def test_the_confusion_matrix_has_predicted_ids_in_rows_and_missed_pixels_in_the_last():
