@@ -6,7 +6,7 @@ Metamers: built to look alike in one light, they are found, and nothing else is.
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -41,23 +41,12 @@ def test_differences_are_those_of_the_published_pairs(first, second, expected):
     assert ciede2000(np.array(second), np.array(first)) == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("srgb", "lab"),
-    [
-        ([1, 1, 1], [100, 0, 0]),
-        ([1, 0, 0], [53.24, 80.09, 67.20]),
-        ([0, 0, 1], [32.30, 79.19, -107.86]),
-        ([0, 0, 0], [0, 0, 0]),
-    ],
-)
-def test_srgb_primaries_have_their_known_lab(srgb, lab):
-    """Lindbloom's calculator, D65."""
-    assert_allclose(srgb_to_lab(np.array(srgb, dtype=float)), lab, atol=0.1)
-
-
-@settings(deadline=None)
 @given(st.lists(st.floats(0, 1), min_size=3, max_size=3))
-def test_lab_leads_back_to_srgb(srgb):
+def test_srgb_has_its_known_lab_and_lab_leads_back(srgb):
+    """Lindbloom's calculator, D65."""
+    colours = np.array([[1.0, 1, 1], [1, 0, 0], [0, 0, 1], [0, 0, 0]])
+    known = [[100, 0, 0], [53.24, 80.09, 67.20], [32.30, 79.19, -107.86], [0, 0, 0]]
+    assert_allclose(srgb_to_lab(colours), known, atol=0.1)
     assert_allclose(lab_to_srgb(srgb_to_lab(np.array(srgb))), srgb, atol=1e-6)
 
 
