@@ -150,6 +150,7 @@ class RelightableScene(RenderableScene, Protocol):
     @property
     def lights(self) -> tuple[str, ...]:
         """Names of the lights that it has; the first is that of its pictures."""
+        ...
 
     def with_light(self, choice: LightChoice) -> RelightableScene:
         """The same scene under another light.
@@ -158,6 +159,7 @@ class RelightableScene(RenderableScene, Protocol):
             ConfigError: there is no such light.
             SceneError: the file of an environment map is missing, damaged or unusable.
         """
+        ...
 
 
 @runtime_checkable
@@ -167,9 +169,11 @@ class EstimatedScene(RenderableScene, Protocol):
     @property
     def num_estimates(self) -> int:
         """How many of them a finished picture takes."""
+        ...
 
     def estimate(self, camera: Cameras, subpixels: int, number: int) -> ModelView:
         """A view with few samples; those of other numbers, from 0, are independent of it."""
+        ...
 
 
 def relit(scene: RenderableScene, choice: LightChoice, method_name: str) -> RelightableScene:

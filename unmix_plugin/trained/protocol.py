@@ -50,26 +50,24 @@ class Probe:
 
 @runtime_checkable
 class RenderedView(Protocol):
-    """One view, rendered once; all its outputs follow from that."""
+    """One view of one `camera`, rendered once; all its outputs follow from that.
+
+    Of (H, W) pixels, in [0, 1]: `opacity`, and `coverage`, how much of a pixel shows something, a sky included; nothing
+    shines through that part.
+    """
 
     @property
-    def camera(self) -> Cameras:
-        """One camera."""
+    def camera(self) -> Cameras: ...
 
     @property
-    def opacity(self) -> Tensor:
-        """(H, W), [0, 1]."""
+    def opacity(self) -> Tensor: ...
 
     @property
-    def coverage(self) -> Tensor:
-        """(H, W), [0, 1]: how much of a pixel shows something, a sky included; nothing shines through that part."""
+    def coverage(self) -> Tensor: ...
 
     def __getitem__(self, name: str) -> Tensor:
-        """An output by its name.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """An output by its name; a ConfigError where there is none."""
+        ...
 
 
 @runtime_checkable
@@ -79,26 +77,32 @@ class RenderableScene(Protocol):
     @property
     def scene_box(self) -> SceneBox:
         """What is modelled, model space."""
+        ...
 
     @property
     def frame(self) -> Normalisation:
         """From the world of the scene's transforms.json to model space."""
+        ...
 
     @property
     def views(self) -> tuple[RunView, ...]:
         """Training views, then evaluation views, with their cameras."""
+        ...
 
     @property
     def device(self) -> torch.device:
         """Where it is rendered."""
+        ...
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user has to be told of it."""
+        ...
 
     @property
     def outputs(self) -> tuple[Output, ...]:
         """All outputs that take no argument, in the order in which they are offered."""
+        ...
 
     def output(self, name: str) -> Output:
         """An output by its name, which may have an argument as in `band:650nm`.
@@ -107,16 +111,16 @@ class RenderableScene(Protocol):
             ConfigError: there is none, or its argument can't be read.
             SpectrumError: the bands don't cover what it needs.
         """
+        ...
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> RenderedView:
         """Render a view; `subpixels` squared rays a pixel, None for as many as in training."""
+        ...
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
         """Outputs of a view by name, (H, W, ...)."""
+        ...
 
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
-        """What is seen in a pixel.
-
-        Raises:
-            ConfigError: the pixel is outside the image.
-        """
+        """What is seen in a pixel; a ConfigError where it is outside the image."""
+        ...
