@@ -270,7 +270,8 @@ def traced_colours(
     to_eye = functional.normalize(eyes[rows[:, 1]] - points.positions[rows[:, 0]], dim=-1)
     with torch.no_grad():
         traced = TracedObject(ray_mesh, environment, surface)
-        radiance = traced.light(points.select(rows[:, 0]), to_eye, samples, generator=generator)
+        seen = replace(points.select(rows[:, 0]), to_eye=to_eye)
+        radiance = traced.light(seen, samples, generator=generator)
     colours = torch.zeros(*known.visible.shape, 3)
     colours[known.visible] = radiance / environment.mean_radiance().mean().clamp(min=1e-12)
     return colours

@@ -1,9 +1,10 @@
-"""Reflectances with closed forms, directions, meshes, cameras and a trained object without a training."""
+"""Reflectances with closed forms, directions, meshes, rays, cameras and a trained object without a training."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +14,13 @@ from torch import Tensor
 from tests.viewer.view_factory import BOX, ring
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.scene_record import SceneRecord
+from unmix_plugin.neumatex.demo.objects import viewpoints
 from unmix_plugin.neumatex.fit.tone import tone_curve
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, PbrFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh, mesh_of
+from unmix_plugin.neumatex.tracing.microfacet import cosine_directions
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.trained.run_views import recorded_views
@@ -27,10 +30,8 @@ def unit(vectors):
     return torch.nn.functional.normalize(vectors, dim=-1)
 
 
-def cosine_directions(uniforms):
-    azimuth, radius = 2 * math.pi * uniforms[:, 0], uniforms[:, 1].sqrt()
-    z = (1 - uniforms[:, 1]).sqrt()
-    return torch.stack([radius * azimuth.cos(), radius * azimuth.sin(), z], dim=-1)
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
 
 
 class Lambert(MaterialFamily):
@@ -44,7 +45,7 @@ class Lambert(MaterialFamily):
         return torch.where(above, parameters / math.pi, 0.0)
 
     def sample(self, parameters, wo, uniforms):
-        return cosine_directions(uniforms)
+        return cosine_directions(uniforms[:, :2].T).T
 
     def density(self, parameters, wi, wo):
         return wi[:, 2].clamp(min=0.0) / math.pi
@@ -76,10 +77,9 @@ class Glossy(MaterialFamily):
         mirrored = wo * torch.tensor([-1.0, -1.0, 1.0])
         first = unit(torch.linalg.cross(mirrored, torch.tensor([0.3, 0.5, -0.8]).expand_as(mirrored)))
         second = torch.linalg.cross(mirrored, first)
-        lobe = cosine[:, None] * mirrored + sine[:, None] * (
-            azimuth.cos()[:, None] * first + azimuth.sin()[:, None] * second
-        )
-        return torch.where(uniforms[:, 2:] < 0.5, lobe, cosine_directions(uniforms[:, :2]))
+        aside = azimuth.cos()[:, None] * first + azimuth.sin()[:, None] * second
+        lobe = cosine[:, None] * mirrored + sine[:, None] * aside
+        return torch.where(uniforms[:, 2:] < 0.5, lobe, cosine_directions(uniforms[:, :2].T).T)
 
     def density(self, parameters, wi, wo):
         return 0.5 * wi[:, 2].clamp(min=0.0) / math.pi + 0.5 * self._lobe(parameters, wi, wo)
@@ -99,38 +99,6 @@ class Uniform:
         return self.values.expand(len(positions), -1)
 
 
-def wide_parameters(number: int, num_parameters: int, seed: int = 0) -> Tensor:
-    """Random parameters, a quarter of them at 0 or 1."""
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.rand(number, num_parameters, generator=generator)
-    ends = torch.rand(number, num_parameters, generator=generator)
-    return torch.where(ends < 0.125, 0.0, torch.where(ends > 0.875, 1.0, drawn))
-
-
-def eye_directions(number: int, seed: int = 1, lowest: float = 0.05) -> Tensor:
-    """Above the surface, cosines from `lowest` to 1."""
-    generator = torch.Generator().manual_seed(seed)
-    z = lowest + (1 - lowest) * torch.rand(number, generator=generator)
-    angle = 2 * math.pi * torch.rand(number, generator=generator)
-    sine = torch.sqrt(1 - z * z)
-    return torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z], -1)
-
-
-def numbers(rows: int, columns: int, seed: int = 2) -> Tensor:
-    """Uniform random numbers."""
-    return torch.rand(rows, columns, generator=torch.Generator().manual_seed(seed))
-
-
-def spherical_grid(rings: int, spokes: int) -> tuple[Tensor, Tensor]:
-    """Directions over the whole sphere and their solid angles."""
-    z = 1 - 2 * (torch.arange(rings, dtype=torch.float64) + 0.5) / rings
-    angle = 2 * math.pi * (torch.arange(spokes, dtype=torch.float64) + 0.5) / spokes
-    z, angle = torch.cartesian_prod(z, angle).unbind(-1)
-    sine = torch.sqrt(1 - z * z)
-    directions = torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z], -1).float()
-    return directions, torch.full((len(directions),), 4 * math.pi / len(directions))
-
-
 @dataclass(frozen=True)
 class WavySurface:
     """Parameters that change smoothly over space, each in its own rhythm."""
@@ -146,29 +114,53 @@ class WavySurface:
 PBR, LAYERED = WavySurface(PbrFamily()), WavySurface(LayeredFamily())
 
 
+def wide_parameters(number: int, num_parameters: int, seed: int = 0) -> Tensor:
+    """Random parameters, a quarter of them at 0 or 1."""
+    drawn, ends = torch.rand(2, number, num_parameters, generator=generator(seed))
+    return torch.where(ends < 0.125, 0.0, torch.where(ends > 0.875, 1.0, drawn))
+
+
+def eye_directions(number: int, seed: int = 1, lowest: float = 0.05) -> Tensor:
+    """Above the surface, cosines from `lowest` to 1."""
+    shares, turns = torch.rand(2, number, generator=generator(seed))
+    z, angle = lowest + (1 - lowest) * shares, 2 * math.pi * turns
+    sine = torch.sqrt(1 - z * z)
+    return torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z], -1)
+
+
+def numbers(rows: int, columns: int, seed: int = 2) -> Tensor:
+    """Uniform random numbers."""
+    return torch.rand(rows, columns, generator=generator(seed))
+
+
+def spherical_grid(rings: int) -> tuple[Tensor, Tensor]:
+    """Directions over the whole sphere, as many on a ring as there are rings, and their solid angles."""
+    steps = (torch.arange(rings, dtype=torch.float64) + 0.5) / rings
+    z, angle = torch.cartesian_prod(1 - 2 * steps, 2 * math.pi * steps).unbind(-1)
+    sine = torch.sqrt(1 - z * z)
+    directions = torch.stack([sine * torch.cos(angle), sine * torch.sin(angle), z], -1).float()
+    return directions, torch.full((len(directions),), 4 * math.pi / len(directions))
+
+
+def mesh_from(*shapes: Any) -> Mesh:
+    """Shapes of trimesh as one mesh."""
+    shape: Any = trimesh.util.concatenate(shapes)
+    return mesh_of(torch.as_tensor(np.array(shape.vertices)), torch.as_tensor(np.array(shape.faces)))
+
+
 def ball(subdivisions: int = 3) -> Mesh:
     """The unit sphere."""
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return mesh_of(torch.as_tensor(np.array(shape.vertices)), torch.as_tensor(np.array(shape.faces)))
+    return mesh_from(trimesh.creation.icosphere(subdivisions=subdivisions))
 
 
 def knot() -> Mesh:
     """A torus in [-1, 1]^3."""
-    shape = trimesh.creation.torus(0.7, 0.3, major_sections=48, minor_sections=24)
-    return mesh_of(torch.as_tensor(np.array(shape.vertices)), torch.as_tensor(np.array(shape.faces)))
+    return mesh_from(trimesh.creation.torus(0.7, 0.3, major_sections=48, minor_sections=24))
 
 
-def ring_cameras(count: int, size: int, distance: float = 4.0) -> Cameras:
-    """Cameras around the z axis that look at the origin, slightly from above."""
-    angles = torch.arange(count) * (2 * torch.pi / count)
-    back = torch.stack([angles.cos(), angles.sin(), torch.full_like(angles, 0.4)], dim=-1)
-    back = torch.nn.functional.normalize(back, dim=-1)
-    right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]).expand_as(back), back)
-    right = torch.nn.functional.normalize(right, dim=-1)
-    up = torch.linalg.cross(back, right)
-    poses = torch.stack([right, up, back, distance * back], dim=-1)
-    focal = torch.full((count, 2), 1.4 * size)
-    return Cameras(poses, focal, torch.full((count, 2), size / 2), torch.zeros(count, 4), size, size)
+def ring_cameras(count: int, size: int) -> Cameras:
+    """Cameras that look at the origin from several sides."""
+    return viewpoints(count, size, 1.0)
 
 
 CAMERAS = ring()
@@ -184,12 +176,11 @@ def uneven_light():
     return Environment(image)
 
 
-def make_object(light=None, surface=PBR, **settings):
-    torch.manual_seed(0)
+def make_object(**settings):
     return TrainedObject(
         RayMesh(ball(2).transformed(0.6, torch.zeros(3))),
-        surface,
-        uneven_light() if light is None else light,
+        PBR,
+        uneven_light(),
         FRAME,
         recorded_views(RECORD),
         BOX,

@@ -8,6 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from tests.neumatex.factory import write_object
+from tests.neumatex.surfaces import generator, unit
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.fit import data_manager
@@ -22,15 +23,12 @@ from unmix_plugin.spectral.bands import Bands
 
 
 def test_the_distance_counts_each_parameter_by_its_expected_error():
-    generator = torch.Generator().manual_seed(1)
-    said = Triplane(5, 8, generator=generator).requires_grad_(False)
-    positions = 2 * torch.rand(7, 3, generator=generator) - 1
-    parameters = torch.rand(7, 5, generator=generator, requires_grad=True)
-    expected = torch.zeros(())
-    for row in range(7):
-        at = positions[row : row + 1]
-        errors = (parameters[row] - said.parameters_at(at)[0]) ** 2
-        expected = expected + (errors / said.log_variance(at)[0].exp()).sum() / 7
+    drawn = generator(1)
+    said = Triplane(5, 8, generator=drawn).requires_grad_(False)
+    positions = 2 * torch.rand(7, 3, generator=drawn) - 1
+    parameters = torch.rand(7, 5, generator=drawn, requires_grad=True)
+    errors = (parameters - said.parameters_at(positions)) ** 2
+    expected = (errors / said.log_variance(positions).exp()).sum() / 7
     found = _distance(said, parameters, positions)
     torch.testing.assert_close(found, expected)
     found.backward()
@@ -65,8 +63,7 @@ def _corners(scale=SCALE):
 
 def _points(count=200):
     """Points and normals of the run's ball, in that model space."""
-    outwards = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
-    outwards = torch.nn.functional.normalize(outwards, dim=1)
+    outwards = unit(torch.randn(count, 3, generator=generator()))
     of_run = RADIUS * outwards.double().numpy()
     positions = torch.from_numpy((of_run - SHIFT) @ TURN.T / SCALE).float()
     return positions, torch.from_numpy(outwards.double().numpy() @ TURN.T).float(), outwards
@@ -100,14 +97,14 @@ def test_a_run_of_other_bands_another_number_or_another_place_is_refused():
 
 @pytest.mark.parametrize("family", [NeuralFamily(), PbrFamily()])
 def test_a_new_triplane_is_grey_and_reflects_as_what_is_no_metal(family):
-    generator = torch.Generator().manual_seed(2)
-    triplane = Triplane(family.num_parameters, 16, generator=generator)
+    drawn = generator(2)
+    triplane = Triplane(family.num_parameters, 16, generator=drawn)
     start_plain(triplane, family)
-    positions = 2 * torch.rand(200, 3, generator=generator) - 1
+    positions = 2 * torch.rand(200, 3, generator=drawn) - 1
     parameters = TriplaneSurface(family, triplane).parameters(positions).detach()
     assert family.base_colour(parameters).sub(0.5).abs().mean() < 0.1
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
-    side = torch.nn.functional.normalize(torch.tensor([[0.7, 0.0, 1.0]]), dim=-1).expand(200, 3)
+    side = unit(torch.tensor([[0.7, 0.0, 1.0]])).expand(200, 3)
     reflectance = family.evaluate(parameters, side, up)
     dark = torch.cat([torch.full((200, 3), 0.02), parameters[:, 3:]], dim=-1)
     # Nearly all of it is the base colour's: a metal's highlight would not go with it.

@@ -9,6 +9,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
+from tests.neumatex.surfaces import ball, generator, knot, unit
 from tests.systems import needs_posix
 from unmix_plugin.errors import SceneError
 from unmix_plugin.formats.meshes import write_glb
@@ -35,25 +36,20 @@ def closest_twin(mesh, origins, directions):
     inside = (second >= 0) & (third >= 0) & (second + third <= 1) & (distances > 0) & (distances < 1e30)
     distances, triangles = torch.where(inside, distances, 1e30).min(dim=1)
     found = distances < 1e30
-    chosen = triangles[:, None]
-    second, third = (values.gather(1, chosen)[:, 0] for values in (second, third))
-    barycentric = torch.stack([1 - second - third, second], dim=-1)
-    return Hits(
-        found,
-        torch.where(found, triangles, -1),
-        torch.where(found[:, None], barycentric, 0.0).float(),
-        distances.float(),
-    )
+    second, third = (values.gather(1, triangles[:, None])[:, 0] for values in (second, third))
+    barycentric = torch.stack([1 - second - third, second], dim=-1) * found[:, None]
+    return Hits(found, torch.where(found, triangles, -1), barycentric.float(), distances.float())
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
-def test_formats_agree(tmp_path, suffix):
+@pytest.mark.parametrize("first", [0, 1])
+def test_formats_agree_and_an_open_mesh_is_noted(tmp_path, suffix, first):
     torus = trimesh.creation.torus(1.0, 0.3, major_sections=12, minor_sections=8)
-    path = tmp_path / f"mesh.{suffix}"
-    torus.export(path)
+    torus.update_faces(np.arange(len(torus.faces)) >= first)
+    torus.export(tmp_path / f"mesh.{suffix}")
     notes = []
-    mesh = read_mesh(path, notes)
-    assert notes == []
+    mesh = read_mesh(tmp_path / f"mesh.{suffix}", notes)
+    assert ["is open" in note for note in notes] == [True] * first
     corners = torch.as_tensor(np.array(torus.triangles), dtype=torch.float32)
     assert_close(mesh.corners(), corners, atol=1e-6, rtol=0)
 
@@ -122,7 +118,7 @@ def test_each_piece_is_turned_so_that_its_front_is_seen(tmp_path, has_normals):
 def test_a_vertex_of_no_triangle_changes_nothing_however_far_it_is(tmp_path):
     box, notes = trimesh.creation.box(), []
     vertices = np.vstack([box.vertices, [[np.nan, 1e30, 0]]])
-    _ply(tmp_path / "box.ply", vertices, box.faces)
+    trimesh.Trimesh(vertices, box.faces, process=False).export(tmp_path / "box.ply")
     read = read_mesh(tmp_path / "box.ply", notes)
     assert notes == []
     assert_close(read.vertices.amax(dim=0).double(), torch.full((3,), 0.5, dtype=torch.float64))
@@ -146,23 +142,11 @@ def test_no_file_outside_the_folder_is_read_for_a_mesh_and_no_pipe(tmp_path):
             read_mesh(folder / "model.gltf")
 
 
-def test_an_open_mesh_is_noted(tmp_path):
-    box = trimesh.creation.box()
-    trimesh.Trimesh(box.vertices, box.faces[1:]).export(tmp_path / "mesh.ply")
-    notes = []
-    read_mesh(tmp_path / "mesh.ply", notes)
-    assert len(notes) == 1
-    assert "open" in notes[0]
-
-
-def _ply(path, vertices, faces):
-    trimesh.Trimesh(vertices, faces, process=False).export(path)
-
-
 def test_bad_meshes_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(reading, "MAX_TRIANGLES", 11)
-    _ply(tmp_path / "line.ply", [[0, 0, 0], [1, 1, 1], [2, 2, 2]], [[0, 1, 2]])
-    _ply(tmp_path / "nan.ply", [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    for name, vertices in (("line", [[1, 1, 1], [2, 2, 2]]), ("nan", [[np.nan, 0, 0], [0, 1, 0]])):
+        corners = [[0, 0, 0], *vertices]
+        trimesh.Trimesh(corners, [[0, 1, 2]], process=False).export(tmp_path / f"{name}.ply")
     (tmp_path / "text.ply").write_text("no mesh")
     (tmp_path / "mesh.stl").write_text("solid")
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
@@ -191,32 +175,20 @@ def test_model_space_is_centred_with_half_edge_one():
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 
 
-def _torus():
-    torus = trimesh.creation.torus(0.7, 0.3, major_sections=24, minor_sections=12)
-    return mesh_of(torch.tensor(torus.vertices), torch.tensor(torus.faces))
-
-
-def _sphere(subdivisions=3):
-    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return mesh_of(torch.tensor(sphere.vertices), torch.tensor(sphere.faces))
-
-
 def _rays(count, seed=0):
-    g = torch.Generator().manual_seed(seed)
+    g = generator(seed)
     origins = 1.5 * torch.randn(count, 3, generator=g)
-    return origins, _unit(torch.randn(count, 3, generator=g) - origins)
-
-
-def _unit(vectors):
-    return torch.nn.functional.normalize(vectors, dim=-1)
+    return origins, unit(torch.randn(count, 3, generator=g) - origins)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [0, 1, 2000])
 def test_closest_hits_are_those_of_the_twin(device, count):
-    mesh, (origins, directions) = _torus(), _rays(count)
+    mesh, (origins, directions) = knot(), _rays(count)
     expected = closest_twin(mesh, origins, directions)
-    hits = RayMesh(mesh, device).closest(origins.to(device), directions.to(device))
+    rays = RayMesh(mesh, device), origins.to(device), directions.to(device)
+    hits = RayMesh.closest(*rays)
+    assert torch.equal(RayMesh.blocked(*rays), hits.found)
     assert torch.equal(hits.found.cpu(), expected.found)
     assert torch.equal(hits.triangles.cpu(), expected.triangles)
     assert_close(hits.distances.cpu(), expected.distances, atol=2e-6, rtol=1e-6)
@@ -224,39 +196,29 @@ def test_closest_hits_are_those_of_the_twin(device, count):
     assert count < 2000 or 0.2 < hits.found.float().mean() < 0.8
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_ray_is_blocked_where_it_has_a_hit(device):
-    rays, (origins, directions) = RayMesh(_torus(), device), _rays(2000, seed=1)
-    origins, directions = origins.to(device), directions.to(device)
-    assert torch.equal(rays.blocked(origins, directions), rays.closest(origins, directions).found)
-
-
 def test_points_lie_on_the_surface_and_face_the_viewer():
-    rays = RayMesh(_sphere())
+    rays = RayMesh(ball())
     origins, directions = _rays(500, seed=2)
-    hits = rays.closest(origins, directions)
-    origins, directions = origins[hits.found], directions[hits.found]
-    hits = rays.closest(origins, directions)
-    points = rays.points(hits, directions)
-    assert_close(points.positions, origins + hits.distances[:, None] * directions, atol=2e-5, rtol=0)
+    distances = rays.closest(origins, directions).distances
+    found, points = rays.seen(origins, directions)
+    origins, directions = origins[found], directions[found]
+    assert_close(points.positions, origins + distances[found, None] * directions, atol=2e-5, rtol=0)
+    assert torch.equal(points.to_eye, -directions)
     assert bool(((points.normals * directions).sum(-1) < 0).all())
     assert bool(((points.geometric_normals * directions).sum(-1) <= 0).all())
     outside = origins.norm(dim=-1) > 1
-    assert_close(points.normals[outside], _unit(points.positions[outside]), atol=0.05, rtol=0)
+    assert_close(points.normals[outside], unit(points.positions[outside]), atol=0.05, rtol=0)
     inside = origins.norm(dim=-1) < 0.9
     assert bool(inside.any())
-    assert_close(points.normals[inside], -_unit(points.positions[inside]), atol=0.02, rtol=0)
+    assert_close(points.normals[inside], -unit(points.positions[inside]), atol=0.02, rtol=0)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
 def test_rays_leave_a_convex_surface_without_meeting_it(scale):
-    mesh = _sphere().transformed(scale, torch.zeros(3))
+    mesh = ball().transformed(scale, torch.zeros(3))
     rays, (origins, directions) = RayMesh(mesh), _rays(4000, seed=3)
-    origins = scale * 2 * _unit(origins)
-    hits = rays.closest(origins, directions)
-    origins, directions = origins[hits.found], directions[hits.found]
-    points = rays.points(rays.closest(origins, directions), directions)
+    _, points = rays.seen(scale * 2 * unit(origins), directions)
     # Nearly along the surface, where rounding would hurt first.
-    tangent = _unit(torch.linalg.cross(points.geometric_normals, directions))
-    assert not bool(rays.blocked(points.positions, _unit(tangent + 0.01 * points.geometric_normals)).any())
+    tangent = unit(torch.linalg.cross(points.to_eye, points.geometric_normals))
+    assert not bool(rays.blocked(points.positions, unit(tangent + 0.01 * points.geometric_normals)).any())
     assert bool(rays.blocked(points.positions, -points.geometric_normals).all())

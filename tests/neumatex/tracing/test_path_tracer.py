@@ -1,6 +1,5 @@
 """The path tracer against closed forms, and whole pictures."""
 
-import dataclasses
 import math
 
 import pytest
@@ -8,11 +7,10 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import Glossy, Lambert, Uniform, unit
+from tests.neumatex.surfaces import Glossy, Lambert, Uniform, ball, generator, mesh_from, unit
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, directions_of_pixels
-from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
@@ -20,48 +18,37 @@ from unmix_plugin.neumatex.tracing.rays import RayMesh, pixel_hits
 GLOSSY = [0.4, 0.3, 0.2, 0.3, 0.5]
 
 
-def _rays(mesh):
-    return RayMesh(mesh_of(torch.tensor(mesh.vertices), torch.tensor(mesh.faces)))
-
-
 def _sphere(subdivisions=3):
-    return _rays(trimesh.creation.icosphere(subdivisions=subdivisions))
+    return RayMesh(ball(subdivisions))
 
 
 def _two_spheres():
     first, second = (trimesh.creation.icosphere(subdivisions=3, radius=0.5) for _ in range(2))
     first.apply_translation((-0.5, 0, 0))
     second.apply_translation((0.52, 0.1, 0.1))
-    return _rays(trimesh.util.concatenate([first, second]))
+    return RayMesh(mesh_from(first, second))
 
 
 def _white():
     return Environment(torch.ones(8, 16, 3))
 
 
-def _generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def _seen(rays, count=200, origin=(0.3, -3.0, 0.4), seed=0):
-    """Points that a viewer outside (or inside) sees, and directions to the viewer."""
-    targets = 1.2 * torch.rand(count, 3, generator=_generator(seed)) - 0.6
+def _seen(rays, count=200, origin=(0.3, -3.0, 0.4)):
+    """Points that a viewer outside (or inside) sees."""
     origins = torch.tensor(origin).expand(count, 3)
-    directions = unit(targets - origins)
-    hits = rays.closest(origins, directions)
-    directions = directions[hits.found]
-    return rays.points(hits.select(hits.found), directions), -directions
+    targets = 1.2 * torch.rand(count, 3, generator=generator()) - 0.6
+    return rays.seen(origins, unit(targets - origins))[1]
 
 
-def _radiance(surface, rays, environment, points, to_eye, samples=64, bounces=1, seed=0):
-    return TracedObject(rays, environment, surface).light(points, to_eye, samples, bounces, _generator(seed))
+def _radiance(surface, rays, environment, points, samples=64, bounces=1, seed=0):
+    return TracedObject(rays, environment, surface).light(points, samples, bounces, generator(seed))
 
 
 def test_white_furnace_of_a_convex_lambertian():
     rays = _sphere(5)
-    points, to_eye = _seen(rays)
+    points = _seen(rays)
     surface = Uniform(Lambert(), [1.0, 0.5, 0.0])
-    radiance = _radiance(surface, rays, _white(), points, to_eye, 256, bounces=3)
+    radiance = _radiance(surface, rays, _white(), points, 256, bounces=3)
     expected = torch.tensor([1.0, 0.5, 0.0]).expand_as(radiance)
     # Facets hide a little of the hemispheres of interpolated normals.
     assert_close(radiance, expected, atol=0.03, rtol=0)
@@ -75,13 +62,11 @@ def test_bounces_within_a_closed_sphere_are_a_geometric_series(bounces):
     open_faces = sphere.faces[sphere.triangles_center[:, 2] < 0.8]
     open_sphere = trimesh.Trimesh(sphere.vertices, open_faces, process=False)
     hole = 1 - open_sphere.area / sphere.area
-    points, to_eye = _seen(_rays(open_sphere), count=3000, origin=(0.0, 0.0, 0.0))
-    below = points.positions[:, 2] < 0.75
-    points, to_eye = points.select(below), to_eye[below]
+    rays = RayMesh(mesh_from(open_sphere))
+    points = _seen(rays, count=3000, origin=(0.0, 0.0, 0.0))
+    points = points.select(points.positions[:, 2] < 0.75)
     albedo = torch.tensor([0.9, 0.6, 0.3])
-    radiance = _radiance(
-        Uniform(Lambert(), albedo), _rays(open_sphere), _white(), points, to_eye, 16, bounces
-    )
+    radiance = _radiance(Uniform(Lambert(), albedo), rays, _white(), points, 16, bounces)
     # Inside a sphere every point sees every part under cos cos / (pi r^2) = 1 / area, so the irradiance is the same
     # everywhere and each reflection keeps the albedo and the closed part.
     closed = albedo * (1 - hole)
@@ -91,12 +76,10 @@ def test_bounces_within_a_closed_sphere_are_a_geometric_series(bounces):
 
 def test_energy_is_not_made():
     rays = _two_spheres()
-    points, to_eye = _seen(rays)
-    radiance = _radiance(
-        Uniform(Lambert(), [1.0] * 3), rays, _white(), points, to_eye, samples=256, bounces=6
-    )
+    points = _seen(rays)
+    radiance = _radiance(Uniform(Lambert(), [1.0] * 3), rays, _white(), points, samples=256, bounces=6)
     assert radiance.max() < 1.05
-    direct = _radiance(Uniform(Lambert(), [1.0] * 3), rays, _white(), points, to_eye, samples=256, bounces=0)
+    direct = _radiance(Uniform(Lambert(), [1.0] * 3), rays, _white(), points, samples=256, bounces=0)
     assert direct.min() < 0.8  # one sphere shadows the other, which bounces make up for
     assert_close(radiance.mean(), torch.tensor(1.0), atol=0.02, rtol=0)
 
@@ -105,14 +88,10 @@ class _OnlyEnvironment(Glossy):
     """Draws nothing itself."""
 
     def sample(self, parameters, wo, uniforms):
-        return -cosine_below(uniforms)
+        return -unit(uniforms + 0.1)
 
     def density(self, parameters, wi, wo):
         return torch.zeros(len(wi))
-
-
-def cosine_below(uniforms):
-    return unit(uniforms + 0.1)
 
 
 class _NeverDrawn(Environment):
@@ -128,11 +107,11 @@ class _NeverDrawn(Environment):
 
 def test_both_strategies_together_agree_with_each_alone():
     rays, light = _two_spheres(), built_in_environment("studio", 3, height=16)
-    points, to_eye = _seen(rays)
-    together = _radiance(Uniform(Glossy(), GLOSSY), rays, light, points, to_eye, 1024, bounces=0)
-    by_light = _radiance(Uniform(_OnlyEnvironment(), GLOSSY), rays, light, points, to_eye, 1024, bounces=0)
+    points = _seen(rays)
+    together = _radiance(Uniform(Glossy(), GLOSSY), rays, light, points, 1024, bounces=0)
+    by_light = _radiance(Uniform(_OnlyEnvironment(), GLOSSY), rays, light, points, 1024, bounces=0)
     by_material = _radiance(
-        Uniform(Glossy(), GLOSSY), rays, _NeverDrawn(light.image), points, to_eye, 1024, bounces=0
+        Uniform(Glossy(), GLOSSY), rays, _NeverDrawn(light.image), points, 1024, bounces=0
     )
     mean = together.mean(dim=0)
     assert_close(by_light.mean(dim=0), mean, rtol=0.01, atol=0)
@@ -154,30 +133,26 @@ def _flux(rays, surface, light, eye):
     x, y = torch.meshgrid(*2 * [torch.linspace(-1.3, 1.3, 120)], indexing="ij")
     origins = 5 * eye + x.reshape(-1, 1) * first + y.reshape(-1, 1) * second
     directions = -eye.expand_as(origins).contiguous()
-    hits = rays.closest(origins, directions)
-    points = rays.points(hits.select(hits.found), directions[hits.found])
+    _, points = rays.seen(origins, directions)
     spot = (directions_of_pixels(64, 128) @ light > 0.985).float()[..., None].expand(-1, -1, 3)
     emitter = Environment(spot.contiguous())
     power = emitter.mean_radiance().sum()
-    radiance = _radiance(surface, rays, emitter, points, eye.expand(len(points.normals), 3), 32, bounces=1)
+    radiance = _radiance(surface, rays, emitter, points, 32, bounces=1)
     return radiance.sum(dim=0) / power
 
 
 def test_gradients_are_those_of_finite_differences():
     rays, light = _two_spheres(), built_in_environment("window-room", 1, height=16)
-    points, to_eye = _seen(rays, count=30)
+    points = _seen(rays, count=30)
     values = torch.tensor(GLOSSY, requires_grad=True)
-    cotangent = torch.rand(len(to_eye), 3, generator=_generator(7))
+    cotangent = torch.rand(len(points.positions), 3, generator=generator(7))
 
     def value(parameters):
         # Densities come from the fixed material, reflectances from the changed one: the same paths in both.
         family = _FixedDraws(values.detach())
-        return (_radiance(Uniform(family, parameters), rays, light, points, to_eye, 32) * cotangent).sum()
+        return (_radiance(Uniform(family, parameters), rays, light, points, 32) * cotangent).sum()
 
-    surface = Uniform(_FixedDraws(values.detach()), GLOSSY)
-    surface.values = values
-    loss = (_radiance(surface, rays, light, points, to_eye, 32) * cotangent).sum()
-    (gradient,) = torch.autograd.grad(loss, values)
+    (gradient,) = torch.autograd.grad(value(values), values)
     step = 0.01
     expected = torch.stack(
         [
@@ -204,14 +179,13 @@ class _FixedDraws(Glossy):
 def test_gradient_of_the_mean_is_the_mean_of_gradients_with_moving_draws():
     """The derivative without fixing draws is estimated without bias: compare with differences of good estimates."""
     rays, light = _sphere(3), built_in_environment("overcast", 1, height=16)
-    points, to_eye = _seen(rays, count=60)
+    points = _seen(rays, count=60)
     values = torch.tensor(GLOSSY, requires_grad=True)
-    surface = Uniform(Glossy(), GLOSSY)
-    surface.values = values
-    (gradient,) = torch.autograd.grad(_radiance(surface, rays, light, points, to_eye, 512).mean(), values)
+    surface = Uniform(Glossy(), values)
+    (gradient,) = torch.autograd.grad(_radiance(surface, rays, light, points, 512).mean(), values)
     step = 0.1 * torch.tensor([0.0, 0, 0, 0, 1.0])
     up, down = (
-        _radiance(Uniform(Glossy(), values.detach() + s * step), rays, light, points, to_eye, 2048).mean()
+        _radiance(Uniform(Glossy(), values.detach() + s * step), rays, light, points, 2048).mean()
         for s in (1, -1)
     )
     assert_close(gradient[4], (up - down) / 0.2, rtol=0.08, atol=2e-4)
@@ -219,14 +193,12 @@ def test_gradient_of_the_mean_is_the_mean_of_gradients_with_moving_draws():
 
 def test_two_calls_are_independent_and_a_seed_repeats():
     rays, light = _sphere(2), built_in_environment("studio", 0, height=16)
-    points, to_eye = _seen(rays)
-    surface, generator = Uniform(Glossy(), GLOSSY), _generator(4)
-    first, second = (
-        TracedObject(rays, light, surface).light(points, to_eye, 4, generator=generator) for _ in range(2)
-    )
-    again = _radiance(surface, rays, light, points, to_eye, samples=4, seed=4)
+    points = _seen(rays)
+    surface, drawn = Uniform(Glossy(), GLOSSY), generator(4)
+    first, second = (TracedObject(rays, light, surface).light(points, 4, generator=drawn) for _ in range(2))
+    again = _radiance(surface, rays, light, points, samples=4, seed=4)
     assert torch.equal(first, again)
-    truth = _radiance(surface, rays, light, points, to_eye, samples=2048, seed=9)
+    truth = _radiance(surface, rays, light, points, samples=2048, seed=9)
     errors = torch.stack([(first - truth)[:, 0], (second - truth)[:, 0]])
     assert torch.corrcoef(errors)[0, 1].abs() < 0.2
 
@@ -234,10 +206,11 @@ def test_two_calls_are_independent_and_a_seed_repeats():
 SIZE = 48
 
 
-def _camera(distance=4.0, size=SIZE):
-    """One on the x axis that looks at the origin, z up."""
-    pose = torch.tensor([[[0.0, 0, 1, distance], [1, 0, 0, 0], [0, 1, 0, 0]]])
+def _camera(size=SIZE, x_axis=(0.0, 1.0, 0.0), back=(1.0, 0.0, 0.0)):
+    """One on the x axis, four units away, z up; by default it looks at the origin."""
+    axes = [torch.tensor(axis) for axis in (x_axis, (0.0, 0.0, 1.0), back, (4.0, 0.0, 0.0))]
     focal = torch.full((1, 2), 1.5 * size)
+    pose = torch.stack(axes, dim=-1)[None]
     return Cameras(pose, focal, torch.full((1, 2), size / 2), torch.zeros(1, 4), size, size)
 
 
@@ -258,7 +231,7 @@ def test_rays_of_a_pixel_are_averaged():
     inner = hits.select(hits.pixels == SIZE // 2 * SIZE + SIZE // 2)
     assert len(inner) == 4
     assert bool((hits.pixels.diff() >= 0).all())
-    assert_close(inner.to_eye.norm(dim=-1), torch.ones(4))
+    assert_close(inner.points.to_eye.norm(dim=-1), torch.ones(4))
 
 
 def test_left_and_up_are_where_they_belong():
@@ -283,6 +256,5 @@ def test_a_white_sphere_in_a_white_world_is_its_alpha():
 
 def test_a_camera_that_sees_nothing_gives_black_and_alpha_zero():
     traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
-    away = torch.tensor([[[0.0, 0, -1, 4], [-1, 0, 0, 0], [0, 1, 0, 0]]])
-    picture, alpha = traced.picture(dataclasses.replace(_camera(size=8), camera_to_world=away), 0, 64)
+    picture, alpha = traced.picture(_camera(8, (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)), 0, 64)
     assert picture.abs().sum() + alpha.sum() == 0

@@ -33,7 +33,8 @@ from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
-from unmix_plugin.neumatex.tracing.path_tracer import TracedObject, TracedObjectCache
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
+from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.neumatex.tracing.surface import Triplane, TriplaneSurface
 
 _START_SEED = 0
@@ -49,19 +50,18 @@ class NeumatexModel(Model):
         """Modules and buffers in the shapes that config and object ask for."""
         record = ObjectRecord.from_json(self.metadata)
         self.record = record
-        self.endmembers: nn.Parameter | None = self._empty_endmembers()
-        self.gains = None if self.endmembers is None else nn.Parameter(torch.ones(len(self.endmembers)))
+        shares = self._checked_num_endmembers()
+        self.endmembers = nn.Parameter(torch.zeros(shares, record.num_colours)) if shares else None
+        self.gains = nn.Parameter(torch.ones(shares)) if shares else None
         if self.endmembers is not None:
             self.family = SpectralFamily(self.endmembers, self.gains)
         else:
             self.family = NeuralFamily() if self.config.material == "neural" else PbrFamily()
-        # A run keeps the decoder that it was fitted with.
-        networks = {name: getattr(self.family, name, None) for name in ("decoder", "encoder")}
-        frozen = {name: part.requires_grad_(False) for name, part in networks.items() if part is not None}
-        self.family_parts = nn.ModuleDict(frozen)
+        self.family_parts = nn.ModuleDict()
+        if isinstance(self.family, NeuralFamily):  # a run keeps the decoder that it was fitted with
+            self.family_parts.update({"decoder": self.family.decoder, "encoder": self.family.encoder})
         generator = torch.Generator().manual_seed(_START_SEED)
         parameters, resolution = self.family.num_parameters, self.config.plane_resolution
-        shares = 0 if self.endmembers is None else len(self.endmembers)
         self.triplane = Triplane(parameters, resolution, generator=generator, num_shares=shares)
         self.light_curve = self._light_curve()
         self.anchor = nn.ModuleDict()  # under which name runs keep the prior
@@ -69,15 +69,14 @@ class NeumatexModel(Model):
             prior = Triplane(parameters, resolution, generator=generator).requires_grad_(False)
             self.anchor["triplane"] = prior
         if not self.config.fit_networks:
-            for network in self.triplane.parameter_groups()["networks"]:
-                network.requires_grad_(False)
+            self.triplane.readers.requires_grad_(False)
         is_light = record.tone_mapping == "linear"
         self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
         if record.bands is not None:
             self.curve = SpectralDisplay(record.bands)
         for name, buffer in _empty_buffers(record).items():
             self.register_buffer(name, buffer)
-        self._traced = TracedObjectCache()
+        self._traced: tuple[TracedObject, Tensor, int] | None = None
 
     def initialise(self, initial_data: Mapping[str, np.ndarray], generator: torch.Generator) -> None:
         """Take mesh and environment over, and begin with the prior's material, or a plain one."""
@@ -104,19 +103,19 @@ class NeumatexModel(Model):
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Planes, networks unless they stay as they are, and the camera's response where there is one."""
-        groups = self.triplane.parameter_groups()
-        if not self.config.fit_networks:
-            groups["networks"] = []
-        spectra = [] if self.endmembers is None else [self.endmembers]
-        gains = [] if self.gains is None else [self.gains]
-        response = list(self.curve.parameters())
-        return {**groups, "response": response, "endmembers": spectra, "gains": gains}
+        return {
+            "planes": [self.triplane.planes],
+            "networks": [*self.triplane.readers.parameters()] if self.config.fit_networks else [],
+            "response": [*self.curve.parameters()],
+            "endmembers": [] if self.endmembers is None else [self.endmembers],
+            "gains": [] if self.gains is None else [self.gains],
+        }
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """Make the endmembers as bright as their gains say, and keep them what reflectances can be."""
+        """Gains become the endmembers' own brightness."""
         if self.endmembers is None:
             return []
-        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_endmembers)]
+        return [TrainingCallback(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._settle_gains)]
 
     @property
     def prior(self) -> Triplane | None:
@@ -142,19 +141,24 @@ class NeumatexModel(Model):
 
     @property
     def traced(self) -> TracedObject:
-        """Mesh, light and materials, ready for rays."""
-        return self._traced.get(self.mesh, self.environment, self.surface)
+        """Mesh, light and materials, ready for rays; kept while the vertices stay as they are."""
+        vertices = self.get_buffer("vertices")
+        if self._traced is None or self._traced[1] is not vertices or self._traced[2] != vertices._version:
+            traced = TracedObject(RayMesh(self.mesh, vertices.device), self.environment, self.surface)
+            self._traced = traced, vertices, vertices._version
+        return self._traced[0]
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, Tensor]:
         """Two independent estimates of the light along the rays, `halves` (2, R, C); which rays meet the mesh, `found`
         (R), and where, `positions` (N, 3). Pictures are those of `TrainedObject`."""
         traced = self.traced
-        seen = traced.seen(ray_bundle.origins, ray_bundle.directions)
-        rows = torch.arange(len(seen.to_eye), device=seen.to_eye.device).repeat(2)
-        points, to_eye = seen.points.select(rows), seen.to_eye[rows]
-        light = traced.light(points, to_eye, self.config.samples // 2, self.config.bounces, self.generator)
-        halves = torch.stack([seen.scatter(part) for part in light.unflatten(0, (2, -1)).unbind()])
-        return {"halves": halves, "found": seen.found, "positions": seen.points.positions}
+        found, points = traced.ray_mesh.seen(ray_bundle.origins, ray_bundle.directions)
+        rows = found.nonzero()[:, 0]
+        twice = points.select(torch.arange(len(rows), device=rows.device).repeat(2))
+        light = traced.light(twice, self.config.samples // 2, self.config.bounces, self.generator)
+        halves = light.new_zeros(2, len(found), light.shape[1])
+        halves = halves.index_copy(1, rows, light.unflatten(0, (2, -1)))
+        return {"halves": halves, "found": found, "positions": points.positions}
 
     def get_loss_dict(
         self,
@@ -237,8 +241,8 @@ class NeumatexModel(Model):
             return LampRatio(self.record.lamp) if name == "auto" else tone_curve(name)
         return tone_curve("agx" if name == "auto" else name)
 
-    def _empty_endmembers(self) -> nn.Parameter | None:
-        """Endmembers (K, B) of a spectral material, not yet filled; None for materials in colours."""
+    def _checked_num_endmembers(self) -> int:
+        """K of a spectral material; 0 of materials in colours."""
         is_spectral, bands = self.record.is_spectral, self.record.num_colours
         if is_spectral != (self.config.material == "spectral"):
             raise ConfigError(
@@ -246,26 +250,17 @@ class NeumatexModel(Model):
                 f"{'bands' if is_spectral else 'colours'}; choose {'spectral' if is_spectral else 'neural or pbr'}"
             )
         if not is_spectral:
-            return None
+            return 0
         count = self.config.num_endmembers
         if not isinstance(count, int):
             raise ConfigError("num-endmembers is not settled: call resolve_auto first")
         if count > bands:
             raise ConfigError(f"num-endmembers is {count} but the pictures have {bands} bands; choose fewer")
-        return nn.Parameter(torch.zeros(count, bands))
+        return count
 
-    def _settle_endmembers(self, step: int, progress: float) -> None:
-        assert self.endmembers is not None
-        assert self.gains is not None
-        _settle(self.endmembers, self.gains)
-
-
-@torch.no_grad()
-def _settle(endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"]) -> None:
-    """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
-    bright = endmembers.clamp(0, 1) * gains.clamp(min=0)[:, None]
-    endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
-    gains.fill_(1)
+    def _settle_gains(self, step: int, progress: float) -> None:
+        assert isinstance(self.family, SpectralFamily)
+        self.family.settle_gains()
 
 
 def _distance(

@@ -9,8 +9,9 @@ Notation: `N` points, `P` parameters, `V` views of `H x W` pixels, `B` bands, `K
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,14 +25,10 @@ from torch.nn.functional import normalize
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.observations import PosedViews
-from unmix_plugin.neumatex.tracing.families import (
-    NUM_GLOSS,
-    LayeredFamily,
-    MaterialFamily,
-    SpectralFamily,
-)
+from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
-from unmix_plugin.neumatex.tracing.path_tracer import SeenPoints, TracedObject
+from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
+from unmix_plugin.neumatex.tracing.rays import SurfacePoints
 from unmix_plugin.neumatex.tracing.surface import Triplane
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.unmixing.abundances import fcls
@@ -68,15 +65,11 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     """Make a new triplane give a plain material nearly everywhere."""
     *_, last = triplane.readers.material_network.children()
     assert isinstance(last, nn.Linear)
+    plain, shares = _plain_parameters(family), triplane.readers.num_shares
     with torch.no_grad():
         triplane.planes.mul_(_START_PLANES)
         last.weight.mul_(_START_SPREAD)
-        plain = _plain_parameters(family)
-        raw = plain.logit()
-        shares = triplane.readers.num_shares
-        if shares:
-            raw[:shares] = plain[:shares].log()
-        last.bias.copy_(raw)
+        last.bias.copy_(torch.cat([plain[:shares].log(), plain[shares:].logit()]))
 
 
 def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
@@ -142,10 +135,10 @@ def start_spectral(
         torch.from_numpy(arrays[name]).to(model.device)
         for name in ("pixels", "pixel_origins", "pixel_directions")
     )
-    seen = model.traced.seen(origins, directions)
-    reflectance, is_lit = _apparent_reflectance(model.traced, seen, pixels[seen.found])
-    points, reflectance = seen.points.select(is_lit), reflectance[is_lit]
-    count, path = model.family.num_parameters - NUM_GLOSS, model.config.from_run
+    found, points = model.traced.ray_mesh.seen(origins, directions)
+    reflectance, is_lit = _apparent_reflectance(model.traced, points, pixels[found])
+    points, reflectance = points.select(is_lit), reflectance[is_lit]
+    count, path = len(model.endmembers), model.config.from_run
     if path is None:
         first = initialise_endmembers(reflectance, count, model.config.endmember_init, generator)
         purity = normalize(reflectance, dim=1) @ normalize(first, dim=1).T
@@ -163,11 +156,11 @@ def start_spectral(
 
 @torch.no_grad()
 def _apparent_reflectance(
-    traced: TracedObject, seen: SeenPoints, radiance: Float[Tensor, "N B"]
+    traced: TracedObject, points: SurfacePoints, radiance: Float[Tensor, "N B"]
 ) -> tuple[Float[Tensor, "N B"], Bool[Tensor, " N"]]:
     """Reflectance of a diffuse base under the plain gloss that would look so bright in direct light; and where enough
     light falls for it to mean something."""
-    white, gloss = (_plain_light(traced, seen, base) for base in (1.0, 0.0))
+    white, gloss = (_plain_light(traced, points, base) for base in (1.0, 0.0))
     diffuse = (white - gloss).clamp(min=1e-6)
     brightness = diffuse.mean(dim=1)
     is_lit = brightness > _DARKEST * brightness.median()
@@ -184,12 +177,12 @@ class _Plain:
         return positions.new_tensor([1.0, *_PLAIN_GLOSS]).expand(len(positions), -1)
 
 
-def _plain_light(traced: TracedObject, seen: SeenPoints, base: float) -> Float[Tensor, "N B"]:
+def _plain_light(traced: TracedObject, points: SurfacePoints, base: float) -> Float[Tensor, "N B"]:
     """What a plain material whose base reflects the same in all bands would send to the eye; direct light only."""
-    endmember = torch.full((1, traced.environment.num_colours), base, device=seen.to_eye.device)
-    plain = TracedObject(traced.ray_mesh, traced.environment, _Plain(SpectralFamily(endmember)))
-    generator = torch.Generator(seen.to_eye.device).manual_seed(0)
-    return plain.light(seen.points, seen.to_eye, _SAMPLES, 0, generator)
+    device = points.positions.device
+    endmember = torch.full((1, traced.environment.num_colours), base, device=device)
+    plain = replace(traced, surface=_Plain(SpectralFamily(endmember)))
+    return plain.light(points, _SAMPLES, 0, torch.Generator(device).manual_seed(0))
 
 
 def _as_bright(
@@ -215,24 +208,20 @@ def _fit_shares(
     generator: torch.Generator,
 ) -> None:
     """Fit planes and networks to shares at points; the other parameters stay where they are."""
-    parameters = list(triplane.parameters())
-    trained = [parameter.requires_grad for parameter in parameters]
-    triplane.requires_grad_(True)
+    fitted = copy.deepcopy(triplane).requires_grad_(True)
     with torch.no_grad():
         others = triplane.parameters_at(positions)[:, triplane.readers.num_shares :]
-    optimiser = torch.optim.Adam(parameters, lr=_RATE)
+    optimiser = torch.optim.Adam(fitted.parameters(), lr=_RATE)
     with torch.enable_grad():
         for _ in range(_STEPS):
             chosen = torch.randint(len(positions), (_POINTS,), generator=generator).to(positions.device)
-            found, kept = triplane.parameters_at(positions[chosen]).tensor_split([shares.shape[1]], dim=1)
+            found, kept = fitted.parameters_at(positions[chosen]).tensor_split([shares.shape[1]], dim=1)
             distance = -(shares[chosen] * found.clamp(min=1e-6).log()).sum(dim=1).mean()
             kept = (kept - others[chosen]).square().sum(dim=1).mean()
             optimiser.zero_grad()
             (distance + kept).backward()
             optimiser.step()
-    for parameter, was_trained in zip(parameters, trained, strict=True):
-        parameter.requires_grad_(was_trained)
-        parameter.grad = None
+    triplane.load_state_dict(fitted.state_dict())
 
 
 @lru_cache(maxsize=1)

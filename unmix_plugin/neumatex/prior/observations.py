@@ -149,7 +149,7 @@ class Observations:
 
 
 def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> SurfacePoints:
-    """Points of a mesh, uniform by area, a little above the surface."""
+    """Points of a mesh, uniform by area, a little above the surface, as seen from straight above."""
     corners = mesh.corners()
     edges = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     crossed = torch.linalg.cross(*edges)
@@ -163,7 +163,7 @@ def sample_surface(mesh: Mesh, count: int, generator: torch.Generator) -> Surfac
     normals = functional.normalize(normals, dim=-1)
     # A file's normals may disagree with the winding of its triangles; the normals say which side is outside.
     geometric = torch.where((geometric * normals).sum(dim=-1, keepdim=True) < 0, -geometric, geometric)
-    return SurfacePoints(positions + _OFF_SURFACE * geometric, normals, geometric)
+    return SurfacePoints(positions + _OFF_SURFACE * geometric, normals, geometric, geometric)
 
 
 def known_light(

@@ -1,4 +1,4 @@
-"""Warp kernels for rays against a triangle mesh: one work item is one ray."""
+"""The Warp kernel of rays against a triangle mesh: one work item is one ray."""
 
 from typing import no_type_check
 
@@ -29,20 +29,3 @@ def closest_kernel(
             triangles[ray] = wp.int64(-1)
             barycentric[ray] = wp.vec2f(0.0, 0.0)
             distances[ray] = longest
-
-
-@wp.kernel(enable_backward=False)
-@no_type_check
-def blocked_kernel(
-    first: int,
-    end: int,
-    stride: int,
-    mesh: wp.uint64,
-    longest: float,
-    origins: wp.array(dtype=wp.vec3f),
-    directions: wp.array(dtype=wp.vec3f),
-    blocked: wp.array(dtype=wp.uint8),
-):
-    for ray in range(first + wp.tid(), end, stride):
-        query = wp.mesh_query_ray(mesh, origins[ray], directions[ray], longest)
-        blocked[ray] = wp.uint8(query.result)

@@ -22,15 +22,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import MaterialFamily
-from unmix_plugin.neumatex.tracing.mesh import Mesh
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
-from unmix_plugin.neumatex.tracing.rays import Hits, PixelHits, RayMesh, SurfacePoints, pixel_hits
+from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, SurfacePoints, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
 
 _PATHS_AT_ONCE = 1 << 18
@@ -39,22 +38,6 @@ _NUMBERS_A_VERTEX = 5
 """Two for the environment, three for the material."""
 _Light = tuple[Tensor, Tensor]
 """Paths (M), and the radiance that they found at one vertex (M, C)."""
-
-
-@dataclass(frozen=True)
-class SeenPoints:
-    """Where rays meet the mesh."""
-
-    found: Bool[Tensor, " R"]
-    points: SurfacePoints
-    """N of them, in the order of the rays that found one."""
-    to_eye: Float[Tensor, "N 3"]
-    """Unit vectors back along the rays."""
-
-    def scatter(self, values: Float[Tensor, "N *rest"]) -> Float[Tensor, "R *rest"]:
-        """Values of points as those of rays; 0 where a ray meets nothing."""
-        whole = values.new_zeros((len(self.found), *values.shape[1:]))
-        return whole.index_put((self.found.nonzero(as_tuple=True)[0],), values)
 
 
 @dataclass(frozen=True)
@@ -73,18 +56,9 @@ class TracedObject:
     def _parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         return self.surface.family.decoded(self.surface.parameters(positions))
 
-    def seen(self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]) -> SeenPoints:
-        """What rays of unit directions meet first."""
-        with torch.no_grad():
-            hits = self.ray_mesh.closest(origins, directions)
-            rows = hits.found.nonzero(as_tuple=True)[0]
-            along = directions[rows]
-            return SeenPoints(hits.found, self.ray_mesh.points(hits.select(rows), along), -along)
-
     def light(
         self,
         points: SurfacePoints,
-        to_eye: Float[Tensor, "N 3"],
         samples: int,
         bounces: int = 1,
         generator: torch.Generator | None = None,
@@ -93,20 +67,23 @@ class TracedObject:
         independent.
 
         Args:
-            points: Of `RayMesh.points`.
-            to_eye: Unit vectors to the viewer.
+            points: As the eye sees them.
             samples: Paths a point, spread evenly over what can be drawn.
             bounces: Reflections before the last one: 0 is direct light only.
             generator: Of torch's numbers, on the device of the points.
         """
-        num_colours = self.environment.num_colours
+        num_points, num_colours = len(points.positions), self.environment.num_colours
         assert num_colours == self.surface.family.num_colours
-        device = to_eye.device
-        numbers = _SamplePoints.draw(len(to_eye), samples, bounces + 1, generator, device)
-        vertices = _first_vertices(self, points, to_eye, samples)
-        radiance = torch.zeros(len(to_eye), num_colours, device=device)
+        device, dimensions = points.positions.device, _NUMBERS_A_VERTEX * (bounces + 1)
+        sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64).to(device)
+        shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
+        vertices = _first_vertices(self, points, samples)
+        radiance = torch.zeros(num_points, num_colours, device=device)
         for depth in range(bounces + 1):
-            drawn = numbers.of(vertices.paths, depth)
+            part = slice(_NUMBERS_A_VERTEX * depth, _NUMBERS_A_VERTEX * (depth + 1))
+            # Path p is sample p % S of point p // S.
+            drawn = sequence[:, part][vertices.paths % samples] + shifts[:, part][vertices.paths // samples]
+            drawn = (drawn - drawn.floor()).clamp(max=1 - 2.0**-24)  # rounded to float32 it must not be 1
             lights, vertices = _shade(self, vertices, drawn, is_last=depth == bounces)
             for paths, found in lights:
                 radiance = radiance.index_add(0, paths // samples, found)
@@ -120,7 +97,7 @@ class TracedObject:
         samples_a_ray = max(1, -(-samples // hits.rays_a_pixel))
         device = self.ray_mesh.device
         parts = [
-            self.light(hits.points.select(rows), hits.to_eye[rows], samples_a_ray, bounces, generator)
+            self.light(hits.points.select(rows), samples_a_ray, bounces, generator)
             for rows in torch.arange(len(hits), device=device).split(max(1, _PATHS_AT_ONCE // samples_a_ray))
         ]
         return torch.cat(parts) if parts else torch.zeros(0, self.environment.num_colours, device=device)
@@ -144,26 +121,6 @@ class TracedObject:
         """
         hits = pixel_hits(self.ray_mesh, cameras, index, subpixels)
         return hits.image(self.light_of_rays(hits, samples, bounces, generator)), hits.alpha()
-
-
-class TracedObjectCache:
-    """Keeps the tree over a mesh's triangles while the mesh stays the same tensors; copies start empty."""
-
-    def __init__(self) -> None:
-        self._vertices: Tensor | None = None
-        self._version = -1
-        self._found: TracedObject | None = None
-
-    def __deepcopy__(self, memo: dict) -> TracedObjectCache:
-        return TracedObjectCache()
-
-    def get(self, mesh: Mesh, environment: Environment, surface: Surface) -> TracedObject:
-        """The object, with what was kept where the vertices have not changed since."""
-        vertices = mesh.vertices
-        if self._found is None or self._vertices is not vertices or self._version != vertices._version:
-            self._vertices, self._version = vertices, vertices._version
-            self._found = TracedObject(RayMesh(mesh, vertices.device), environment, surface)
-        return self._found
 
 
 @dataclass(frozen=True)
@@ -190,37 +147,39 @@ class _Vertices:
         return _Vertices(points=self.points.select(rows), **others)
 
 
-def _first_vertices(world: TracedObject, points: SurfacePoints, to_eye: Tensor, samples: int) -> _Vertices:
+def _first_vertices(world: TracedObject, points: SurfacePoints, samples: int) -> _Vertices:
     # Materials are looked up once a point, not once a sample.
     parameters, axes = world._parameters(points.positions), frames(points.normals)
-    wo = to_local(axes, to_eye)
-    rows = torch.arange(len(to_eye), device=to_eye.device).repeat_interleave(samples)
-    throughput = torch.ones(len(rows), world.environment.num_colours, device=to_eye.device)
-    paths = torch.arange(len(rows), device=to_eye.device)
+    wo = to_local(axes, points.to_eye)
+    rows = torch.arange(len(wo), device=wo.device).repeat_interleave(samples)
+    throughput = torch.ones(len(rows), world.environment.num_colours, device=wo.device)
+    paths = torch.arange(len(rows), device=wo.device)
     return _Vertices(paths, points.select(rows), axes[rows], wo[rows], parameters[rows], throughput)
 
 
 def _shade(
     world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M D"], is_last: bool
 ) -> tuple[list[_Light], _Vertices]:
-    """Direct light at vertices by both strategies, and the vertices that the paths reach next."""
+    """Direct light at vertices by both strategies, and the vertices that the paths reach next, if that counts."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
     wi = world._family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
     directions = to_world(vertices.axes, wi)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
-    if is_last:
-        free = ~world.ray_mesh.blocked(vertices.points.positions, directions)
-        rows = free.nonzero()[:, 0]
-        carried, density = _carried(world, vertices.select(rows), wi[rows])
-        escaped = _light_by_material(world, vertices.paths[rows], directions[rows], carried, density)
-        return [light, escaped], vertices.select(rows[:0])
     hits = world.ray_mesh.closest(vertices.points.positions, directions)
-    carried, density = _carried(world, vertices, wi)
     free, met = (~hits.found).nonzero()[:, 0], hits.found.nonzero()[:, 0]
+    if is_last:
+        carried, density = _carried(world, vertices.select(free), wi[free])
+        return [
+            light,
+            _light_by_material(world, vertices.paths[free], directions[free], carried, density),
+        ], vertices
+    carried, density = _carried(world, vertices, wi)
     escaped = _light_by_material(world, vertices.paths[free], directions[free], carried[free], density[free])
-    reached = _reached(world, vertices.paths[met], hits.select(met), directions[met], carried[met])
-    return [light, escaped], reached
+    points = world.ray_mesh.points(hits.select(met), directions[met])
+    axes, parameters = frames(points.normals), world._parameters(points.positions)
+    wo = to_local(axes, points.to_eye)
+    return [light, escaped], _Vertices(vertices.paths[met], points, axes, wo, parameters, carried[met])
 
 
 def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M 2"]) -> _Light:
@@ -258,45 +217,8 @@ def _light_by_material(
     return paths, carried * (weight[:, None] * world.environment.radiance(directions))
 
 
-def _reached(
-    world: TracedObject, paths: Tensor, hits: Hits, directions: Tensor, carried: Tensor
-) -> _Vertices:
-    """The next vertices of paths that met the mesh."""
-    points = world.ray_mesh.points(hits, directions)
-    axes, parameters = frames(points.normals), world._parameters(points.positions)
-    return _Vertices(paths, points, axes, to_local(axes, -directions), parameters, carried)
-
-
 def _power_heuristic(chosen: Float[Tensor, " M"], other: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
     """Weight of a direction that one strategy drew, by the densities of both; of exponent 2."""
     # By the ratio, since squares of the densities of sharp lobes overflow.
     ratio = other / chosen
     return torch.where(torch.isfinite(ratio), 1 / (1 + ratio * ratio), 0.0)
-
-
-@dataclass(frozen=True)
-class _SamplePoints:
-    """Numbers in [0, 1) of N points, S samples each."""
-
-    sequence: Float64[Tensor, "S D"]
-    """Common to the points."""
-    shifts: Float64[Tensor, "N D"]
-    """Of each point."""
-
-    @staticmethod
-    def draw(
-        num_points: int, samples: int, vertices: int, generator: torch.Generator | None, device: torch.device
-    ) -> _SamplePoints:
-        """Numbers for paths of so many vertices."""
-        dimensions = _NUMBERS_A_VERTEX * vertices
-        sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64)
-        shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
-        return _SamplePoints(sequence.to(device), shifts)
-
-    def of(self, paths: Int[Tensor, " M"], vertex: int) -> Float[Tensor, "M 5"]:
-        """Numbers of a vertex of paths; path p is sample p % S of point p // S."""
-        samples = len(self.sequence)
-        part = slice(_NUMBERS_A_VERTEX * vertex, _NUMBERS_A_VERTEX * (vertex + 1))
-        moved = self.sequence[:, part][paths % samples] + self.shifts[:, part][paths // samples]
-        # Rounding to float32 later must not reach 1.
-        return (moved - moved.floor()).clamp(max=1 - 2.0**-24)

@@ -57,6 +57,8 @@ class SurfacePoints:
     """Unit shading normals, turned to the viewer."""
     geometric_normals: Float[Tensor, "N 3"]
     """Unit normals of the triangles, turned to the viewer."""
+    to_eye: Float[Tensor, "N 3"]
+    """Unit vectors to the viewer."""
 
     def select(self, rows: Tensor) -> SurfacePoints:
         """Some of the points: by a mask or by indices."""
@@ -82,20 +84,23 @@ class RayMesh:
         triangles = torch.empty(len(origins), dtype=torch.int64, device=self.device)
         barycentric = origins.new_empty((len(origins), 2))
         distances = origins.new_empty(len(origins))
-        vec2 = vector_type(2, torch.float32)
+        vec2, vec3 = (vector_type(size, torch.float32) for size in (2, 3))
+        rays = [as_warp(values.contiguous(), vec3) for values in (origins, directions)]
         written = [as_warp(triangles), as_warp(barycentric, vec2), as_warp(distances)]
-        launch(closest_kernel, len(origins), [*self._rays(origins, directions), *written], self.device)
+        arguments = [self._tree.id, _LONGEST, *rays, *written]
+        launch(closest_kernel, len(origins), arguments, self.device)
         return Hits(triangles >= 0, triangles, barycentric, distances)
 
     def blocked(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """Whether rays meet the mesh at all."""
-        from unmix_plugin.neumatex.tracing._ray_kernels import blocked_kernel
+        return self.closest(origins, directions).found
 
-        blocked = torch.empty(len(origins), dtype=torch.uint8, device=self.device)
-        launch(
-            blocked_kernel, len(origins), [*self._rays(origins, directions), as_warp(blocked)], self.device
-        )
-        return blocked.bool()
+    def seen(
+        self, origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"]
+    ) -> tuple[Bool[Tensor, " R"], SurfacePoints]:
+        """Which rays meet the mesh, and where each of these does."""
+        hits = self.closest(origins, directions)
+        return hits.found, self.points(hits.select(hits.found), directions[hits.found])
 
     def points(self, hits: Hits, directions: Float[Tensor, "N 3"]) -> SurfacePoints:
         """Surface points of hits, all of which are found.
@@ -116,19 +121,11 @@ class RayMesh:
         geometric = torch.where(backside, -geometric, geometric)
         # A triangle's own vertices may be wound against its normals: what faces the viewer decides.
         shading = torch.where((shading * geometric).sum(dim=-1, keepdim=True) < 0, -shading, shading)
-        return SurfacePoints(positions + self._offset * geometric, _bent_to(-directions, shading), geometric)
-
-    def _rays(self, origins: Tensor, directions: Tensor) -> list[Any]:
-        vec3 = vector_type(3, torch.float32)
-        rays = [as_warp(values.contiguous(), vec3) for values in (origins, directions)]
-        return [self._tree.id, _LONGEST, *rays]
-
-
-def _bent_to(to_eye: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Normals whose cosine with the direction to the viewer is at least a little above 0."""
-    cosines = (normals * to_eye).sum(dim=-1, keepdim=True)
-    bent = torch.nn.functional.normalize(normals + (_LEAST_COSINE - cosines) * to_eye, dim=-1)
-    return torch.where(cosines < _LEAST_COSINE, bent, normals)
+        # Where interpolation turned normals away from the viewer, they are bent to be seen just so.
+        cosines = -(shading * directions).sum(dim=-1, keepdim=True)
+        bent = torch.nn.functional.normalize(shading - (_LEAST_COSINE - cosines) * directions, dim=-1)
+        shading = torch.where(cosines < _LEAST_COSINE, bent, shading)
+        return SurfacePoints(positions + self._offset * geometric, shading, geometric, -directions)
 
 
 @dataclass(frozen=True)
@@ -138,8 +135,6 @@ class PixelHits:
     pixels: Int[Tensor, " K"]
     """Pixel of each ray, row * W + column, increasing; a pixel has up to n x n rays."""
     points: SurfacePoints
-    to_eye: Float[Tensor, "K 3"]
-    """Unit vectors to the camera."""
     width: int
     height: int
     rays_a_pixel: int
@@ -160,26 +155,18 @@ class PixelHits:
 
     def select(self, rows: Tensor) -> PixelHits:
         """Some of the rays, by increasing indices or a mask."""
-        points = self.points.select(rows)
-        return replace(self, pixels=self.pixels[rows], points=points, to_eye=self.to_eye[rows])
+        return replace(self, pixels=self.pixels[rows], points=self.points.select(rows))
 
 
 def pixel_hits(ray_mesh: RayMesh, cameras: Cameras, index: int, subpixels: int = 1) -> PixelHits:
     """The hits of one camera."""
-    width, height = cameras.size(index)
-    pixels, parts, to_eye = [], [], []
     middles = [(place + 0.5) / subpixels for place in range(subpixels)]
+    pixels, parts = [], []
     for offset in [(x, y) for y in middles for x in middles]:
         rays = cameras.to(ray_mesh.device).image_rays(index, offset)
-        hits = ray_mesh.closest(rays.origins, rays.directions)
-        found = hits.found.nonzero()[:, 0]
-        directions = rays.directions[found]
-        parts.append(ray_mesh.points(hits.select(found), directions))
-        pixels.append(found)
-        to_eye.append(-directions)
-    points = SurfacePoints(
-        *(torch.cat(part) for part in zip(*(vars(one).values() for one in parts), strict=True))
-    )
-    order = torch.cat(pixels).argsort(stable=True)
-    hits = PixelHits(torch.cat(pixels), points, torch.cat(to_eye), width, height, subpixels**2)
-    return hits.select(order)
+        found, points = ray_mesh.seen(rays.origins, rays.directions)
+        pixels.append(found.nonzero()[:, 0])
+        parts.append(vars(points).values())
+    points = SurfacePoints(*(torch.cat(part) for part in zip(*parts, strict=True)))
+    hits = PixelHits(torch.cat(pixels), points, *cameras.size(index), subpixels**2)
+    return hits.select(hits.pixels.argsort(stable=True))

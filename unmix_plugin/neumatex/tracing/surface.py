@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -67,7 +67,6 @@ class Readers(nn.Module):
     def __init__(
         self,
         num_parameters: int,
-        num_channels: int = NUM_CHANNELS,
         generator: torch.Generator | None = None,
         num_shares: int = 0,
     ) -> None:
@@ -79,7 +78,7 @@ class Readers(nn.Module):
             num_shares: How many of the first parameters are shares, which sum to 1.
         """
         super().__init__()
-        inputs = 3 * num_channels + 3 + 6 * _NUM_FREQUENCIES
+        inputs = 3 * NUM_CHANNELS + 3 + 6 * _NUM_FREQUENCIES
         self.num_parameters = num_parameters
         self.num_shares = num_shares
         self.material_network = _network(inputs, num_parameters, generator)
@@ -105,7 +104,6 @@ class Triplane(nn.Module):
         self,
         num_parameters: int,
         resolution: int = 128,
-        num_channels: int = NUM_CHANNELS,
         generator: torch.Generator | None = None,
         num_shares: int = 0,
     ) -> None:
@@ -118,21 +116,19 @@ class Triplane(nn.Module):
             num_shares: How many of the first parameters are shares, which sum to 1.
         """
         super().__init__()
-        texels = (3, num_channels, resolution, resolution)
+        texels = (3, NUM_CHANNELS, resolution, resolution)
         self.planes = nn.Parameter(0.1 * torch.randn(texels, generator=generator))
-        self.readers = Readers(num_parameters, num_channels, generator, num_shares)
+        self.readers = Readers(num_parameters, generator, num_shares)
 
     @staticmethod
     def filled(readers: Readers, planes: Float[Tensor, "3 C R R"], resolution: int) -> Triplane:
         """Planes in a resolution of its own with copies of the networks that read them."""
-        triplane, size = (
-            Triplane(readers.num_parameters, resolution, planes.shape[1]),
-            (resolution, resolution),
-        )
+        triplane, size = Triplane(readers.num_parameters, resolution), (resolution, resolution)
         triplane.readers.load_state_dict(readers.state_dict())
+        if planes.shape[-1] != resolution:
+            planes = functional.interpolate(planes, size, mode="bilinear", align_corners=True)
         with torch.no_grad():
-            resized = functional.interpolate(planes, size, mode="bilinear", align_corners=True)
-            triplane.planes.copy_(resized if planes.shape[-1] != resolution else planes)
+            triplane.planes.copy_(planes)
         return triplane
 
     def parameters_at(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
@@ -142,10 +138,6 @@ class Triplane(nn.Module):
     def log_variance(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
         """Logarithm of the expected squared error of each parameter, within `LOG_VARIANCE_RANGE`."""
         return self.readers.log_variance(plane_features(self.planes, positions))
-
-    def parameter_groups(self) -> dict[Literal["planes", "networks"], list[nn.Parameter]]:
-        """What an optimiser may move: an object's planes, and the networks that are frozen while one is fitted."""
-        return {"planes": [self.planes], "networks": list(self.readers.parameters())}
 
 
 def plane_features(planes: Float[Tensor, "3 C R R"], positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N F"]:
@@ -175,12 +167,11 @@ def bounded_log_variance(raw: Float[Tensor, "*n P"]) -> Float[Tensor, "*n P"]:
 def _network(inputs: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:
     sizes = [inputs, _WIDTH, _WIDTH, _WIDTH, outputs]
     layers: list[nn.Module] = []
-    for index, (before, after) in enumerate(itertools.pairwise(sizes)):
-        is_last = index == len(sizes) - 2
+    for before, after in itertools.pairwise(sizes):
+        is_last = len(layers) == 2 * (len(sizes) - 2)
         layer = nn.Linear(before, after, device="meta").to_empty(device="cpu")  # no global random numbers
         bound = (3 if is_last else 6) ** 0.5 / before**0.5
-        with torch.no_grad():
-            layer.weight.uniform_(-bound, bound, generator=generator)
-            layer.bias.zero_()
+        nn.init.uniform_(layer.weight, -bound, bound, generator)
+        nn.init.zeros_(layer.bias)
         layers += [layer] if is_last else [layer, nn.ReLU()]
     return nn.Sequential(*layers)
