@@ -4,10 +4,6 @@ Its published weights are not public, and neither is how eleven frames become th
 the frames of each place. Weights of Wan2.1 itself are what training starts from: with them alone the planes mean
 nothing. The prior that is trained and shipped is `small`.
 
-Weights are read from a folder in diffusers' layout, that of Wan-AI/Wan2.1-T2V-1.3B-Diffusers: transformer/ and vae/,
-each config.json and safetensors; the text encoder is not needed. A file `null_text.safetensors` with one tensor
-`embedding` (512 x 4096), the text encoder's output for an empty prompt, is used where there is one.
-
 Notation: `B` objects, `S` pixels along an edge of a view and texels along an edge of a plane (512 as published), `L`
 the same in latents (S / 8), `Z` channels of latents, `F` their frames (11 as published), `T` tokens of `D` numbers for
 a text. Needs the extra `lmrm` (diffusers).
@@ -15,13 +11,12 @@ a text. Needs the extra `lmrm` (diffusers).
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -30,9 +25,7 @@ from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS, Readers, Triplan
 
 if TYPE_CHECKING:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
-    from diffusers.models.modeling_utils import ModelMixin
     from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
-
 
 ORBIT_VIEWS = 17
 """Views of a circle around the object, which the autoencoder takes for a film."""
@@ -42,7 +35,6 @@ LATENT_FRAMES = 1 + (ORBIT_VIEWS - 1) // 4 + CANONICAL_VIEWS
 """F: the autoencoder puts the first frame of a film alone, then four into one."""
 TEXT_TOKENS = 512
 """Length of the text embedding that the transformer was trained with."""
-_NULL_TEXT = "null_text.safetensors"
 
 
 class WanPrior(nn.Module):
@@ -69,7 +61,7 @@ class WanPrior(nn.Module):
         """
         super().__init__()
         channels = autoencoder.config["z_dim"]
-        self.transformer, self.autoencoder = transformer, widened(autoencoder)
+        self.transformer, self.autoencoder = transformer, _widened(autoencoder)
         for frozen in (autoencoder.encoder, autoencoder.quant_conv):
             frozen.requires_grad_(requires_grad=False)
         self.planes_head = nn.Linear(LATENT_FRAMES * channels, 3 * channels, device=transformer.device)
@@ -120,15 +112,8 @@ class WanPrior(nn.Module):
         """One object's planes with copies of the networks that read them."""
         return Triplane.filled(self.readers, planes, planes.shape[-1])
 
-    def parameter_groups(self) -> dict[Literal["backbone", "networks"], list[nn.Parameter]]:
-        """What training moves: the backbone slowly (published: 5e-5), what is new faster (5e-4)."""
-        new = [*self.planes_head.parameters(), *self.readers.parameters()]
-        known = {id(parameter) for parameter in new}
-        rest = [p for p in self.parameters() if p.requires_grad and id(p) not in known]
-        return {"backbone": rest, "networks": new}
 
-
-def widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
+def _widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
     """The autoencoder with a decoder of 12 channels, which starts as the three colours repeated four times."""
     last = autoencoder.decoder.conv_out
     repeats = NUM_CHANNELS // last.out_channels
@@ -139,99 +124,49 @@ def widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
     return autoencoder
 
 
-def _diffusers_models() -> tuple[type[WanTransformer3DModel], type[AutoencoderKLWan]]:
-    """The two classes of diffusers.
+def read_wan_prior(folder: Path, num_parameters: int) -> WanPrior:
+    """The prior that training starts from: Wan2.1's weights in float32, and new networks behind them.
 
+    Args:
+        folder: In diffusers' layout, as Wan-AI/Wan2.1-T2V-1.3B-Diffusers has it: transformer/ and vae/, each with
+            config.json and safetensors; and perhaps null_text.safetensors with one tensor `embedding` (512 x 4096), the
+            text encoder's output for an empty prompt.
+        num_parameters: P of the material.
     Raises:
-        ConfigError: the extra is not installed.
+        ConfigError: the extra is not installed, or a file or tensor is missing, damaged or of another shape.
     """
     try:
         from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
         from diffusers.models.transformers.transformer_wan import WanTransformer3DModel
     except ImportError as error:
-        raise ConfigError(
-            f"the large prior needs diffusers, which is not installed: {install_hint('lmrm')}"
-        ) from error
-    return WanTransformer3DModel, AutoencoderKLWan
-
-
-def read_wan_prior(folder: Path, num_parameters: int) -> WanPrior:
-    """The prior that training starts from: Wan2.1's weights in float32, and new networks behind them.
-
-    Args:
-        num_parameters: P of the material.
-    Raises:
-        ConfigError: the extra is not installed, or a file or tensor is missing, damaged or of another shape.
-    """
-    transformer_class, autoencoder_class = _diffusers_models()
-    transformer = _read_model(transformer_class, folder / "transformer")
-    autoencoder = _read_model(autoencoder_class, folder / "vae")
-    null_text = _read_null_text(folder / _NULL_TEXT, transformer.config["text_dim"])
+        raise ConfigError(f"the large prior needs diffusers: {install_hint('lmrm')}") from error
+    transformer = _read_model(WanTransformer3DModel, folder / "transformer")
+    autoencoder = _read_model(AutoencoderKLWan, folder / "vae")
+    path, expected, null_text = folder / "null_text.safetensors", transformer.config["text_dim"], None
+    if path.exists():
+        try:
+            null_text = load_file(path)["embedding"]
+        except (OSError, SafetensorError, KeyError) as error:
+            raise ConfigError(f"{path} can't be read, or has no tensor named embedding: {error}") from error
+        if null_text.shape != (TEXT_TOKENS, expected):
+            found = tuple(null_text.shape)
+            raise ConfigError(f"{path}: embedding has shape {found}, expected {(TEXT_TOKENS, expected)}")
     return WanPrior(transformer, autoencoder, num_parameters, null_text)
 
 
 def _read_model(model_class: Any, folder: Path) -> Any:
-    """A model of diffusers, after its files were compared with its configuration."""
-    config = _read_config(folder / "config.json", model_class)
-    with torch.device("meta"):
-        expected = model_class.from_config(config)
-    paths = sorted(folder.glob("*.safetensors"))
-    if not paths:
-        raise ConfigError(f"{folder} has no *.safetensors; weights in other formats are not read")
-    _compare(folder, expected, paths)
-    model = model_class.from_config(config)
-    for path in paths:  # every tensor was found to be in one of them
-        model.load_state_dict(load_file(path), strict=False)
-    return model
-
-
-def _read_config(path: Path, model_class: type) -> dict[str, Any]:
+    """A model of diffusers, whose own reader needs one more package."""
     try:
-        config = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+        model = model_class.from_config(model_class.load_config(folder, local_files_only=True))
+        missing = set(model.state_dict())
+        for path in sorted(folder.glob("*.safetensors")):
+            tensors = load_file(path)
+            model.load_state_dict(tensors, strict=False)  # other shapes are refused all the same
+            missing -= tensors.keys()
+    except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise ConfigError(
-            f"{path} is missing; name a folder in diffusers' layout, with transformer/ and vae/"
+            f"{folder}: can't be read as a {model_class.__name__} in diffusers' layout: {error}"
         ) from error
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} can't be read as JSON: {error}") from error
-    found = config.get("_class_name") if isinstance(config, dict) else None
-    if found != model_class.__name__:
-        raise ConfigError(f"{path} describes {found}; expected {model_class.__name__} of Wan2.1")
-    return config
-
-
-def _compare(folder: Path, expected: ModelMixin, paths: list[Path]) -> None:
-    """Refuse files without a tensor, or with one of another shape; no tensor is read for that."""
-    found: dict[str, tuple[int, ...]] = {}
-    for path in paths:
-        try:
-            with safe_open(path, framework="pt") as file:
-                found |= {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-        except (OSError, SafetensorError) as error:  # noqa: PERF203 - the file is named
-            raise ConfigError(f"{path} can't be read: {error}; fetch it again") from error
-    wanted = {name: tuple(tensor.shape) for name, tensor in expected.state_dict().items()}
-    missing = sorted(wanted.keys() - found.keys())
     if missing:
-        raise ConfigError(
-            f"{folder}: {len(missing)} of {len(wanted)} tensors are missing, the first is {missing[0]}"
-        )
-    for name, shape in wanted.items():
-        if found[name] != shape:
-            raise ConfigError(
-                f"{folder}: tensor {name} has shape {found[name]}, but config.json says {shape}; "
-                "the two files are not of one model"
-            )
-
-
-def _read_null_text(path: Path, width: int) -> torch.Tensor | None:
-    if not path.exists():
-        return None
-    try:
-        embedding = load_file(path)["embedding"]
-    except (OSError, SafetensorError, KeyError) as error:
-        raise ConfigError(f"{path} can't be read, or has no tensor named embedding: {error}") from error
-    if embedding.shape != (TEXT_TOKENS, width):
-        raise ConfigError(
-            f"{path}: embedding has shape {tuple(embedding.shape)}, expected {(TEXT_TOKENS, width)}"
-        )
-    return embedding
+        raise ConfigError(f"{folder}: *.safetensors lack {len(missing)} tensors, such as {min(missing)}")
+    return model
