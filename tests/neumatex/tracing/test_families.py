@@ -4,32 +4,35 @@ import math
 
 import pytest
 import torch
-import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import Uniform, eye_directions, numbers, spherical_grid, unit, wide_parameters
+from tests.neumatex.surfaces import (
+    Uniform,
+    ball,
+    eye_directions,
+    generator,
+    numbers,
+    spherical_grid,
+    unit,
+    wide_parameters,
+)
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, PbrFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.layers import ggx_albedo
-from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.microfacet import frames, to_local, to_world
 from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 
-NORMALS = torch.nn.functional.normalize(
-    torch.cat([numbers(200, 3) - 0.5, torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])]),
-    dim=-1,
-)
-DIRECTIONS = torch.nn.functional.normalize(numbers(len(NORMALS), 3, seed=9) - 0.5, dim=-1)
-
 
 def test_frames_are_rotations_whose_z_axis_is_the_normal():
-    found = frames(NORMALS)
+    axes = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    normals = unit(torch.cat([numbers(200, 3) - 0.5, axes]))
+    directions, found = unit(numbers(203, 3, seed=9) - 0.5), frames(normals)
     assert_close(found @ found.mT, torch.eye(3).expand_as(found), atol=1e-5, rtol=0)
     assert_close(torch.linalg.det(found), torch.ones(len(found)), atol=1e-5, rtol=0)
-    assert_close(to_world(found, torch.tensor([[0.0, 0.0, 1.0]]).expand_as(NORMALS)), NORMALS)
-    assert_close(to_world(found, to_local(found, DIRECTIONS)), DIRECTIONS, atol=1e-5, rtol=0)
+    assert_close(to_world(found, axes[:1].expand_as(normals)), normals)
+    assert_close(to_world(found, to_local(found, directions)), directions, atol=1e-5, rtol=0)
 
 
 SPECTRAL = SpectralFamily(torch.tensor([[0.9, 0.5, 0.1, 0.3, 0.0], [0.0, 0.2, 1.0, 0.6, 0.1]]) / 2)
@@ -63,7 +66,7 @@ def test_nothing_is_reflected_below_the_surface(family: MaterialFamily):
 def test_the_density_integrates_to_one(family: MaterialFamily):
     # Lobes that the grid resolves: roughness of every kind at least 0.4.
     parameters = 0.4 + 0.6 * wide_parameters(5, family.num_parameters)
-    wi, solid_angles = spherical_grid(500, 500)
+    wi, solid_angles = spherical_grid(500)
     for row, wo in zip(parameters, eye_directions(5, lowest=0.2), strict=True):
         density = family.density(row.expand(len(wi), -1), wi, wo.expand_as(wi))
         assert float((density * solid_angles).sum()) == pytest.approx(1.0, abs=0.003)
@@ -85,7 +88,7 @@ def test_samples_are_drawn_from_the_density(family: MaterialFamily):
 @each_family
 def test_sampling_estimates_the_same_reflected_light_as_a_uniform_sphere(family: MaterialFamily):
     parameters = 0.3 + 0.7 * wide_parameters(4, family.num_parameters)
-    grid, solid_angles = spherical_grid(400, 400)
+    grid, solid_angles = spherical_grid(400)
     for row, wo in zip(parameters, eye_directions(4), strict=True):
         light = 1.0 + grid[:, :1] + grid[:, 2:]
         values = family.evaluate(row.expand(len(grid), -1), grid, wo.expand_as(grid)) * light
@@ -153,13 +156,13 @@ FAMILY = LayeredFamily()
 INDEX = {name: i for i, name in enumerate(LayeredFamily.PARAMETERS)}
 
 
-def albedo(parameters: torch.Tensor, wo: torch.Tensor) -> torch.Tensor:
+def albedo(parameters: torch.Tensor, wo: torch.Tensor, family: MaterialFamily = FAMILY) -> torch.Tensor:
     """Share of light that one material reflects from one direction, by importance sampling."""
     uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 15)
     rows, eyes = parameters.expand(len(uniforms), -1), wo.expand(len(uniforms), 3)
-    wi = FAMILY.sample(rows, eyes, uniforms)
-    weights = wi[:, 2].clamp_min(0) / FAMILY.density(rows, wi, eyes)
-    return (FAMILY.evaluate(rows, wi, eyes) * weights[:, None]).mean(0)
+    wi = family.sample(rows, eyes, uniforms)
+    weights = wi[:, 2].clamp_min(0) / family.density(rows, wi, eyes)
+    return (family.evaluate(rows, wi, eyes) * weights[:, None]).mean(0)
 
 
 def material(**named: float) -> torch.Tensor:
@@ -171,10 +174,11 @@ def material(**named: float) -> torch.Tensor:
     return parameters
 
 
-def test_a_white_furnace_is_never_brightened():
-    white = wide_parameters(60, FAMILY.num_parameters)
+@pytest.mark.parametrize("family", [FAMILY, NeuralFamily()])
+def test_a_white_furnace_is_never_brightened(family: MaterialFamily):
+    white = wide_parameters(60, family.num_parameters)
     white[:, :3] = 1.0
-    found = torch.stack([albedo(row, wo) for row, wo in zip(white, eye_directions(60), strict=True)])
+    found = torch.stack([albedo(row, wo, family) for row, wo in zip(white, eye_directions(60), strict=True)])
     assert float(found.max()) < 1.005
 
 
@@ -219,7 +223,7 @@ def test_haze_moves_light_from_the_highlight_to_its_surroundings():
 
 def test_albedo_of_the_tables_is_that_of_the_lobes():
     """A black metal-free base under one layer: what the stack reflects is what its tables say."""
-    grid, solid_angles = spherical_grid(800, 800)
+    grid, solid_angles = spherical_grid(800)
     parameters = material(specular_level=1.0, roughness=0.6)
     parameters[:3] = 0.0
     for wo in eye_directions(4, lowest=0.1):
@@ -237,17 +241,13 @@ ENDMEMBERS = torch.tensor([[0.9, 0.5, 0.1, 0.3, 0.0], [0.0, 0.2, 1.0, 0.6, 0.1],
 
 def _ball_in_even_light(family, values, samples=256):
     """Radiance (N B) of a ball of one material, and cosines to the eye."""
-    ball = trimesh.creation.icosphere(subdivisions=4)
-    rays = RayMesh(mesh_of(torch.tensor(ball.vertices), torch.tensor(ball.faces)))
-    targets = torch.rand(100, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    origins = torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
-    directions = unit(targets - origins)
-    points = rays.points(rays.closest(origins, directions), directions)
+    rays, origins = RayMesh(ball(4)), torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
+    _, points = rays.seen(origins, unit(numbers(100, 3) - 0.5 - origins))
     light = Environment(LIGHT.expand(8, 16, 5).contiguous())
-    generator = torch.Generator().manual_seed(1)
-    traced = TracedObject(rays, light, Uniform(family, values))
-    radiance = traced.light(points, -directions, samples, generator=generator)
-    return radiance, -(directions * points.normals).sum(dim=-1)
+    radiance = TracedObject(rays, light, Uniform(family, values)).light(
+        points, samples, generator=generator(1)
+    )
+    return radiance, (points.to_eye * points.normals).sum(dim=-1)
 
 
 @pytest.mark.parametrize(("roughness", "level"), [(0.3, 0.2), (0.6, 0.7), (1.0, 0.0)])

@@ -42,17 +42,6 @@ def test_decoded_parameters_reflect_and_are_drawn_alike():
     assert torch.equal(family.base_colour(decoded), FAMILY.base_colour(rows))
 
 
-def test_latents_of_any_value_never_brighten_a_white_furnace():
-    uniforms = torch.quasirandom.SobolEngine(3, scramble=True, seed=0).draw(1 << 14)
-    white = numbers(40, 9)
-    white[:, :3] = 1.0
-    for row, wo in zip(white, eye_directions(40), strict=True):
-        rows, eyes = row.expand(len(uniforms), -1), wo.expand(len(uniforms), 3)
-        wi = FAMILY.sample(rows, eyes, uniforms)
-        weights = wi[:, 2].clamp_min(0) / FAMILY.density(rows, wi, eyes)
-        assert float((FAMILY.evaluate(rows, wi, eyes) * weights[:, None]).mean(0).max()) < 1.005
-
-
 def test_the_specular_part_does_not_know_the_base_colour():
     rows = numbers(100, 9)
     black, white = rows.clone(), rows.clone()
@@ -95,25 +84,19 @@ def test_the_record_belongs_to_the_shipped_file():
 
 
 def test_what_is_written_is_read_back(tmp_path: Path):
-    decoder, encoder = Decoder(), Encoder()
-    write_weights(tmp_path / "w.safetensors", decoder, encoder, {})
+    decoder = Decoder()
+    write_weights(tmp_path / "w.safetensors", decoder, Encoder(), {})
     found, _ = _read_weights(tmp_path / "w.safetensors")
     latents = torch.rand(5, 6)
-    assert_close(found(latents).metal_colour, decoder(latents).metal_colour)
+    assert_close(found.numbers(latents), decoder.numbers(latents))
 
 
 def test_other_weights_are_refused_with_the_reason(tmp_path: Path):
     path = tmp_path / "w.safetensors"
     for write, said in (
-        (
-            lambda: write_weights(path, Decoder(width=7), Encoder(), {}),
-            r"weights of another shape .*decoder\.hidden\.0\.bias is \(7,\), expected",
-        ),
-        (
-            lambda: path.write_bytes(safetensors.torch.save({"other": torch.zeros(2)})),
-            r"decoder\.hidden\.0\.bias is missing",
-        ),
-        (lambda: path.write_text("no weights"), "can't read the material decoder's weights"),
+        (lambda: write_weights(path, Decoder(width=7), Encoder(), {}), r"size mismatch for decoder\.hidden"),
+        (lambda: path.write_bytes(safetensors.torch.save({"other": torch.zeros(2)})), "Missing key"),
+        (lambda: path.write_text("no weights"), "w.safetensors: can't be read as weights of the material"),
     ):
         write()
         with pytest.raises(ConfigError, match=said):

@@ -10,19 +10,10 @@ import math
 from abc import ABC, abstractmethod
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from unmix_plugin.neumatex.tracing.layers import (
-    LARGEST_COAT_ROUGHNESS,
-    LARGEST_COVER,
-    LARGEST_DIELECTRIC_F0,
-    LARGEST_HAZE,
-    LARGEST_SHEEN,
-    LayerStack,
-    ggx_albedo,
-    mean_ggx_albedo,
-)
+from unmix_plugin.neumatex.tracing.layers import LayerStack, ggx_albedo, mean_ggx_albedo
 from unmix_plugin.neumatex.tracing.microfacet import (
     LobeMixture,
     alpha_of,
@@ -33,8 +24,6 @@ from unmix_plugin.neumatex.tracing.microfacet import (
     visibility,
 )
 
-NUM_GLOSS = 2
-"""Parameters of the gloss of `SpectralFamily`."""
 _DIELECTRIC_F0 = 0.04
 
 
@@ -150,21 +139,14 @@ class LayeredFamily(StackFamily):
     num_parameters = len(PARAMETERS)
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
-        base, scalars = parameters.T.contiguous().split([3, parameters.shape[1] - 3])
-        metallicity, roughness, level, coat, coat_roughness, *others = scalars.unbind(0)
+        base, *scalars = parameters.T.contiguous().split([3, *[1] * (parameters.shape[1] - 3)])
+        metallicity, roughness, level, coat, coat_roughness, *others = scalars
         sheen, sheen_roughness, tint, haze, spread, dust = others
         hue = base / base.amax(0).clamp_min(1e-3)
-        hazy = roughness + (1.0 - roughness) * (0.15 + 0.6 * spread)
-        return LayerStack(
-            dust_cover=LARGEST_COVER * dust,
-            sheen_colour=LARGEST_SHEEN * sheen * (1.0 + tint * (hue - 1.0)),
-            sheen_roughness=sheen_roughness,
-            coat_weight=coat,
-            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * coat_roughness, roughness, hazy]),
-            haze_weight=LARGEST_HAZE * haze,
-            metallicity=metallicity,
-            metal_colour=base,
-            dielectric_f0=LARGEST_DIELECTRIC_F0 * level,
+        of_sheen = [sheen * (1.0 + tint * (hue - 1.0)), sheen_roughness]
+        rough = [coat_roughness, roughness, 0.15 + 0.6 * spread]
+        return LayerStack.of_numbers(
+            torch.cat([dust, *of_sheen, coat, *rough, haze, metallicity, base, level])
         )
 
 
@@ -186,14 +168,10 @@ class PbrFamily(MaterialFamily):
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
         base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
-        wi, wo = wi.T.contiguous(), wo.T.contiguous()
-        half = half_vectors(wi, wo)
         f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
-        fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
-        alpha = alpha_of(roughness)
-        lobe = distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        fresnel, facets, masking, above = _gloss(roughness, f0, wi.T.contiguous(), wo.T.contiguous())
         diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
-        return ((diffuse + fresnel * lobe) * ((wi[2] > 0) & (wo[2] > 0))).T
+        return ((diffuse + fresnel * (facets * masking)) * above).T
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         return parameters[:, :3]
@@ -240,32 +218,48 @@ class SpectralFamily(MaterialFamily):
     def evaluate(
         self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N C"]:
-        roughness, f0 = self._gloss(parameters)
+        roughness, f0 = self._roughness_and_f0(parameters)
         wi, wo = wi.T.contiguous(), wo.T.contiguous()
-        half = half_vectors(wi, wo)
-        alpha = alpha_of(roughness)
-        fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
-        gloss = fresnel * distribution(alpha, half) * visibility(alpha, wi[2], wo[2])
+        fresnel, facets, masking, above = _gloss(roughness, f0, wi, wo)
         a, b = mean_ggx_albedo(roughness)
         passed = _passing(roughness, f0, wi[2]) * _passing(roughness, f0, wo[2]) / (1.0 - (f0 * a + b))
-        above = (wi[2] > 0) & (wo[2] > 0)
-        base = self.base_colour(parameters)
-        return (passed * above / math.pi).T * base + (gloss * above).T
+        return (passed * above / math.pi).T * self.base_colour(parameters) + (fresnel * facets * masking * above).T
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Diffuse reflectance of each band, [0, 1]."""
         return self.abundances(parameters) @ (self.gains[:, None] * self.endmembers)
 
-    def _gloss(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
-        """Roughness (1 N), and what the gloss reflects at normal incidence (1 N)."""
+    @torch.no_grad()
+    def settle_gains(self) -> None:
+        """Make endmembers as bright as their gains say, as far as reflectances can be, and the gains 1; in place."""
+        bright = self.endmembers.clamp(0, 1) * self.gains.clamp(min=0)[:, None]
+        self.endmembers.copy_(bright / bright.amax(dim=1, keepdim=True).clamp(min=1))
+        self.gains.fill_(1)
+
+    def _roughness_and_f0(self, parameters: Tensor) -> tuple[Tensor, Tensor]:
+        """Each (1 N); f0 is what the gloss reflects at normal incidence."""
         roughness, level = parameters[:, self.num_endmembers :].T.contiguous().split([1, 1])
         return roughness, level * level
 
     def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
-        roughness, f0 = self._gloss(parameters)
+        roughness, f0 = self._roughness_and_f0(parameters)
         passed = _passing(roughness, f0, wo[2])
         diffuse = passed[0] * self.base_colour(parameters).mean(dim=1)
         return LobeMixture.of_albedos(alpha_of(roughness), diffuse, 1.0 - passed)
+
+
+def _gloss(
+    roughness: Float[Tensor, "1 N"],
+    f0: Float[Tensor, "C N"],
+    wi: Float[Tensor, "3 N"],
+    wo: Float[Tensor, "3 N"],
+) -> tuple[Float[Tensor, "C N"], Float[Tensor, "1 N"], Float[Tensor, "1 N"], Bool[Tensor, " N"]]:
+    """Factors of a GGX lobe: Schlick's Fresnel term, distribution, visibility; and whether both directions are above
+    the surface."""
+    half, alpha = half_vectors(wi, wo), alpha_of(roughness)
+    fresnel = f0 + (1.0 - f0) * schlick(dot(wo, half))
+    above = (wi[2] > 0) & (wo[2] > 0)
+    return fresnel, distribution(alpha, half), visibility(alpha, wi[2], wo[2]), above
 
 
 def _passing(roughness: Tensor, f0: Tensor, cosine: Float[Tensor, " N"]) -> Float[Tensor, "1 N"]:

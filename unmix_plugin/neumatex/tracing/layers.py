@@ -11,6 +11,7 @@ Notation as in `microfacet`.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -30,6 +31,8 @@ from unmix_plugin.neumatex.tracing.microfacet import (
     visibility,
 )
 
+NUM_NUMBERS = 15
+"""That name a stack: L."""
 LARGEST_COVER = 0.7
 DUST_COLOUR = (0.52, 0.46, 0.38)
 """Linear RGB, grey-brown."""
@@ -44,15 +47,6 @@ LARGEST_SHEEN = 0.6
 LARGEST_HAZE = 0.7
 _COAT_F0 = 0.04
 _ROWS, _COLUMNS, _STRATA = 32, 48, 32
-
-
-def _dust_passed(cover: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Share of light along a direction that passes the dust.
-
-    >>> _dust_passed(torch.tensor([0.5]), torch.tensor([0.5]))
-    tensor([0.2500])
-    """
-    return torch.exp(torch.log1p(-cover) / cosine.clamp_min(SMALLEST_COSINE))
 
 
 def _mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
@@ -88,13 +82,8 @@ def ggx_albedo(
     roughness: Float[Tensor, "K N"], cosine: Float[Tensor, " N"]
 ) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
     """`(a, b)`: a GGX lobe of Schlick's Fresnel term reflects `f0 a + b` of what comes from this cosine."""
-    a, b = _look_up(_ggx_cells(roughness.device), roughness, cosine).unbind(0)
+    a, b = _look_up(_cells(ggx_table, roughness.device), roughness, cosine).unbind(0)
     return a, b
-
-
-def _sheen_albedo(roughness: Float[Tensor, " N"], cosine: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Directional albedo of white sheen, [0, 1]."""
-    return _look_up(_sheen_cells(roughness.device), roughness[None], cosine)[0, 0]
 
 
 def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
@@ -155,11 +144,6 @@ def _direction(cosine: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=4)
-def _ggx_cells(device: torch.device) -> Tensor:
-    return _cells(ggx_table()).to(device)
-
-
-@lru_cache(maxsize=4)
 def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
     """Means of each row, (2, rows), and their rise to the next row."""
     # The integral of 2 mu E(mu), with mu the square of the column.
@@ -168,17 +152,14 @@ def _ggx_means(device: torch.device) -> tuple[Tensor, Tensor]:
     return means, means.diff(dim=1)
 
 
-@lru_cache(maxsize=4)
-def _sheen_cells(device: torch.device) -> Tensor:
-    return _cells(sheen_table()).to(device)
-
-
-def _cells(table: Tensor) -> Tensor:
-    """Four coefficients of each bilinear cell for each channel, (4 channels, cells)."""
+@lru_cache(maxsize=8)
+def _cells(make: Callable[[], Tensor], device: torch.device) -> Tensor:
+    """Of a table: four coefficients of each bilinear cell for each channel, (4 channels, cells)."""
+    table = make()
     corner, right = table[:-1, :-1], table[:-1, 1:] - table[:-1, :-1]
     below, twist = table[1:, :-1] - table[:-1, :-1], table[1:, 1:] - table[1:, :-1] - right
     cells = torch.stack([corner, right, below, twist])
-    return cells.permute(0, 3, 1, 2).reshape(4 * table.shape[2], -1).contiguous()
+    return cells.permute(0, 3, 1, 2).reshape(4 * table.shape[2], -1).contiguous().to(device)
 
 
 def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
@@ -210,6 +191,29 @@ class LayerStack:
     metallicity: Float[Tensor, " N"]
     metal_colour: Float[Tensor, "3 N"]
     dielectric_f0: Float[Tensor, " N"]
+
+    @staticmethod
+    def of_numbers(numbers: Float[Tensor, "15 N"]) -> "LayerStack":
+        """From parts of the most that each may be, [0, 1], in this order: dust, sheen's colour and roughness, coat,
+        roughness of coat and surface, how much of what is left the haze is rougher, haze, metallicity, metal's colour,
+        f0."""
+        # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
+        dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
+            [1, 3, 1, 1, 3, 1, 1, 3, 1]
+        )
+        of_coat, surface, beyond = roughness.unbind(0)
+        hazy = surface + (1.0 - surface) * beyond
+        return LayerStack(
+            dust_cover=LARGEST_COVER * dust[0],
+            sheen_colour=LARGEST_SHEEN * sheen,
+            sheen_roughness=sheen_roughness[0],
+            coat_weight=coat[0],
+            roughness=torch.stack([LARGEST_COAT_ROUGHNESS * of_coat, surface, hazy]),
+            haze_weight=LARGEST_HAZE * haze[0],
+            metallicity=metallicity[0],
+            metal_colour=metal,
+            dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
+        )
 
     def reflectance(
         self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
@@ -265,8 +269,11 @@ class LayerStack:
         (coat_a, *surface_a), (coat_b, *surface_b) = (x.unbind(0) for x in ggx_albedo(self.roughness, cosine))
         coat = 1.0 - self.coat_weight * (_COAT_F0 * coat_a + coat_b)
         surface = 1.0 - (self.dielectric_f0 * self._mixed(*surface_a) + self._mixed(*surface_b))
-        sheen = 1.0 - self.sheen_colour.amax(0) * _sheen_albedo(self.sheen_roughness, cosine)
-        return _Passing(_dust_passed(self.dust_cover, cosine), sheen, coat, surface)
+        cells = _cells(sheen_table, cosine.device)
+        white = _look_up(cells, self.sheen_roughness[None], cosine)[0, 0]
+        sheen = 1.0 - self.sheen_colour.amax(0) * white
+        dust = torch.exp(torch.log1p(-self.dust_cover) / cosine.clamp_min(SMALLEST_COSINE))
+        return _Passing(dust, sheen, coat, surface)
 
     def _surface_mean(self) -> Tensor:
         """Mean of `surface` over directions, which makes a white base under it lose no light."""

@@ -28,17 +28,15 @@ from torch import Tensor, nn
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.tracing.families import LayeredFamily, StackFamily
 from unmix_plugin.neumatex.tracing.layers import (
-    LARGEST_COAT_ROUGHNESS,
     LARGEST_COVER,
     LARGEST_DIELECTRIC_F0,
     LARGEST_HAZE,
     LARGEST_SHEEN,
+    NUM_NUMBERS,
     LayerStack,
 )
 
 NUM_LATENTS = 6
-_NUM_NUMBERS = 15
-"""That name the layers: L."""
 _NUM_FEATURES = 23
 SHIPPED = Path(__file__).parent.parent / "weights" / "decoder.safetensors"
 
@@ -49,11 +47,11 @@ class Decoder(nn.Module):
     def __init__(self, width: int = 48) -> None:
         super().__init__()
         self.hidden = nn.ModuleList([nn.Linear(NUM_LATENTS, width), nn.Linear(width, width)])
-        self.last = nn.Linear(width, _NUM_NUMBERS)
+        self.last = nn.Linear(width, NUM_NUMBERS)
 
     def forward(self, latents: Float[Tensor, "N 6"]) -> LayerStack:
         """The layers of latents in [0, 1]."""
-        return _layers_of(self.numbers(latents))
+        return LayerStack.of_numbers(self.numbers(latents))
 
     def numbers(self, latents: Float[Tensor, "N 6"]) -> Float[Tensor, "L N"]:
         """Numbers in [0, 1] that name the layers of latents."""
@@ -61,26 +59,6 @@ class Decoder(nn.Module):
         for layer in self.hidden:
             x = nn.functional.silu(layer(x))
         return torch.sigmoid(torch.addmm(self.last.bias[:, None], self.last.weight, x.T))
-
-
-def _layers_of(numbers: Float[Tensor, "L N"]) -> LayerStack:
-    # Gradients of a split are joined once; each index into `numbers` would fill zeros for all of them.
-    dust, sheen, sheen_roughness, coat, roughness, haze, metallicity, metal, level = numbers.split(
-        [1, 3, 1, 1, 3, 1, 1, 3, 1]
-    )
-    of_coat, surface, beyond = roughness.unbind(0)
-    hazy = surface + (1.0 - surface) * beyond
-    return LayerStack(
-        dust_cover=LARGEST_COVER * dust[0],
-        sheen_colour=LARGEST_SHEEN * sheen,
-        sheen_roughness=sheen_roughness[0],
-        coat_weight=coat[0],
-        roughness=torch.stack([LARGEST_COAT_ROUGHNESS * of_coat, surface, hazy]),
-        haze_weight=LARGEST_HAZE * haze[0],
-        metallicity=metallicity[0],
-        metal_colour=metal,
-        dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
-    )
 
 
 class Encoder(nn.Module):
@@ -118,25 +96,17 @@ def _read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
     """Decoder and encoder, frozen.
 
     Raises:
-        ConfigError: the file can't be read, or its weights have another shape.
+        ConfigError: the file can't be read, or its weights have other names or shapes.
     """
-    try:
-        tensors = safetensors.torch.load(path.read_bytes())
-    except (OSError, SafetensorError) as error:
-        raise ConfigError(f"can't read the material decoder's weights in {path}: {error}") from error
     decoder, encoder = Decoder(), Encoder()
-    both = nn.ModuleDict({"decoder": decoder, "encoder": encoder})
-    found, expected = (
-        {name: tuple(tensor.shape) for name, tensor in one.items()} for one in (tensors, both.state_dict())
-    )
-    for name in sorted(expected | found):
-        if found.get(name) != expected.get(name):
-            raise ConfigError(
-                f"weights of another shape in {path}: {name} is {found.get(name, 'missing')}, expected "
-                f"{expected.get(name, 'no such tensor')}; train them with python -m tools.train_decoder"
-            )
-    both.load_state_dict(tensors)
-    both.requires_grad_(False)
+    both = nn.ModuleDict({"decoder": decoder, "encoder": encoder}).requires_grad_(False)
+    try:
+        both.load_state_dict(safetensors.torch.load(path.read_bytes()))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        raise ConfigError(
+            f"{path}: can't be read as weights of the material decoder; train them with python -m tools.train_decoder: "
+            f"{error}"
+        ) from error
     return decoder, encoder
 
 
@@ -146,10 +116,10 @@ _shipped_weights = lru_cache(maxsize=1)(_read_weights)
 class _DecodedFamily(StackFamily):
     """Parameters: diffuse colour (0 to 2, linear), then the numbers that a decoder made of latents."""
 
-    num_parameters = 3 + _NUM_NUMBERS
+    num_parameters = 3 + NUM_NUMBERS
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
-        return _layers_of(parameters[:, 3:].T.contiguous())
+        return LayerStack.of_numbers(parameters[:, 3:].T.contiguous())
 
 
 class NeuralFamily(StackFamily):
@@ -162,13 +132,8 @@ class NeuralFamily(StackFamily):
     num_parameters = 3 + NUM_LATENTS
 
     def __init__(self) -> None:
-        """Take copies of the package's decoder and encoder.
-
-        Raises:
-            ConfigError: their weights can't be read, or have another shape.
-        """
-        decoder, encoder = _shipped_weights()
-        self.decoder, self.encoder = deepcopy(decoder), deepcopy(encoder)
+        """Take copies of the package's decoder and encoder. Raises ConfigError: their weights can't be read."""
+        self.decoder, self.encoder = deepcopy(_shipped_weights())
 
     def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
         return self.decoder(parameters[:, 3:])
