@@ -148,9 +148,15 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
         SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
             are not finite, or too many triangles.
     """
-    vertices, faces, normals, uv = _joined([_placed(path, *part) for part in _parts(path)])
-    _check(path, vertices, faces)
-    faces = _with_area(path, vertices, faces)
+    parts = [_placed(path, *part) for part in _parts(path)]
+    firsts = np.cumsum([0, *(len(part["vertices"]) for part in parts)])
+    faces = np.concatenate([part["faces"] + first for part, first in zip(parts, firsts, strict=False)])
+    vertices, normals, uv = (
+        np.concatenate([part[name] for part in parts]) if all(name in part for part in parts) else None
+        for name in ("vertices", "normals", "uv")
+    )
+    assert vertices is not None
+    faces = _sound_faces(path, vertices, faces)
     if notes is not None and not _is_closed(vertices, faces):
         notes.append(
             f"{path.name}: the mesh is open; light may pass through its holes, and its inside is black"
@@ -203,7 +209,11 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     parts = [part for part in parts if isinstance(part[0], trimesh.Trimesh) and len(part[0].faces)]
     if not parts:
         raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
-    _allow_triangles(path, sum(len(mesh.faces) for mesh, _ in parts))  # which may be the same mesh many times
+    number = sum(len(mesh.faces) for mesh, _ in parts)  # which may be the same mesh many times
+    if number > MAX_TRIANGLES:
+        raise SceneError(
+            f"{path}: has {number:,} triangles, at most {MAX_TRIANGLES:,} are read; decimate the mesh"
+        )
     return parts
 
 
@@ -230,13 +240,6 @@ def _allow_numbers(path: Path) -> None:
         refuse(path, f"{zeros:,} numbers that are not in the file", f"at most {MAX_TRIANGLES:,}", SceneError)
 
 
-def _allow_triangles(path: Path, number: int) -> None:
-    if number > MAX_TRIANGLES:
-        raise SceneError(
-            f"{path}: has {number:,} triangles, at most {MAX_TRIANGLES:,} are read; decimate the mesh"
-        )
-
-
 def _to_world(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
     """A mesh's transform to the world that it comes from, where it says how `write_glb` took it from there."""
     from scipy.spatial.transform import Rotation  # slow to import
@@ -259,43 +262,35 @@ def _vector(extras: Mapping[str, Any], key: str) -> np.ndarray | None:
     return np.array(sound) if len(sound) == len(numbers) == 3 else None
 
 
-def _placed(path: Path, loaded: Any, transform: np.ndarray) -> tuple[np.ndarray | None, ...]:
-    """Positions, triangles, and normals and texture coordinates if the file has them, in the world."""
+def _placed(path: Path, loaded: Any, transform: np.ndarray) -> dict[str, np.ndarray]:
+    """`vertices` and `faces` in the world, and `normals` and `uv` if the file has usable ones."""
     linear, vertices = transform[:3, :3], np.asarray(loaded.vertices, dtype=np.float64)
     if vertices.shape[1:] != (3,) or not np.isfinite(transform).all():
         raise SceneError(
             f"{path}: positions of shape {vertices.shape}, moved by {transform.tolist()}; expected 3 finite numbers "
             "each: export the mesh again"
         )
-    vertices = vertices @ linear.T + transform[:3, 3]
     faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-    normals = _file_normals(loaded)
-    if normals is not None:
-        normals = normals @ np.linalg.pinv(linear)
+    is_mirrored = np.linalg.det(linear) < 0
+    found = {
+        "vertices": vertices @ linear.T + transform[:3, 3],
+        "faces": faces[:, ::-1] if is_mirrored else faces,
+    }
+    if "vertex_normals" in loaded._cache.cache:  # others would be made up
+        normals = np.array(loaded.vertex_normals, dtype=np.float64)
+        lengths = np.linalg.norm(normals, axis=1) if normals.shape == vertices.shape else np.zeros(1)
+        if ((lengths > 1e-6) & (lengths < _FAR)).all():
+            found["normals"] = normals @ np.linalg.pinv(linear)
     uv: Any = getattr(loaded.visual, "uv", None)
-    uv = None if np.shape(uv) != (len(vertices), 2) or not (np.abs(uv) < _FAR).all() else np.asarray(uv)
-    return vertices, faces[:, ::-1] if np.linalg.det(linear) < 0 else faces, normals, uv
+    if np.shape(uv) == (len(vertices), 2) and (np.abs(uv) < _FAR).all():
+        found["uv"] = np.asarray(uv)
+    return found
 
 
-def _joined(
-    parts: list[tuple[Any, ...]],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray | None]:
-    """One mesh; normals and texture coordinates only if all parts have them."""
-    firsts = np.cumsum([0, *(len(part[0]) for part in parts[:-1])])
-    faces = np.concatenate([part[1] + first for part, first in zip(parts, firsts, strict=True)])
-    vertices, normals, uv = (
-        None
-        if any(part[index] is None for part in parts)
-        else np.concatenate([part[index] for part in parts])
-        for index in (0, 2, 3)
-    )
-    assert vertices is not None
-    return vertices, faces, normals, uv
+def _sound_faces(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The triangles that have an area; vertices of no triangle are moved to others, wherever they are."""
+    from trimesh import triangles
 
-
-def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    if not len(faces):
-        raise SceneError(f"{path}: has no triangles; export the object as a triangle mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise SceneError(f"{path}: a triangle names vertex {faces.max()} of {len(vertices)}; export it again")
     sound = np.all(np.abs(vertices) < _FAR, axis=1)  # false for NaN
@@ -305,28 +300,12 @@ def _check(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
             f"{path}: the position of vertex {index} is not finite, or too far away: {found}; expected numbers below "
             f"{_FAR:g}: export the mesh again"
         )
-    vertices[~sound] = vertices[faces[0, 0]]  # those of no triangle
-
-
-def _with_area(path: Path, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The triangles that have an area."""
-    from trimesh import triangles
-
-    areas = triangles.area(vertices[faces])
+    vertices[~sound] = vertices[faces[0, 0]]
     diagonal = np.ptp(vertices[faces.reshape(-1)], axis=0)
-    keep = areas > _SMALLEST_FACE * float(diagonal @ diagonal)
+    keep = triangles.area(vertices[faces]) > _SMALLEST_FACE * float(diagonal @ diagonal)
     if not keep.any():
         raise SceneError(f"{path}: none of its {len(faces)} triangles has an area; export the mesh again")
     return faces[keep]
-
-
-def _file_normals(loaded: Any) -> np.ndarray | None:
-    """Normals that the file holds; None where it has none, or no usable ones."""
-    if "vertex_normals" not in loaded._cache.cache:
-        return None
-    normals = np.array(loaded.vertex_normals, dtype=np.float64)
-    lengths = np.linalg.norm(normals, axis=1) if normals.shape == np.shape(loaded.vertices) else np.zeros(1)
-    return normals if ((lengths > 1e-6) & (lengths < _FAR)).all() else None
 
 
 def _places(vertices: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
