@@ -181,7 +181,7 @@ def materials(run: Path, folder: Path) -> dict[str, float]:
         endmembers = scene.surface.family.endmembers
     else:
         endmembers = require_materials(scene, FIELD).materials.endmembers.detach() / lamp
-    true_endmembers = torch.from_numpy(truth.true_materials.endmembers).float()
+    true_endmembers = torch.from_numpy(truth.true_materials.spectra).float()
     pixels = [seen_pixels(truth, scene, endmembers, lamp, index) for index in truth.split.evaluation]
     parts = (torch.cat(part).double().numpy() for part in zip(*pixels, strict=True))
     light, true, found, shaded, abundances = parts
@@ -215,8 +215,9 @@ def seen_pixels(
     if hasattr(scene, "materials"):
         diffuse = scene.materials.diffuse(view.coefficients)[shown] / opacity[shown][:, None]
         with_shading = (diffuse / lamp).mean(dim=1)
-    abundances = torch.from_numpy(truth.true_materials.abundances(index))[shown]
-    true = abundances @ torch.from_numpy(truth.true_materials.endmembers).float()
+    known = {name: torch.from_numpy(values) for name, values in truth.truth(index).items()}
+    abundances = known["true_abundances"][shown]
+    true = abundances @ known["true_endmembers"]
     return light[shown], true.mean(dim=1), found, with_shading, abundances
 
 

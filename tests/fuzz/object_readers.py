@@ -18,9 +18,6 @@ from unmix_plugin.neumatex.fit.object_scene import _read_folder
 from unmix_plugin.neumatex.fit.pictures import read_picture
 from unmix_plugin.neumatex.tracing.light_files import read_environment
 from unmix_plugin.neumatex.tracing.mesh import read_mesh
-from unmix_plugin.scenes.reading.faults import Faults
-from unmix_plugin.scenes.reading.splits import split_frames
-from unmix_plugin.scenes.reading.transforms_json import read_transforms
 
 
 @cache
@@ -76,16 +73,8 @@ def transforms_reader() -> Reader:
     """An object's own keys, with those of every scene."""
 
     def read(path: Path) -> None:
-        faults = Faults(path.parent)
-        entry = read_transforms(path.parent, faults, needs_cubes=False)
-        split_frames(entry, "auto", 2, faults)
-        _read_folder(path.parent, entry, faults)
-        faults.raise_if_any()
+        _read_folder(path.parent, [], needs_mesh=True)
 
-    samples = [
-        json.loads(_object()["transforms.json"]) | more for more in ({}, {"environment_path": "e.exr"})
-    ]
-    reader = _reader("transforms.json", read, tuple(json.dumps(sample).encode() for sample in samples))
-    return Reader(
-        *(reader.samples, reader.file_name, reader.read, reader.allowed, mutate_json, (("e.exr", b""),))
-    )
+    content, beside = json.loads(_object()["transforms.json"]), (("e.exr", b""), ("mesh.ply", b""))
+    samples = tuple(json.dumps(content | more).encode() for more in ({}, {"environment_path": "e.exr"}))
+    return Reader(samples, "transforms.json", read, (SceneError,), mutate_json, beside)

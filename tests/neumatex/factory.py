@@ -11,6 +11,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from tests.commands.running import done, run_of
+from unmix_plugin.commands.train import train
 from unmix_plugin.formats.exr import write_exr
 
 SMALL = [
@@ -20,51 +22,67 @@ SMALL = [
     "--pipeline.model.samples=4",
     "--device=cpu",
 ]
-
-
 SIZE = 24
 NUM_VIEWS = 6
 CENTRE = np.array([0.3, -0.2, 1.5])
 RADIUS = 0.5
 DISTANCE = 3.0
 LENS_PX = 60.0
+COLOUR = (0.5, 0.3, 0.1)
+WAVELENGTHS = [450.0, 500.0, 550.0, 600.0, 650.0]
+LAMP = np.array([0.4, 0.6, 0.8, 1.0, 0.9])
+ENDMEMBERS = np.array([[0.7, 0.5, 0.2, 0.1, 0.1], [0.05, 0.1, 0.2, 0.5, 0.6]])
+
+
+def trained_on(folder: Path, *words: object, steps: int) -> Path:
+    """The run of a small training of an object."""
+    place = ["--data", folder, "--output-dir", folder.parent / "outputs", "--max-num-iterations", steps]
+    return run_of(done(train, "neumatex", *place, *SMALL, *words))
 
 
 def write_object(folder: Path, suffix: str = ".exr", **extra: Any) -> Path:
-    """Write the object; `extra` are further keys of transforms.json."""
-    folder.mkdir(parents=True, exist_ok=True)
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-    ball.apply_translation(CENTRE)
-    ball.export(folder / "mesh.ply")
-    write_light(folder, sky=1.0)
-    write_views(folder, suffix, colour=(0.5, 0.3, 0.1), **extra)
-    for index in (0,):
-        write_picture(folder / "truth" / "base_colour" / f"{index:03d}.exr", (0.5, 0.3, 0.1))
-    relit = folder / "relit" / "dim"
-    write_light(relit, sky=0.5)
-    write_views(relit, suffix, colour=(0.25, 0.15, 0.05), count=2, tone_mapping="linear")
+    """Write the object in colours; `extra` are further keys of transforms.json."""
+    _write_ball(folder)
+    write_views(folder, suffix, COLOUR, **extra)
+    write_picture(folder / "truth" / "base_colour" / "000.exr", COLOUR)
+    write_light(folder / "relit" / "dim", sky=0.5)
+    write_views(folder / "relit" / "dim", suffix, (0.25, 0.15, 0.05), count=2, tone_mapping="linear")
     return folder
 
 
-def write_light(folder: Path, sky: float, name: str = "environment.exr") -> Path:
+def write_spectral_object(folder: Path, **extra: Any) -> Path:
+    """Write the object in bands, half of it of each material."""
+    _write_ball(folder)
+    write_table(folder / "illuminant.csv", ("power",), LAMP[None])
+    write_table(folder / "endmembers.csv", ("blue", "red"), ENDMEMBERS)
+    keys = {"illuminant_path": "illuminant.csv", "endmembers_path": "endmembers.csv", **extra}
+    write_cubes(folder, NUM_VIEWS, 1.0, materials=["blue", "red"], **keys)
+    write_light(folder / "relit" / "dim", sky=0.5)
+    write_cubes(folder / "relit" / "dim", 2, 0.5)
+    return folder
+
+
+def _write_ball(folder: Path) -> None:
+    write_light(folder, sky=1.0)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+    ball.apply_translation(CENTRE)
+    ball.export(folder / "mesh.ply")
+
+
+def write_light(folder: Path, sky: float) -> Path:
     """A latitude-longitude map of even light."""
     folder.mkdir(parents=True, exist_ok=True)
-    image = np.full((8, 16), sky, np.float32)
-    return write_exr(folder / name, {"R": image, "G": image, "B": image}, {})
+    return write_exr(folder / "environment.exr", dict.fromkeys("RGB", np.full((8, 16), sky, np.float32)), {})
 
 
 def write_views(
     folder: Path, suffix: str, colour: tuple[float, ...], count: int = NUM_VIEWS, **extra: Any
 ) -> None:
     """Pictures of the ball in one colour, with alpha, and their transforms.json."""
-    frames = []
-    for index in range(count):
-        angle = 2 * math.pi * index / count
-        name = f"images/{index:03d}{suffix}"
+    names = [f"images/{index:03d}{suffix}" for index in range(count)]
+    for name in names:
         write_picture(folder / name, colour)
-        frames.append({"file_path": name, "transform_matrix": pose(angle).tolist()})
-    content = {"fl_x": LENS_PX, "frames": frames, **extra}
-    (folder / "transforms.json").write_text(json.dumps(content))
+    _write_transforms(folder, [{"file_path": name} for name in names], **extra)
 
 
 def write_picture(path: Path, colour: tuple[float, ...], lit_rows: int = SIZE) -> None:
@@ -82,6 +100,37 @@ def write_picture(path: Path, colour: tuple[float, ...], lit_rows: int = SIZE) -
     Image.fromarray((pixels * 255 + 0.5).astype(np.uint8)).save(path)
 
 
+def write_cubes(folder: Path, count: int, sky: float, **extra: Any) -> None:
+    """Cubes, pictures with alpha, abundances and transforms.json."""
+    above = (np.arange(SIZE) < SIZE / 2)[:, None, None]
+    shares = np.where(above, [1.0, 0.0], [0.0, 1.0]) * np.ones((1, SIZE, 1))
+    frames = []
+    for index in range(count):
+        frame = {
+            "file_path": f"images/{index:03d}.png",
+            "hyperspectral_file_path": f"cubes/{index:03d}.npy",
+            "abundance_file_path": f"abundances/{index:03d}.npy",
+        }
+        write_picture(folder / frame["file_path"], (0.5, 0.5, 0.5))
+        for name, numbers in (("cubes", sky * LAMP * (shares @ ENDMEMBERS)), ("abundances", shares)):
+            (folder / name).mkdir(exist_ok=True)
+            np.save(folder / name / f"{index:03d}.npy", numbers.astype(np.float32))
+        frames.append(frame)
+    _write_transforms(folder, frames, **{"wavelengths": WAVELENGTHS, **extra})
+
+
+def _write_transforms(folder: Path, frames: list[dict[str, Any]], **extra: Any) -> None:
+    """Poses are evenly spread around the ball; keys that are None are left out."""
+    angles = np.linspace(0, 2 * math.pi, len(frames), endpoint=False)
+    posed = [
+        {**frame, "transform_matrix": pose(angle).tolist()}
+        for frame, angle in zip(frames, angles, strict=True)
+    ]
+    content = {"fl_x": LENS_PX, "frames": posed, **extra}
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
 def pose(angle: float) -> np.ndarray:
     """A camera that looks at the ball's centre from an angle about +z."""
     back = np.array([math.cos(angle), math.sin(angle), 0.0])
@@ -89,49 +138,6 @@ def pose(angle: float) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3] = np.column_stack([right, np.cross(back, right), back, CENTRE + DISTANCE * back])
     return matrix
-
-
-WAVELENGTHS = [450.0, 500.0, 550.0, 600.0, 650.0]
-LAMP = np.array([0.4, 0.6, 0.8, 1.0, 0.9])
-ENDMEMBERS = np.array([[0.7, 0.5, 0.2, 0.1, 0.1], [0.05, 0.1, 0.2, 0.5, 0.6]])
-
-
-def write_spectral_object(folder: Path, **extra: Any) -> Path:
-    """Write the object; `extra` are further keys of transforms.json."""
-    folder.mkdir(parents=True, exist_ok=True)
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-    ball.apply_translation(CENTRE)
-    ball.export(folder / "mesh.ply")
-    write_light(folder, sky=1.0)
-    write_table(folder / "illuminant.csv", ("power",), LAMP[None])
-    write_table(folder / "endmembers.csv", ("blue", "red"), ENDMEMBERS)
-    keys = {"illuminant_path": "illuminant.csv", "endmembers_path": "endmembers.csv", **extra}
-    write_cubes(folder, NUM_VIEWS, 1.0, materials=["blue", "red"], **keys)
-    relit = folder / "relit" / "dim"
-    write_light(relit, sky=0.5)
-    write_cubes(relit, 2, 0.5)
-    return folder
-
-
-def write_cubes(folder: Path, count: int, sky: float, **extra: Any) -> None:
-    """Cubes, pictures with alpha, abundances and transforms.json."""
-    above = (np.arange(SIZE) < SIZE / 2)[:, None, None]
-    shares = np.where(above, [1.0, 0.0], [0.0, 1.0]) * np.ones((1, SIZE, 1))
-    frames = []
-    for index in range(count):
-        names = {
-            "file_path": f"images/{index:03d}.png",
-            "hyperspectral_file_path": f"cubes/{index:03d}.npy",
-            "abundance_file_path": f"abundances/{index:03d}.npy",
-        }
-        write_picture(folder / names["file_path"], (0.5, 0.5, 0.5))
-        for name, numbers in (("cubes", sky * LAMP * (shares @ ENDMEMBERS)), ("abundances", shares)):
-            (folder / name).mkdir(exist_ok=True)
-            np.save(folder / name / f"{index:03d}.npy", numbers.astype(np.float32))
-        frames.append({**names, "transform_matrix": pose(2 * math.pi * index / count).tolist()})
-    content = {"fl_x": LENS_PX, "wavelengths": WAVELENGTHS, "frames": frames, **extra}
-    content = {key: value for key, value in content.items() if value is not None}
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 def write_table(path: Path, names: tuple[str, ...], spectra: np.ndarray) -> None:

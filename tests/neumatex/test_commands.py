@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.commands.running import done, refused, run, run_of
-from tests.neumatex.factory import SMALL, write_light, write_object
+from tests.commands.running import done, refused
+from tests.neumatex.factory import trained_on, write_light, write_object
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
-from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex.export.material import material_paths
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
@@ -18,11 +17,7 @@ from unmix_plugin.trained.open_run import load_run, snapshot
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A run of two steps with neural materials."""
-    folder = tmp_path_factory.mktemp("object")
-    write_object(folder / "ball")
-    words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 2]
-    ended = done(train, "neumatex", *words, *SMALL, "--pipeline.model.material=neural")
-    return run_of(ended)
+    return trained_on(write_object(tmp_path_factory.mktemp("object") / "ball"), steps=2)
 
 
 def test_the_material_is_exported_with_its_latents_and_decoder(trained, tmp_path):
@@ -38,9 +33,7 @@ def test_the_material_is_exported_with_its_latents_and_decoder(trained, tmp_path
 
 
 def test_products_of_mixed_materials_are_refused_in_one_sentence(trained, tmp_path):
-    ended = run(export, "endmembers", "--run", trained, "--output", tmp_path, "--device", "cpu")
-    assert ended.status == 2
-    said = " ".join(ended.err.split())
+    said = refused(export, "endmembers", "--run", trained, "--output", tmp_path, "--device", "cpu")
     assert "the method neumatex makes no scene of mixed materials" in said
     assert "unmix-export has products of its own for it: material" in said
 

@@ -190,9 +190,8 @@ def test_pictures_can_be_rendered_again_from_the_files_under_both_lights(spectra
         traced = TracedObject(RayMesh(mesh), light, surface)
         radiance, alpha = traced.picture(pictures.cameras, 0, 160, bounces=2, generator=generator)
         picture = pictures.read(0)
-        assert picture.alpha is not None
         found, seen = torch.from_numpy(picture.numbers), alpha > 0.99
-        assert_close(torch.from_numpy(picture.alpha), alpha, atol=1 / 255, rtol=0)
+        assert_close(torch.from_numpy(picture.opacity), alpha, atol=1 / 255, rtol=0)
         error = (found[seen] - radiance[seen]).abs().mean() / radiance[seen].mean()
         assert float(error) < 0.06
 
@@ -202,19 +201,16 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder
     truth = scene.true_materials
     assert truth is not None
     assert scene.bands is not None
-    shares = scene.abundances(0)
-    assert shares is not None
+    shares = scene.truth(0)["true_abundances"]
     like_any_other = load_scene(spectral_folder)
     assert like_any_other.material_names == truth.names
     assert (len(like_any_other.frames), len(like_any_other.eval_indices)) == (9, 2)
     assert like_any_other.has_alpha
     assert like_any_other.has_abundances
-    alpha = scene.pictures.read(0).alpha
-    assert alpha is not None
-    np.testing.assert_allclose(shares.sum(axis=-1)[alpha > 0.5], 1, atol=2e-3)
-    assert scene.abundances(1) is None
+    np.testing.assert_allclose(shares.sum(axis=-1)[scene.pictures.read(0).opacity > 0.5], 1, atol=2e-3)
+    assert scene.truth(1) == {}
     vertices = seeded_mesh(3).vertices
     surface = SpectralSurface(3, scene.bands.centers_nm, vertices)
     means = surface.parameters(vertices)[:, :4].mean(dim=0)
     assert_close(means, torch.full((4,), 0.25), atol=0.02, rtol=0)
-    assert_close(surface.family.endmembers.double(), torch.from_numpy(truth.endmembers), atol=1e-6, rtol=0)
+    assert_close(surface.family.endmembers.double(), torch.from_numpy(truth.spectra), atol=1e-6, rtol=0)

@@ -1,7 +1,5 @@
 """What a page knows of an object: against closed forms on a ball, and opened in a browser."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -9,17 +7,12 @@ import trimesh
 
 from tests.commands.browser import CHROMIUM, FLAGS, HAS_BROWSER, SOFTWARE_GL
 from tests.commands.running import done
-from tests.neumatex.factory import SMALL, write_object, write_spectral_object
+from tests.neumatex.factory import trained_on, write_object, write_spectral_object
+from tests.neumatex.surfaces import ball, mesh_from
 from unmix_plugin.commands.export import export
-from unmix_plugin.commands.train import train
 from unmix_plugin.neumatex.export import page
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.mesh import mesh_of
-
-
-def ball(subdivisions):
-    shape = trimesh.creation.icosphere(subdivisions=subdivisions)
-    return mesh_of(torch.from_numpy(shape.vertices.copy()), torch.from_numpy(shape.faces.copy()))
 
 
 def test_a_ball_gets_light_as_a_cosine_lobe_and_a_white_sky_makes_it_white():
@@ -39,8 +32,7 @@ def test_what_an_object_hides_of_the_sky_comes_back_from_it_in_part():
     assert page._transfer(hollow, torch.ones(len(mesh.vertices))).abs().max() == 0
     floor = trimesh.creation.box((2.0, 2.0, 0.02)).subdivide_to_size(0.2)
     wall = trimesh.creation.box((0.02, 2.0, 2.0), trimesh.transformations.translation_matrix([1.0, 0, 1.0]))
-    joined: Any = trimesh.util.concatenate([floor, wall.subdivide_to_size(0.2)])
-    corner = mesh_of(torch.from_numpy(joined.vertices.copy()), torch.from_numpy(joined.faces.copy()))
+    corner = mesh_from(floor, wall.subdivide_to_size(0.2))
     near = ((corner.vertices - torch.tensor([0.9, 0.0, 0.01])).norm(dim=1)).argmin()
     dark, bright = (
         page._transfer(corner, torch.full((len(corner.vertices),), part))[near, 0] for part in (0.0, 0.8)
@@ -77,11 +69,10 @@ def test_large_triangles_are_split_and_millions_merged_with_normals_kept(monkeyp
 def test_the_page_of_an_object_turns_its_light_and_shows_its_material(kind, tmp_path):
     from playwright.sync_api import sync_playwright
 
-    (write_object if kind == "colours" else write_spectral_object)(tmp_path / "ball")
-    words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "outputs", "--max-num-iterations", 2]
+    folder = (write_object if kind == "colours" else write_spectral_object)(tmp_path / "ball")
     material = "pbr" if kind == "colours" else "spectral"
-    ended = done(train, "neumatex", *words, *SMALL, f"--pipeline.model.material={material}")
-    place = ["--run", ended.last_line.removeprefix("run: "), "--output", tmp_path]
+    run = trained_on(folder, f"--pipeline.model.material={material}", steps=2)
+    place = ["--run", run, "--output", tmp_path]
     done(export, "page", *place, "--resolution", 24, "--title", "<i>ball</i>")
     with sync_playwright() as session:
         browser = session.chromium.launch(executable_path=CHROMIUM, args=[FLAGS[1], *SOFTWARE_GL])

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,12 +28,12 @@ from tests.neumatex.factory import (
     write_table,
     write_views,
 )
+from tests.neumatex.surfaces import mesh_from
 from unmix_plugin.errors import SceneError, UnmixError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManager, ObjectDataManagerConfig, _PixelList
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.fit.pictures import read_picture
-from unmix_plugin.neumatex.tracing.mesh import mesh_of
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.spectral.bands import Bands
@@ -48,26 +49,32 @@ def folder(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "ball"))
 
 
-def _change(folder: Path, **keys) -> None:
+def _change(folder: Path, **keys: Any) -> None:
     """Change keys of transforms.json; None takes one out."""
     path = folder / "transforms.json"
     content = {**json.loads(path.read_text()), **keys}
     path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
 
 
+def _change_frames(folder: Path, change: Callable[[int, dict[str, Any]], Any]) -> None:
+    """Change each frame of transforms.json in place."""
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    for index, frame in enumerate(frames):
+        change(index, frame)
+    _change(folder, frames=frames)
+
+
 def test_the_mesh_fills_model_space_and_cameras_see_it_where_alpha_is(made):
     scene = load_object(made)
     vertices = scene.mesh.vertices
     assert float(vertices.abs().max()) == pytest.approx(1, abs=1e-5)
-    np.testing.assert_allclose(scene.frame.to_world(np.zeros(3)), CENTRE, atol=1e-6)
+    assert_allclose(scene.frame.to_world(np.zeros(3)), CENTRE, atol=1e-6)
     assert scene.frame.scale == pytest.approx(1 / RADIUS, rel=1e-5)
     assert scene.split.evaluation == (0,)
     assert len(scene.split.train) == 5
     rays = scene.pictures.cameras.image_rays(2)
-    seen = RayMesh(scene.mesh).closest(rays.origins, rays.directions).found.reshape(24, 24).numpy()
-    alpha = scene.pictures.read(2).alpha
-    assert alpha is not None
-    assert (seen == (alpha > 0.5)).mean() > 0.96
+    seen = RayMesh(scene.mesh).blocked(rays.origins, rays.directions).reshape(24, 24).numpy()
+    assert (seen == (scene.pictures.read(2).opacity > 0.5)).mean() > 0.96
 
 
 def test_light_truth_tone_and_held_out_lights_are_read(made):
@@ -76,25 +83,25 @@ def test_light_truth_tone_and_held_out_lights_are_read(made):
     assert [light.name for light in scene.lights] == ["dim"]
     assert len(scene.lights[0].pictures) == 2
     assert float(scene.lights[0].environment.image.max()) == 0.5
-    truth = scene.base_colour(0)
-    assert truth is not None
-    np.testing.assert_allclose(truth[12, 12], (0.5, 0.3, 0.1), rtol=1e-6)
-    assert scene.base_colour(1) is None
+    assert_allclose(scene.truth(0)["base_colour"][12, 12], (0.5, 0.3, 0.1), rtol=1e-6)
+    assert scene.truth(1) == {}
 
 
 def test_poses_that_nerfstudio_turned_and_scaled_find_the_mesh_in_the_world(made, folder):
     expected = load_object(made).pictures.cameras
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     placement = Placement(turn, np.array([1.0, 2.0, 3.0]), 0.25, np.array([5.0, 0.0, 0.0]))
-    content = json.loads((folder / "transforms.json").read_text())
-    for frame in content["frames"]:
+
+    def place(_: int, frame: dict[str, Any]) -> None:
         pose = np.array(frame["transform_matrix"])
         pose[:3, 3] = placement.to_scene(pose[:3, 3])
         pose[:3, :3] = turn @ pose[:3, :3]
         frame["transform_matrix"] = pose.tolist()
-    (folder / "transforms.json").write_text(json.dumps({**content, **placement.to_json()}))
+
+    _change_frames(folder, place)
+    _change(folder, **placement.to_json())
     found = load_object(folder).pictures.cameras
-    np.testing.assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-5)
+    assert_allclose(found.camera_to_world, expected.camera_to_world, atol=1e-5)
 
 
 def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
@@ -104,8 +111,8 @@ def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
     mesh.vertices = np.stack([x, z, -y], axis=1)
     mesh.export(folder / "mesh.ply")
     found = load_object(folder)
-    np.testing.assert_allclose(found.mesh.vertices, expected.mesh.vertices, atol=1e-5)
-    np.testing.assert_allclose(found.mesh.normals, expected.mesh.normals, atol=1e-3)
+    assert_allclose(found.mesh.vertices, expected.mesh.vertices, atol=1e-5)
+    assert_allclose(found.mesh.normals, expected.mesh.normals, atol=1e-3)
     assert found.notes[len(expected.notes) :] == (
         "mesh.ply has y as its upward axis, the poses have z: the mesh was turned",
     )
@@ -113,25 +120,27 @@ def test_a_mesh_with_y_upwards_is_turned_and_that_is_said(made, folder):
 
 def _write_pillar(folder: Path, has_alpha: bool = True) -> np.ndarray:
     """A pillar at the world's origin in place of the ball, seen by cameras around it; its vertices."""
-    content = json.loads((folder / "transforms.json").read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) - _MOVE).tolist()
-    (folder / "transforms.json").write_text(json.dumps(content))
+
+    def move(_: int, frame: dict[str, Any]) -> None:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, 3] -= CENTRE
+        frame["transform_matrix"] = pose.tolist()
+
+    _change_frames(folder, move)
     shutil.rmtree(folder / "relit")
     pillar = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
     pillar.apply_scale([0.8, 0.8, 1.0])
     pillar.export(folder / "mesh.ply")
-    cameras = load_object(folder).pictures.cameras
-    shape = mesh_of(torch.tensor(pillar.vertices / RADIUS), torch.tensor(pillar.faces))
+    cameras, rays_mesh = (
+        load_object(folder).pictures.cameras,
+        RayMesh(mesh_from(pillar).transformed(1 / RADIUS, torch.zeros(3))),
+    )
     for index, path in enumerate(sorted((folder / "images").iterdir())):
         rays = cameras.image_rays(index)
-        seen = RayMesh(shape).closest(rays.origins, rays.directions).found.reshape(SIZE, SIZE)
+        seen = rays_mesh.blocked(rays.origins, rays.directions).reshape(SIZE, SIZE)
         alpha = seen.numpy().astype(np.float32)
         write_exr(path, {**dict.fromkeys("RGB", 0.5 * alpha), **({"A": alpha} if has_alpha else {})}, {})
     return np.array(pillar.vertices)
-
-
-_MOVE = np.column_stack([np.zeros((4, 3)), [*CENTRE, 0.0]])
 
 
 @pytest.mark.parametrize("suffix", ["ply", "obj", "glb"])
@@ -182,20 +191,9 @@ def _blank_alpha(folder: Path) -> None:
         write_exr(path, dict.fromkeys("RGBA", np.zeros((SIZE, SIZE), np.float32)), {})
 
 
-def _bad_light(folder: Path) -> None:
-    image = np.full((8, 16), np.nan, np.float32)
-    write_exr(folder / "environment.exr", {"R": image, "G": image, "B": image}, {})
-
-
 def _second_mesh(folder: Path) -> None:
     shutil.move(folder / "mesh.ply", folder / "a.ply")
     shutil.copy(folder / "a.ply", folder / "b.ply")
-
-
-def _no_pose(folder: Path) -> None:
-    content = json.loads((folder / "transforms.json").read_text())
-    del content["frames"][3]["transform_matrix"]
-    (folder / "transforms.json").write_text(json.dumps(content))
 
 
 def _reshape(folder: Path, factor: float, shift: float = 0.0) -> None:
@@ -228,23 +226,19 @@ def test_pictures_and_light_of_different_units_are_told_and_mere_shade_is_not(ma
 
 
 def test_integer_arrays_of_file_path_are_divided_by_the_value_scale(folder):
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for index, frame in enumerate(content["frames"]):
-        frame["file_path"] = f"images/{index}.npy"
-        np.save(folder / frame["file_path"], np.full((SIZE, SIZE, 3), 2000, np.uint16))
-    path.write_text(json.dumps({**content, "value_scale": 4000}))
+    np.save(folder / "images" / "all.npy", np.full((SIZE, SIZE, 3), 2000, np.uint16))
+    _change_frames(folder, lambda _, frame: frame.update(file_path="images/all.npy"))
+    _change(folder, value_scale=4000)
     assert load_object(folder).pictures.read(0).numbers.max() == 0.5
 
 
 def test_what_means_nothing_where_alpha_is_0_is_0(folder):
     path = folder / "images" / "001.exr"
     given = read_picture(path)
-    assert given.alpha is not None
-    hidden = given.alpha == 0
+    hidden = given.opacity == 0
     assert hidden.any()
     channels = {name: np.where(hidden, np.nan, given.numbers[..., i]) for i, name in enumerate("RGB")}
-    write_exr(path, {**channels, "A": given.alpha}, {})
+    write_exr(path, {**channels, "A": given.opacity}, {})
     found = read_picture(path).numbers
     assert (found[hidden] == 0).all()
     assert_allclose(found[~hidden], given.numbers[~hidden])
@@ -284,24 +278,26 @@ def _write_truth(folder: Path, shape: tuple[int, int], names: str) -> None:
     write_exr(folder / "truth/base_colour/000.exr", dict.fromkeys(names, np.ones(shape, np.float32)), {})
 
 
-def _png_under_held_out_light(folder: Path) -> None:
-    write_views(folder / "relit" / "dim", ".png", (0.2, 0.1, 0.1), count=2)
-
-
-def _bands_under_held_out_light(folder: Path) -> None:
-    write_cubes(folder / "relit" / "dim", 2, 0.5, wavelengths=None)
-
-
 def _named_bands_as_colours(folder: Path) -> None:
     for path in (folder / "images").iterdir():
         channels = {f"S0.{nm},0nm": np.ones((SIZE, SIZE), np.float32) for nm in (450, 550, 650)}
         write_exr(path, channels, {})
 
 
-def _too_few_rows(folder: Path) -> None:
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    frames[3]["row_poses"] = [frames[3].pop("transform_matrix")] * 5
-    _change(folder, frames=frames)
+def _without_pose(index: int, frame: dict[str, Any]) -> Any:
+    return frame.pop("transform_matrix") if index == 3 else None
+
+
+def _with_rows(index: int, frame: dict[str, Any]) -> None:
+    if index == 3:
+        frame["row_poses"] = [frame.pop("transform_matrix")] * 5
+
+
+def _mixed_pictures(folder: Path) -> None:
+    write_picture(folder / "images" / "png.png", (0.1, 0.1, 0.1))
+    _change_frames(
+        folder, lambda index, frame: frame.update(file_path="images/png.png") if index == 3 else None
+    )
 
 
 FAULTS = {
@@ -311,11 +307,11 @@ FAULTS = {
     ),
     "truth of five colours": (lambda folder: _write_truth(folder, (SIZE, SIZE), "RGBXY"), "24, 5.; expected"),
     "response of held-out pictures": (
-        _png_under_held_out_light,
+        lambda folder: write_views(folder / "relit" / "dim", ".png", (0.2, 0.1, 0.1), count=2),
         "is camera, a response that is learnt from .* but those are linear; expected linear, srgb or agx",
     ),
     "bands under a held-out light": (
-        _bands_under_held_out_light,
+        lambda folder: write_cubes(folder / "relit" / "dim", 2, 0.5, wavelengths=None),
         "dim: pictures of 5 bands; the object has 3 colours: give the same",
     ),
     "bands that are no colours": (_named_bands_as_colours, "light's spectrum is not known"),
@@ -332,9 +328,15 @@ FAULTS = {
     "no mesh": (lambda folder: (folder / "mesh.ply").unlink(), r"has no mesh; put mesh.glb or .* there"),
     "several meshes": (_second_mesh, r"has several: a.ply, b.ply; name one with 'mesh_path'"),
     "no light": (lambda folder: (folder / "environment.exr").unlink(), "no environment; put environment.exr"),
-    "broken light": (_bad_light, "environment.exr.*not finite"),
-    "no pose": (_no_pose, r"frames\[3\]: 'transform_matrix' is absent"),
-    "too few rows": (_too_few_rows, rf"frames\[3\]: 'row_poses' has 5 poses, but the image has {SIZE} rows"),
+    "broken light": (lambda folder: write_light(folder, sky=np.nan), "environment.exr.*not finite"),
+    "no pose": (
+        lambda folder: _change_frames(folder, _without_pose),
+        r"frames\[3\]: 'transform_matrix' is absent",
+    ),
+    "too few rows": (
+        lambda folder: _change_frames(folder, _with_rows),
+        rf"frames\[3\]: 'row_poses' has 5 poses, but the image has {SIZE} rows",
+    ),
     "no picture": (lambda folder: (folder / "images/004.exr").unlink(), "'images/004.exr' is missing"),
     "unknown tone": (lambda folder: _change(folder, tone_mapping="filmic"), "'tone_mapping' is \"filmic\""),
     "wrong turn": (
@@ -345,18 +347,12 @@ FAULTS = {
         lambda folder: write_picture(folder / "images/001.exr", (-1.0, 0.0, 0.0)),
         "001.exr: negative values, NaN or infinity in .* pixels?;",
     ),
-    "mixed pictures": (lambda folder: _change(folder, frames=_with_png(folder)), "mix pictures of light"),
+    "mixed pictures": (_mixed_pictures, "mix pictures of light"),
     "held-out light": (
         lambda folder: write_light(folder / "relit/dim", sky=0.0),
         "relit/dim/environment.exr",
     ),
 }
-
-
-def _with_png(folder: Path) -> list:
-    write_picture(folder / "images" / "png.png", (0.1, 0.1, 0.1))
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    return [*frames[:-1], {**frames[-1], "file_path": "images/png.png"}]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -408,13 +404,10 @@ def test_a_held_out_light_may_have_its_own_lamp_and_an_option_replaces_the_objec
 
 def test_true_materials_are_read(made_spectral):
     scene = load_object(made_spectral)
-    truth = scene.true_materials
-    assert truth is not None
-    assert truth.names == ("blue", "red")
-    assert_allclose(truth.endmembers, ENDMEMBERS)
-    shares = scene.abundances(0)
-    assert shares is not None
-    assert shares[3, 12].tolist() == [1, 0]
+    assert scene.true_materials is not None
+    assert scene.true_materials.names == ("blue", "red")
+    assert_allclose(scene.truth(0)["true_endmembers"], ENDMEMBERS, rtol=1e-6)
+    assert scene.truth(0)["true_abundances"][3, 12].tolist() == [1, 0]
 
 
 def _store_integers(spectral_folder: Path) -> None:
@@ -438,12 +431,10 @@ def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectra
     black = np.full((height, width), 255, np.uint8)
     black[:, : width // 2] = 0
     Image.fromarray(black).save(spectral_folder / "mask.png")
-    frames = json.loads((spectral_folder / "transforms.json").read_text())["frames"]
-    frames[view]["mask_path"] = "mask.png"
-    _change(spectral_folder, frames=frames)
-    pixels, all_pixels = (
-        _PixelList.of(object_, 10**6, 0) for object_ in (load_object(spectral_folder), scene)
+    _change_frames(
+        spectral_folder, lambda index, frame: frame.update(mask_path="mask.png") if index == view else None
     )
+    pixels, all_pixels = (_PixelList(one, 10**6, 0) for one in (load_object(spectral_folder), scene))
     masked = (all_pixels.views == 0) & (all_pixels.corners[:, 0] < width // 2)
     assert masked.any()
     assert len(pixels.views) == int((~masked).sum())
@@ -452,9 +443,8 @@ def test_pixels_that_a_mask_leaves_out_are_not_trained_on(made_spectral, spectra
 @pytest.mark.parametrize("kind", ["cubes/000.npy", "images/000.png", "mask.png"])
 def test_another_cube_alpha_or_mask_makes_it_another_object(spectral_folder, kind):
     Image.new("L", (SIZE, SIZE), 255).save(spectral_folder / "mask.png")
-    frames = json.loads((spectral_folder / "transforms.json").read_text())["frames"]
-    _change(spectral_folder, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
-    before = load_object(spectral_folder).summary()["input_hashes"]
+    _change_frames(spectral_folder, lambda _, frame: frame.update(mask_path="mask.png"))
+    before = load_object(spectral_folder).input_hashes
     path = spectral_folder / kind
     if path.suffix == ".npy":
         np.save(path, np.load(path) * np.float32(0.9))
@@ -462,7 +452,7 @@ def test_another_cube_alpha_or_mask_makes_it_another_object(spectral_folder, kin
         pixels = np.array(Image.open(path))
         pixels[0, 0] = 0 if pixels[0, 0].any() else 1
         Image.fromarray(pixels).save(path)
-    assert load_object(spectral_folder).summary()["input_hashes"] != before
+    assert load_object(spectral_folder).input_hashes != before
 
 
 def _bands_per_frame(*bands: int) -> Callable[[Path], None]:
@@ -471,27 +461,26 @@ def _bands_per_frame(*bands: int) -> Callable[[Path], None]:
     def change(folder: Path) -> None:
         for path in (folder / "cubes").glob("*.npy"):
             np.save(path, np.load(path)[..., list(bands)])
-        frames = json.loads((folder / "transforms.json").read_text())["frames"]
-        _change(folder, frames=[{**frame, "bands": list(bands)} for frame in frames])
+        _change_frames(folder, lambda _, frame: frame.update(bands=list(bands)))
 
     return change
 
 
 def _own_responses(folder: Path) -> None:
     write_table(folder / "responses.csv", ("a", "b", "c", "d", "e"), np.eye(5)[::-1])
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    _change(folder, frames=[{**frame, "responses_path": "responses.csv"} for frame in frames])
+    _change_frames(folder, lambda _, frame: frame.update(responses_path="responses.csv"))
 
 
 def _exr_cubes(folder: Path, shift_nm: float) -> None:
     """Cubes as spectral images whose channels name other wavelengths."""
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
     bands = Bands.of([nm + shift_nm for nm in WAVELENGTHS])
-    for index, frame in enumerate(frames):
+
+    def store(index: int, frame: dict[str, Any]) -> None:
         cube = np.load(folder / frame["hyperspectral_file_path"])
         frame["hyperspectral_file_path"] = f"cubes/{index}.exr"
         write_spectral_exr(folder / f"cubes/{index}.exr", cube, bands, None)
-    _change(folder, frames=frames)
+
+    _change_frames(folder, store)
 
 
 def test_wavelengths_of_spectral_images_count_as_those_of_transforms_json_do(made_spectral, spectral_folder):
@@ -509,14 +498,9 @@ def test_bands_of_frames_that_are_all_in_order_change_nothing(spectral_folder):
     assert load_object(spectral_folder).pictures.num_colours == 5
 
 
-def _fewer_shares(folder: Path) -> None:
-    for path in (folder / "abundances").glob("*.npy"):
-        np.save(path, np.load(path)[::2, ::2])
-
-
-def _fewer_bands(spectral_folder: Path) -> None:
-    for path in (spectral_folder / "relit" / "dim" / "cubes").glob("*.npy"):
-        np.save(path, np.load(path)[..., :4])
+def _thinned(folder: Path, part: tuple[slice, ...]) -> None:
+    for path in folder.glob("*.npy"):
+        np.save(path, np.load(path)[part])
 
 
 @pytest.mark.parametrize(
@@ -536,13 +520,19 @@ def _fewer_bands(spectral_folder: Path) -> None:
             lambda folder: _exr_cubes(folder, 200.0),
             "450-650 nm, but the files of the pictures say 5 bands, 650-",
         ),
-        (_fewer_shares, r"has shape \(12, 12, 2\); expected \(24, 24, 2\): .* and 2 materials"),
+        (
+            lambda folder: _thinned(folder / "abundances", (slice(None, None, 2),) * 2),
+            r"has shape \(12, 12, 2\); expected \(24, 24, 2\): .* and 2 materials",
+        ),
         (
             lambda folder: _change(folder / "relit" / "dim", tone_mapping="srgb"),
-            "pictures of bands with 'tone_mapping' srgb; expected linear light",
+            "pictures of 5 bands with 'tone_mapping' srgb; expected linear light",
         ),
         (_store_integers, "holds uint16; expected floats, or 'value_scale'"),
-        (_fewer_bands, "pictures of 4 bands, wavelengths of 5 bands"),
+        (
+            lambda folder: _thinned(folder / "relit/dim/cubes", (slice(None), slice(None), slice(4))),
+            "pictures of 4 bands; the object has 5 bands",
+        ),
         (lambda folder: write_cubes(folder / "relit" / "dim", 2, 1.0, wavelengths=[1, 2]), "wavelengths"),
     ],
 )

@@ -10,16 +10,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.commands.running import done, picture_size, refused, run_of
+from tests.commands.running import done, picture_size, refused
 from tests.neumatex.factory import (
     CENTRE,
     ENDMEMBERS,
     LAMP,
     RADIUS,
     SMALL,
+    trained_on,
     write_object,
     write_spectral_object,
 )
+from tests.neumatex.surfaces import unit
 from tests.products.ball_model import RADIUS as RUN_RADIUS
 from tests.products.ball_model import ball_scene
 from unmix_plugin.commands.eval import evaluate
@@ -27,7 +29,7 @@ from unmix_plugin.commands.export import export
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import load_model
 from unmix_plugin.neumatex.fit import data_manager, start
-from unmix_plugin.neumatex.fit.model import NeumatexModel, _settle
+from unmix_plugin.neumatex.fit.model import NeumatexModel
 from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
@@ -38,7 +40,7 @@ from unmix_plugin.trained.open_run import load_run
 from unmix_plugin.viewer.rendering.painting import layers_of
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 
-SPECTRAL = [*SMALL, "--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
+SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,11 +55,8 @@ def few_pixels():
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 30 steps."""
-    folder = tmp_path_factory.mktemp("neumatex")
-    write_spectral_object(folder / "ball")
-    words = ["--data", folder / "ball", "--output-dir", folder / "outputs", "--max-num-iterations", 30]
-    ended = done(train, "neumatex", *words, *SPECTRAL)
-    return run_of(ended)
+    folder = write_spectral_object(tmp_path_factory.mktemp("neumatex") / "ball")
+    return trained_on(folder, *SPECTRAL, steps=30)
 
 
 @pytest.fixture(scope="module")
@@ -131,12 +130,9 @@ def test_the_export_has_abundance_textures_and_endmembers(trained):
 
 
 def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
-    write_spectral_object(tmp_path / "ball")
-    words = ["--data", tmp_path / "ball", "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
-    settings = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=auto"]
-    ended = done(train, "neumatex", *words, *settings, *SMALL)
-    model = load_model(run_of(ended), "cpu").model
-    assert len(model.get_parameter("endmembers")) == 2
+    folder = write_spectral_object(tmp_path / "ball")
+    run = trained_on(folder, *SPECTRAL, "--pipeline.model.num-endmembers=auto", steps=1)
+    assert len(load_model(run, "cpu").model.get_parameter("endmembers")) == 2
 
 
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
@@ -144,16 +140,13 @@ def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monk
     of_run = replace(ball_scene(), frame=there)
     monkeypatch.setattr(start, "_opened", lambda _: of_run)
     folder = write_spectral_object(tmp_path / "ball")
-    words = ["--data", folder, "--output-dir", tmp_path / "out", "--max-num-iterations", 1]
-    settings = ["--pipeline.model.material=spectral", "--pipeline.model.from-run=run"]
-    ended = done(train, "neumatex", *words, *settings, "--pipeline.datamanager.lamp=E", *SMALL)
-    model = load_model(run_of(ended), "cpu").model
+    settings = [SPECTRAL[0], "--pipeline.model.from-run=run", "--pipeline.datamanager.lamp=E"]
+    model = load_model(trained_on(folder, *settings, steps=1), "cpu").model
     assert isinstance(model, NeumatexModel)
     assert model.endmembers is not None
-    unit = torch.nn.functional.normalize
     light = torch.ones(5) if of_run.light is None else of_run.light
-    expected = unit(of_run.materials.endmembers.detach() / light, dim=1)
-    found = unit(model.endmembers.detach(), dim=1)
+    expected = unit(of_run.materials.endmembers.detach() / light)
+    found = unit(model.endmembers.detach())
     assert float((found * expected).sum(dim=1).min()) > 0.999
     poles = torch.tensor([[0.0, 0.1, 0.99], [0.1, 0.0, -0.99]])
     assert model.surface.parameters(poles)[:, :3].argmax(dim=1).tolist() == [0, 1]
@@ -175,7 +168,6 @@ def test_a_material_that_does_not_fit_the_pictures_ends_with_status_2(
     assert expected in refused(train, "neumatex", *words, *SMALL)
 
 
-unit = torch.nn.functional.normalize
 DARK_AND_BRIGHT = torch.tensor([[0.05, 0.1, 0.2, 0.1], [0.9, 0.8, 0.4, 0.2]])
 
 
@@ -184,11 +176,11 @@ def test_mixed_pixels_do_not_make_dark_endmembers_brighter_nor_bright_ones_darke
     share = torch.rand(5000, 1, generator=generator)
     share[:200], share[200:400] = 0.0, 1.0  # few show one material alone
     pixels = torch.cat([share, 1 - share], dim=1) @ DARK_AND_BRIGHT
-    purity = unit(pixels, dim=1) @ unit(DARK_AND_BRIGHT, dim=1).T
-    assert_close(_as_bright(unit(DARK_AND_BRIGHT, dim=1), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
+    purity = unit(pixels) @ unit(DARK_AND_BRIGHT).T
+    assert_close(_as_bright(unit(DARK_AND_BRIGHT), pixels, purity), DARK_AND_BRIGHT, rtol=1e-3, atol=0)
     found = _as_bright(DARK_AND_BRIGHT, 5 * DARK_AND_BRIGHT, torch.eye(2))
     assert float(found.max()) <= 1
-    assert_close(unit(found, dim=1), unit(DARK_AND_BRIGHT, dim=1))
+    assert_close(unit(found), unit(DARK_AND_BRIGHT))
 
 
 @pytest.mark.parametrize("gains", [(0.5, 1.05), (3.0, 2.0)])
@@ -197,8 +189,8 @@ def test_gains_that_are_settled_leave_what_is_reflected_or_at_most_1_and_spectra
     family, parameters = SpectralFamily(endmembers, factors), torch.tensor([[0.4, 0.6, 0.5, 0.2]])
     before = family.base_colour(parameters)
     assert_close(before, (torch.tensor([[0.4, 0.6]]) * factors) @ DARK_AND_BRIGHT)
-    _settle(endmembers, factors)
-    assert_close(unit(endmembers, dim=1), unit(DARK_AND_BRIGHT, dim=1))
+    family.settle_gains()
+    assert_close(unit(endmembers), unit(DARK_AND_BRIGHT))
     assert float(endmembers.max()) <= 1
     assert factors.tolist() == [1.0, 1.0]
     if max(gains) < 1.1:

@@ -7,31 +7,21 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from tests.neumatex.surfaces import generator, unit
 from unmix_plugin.errors import SceneError, SpectrumError
 from unmix_plugin.formats.exr import write_exr, write_spectral_exr
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment, _PictureInversion, directions_of_pixels
-from unmix_plugin.neumatex.tracing.light_files import (
-    of_lamp,
-    read_environment,
-    read_environment_of_bands,
-    read_lamp,
-)
+from unmix_plugin.neumatex.tracing.light_files import of_lamp, read_environment, read_lamp
 from unmix_plugin.spectral.bands import Bands
 
 
-def _uniforms(count, seed=0):
-    return torch.rand(count, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+def _uniforms(count):
+    return torch.rand(count, 2, generator=generator(), dtype=torch.float64)
 
 
-def _directions(count, seed=0):
-    normals = torch.randn(count, 3, generator=torch.Generator().manual_seed(seed))
-    return torch.nn.functional.normalize(normals, dim=-1)
-
-
-def _spotty(height=16):
-    g = torch.Generator().manual_seed(5)
-    return Environment(torch.rand(height, 2 * height, 3, generator=g) ** 6)
+def _spotty(rotation=0.0):
+    return Environment(torch.rand(16, 32, 3, generator=generator(5)) ** 6, rotation)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +31,7 @@ def test_pixels_are_drawn_by_their_weights_and_evenly_within(weights):
     given = torch.tensor(weights)
     axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
-    row, column, down, across = _PictureInversion.of(given).draw(grid)
+    row, column, down, across = _PictureInversion(given.double()).draw(grid)
     drawn = torch.zeros_like(given, dtype=torch.float64).index_put_(
         (row, column), torch.ones_like(down), True
     )
@@ -73,13 +63,13 @@ def test_directions_follow_the_stated_convention():
 
 @pytest.mark.parametrize("rotation", [0.0, -120.0])
 def test_draws_have_the_stated_density_which_integrates_to_one(rotation):
-    environment = Environment(_spotty().image, rotation)
+    environment = _spotty(rotation)
     directions, density = environment.sample(_uniforms(200_000))
     assert_close(directions.norm(dim=-1), torch.ones(200_000))
     same = torch.isclose(environment.density(directions), density, rtol=1e-4)
     assert same.float().mean() > 0.9999  # some fall on an edge of pixels
     estimate = (directions[:, 0].exp() * (1 + directions[:, 2]) / density).double().mean()
-    uniform = _directions(400_000)
+    uniform = unit(torch.randn(400_000, 3, generator=generator()))
     assert 4 * math.pi * float(environment.density(uniform).double().mean()) == pytest.approx(1, abs=0.02)
     expected = 4 * math.pi * (uniform[:, 0].exp() * (1 + uniform[:, 2])).double().mean()
     # The density of dark pixels is small, so single draws weigh much.
@@ -101,7 +91,7 @@ def test_built_in_environments_are_seeded_and_well_exposed(name):
     assert_close(first.mean_radiance().mean(), torch.tensor(0.8), atol=1e-4, rtol=0)
 
 
-def _picture(height=4, width=8):
+def _picture(height, width):
     return np.random.default_rng(0).uniform(0.01, 20, (height, width, 3)).astype(np.float32)
 
 
@@ -150,23 +140,16 @@ def test_exr_is_read_and_hdr_flat_run_length_coded_and_in_the_old_code(tmp_path)
     assert_close(read_environment(tmp_path / "old.hdr").image, torch.from_numpy(old))
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "message"),
-    [
-        ((1, 2, 0), np.nan, "not finite in 1 pixel, first in row 1, column 2"),
-        ((0, 3, 1), -0.5, "negative value in 1 pixel,"),
-        (slice(None), 0.0, "black everywhere"),
-    ],
-)
-def test_impossible_values_are_refused(tmp_path, place, value, message):
-    image = _picture()
-    image[place] = value
-    with pytest.raises(SceneError, match=message):
-        read_environment(_exr(tmp_path / "light.exr", image))
-
-
-def test_wrong_aspect_channels_and_files_are_refused(tmp_path):
+def test_impossible_values_wrong_aspect_channels_and_files_are_refused(tmp_path):
     image = _picture(8, 16)
+    for name, place, value in (
+        ("nan", (1, 2, 0), np.nan),
+        ("negative", (0, 3, 1), -0.5),
+        ("black", slice(None), 0.0),
+    ):
+        spoiled = image.copy()
+        spoiled[place] = value
+        _exr(tmp_path / f"{name}.exr", spoiled)
     _exr(tmp_path / "square.exr", _picture(4, 6))
     write_exr(tmp_path / "depth.exr", {"Z": image[..., 0]}, {})
     (tmp_path / "light.png").write_bytes(b"")
@@ -175,6 +158,9 @@ def test_wrong_aspect_channels_and_files_are_refused(tmp_path):
     (tmp_path / "cut.hdr").write_bytes(_header(image) + _rgbe(image).tobytes()[:-9])
     (tmp_path / "up.hdr").write_bytes(_header(image, order=b"+Y %d +X %d\n") + _rgbe(image).tobytes())
     for name, said in {
+        "nan.exr": "not finite in 1 pixel, first in row 1, column 2",
+        "negative.exr": "negative value in 1 pixel,",
+        "black.exr": "black everywhere",
         "square.exr": "is 6 x 4 pixels",
         "depth.exr": "needs R, G and B",
         "missing.exr": "no such environment map",
@@ -213,12 +199,10 @@ def test_a_lamp_is_a_table_or_a_name_with_its_greatest_band_1(tmp_path):
 def test_lines_of_a_lamp_between_bands_count_and_its_own_rounded_bands_are_taken_as_they_are(tmp_path):
     lines = "400,1\n579,1\n580,101\n581,1\n800,1\n"
     found = read_lamp(_csv(tmp_path / "lines.csv", f"wavelength,power\n{lines}"), BANDS)
-    np.testing.assert_allclose(
-        found, [0.5, 1, 0.5, 0.5]
-    )  # a triangle of area 100 nm in a band of 100 nm over 1
-    rounded = read_lamp(
-        _csv(tmp_path / "lamp.csv", "wavelength,power\n450.0004,1\n550,4\n650,1\n750,1\n"), BANDS
-    )
+    # A triangle of area 100 nm in a band of 100 nm over 1.
+    np.testing.assert_allclose(found, [0.5, 1, 0.5, 0.5])
+    table = "wavelength,power\n450.0004,1\n550,4\n650,1\n750,1\n"
+    rounded = read_lamp(_csv(tmp_path / "lamp.csv", table), BANDS)
     np.testing.assert_allclose(rounded, [0.25, 1, 0.25, 0.25])
 
 
@@ -237,7 +221,7 @@ def test_lamps_that_tell_nothing_of_some_band_are_refused(tmp_path, text, expect
 
 def test_colours_of_an_environment_get_the_lamps_spectrum_by_their_luminance():
     lamp = torch.tensor([0.1, 0.5, 1.0, 0.2])
-    image = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(4, 8, 3, generator=generator())
     light = of_lamp(Environment(image, 30.0, 1.0), lamp)
     luminance = 0.2126 * image[..., 0] + 0.7152 * image[..., 1] + 0.0722 * image[..., 2]
     assert_close(light.image, luminance[..., None] * lamp)
@@ -249,21 +233,20 @@ def test_a_spectral_environment_is_brought_to_the_bands(tmp_path):
     source = Bands.of([400, 600, 800])
     image = np.ones((4, 8, 1), np.float32) * np.array([1, 2, 6], np.float32)
     path = write_spectral_exr(tmp_path / "light.exr", image, source, None)
-    light = read_environment_of_bands(path, BANDS, None, 10.0)
+    light = read_environment(path, 10.0, bands=BANDS)
     assert_close(light.image[0, 0], torch.tensor([1.25, 1.75, 3.0, 5.0]))
     assert light.rotation_deg == 10.0
 
 
 def test_environments_whose_light_is_not_known_in_every_band_are_refused(tmp_path):
-    grey = np.ones((4, 8), np.float32)
+    grey, two = np.ones((4, 8), np.float32), np.ones((4, 8, 2), np.float32)
     colours = write_exr(tmp_path / "rgb.exr", dict.fromkeys("RGB", grey), {})
-    with pytest.raises(SceneError, match=r"light's spectrum is not known; give the lamp's"):
-        read_environment_of_bands(colours, BANDS, None)
-    short = write_spectral_exr(
-        tmp_path / "short.exr", np.ones((4, 8, 2), np.float32), Bands.of([500, 700]), None
-    )
-    with pytest.raises(SceneError, match=r"do not match: .* 50 nm below and 50 nm above"):
-        read_environment_of_bands(short, BANDS, None)
+    short = write_spectral_exr(tmp_path / "short.exr", two, Bands.of([500, 700]), None)
     nameless = write_exr(tmp_path / "two.exr", dict.fromkeys("PQ", grey), {})
-    with pytest.raises(SceneError, match="needs R, G and B"):
-        read_environment_of_bands(nameless, BANDS, np.ones(4))
+    for path, lamp, said in (
+        (colours, None, "light's spectrum is not known; give the lamp's"),
+        (short, None, "do not match: .* 50 nm below and 50 nm above"),
+        (nameless, np.ones(4), "needs R, G and B"),
+    ):
+        with pytest.raises(SceneError, match=said):
+            read_environment(path, bands=BANDS, lamp=lamp)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.engine import Cameras, nearest_to_axes
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
+from unmix_plugin.neumatex.fit.pictures import PosedPictures
 from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.scene import Normalisation
@@ -60,9 +60,28 @@ def outline_overlaps(
             "alpha of all pictures is below one half everywhere, so that no pixel shows the object; write alpha "
             "that is 1 on the object, or pictures without alpha"
         )
-    step = max(1, -(-len(cameras) // _MOST_VIEWS))
-    views = range(0, len(cameras), step)
-    return np.array([_overlap(ray_mesh, cameras[view], alphas[view]) for view in views])
+    return np.array([_overlap(ray_mesh, cameras[view], alphas[view]) for view in _some_views(len(cameras))])
+
+
+def _some_views(count: int) -> range:
+    """Evenly spread."""
+    return range(0, count, max(1, -(-count // _MOST_VIEWS)))
+
+
+def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"] | None) -> float:
+    """Shared part of silhouette and alpha; without alpha 1 where the mesh is in the view."""
+    small = camera.shrunk(LONGEST_EDGE_PX**2)
+    rays = small.image_rays(0).to(ray_mesh.device)
+    seen = ray_mesh.blocked(rays.origins, rays.directions).cpu()
+    if alpha is None:
+        return float(seen.any())
+    rows, columns = (
+        np.minimum(((np.arange(count) + 0.5) * whole / count).astype(int), whole - 1)
+        for count, whole in ((small.height, camera.height), (small.width, camera.width))
+    )
+    shown = torch.from_numpy(alpha[rows][:, columns] > _HALF_OPAQUE).flatten()
+    union = int((seen | shown).sum())
+    return float((seen & shown).sum()) / union if union else 1.0
 
 
 def is_misplaced(overlaps: Float64[np.ndarray, " V"]) -> bool:
@@ -81,12 +100,19 @@ def misplacement(
         frame: To give places in the world.
         where: What the message calls the mesh.
     """
-    wrong, edge = int((overlaps < LEAST_OVERLAP).sum()), 2 / frame.scale
+    wrong, edge, poses = int((overlaps < LEAST_OVERLAP).sum()), 2 / frame.scale, cameras.camera_to_world
+    positions = frame.to_world(poses[:, :, 3].double().numpy())
+    middle, target = frame.to_world(np.zeros(3)), frame.to_world(nearest_to_axes(poses.double().numpy()))
+    away = float(np.median(np.linalg.norm(positions - target, axis=1)))
+    unit = 10.0 ** math.floor(math.log10(1e-4 * max(away, edge)))  # beyond it, digits are of rounding
+    middle, target = (np.round(point / unit) * unit + 0.0 for point in (middle, target))
+    places = [f"({', '.join(f'{value:.4g}' for value in point)})" for point in (middle, target)]
     return (
         f"{where} is not where the pictures show the object: in {wrong} of {len(overlaps)} views it covers less "
         f"than half of what alpha shows, or is not in the view (median overlap {np.median(overlaps):.0%}). Its box "
-        f"is {edge:.4g} long; {_places(cameras, frame)}. Bring it into the world of the poses: the same origin, unit "
-        "and axes. With y upwards it does not fit either"
+        f"is {edge:.4g} long; its middle is {places[0]}, the cameras look at {places[1]}, "
+        f"{np.linalg.norm(target - middle):.4g} away from there, and stand {away:.4g} from what they look at. Bring it "
+        "into the world of the poses: the same origin, unit and axes. With y upwards it does not fit either"
     )
 
 
@@ -101,43 +127,12 @@ def outline_doubt(overlaps: Float64[np.ndarray, " V"], where: str) -> str | None
     )
 
 
-def _places(cameras: Cameras, frame: Normalisation) -> str:
-    """Where the mesh and the cameras are in the world, without digits that rounding made."""
-    poses = cameras.camera_to_world.double().numpy()
-    positions = frame.to_world(poses[:, :, 3])
-    middle, target = frame.to_world(np.zeros(3)), frame.to_world(nearest_to_axes(poses))
-    away = float(np.median(np.linalg.norm(positions - target, axis=1)))
-    unit = 10.0 ** math.floor(math.log10(1e-4 * max(away, 2 / frame.scale)))
-    middle, target = (np.round(point / unit) * unit + 0.0 for point in (middle, target))
-    shown = [f"({', '.join(f'{value:.4g}' for value in point)})" for point in (middle, target)]
-    return (
-        f"its middle is {shown[0]}, the cameras look at {shown[1]}, {np.linalg.norm(target - middle):.4g} away from "
-        f"there, and stand {away:.4g} from what they look at"
-    )
-
-
-def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"] | None) -> float:
-    """Shared part of silhouette and alpha; without alpha 1 where the mesh is in the view."""
-    small = camera.shrunk(LONGEST_EDGE_PX**2)
-    rays = small.image_rays(0).to(ray_mesh.device)
-    seen = ray_mesh.closest(rays.origins, rays.directions).found.cpu()
-    if alpha is None:
-        return float(seen.any())
-    rows, columns = (
-        np.minimum(((np.arange(count) + 0.5) * whole / count).astype(int), whole - 1)
-        for count, whole in ((small.height, camera.height), (small.width, camera.width))
-    )
-    shown = torch.from_numpy(alpha[rows][:, columns] > _HALF_OPAQUE).flatten()
-    union = int((seen | shown).sum())
-    return float((seen & shown).sum()) / union if union else 1.0
-
-
 def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
     """How much cameras see each triangle from its front, less how much from behind: sums of cosines over rays."""
     mesh, seen = ray_mesh.mesh, torch.zeros(len(ray_mesh.mesh.faces))
     a, b, c = mesh.corners().unbind(dim=1)
     normals = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
-    for view in range(0, len(cameras), max(1, -(-len(cameras) // _MOST_VIEWS))):
+    for view in _some_views(len(cameras)):
         rays = cameras[view].shrunk(_SIDES_EDGE_PX**2).image_rays(0)
         hits = ray_mesh.closest(rays.origins, rays.directions)
         triangles = hits.triangles[hits.found]
@@ -152,24 +147,22 @@ def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None
     """
     if pictures.tone != "linear":
         return None
-    step = max(1, -(-len(pictures) // _MOST_VIEWS))
-    read = [pictures.read(view) for view in range(0, len(pictures), step)]
-    shown = [picture.numbers[opacity(picture) >= OPAQUE_ALPHA] for picture in read if has_alpha(picture)]
+    read = [pictures.read(view) for view in _some_views(len(pictures))]
+    shown = [picture.numbers[picture.opacity >= OPAQUE_ALPHA] for picture in read if picture.has_alpha]
     found = np.concatenate(shown).mean(axis=1) if shown else np.zeros(0)
     mean = float(environment.mean_radiance().mean())
     if not (found.size and mean > 0):
         return None
     middle, bright = (float(np.quantile(found, share)) / mean for share in (0.5, 0.95))
-    if middle > BOUNDS[1]:
+    low, high = BOUNDS
+    if middle > high:
         ratio, what = middle, "half of the object's pixels are more than"
-        usual = f"at most {BOUNDS[1]:g} times"
-    elif 0 < bright < BOUNDS[0]:
+    elif 0 < bright < low:
         ratio, what = bright, "95 % of the object's pixels are less than"
-        usual = f"at least {BOUNDS[0]:g} times"
     else:
         return None
     return (
-        f"{what} {ratio:.2g} times as bright as the mean of the environment map; {usual} is usual. Pictures and map "
-        "seem to have different units, and materials come out wrong then. Scale one of them: an "
+        f"{what} {ratio:.2g} times as bright as the mean of the environment map; {low:g} to {high:g} times is usual. "
+        "Pictures and map seem to have different units, and materials come out wrong then. Scale one of them: an "
         f"'environment_exposure_stops' {math.log2(ratio / _USUAL):.0f} higher would be about right"
     )

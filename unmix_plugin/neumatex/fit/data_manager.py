@@ -30,8 +30,7 @@ from unmix_plugin.engine import (
 )
 from unmix_plugin.errors import SceneError, require
 from unmix_plugin.formats.files import numbered_apart
-from unmix_plugin.neumatex.fit.object_scene import ObjectScene, load_object
-from unmix_plugin.neumatex.fit.pictures import PosedPictures, has_alpha, opacity
+from unmix_plugin.neumatex.fit.object_scene import HeldOutLight, ObjectScene, load_object
 from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
@@ -103,10 +102,11 @@ class ObjectDataManager(DataManager):
         reach = self.object.mesh.vertices.abs().amax(dim=0).clamp(min=_THINNEST)
         self.scene_box = SceneBox(torch.stack([-reach, reach]))
         self._num_rays = config.train_num_rays_per_batch
-        lights = [(light, view) for light in self.object.lights for view in range(len(light.pictures))]
-        self._images = [*split.evaluation, *lights]
+        self._images: list[tuple[HeldOutLight | None, int]] = [(None, view) for view in split.evaluation]
         named = [pictures.names[view] for view in split.evaluation]
-        named += [f"{light.name}-{light.pictures.names[view]}" for light, view in lights]
+        for light in self.object.lights:
+            self._images += [(light, view) for view in range(len(light.pictures))]
+            named += [f"{light.name}-{name}" for name in light.pictures.names]
         self._names = numbered_apart(map(readable_name, named))
 
     def next_train(self, step: int) -> tuple[RayBundle, dict[str, Tensor]]:
@@ -122,14 +122,25 @@ class ObjectDataManager(DataManager):
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
         """Camera and whole image; those under held-out lights come after the evaluation views."""
-        place = self._images[index]
-        if isinstance(place, int):
-            return self._image(self.object.pictures, place, self._truth(place))
-        light, view = place
-        environment = light.environment
-        placement = torch.tensor([environment.rotation_deg, environment.exposure_stops], device=self.device)
-        entries = {"environment": environment.image.to(self.device), "environment_placement": placement}
-        return self._image(light.pictures, view, entries)
+        light, view = self._images[index]
+        pictures = self.object.pictures if light is None else light.pictures
+        picture, camera = pictures.read(view), pictures.cameras[view]
+        shown = picture.opacity
+        if not picture.has_alpha:
+            shown = shown * _sees_mesh(self._ray_mesh, camera).numpy()
+        batch = {
+            "numbers": torch.from_numpy(picture.numbers),
+            "alpha": torch.from_numpy(shown),
+            "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
+            "lights": torch.tensor(len(self.object.lights)),
+        }
+        if light is None:
+            batch |= {name: torch.from_numpy(truth) for name, truth in self.object.truth(view).items()}
+        else:
+            given = light.environment
+            placement = torch.tensor([given.rotation_deg, given.exposure_stops])
+            batch |= {"environment": given.image, "environment_placement": placement}
+        return camera, {name: values.to(self.device) for name, values in batch.items()}
 
     def eval_name(self, index: int) -> str:
         """The picture's name, after its light's where that is held out."""
@@ -160,14 +171,21 @@ class ObjectDataManager(DataManager):
         arrays = {"vertices": mesh.vertices, "faces": mesh.faces, "normals": mesh.normals, "uv": mesh.uv}
         arrays["light_map"] = light.image
         buffers = {name: array.numpy() for name, array in arrays.items() if array is not None}
-        return {
-            **buffers,
-            **(_view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays()),
-        }
+        return buffers | (_view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays())
 
     def summary(self) -> dict[str, Any]:
         """Files, splits, normalisation, hashes."""
-        return self.object.summary()
+        found = self.object
+        return {
+            "root": str(found.root),
+            "frames": found.pictures.names,
+            "train_indices": list(found.split.train),
+            "eval_indices": list(found.split.evaluation),
+            "normalisation": found.frame.to_json(),
+            "tone_mapping": found.pictures.tone,
+            "lights": {light.name: light.pictures.names for light in found.lights},
+            "input_hashes": dict(found.input_hashes),
+        }
 
     @classmethod
     def check_record(cls, metadata: Mapping[str, Any], summary: Mapping[str, Any]) -> None:
@@ -186,42 +204,12 @@ class ObjectDataManager(DataManager):
     @cached_property
     def _pixels(self) -> _PixelList:
         """Read when training begins: evaluation needs none of it."""
-        return _PixelList.of(self.object, self.options.max_pixels, self.seed)
+        return _PixelList(self.object, self.options.max_pixels, self.seed)
 
     @cached_property
     def _ray_mesh(self) -> RayMesh:
         """Says which pixels show the object where alpha does not."""
         return RayMesh(self.object.mesh)
-
-    def _image(
-        self, pictures: PosedPictures, view: int, others: dict[str, Tensor]
-    ) -> tuple[Cameras, dict[str, Tensor]]:
-        picture = pictures.read(view)
-        shown = opacity(picture)
-        if not has_alpha(picture):
-            shown = shown * _sees_mesh(self._ray_mesh, pictures.cameras[view]).numpy()
-        batch = {
-            "numbers": self._tensor(picture.numbers),
-            "alpha": self._tensor(shown),
-            "tone": torch.tensor(TONE_MAPPINGS.index(pictures.tone)),
-            "lights": torch.tensor(len(self.object.lights)),
-        }
-        return pictures.cameras[view], {**batch, **others}
-
-    def _truth(self, view: int) -> dict[str, Tensor]:
-        """What is known of a view's materials."""
-        if self.object.bands is None:
-            colours = self.object.base_colour(view)
-            return {} if colours is None else {"base_colour": self._tensor(colours)}
-        materials = self.object.true_materials
-        abundances = self.object.abundances(view)
-        if materials is None or abundances is None:
-            return {}
-        endmembers = self._tensor(materials.endmembers.astype(np.float32))
-        return {"true_abundances": self._tensor(abundances), "true_endmembers": endmembers}
-
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self.device)
 
     def _pixel_arrays(self) -> dict[str, np.ndarray]:
         """Rays and spectra of some training pixels, the lamp, and where the model's axes are in the world."""
@@ -238,17 +226,11 @@ class ObjectDataManager(DataManager):
         }
 
 
-@dataclass(frozen=True)
 class _PixelList:
-    """Pixels of training views that show the mesh and nothing else, by view and place."""
+    """Pixels of training views that show the mesh and nothing else: `views` (M), `corners` (M 2), column and row, and
+    `numbers` (M C)."""
 
-    views: Int[Tensor, " M"]
-    corners: Int[Tensor, "M 2"]
-    """Column and row."""
-    numbers: Float[Tensor, "M C"]
-
-    @staticmethod
-    def of(scene: ObjectScene, most: int, seed: int) -> _PixelList:
+    def __init__(self, scene: ObjectScene, most: int, seed: int) -> None:
         """Read the training views; of more pixels than `most`, so many are drawn.
 
         Raises:
@@ -257,21 +239,18 @@ class _PixelList:
         ray_mesh, parts = RayMesh(scene.mesh), []
         generator = torch.Generator().manual_seed(seed)
         share = most // len(scene.split.train) + 1
-        for row, view in enumerate(scene.split.train):
+        for number, view in enumerate(scene.split.train):
             picture = scene.pictures.read(view)
-            sees_mesh = _sees_mesh(ray_mesh, scene.pictures.cameras[view])
-            rows, columns = (torch.from_numpy(opacity(picture) >= OPAQUE_ALPHA) & sees_mesh).nonzero(
-                as_tuple=True
-            )
-            if len(rows) > share:
-                kept = torch.randperm(len(rows), generator=generator)[:share]
-                rows, columns = rows[kept], columns[kept]
+            shown = torch.from_numpy(picture.opacity >= OPAQUE_ALPHA)
+            places = (shown & _sees_mesh(ray_mesh, scene.pictures.cameras[view])).nonzero()
+            if len(places) > share:
+                places = places[torch.randperm(len(places), generator=generator)[:share]]
+            rows, columns = places.unbind(dim=-1)
             numbers = torch.from_numpy(picture.numbers)[rows, columns]
-            parts.append((torch.full_like(rows, row), torch.stack([columns, rows], dim=-1), numbers))
-        found = _PixelList(*(torch.cat(values) for values in zip(*parts, strict=True)))
-        if not len(found.views):
+            parts.append((torch.full_like(rows, number), places.flip(1), numbers))
+        self.views, self.corners, self.numbers = (torch.cat(part) for part in zip(*parts, strict=True))
+        if not len(self.views):
             raise SceneError(f"{scene.root}: no training view shows the mesh and opaque alpha in one pixel")
-        return found
 
     def draw(
         self, count: int, generator: torch.Generator
@@ -305,7 +284,7 @@ def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
         if scene.pictures.tone != "linear":
             light = srgb_to_linear(light)  # about; an unknown response is only known after the fit
         arrays[f"view_{number}_light"] = light.numpy()
-        arrays[f"view_{number}_alpha"] = opacity(picture)[::step, ::step].copy()
+        arrays[f"view_{number}_alpha"] = picture.opacity[::step, ::step].copy()
         arrays[f"view_{number}_pose"] = cameras.camera_to_world[row].numpy()
         arrays[f"view_{number}_lens"] = torch.cat([lens, cameras.distortion[row]]).numpy()
     return arrays

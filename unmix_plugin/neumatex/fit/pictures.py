@@ -11,7 +11,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32
 
 from unmix_plugin.engine import Cameras
 from unmix_plugin.errors import CaptureError, SceneError, counted
@@ -38,8 +38,19 @@ class Picture:
     """Opacity in [0, 1]; None where the file has none."""
     valid: Bool[np.ndarray, "H W"] | None = None
     """Pixels that count; None where no mask says."""
-    wavelengths_nm: Float64[np.ndarray, " C"] | None = None
+    wavelengths_nm: tuple[float, ...] | None = None
     """Of the bands, as the file says; None where it says none."""
+
+    @property
+    def has_alpha(self) -> bool:
+        """Whether some pixel is not opaque."""
+        return self.alpha is not None and bool((self.alpha < 1).any())
+
+    @property
+    def opacity(self) -> Float32[np.ndarray, "H W"]:
+        """Alpha; 1 where the picture has none, 0 where a mask says that pixels do not count."""
+        alpha = np.ones(self.numbers.shape[:2], np.float32) if self.alpha is None else self.alpha
+        return alpha if self.valid is None else alpha * self.valid
 
 
 def read_picture(path: Path, value_scale: float | None = None) -> Picture:
@@ -84,13 +95,14 @@ def _read_exr(path: Path) -> Picture:
 
     channels = channel_names(path)  # refuses other files
     opened = open_spectral_file(path)
-    numbers, wavelengths = opened.read().astype(np.float32), opened.bands.wavelengths_nm
+    numbers, nm, alpha = opened.read().astype(np.float32), opened.bands.wavelengths_nm, None
     if numbers.shape[2] < 3:
         raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
-    if "A" not in channels:
-        return Picture(numbers, None, wavelengths_nm=wavelengths)
-    alpha = open_spectral_file(path, ReadOptions(dataset="A")).read()
-    return Picture(numbers, alpha[..., 0].astype(np.float32).clip(0, 1), wavelengths_nm=wavelengths)
+    if "A" in channels:
+        alpha = (
+            open_spectral_file(path, ReadOptions(dataset="A")).read()[..., 0].astype(np.float32).clip(0, 1)
+        )
+    return Picture(numbers, alpha, wavelengths_nm=None if nm is None else tuple(nm.tolist()))
 
 
 def _read_npy(path: Path, value_scale: float | None) -> Picture:
@@ -112,22 +124,46 @@ def _read_npy(path: Path, value_scale: float | None) -> Picture:
 class _PictureFiles:
     """The files of one picture."""
 
-    name: str
-    """Short name, unique among its neighbours, fit for file names."""
     colours: Path
     """What holds its colours."""
-    opacity: Path | None = None
+    opacity: Path | None
     """What holds its alpha, where that is another file."""
-    mask: Path | None = None
+    mask: Path | None
     """Black where pixels do not count."""
-    value_scale: float | None = None
+    value_scale: float | None
     """Stored number of a .npy array that stands for 1."""
+
+    def read(self) -> Picture:
+        """The picture; colours of a cube whose alpha is apart are divided by it.
+
+        Raises:
+            SceneError: a file can't be read, or their sizes differ.
+        """
+        picture = read_picture(self.colours, self.value_scale)
+        height, width = picture.numbers.shape[:2]
+        if self.mask is not None:
+            try:
+                picture = replace(picture, valid=read_mask(self.mask, (height, width)))
+            except UnreadableImageError as error:
+                raise SceneError(f"{self.mask} {error}") from error
+        alpha = None if self.opacity is None else read_picture(self.opacity).alpha
+        if alpha is None:
+            return picture
+        if alpha.shape != (height, width):
+            raise SceneError(
+                f"{self.opacity}: has {alpha.shape[1]} x {alpha.shape[0]} pixels, its cube {self.colours.name} has "
+                f"{width} x {height}; give both one size"
+            )
+        numbers = picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None]
+        return replace(picture, numbers=numbers, alpha=alpha)
 
 
 @dataclass(frozen=True)
 class PosedPictures:
     """Pictures and their cameras, read when asked for."""
 
+    names: list[str]
+    """Short, distinct, fit for file names."""
     files: tuple[_PictureFiles, ...]
     cameras: Cameras
     """Model space, one a picture."""
@@ -135,66 +171,32 @@ class PosedPictures:
     """What the numbers are of light."""
     num_colours: int
     """C."""
-    wavelengths_nm: tuple[float, ...] | None = None
+    wavelengths_nm: tuple[float, ...] | None
     """Of the bands, as the files say; None where they say none."""
 
     def __len__(self) -> int:
         return len(self.files)
 
-    @property
-    def names(self) -> list[str]:
-        """Of the pictures."""
-        return [files.name for files in self.files]
-
     def read(self, index: int) -> Picture:
-        """One picture, checked; premultiplied cubes whose alpha is apart are divided by it.
+        """One picture, checked.
 
         Raises:
             SceneError: it can't be read, or its size has changed.
         """
-        files = self.files[index]
-        picture = _read_files(files)
-        width, height = self.cameras.size(index)
+        picture, (width, height) = self.files[index].read(), self.cameras.size(index)
         if picture.numbers.shape[:2] != (height, width):
-            raise SceneError(f"{files.colours} has changed since it was first read; start again")
+            raise SceneError(f"{self.files[index].colours} has changed since it was first read; start again")
         return picture
 
     @cached_property
     def hashes(self) -> dict[str, str]:
         """SHA-256 of each file, by its picture's name and what else it holds of it."""
         return {
-            f"{files.name}{what}": sha256_of(path)
-            for files in self.files
+            f"{name}{what}": sha256_of(path)
+            for name, files in zip(self.names, self.files, strict=True)
             for what, path in (("", files.colours), (" alpha", files.opacity), (" mask", files.mask))
             if path is not None
         }
-
-
-def _read_files(files: _PictureFiles) -> Picture:
-    """A picture from its one or two files.
-
-    Raises:
-        SceneError: one can't be read, or their sizes differ.
-    """
-    picture = read_picture(files.colours, files.value_scale)
-    if files.mask is not None:
-        try:
-            height, width = picture.numbers.shape[:2]
-            picture = replace(picture, valid=read_mask(files.mask, (height, width)))
-        except UnreadableImageError as error:
-            raise SceneError(f"{files.mask} {error}") from error
-    if files.opacity is None:
-        return picture
-    alpha = read_picture(files.opacity).alpha
-    if alpha is None:
-        return picture
-    if alpha.shape != picture.numbers.shape[:2]:
-        raise SceneError(
-            f"{files.opacity}: has {alpha.shape[1]} x {alpha.shape[0]} pixels, its cube {files.colours.name} has "
-            f"{picture.numbers.shape[1]} x {picture.numbers.shape[0]}; give both one size"
-        )
-    numbers = picture.numbers / np.maximum(alpha, np.float32(1e-3))[..., None]
-    return replace(picture, numbers=numbers, alpha=alpha)
 
 
 def read_posed_pictures(
@@ -211,16 +213,19 @@ def read_posed_pictures(
         SceneError: pictures are missing or malformed; all their faults in one message.
     """
     faults = Faults(root)
-    located = [_locate(root, frame, entry.value_scale, faults) for frame in entry.frames]
+    located = [_locate(root, one, entry.value_scale, faults) for one in entry.frames]
     faults.raise_if_any()
-    names = distinct_names(
-        [files.colours.relative_to(root).as_posix() for files in located if files is not None]
-    )
-    named = [
-        replace(files, name=name) for name, files in zip(names, located, strict=True) if files is not None
-    ]
-    sizes, colours = _check(root, named, faults)
-    kinds = {files.colours.suffix.lower() in LIGHT_SUFFIXES for files in named}
+    files = [one for one in located if one is not None]
+    sizes, colours = [], set()
+    for one in files:
+        try:
+            picture = one.read()
+        except SceneError as error:
+            faults.add(str(root), str(error).replace(f"{root}/", ""))
+            continue
+        sizes.append(picture.numbers.shape[:2])
+        colours.add((picture.numbers.shape[2], picture.wavelengths_nm))
+    kinds = {one.colours.suffix.lower() in LIGHT_SUFFIXES for one in files}
     if len(kinds) > 1 or len(colours) > 1:
         faults.add(
             "frames",
@@ -238,8 +243,9 @@ def read_posed_pictures(
             )
     entry = at_sizes(entry, sizes, faults)
     faults.raise_if_any()
-    usual: ToneMapping = "linear" if kinds == {True} else "camera"
-    return PosedPictures(tuple(named), make_cameras(entry, sizes, frame), tone or usual, count, wavelengths)
+    cameras, usual = make_cameras(entry, sizes, frame), "linear" if kinds == {True} else "camera"
+    names = distinct_names([one.colours.relative_to(root).as_posix() for one in files])
+    return PosedPictures(names, tuple(files), cameras, tone or usual, count, wavelengths)
 
 
 def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Faults) -> _PictureFiles | None:
@@ -253,36 +259,6 @@ def _locate(root: Path, frame: FrameEntry, value_scale: float | None, faults: Fa
     keys = [key for key in ("hyperspectral_file_path", "file_path", "mask_path") if key in frame.paths]
     found = {key: resolve_path(root, frame.paths[key], None, frame.where, faults) for key in keys}
     mask = found.pop("mask_path", None)
-    pictures = [path for path in found.values() if path is not None]
-    if len(pictures) < len(found) or not pictures or (mask is None and "mask_path" in keys):
-        return None
-    return _PictureFiles("", *pictures, mask=mask, value_scale=value_scale)
-
-
-def _check(
-    root: Path, named: list[_PictureFiles], faults: Faults
-) -> tuple[list[tuple[int, int]], set[tuple[int, tuple[float, ...] | None]]]:
-    """Sizes of all pictures, and the numbers of colours and wavelengths that they have."""
-    sizes, colours = [], set()
-    for files in named:
-        try:
-            picture = _read_files(files)
-        except SceneError as error:
-            faults.add(str(root), str(error).replace(f"{root}/", ""))
-            continue
-        height, width, count = picture.numbers.shape
-        sizes.append((height, width))
-        found = picture.wavelengths_nm
-        colours.add((count, None if found is None else tuple(found.tolist())))
-    return sizes, colours
-
-
-def has_alpha(picture: Picture) -> bool:
-    """Whether some pixel is not opaque."""
-    return picture.alpha is not None and bool((picture.alpha < 1).any())
-
-
-def opacity(picture: Picture) -> Float32[np.ndarray, "H W"]:
-    """Alpha; 1 where the picture has none, 0 where a mask says that pixels do not count."""
-    alpha = np.ones(picture.numbers.shape[:2], np.float32) if picture.alpha is None else picture.alpha
-    return alpha if picture.valid is None else alpha * picture.valid
+    colours, *others = found.values()
+    opacity = others[0] if others else None
+    return None if colours is None else _PictureFiles(colours, opacity, mask, value_scale)

@@ -21,14 +21,10 @@ from unmix_plugin.errors import ConfigError, did_you_mean
 from unmix_plugin.neumatex.fit.tone import SpectralDisplay
 from unmix_plugin.neumatex.tracing.built_in_lights import NAMES, built_in_environment
 from unmix_plugin.neumatex.tracing.environment import Environment
-from unmix_plugin.neumatex.tracing.families import MaterialFamily, PbrFamily, SpectralFamily
-from unmix_plugin.neumatex.tracing.light_files import (
-    ENVIRONMENT_SUFFIXES,
-    of_lamp,
-    read_environment,
-    read_environment_of_bands,
-)
+from unmix_plugin.neumatex.tracing.families import PbrFamily, SpectralFamily
+from unmix_plugin.neumatex.tracing.light_files import ENVIRONMENT_SUFFIXES, of_lamp, read_environment
 from unmix_plugin.neumatex.tracing.mesh import Mesh
+from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import PixelHits, RayMesh, pixel_hits
 from unmix_plugin.neumatex.tracing.surface import Surface
@@ -127,13 +123,9 @@ class TrainedObject:
     @property
     def outputs(self) -> tuple[Output, ...]:
         """All that can be shown of the materials and of the light that they reflect, in the order of offering."""
-        family = self.surface.family
-        own: tuple[Output, ...] = ()
-        if isinstance(family, SpectralFamily):
-            own = _SPECTRAL
-        elif _has_latents(family) or isinstance(family, PbrFamily):
-            own = _LATENTS if _has_latents(family) else _PBR
-        return (*_COMMON, *own, *(() if self.log_variance is None else (_UNCERTAINTY,)), *_GEOMETRY)
+        own = {SpectralFamily: _SPECTRAL, NeuralFamily: _LATENTS, PbrFamily: _PBR}
+        uncertainty = () if self.log_variance is None else (_UNCERTAINTY,)
+        return (*_COMMON, *own.get(type(self.surface.family), ()), *uncertainty, *_GEOMETRY)
 
     def output(self, name: str) -> Output:
         """An output by its name.
@@ -157,11 +149,8 @@ class TrainedObject:
         """
         own = self.own_light or self.environment
         light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))
-        turned = Environment(
-            light.image.to(self.device),
-            light.rotation_deg + choice.rotation_deg,
-            light.exposure_stops + choice.exposure_stops,
-        )
+        angle, stops = light.rotation_deg + choice.rotation_deg, light.exposure_stops + choice.exposure_stops
+        turned = Environment(light.image.to(self.device), angle, stops)
         return replace(self, environment=turned, own_light=own)
 
     def _named_light(self, name: str) -> Environment:
@@ -177,7 +166,7 @@ class TrainedObject:
         path = Path(name)
         if self.bands is None or self.lamp is None:
             return _environment_file(path, path.stat().st_mtime_ns if path.exists() else 0)
-        return read_environment_of_bands(path, self.bands, self.lamp.cpu().double().numpy())
+        return read_environment(path, bands=self.bands, lamp=self.lamp.cpu().double().numpy())
 
     def look(self, camera: Cameras, subpixels: int | None = None) -> ModelView:
         """All outputs of a view; `subpixels` squared rays a pixel."""
@@ -264,7 +253,7 @@ class TrainedObject:
             found |= {"spectral": linear, "reflectance": hits.image(base), "abundances": shares}
             found["segmentation"] = material_ids(shares, alpha)
             found["roughness"], found["specular_level"] = means[..., family.num_endmembers :].unbind(dim=-1)
-        elif _has_latents(family):
+        elif isinstance(family, NeuralFamily):
             found["latents_a"], found["latents_b"] = means[..., 3:6], means[..., 6:9]
         elif isinstance(family, PbrFamily):
             found["roughness"], found["metallicity"] = means[..., 3:5].unbind(dim=-1)
@@ -278,11 +267,6 @@ class TrainedObject:
 def _environment_file(path: Path, changed_ns: int) -> Environment:  # noqa: ARG001 - a changed file is another one
     """An environment map, kept while it stays as it is: a slider that turns it asks for it again and again."""
     return read_environment(path)
-
-
-def _has_latents(family: MaterialFamily) -> bool:
-    """Whether parameters 3 to 8 are latents of a decoder."""
-    return getattr(family, "decoder", None) is not None
 
 
 def _in_chunks(

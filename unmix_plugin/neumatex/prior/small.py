@@ -203,7 +203,8 @@ def predict(
         ray_mesh = RayMesh(ray_mesh.mesh.to("cpu"))
     chosen = views[well_spread(views.cameras.camera_to_world[:, :, 3], _MOST_VIEWS)]
     with torch.no_grad():
-        observations = _observe(chosen, ray_mesh, environment.to("cpu"), generator)
+        environment = replace(environment, image=environment.image.cpu())
+        observations = _observe(chosen, ray_mesh, environment, generator)
         said = prior.estimate(prior(observations), material)
     planes = fit_planes(prior.readers_of(material), Estimates(observations.positions, *said))[0]
     return Triplane.filled(prior.readers_of(material), planes, resolution)
@@ -245,34 +246,28 @@ def _read_colours(
     return torch.stack(colours, dim=1), torch.stack(shown, dim=1)
 
 
-def read_small_prior(
-    material: MaterialName, folder: Path = SHIPPED, decoder_sha256: str | None = None
-) -> SmallPrior:
+def read_small_prior(material: MaterialName, folder: Path = SHIPPED) -> SmallPrior:
     """The prior in a folder, ready to predict.
 
     Args:
         material: What it is to predict. Only `neural` depends on the decoder: latents mean something only beside the
             one that they were made for, so the record has its SHA-256.
-        decoder_sha256: Of the decoder in use; the shipped one's by default.
     Raises:
-        RunError: a file is missing or damaged, or the latents belong to another decoder.
+        RunError: a file is missing or damaged, or the latents belong to another decoder than the shipped one.
     """
-    record = read_record(folder)
-    if material == "neural":
-        expected = shipped_decoder_sha256() if decoder_sha256 is None else decoder_sha256
-        if record.get("decoder_sha256") != expected:
-            raise RunError(
-                f"the prior in {folder} was trained for the material decoder "
-                f"{str(record.get('decoder_sha256'))[:12]}, but the decoder in use is {expected[:12]}: its latents "
-                "would mean something else; train it again (python -m tools.train_prior) or use "
-                "--pipeline.model.material pbr"
-            )
-    path = folder / WEIGHTS
+    record, path, decoder = read_record(folder), folder / WEIGHTS, shipped_decoder_sha256()
+    made_for = record.get("decoder_sha256")
+    if material == "neural" and made_for != decoder:
+        raise RunError(
+            f"the prior in {folder} was trained for the material decoder {str(made_for)[:12]}, but the decoder in use "
+            f"is {decoder[:12]}: its latents would mean something else; train it again (python -m tools.train_prior) "
+            "or use --pipeline.model.material pbr"
+        )
+    prior = SmallPrior()
     try:
         data = path.read_bytes()
         if hashlib.sha256(data).hexdigest() != record.get("sha256"):
             raise RunError(f"{path} is not the file that {RECORD} describes; install the package again")
-        prior = SmallPrior()
         prior.load_state_dict(safetensors.torch.load(data))
     except (OSError, SafetensorError, RuntimeError) as error:
         raise RunError(f"{path} can't be read as weights of the prior: {error}") from error
@@ -280,11 +275,7 @@ def read_small_prior(
 
 
 def read_record(folder: Path = SHIPPED) -> dict[str, Any]:
-    """How a prior was made.
-
-    Raises:
-        RunError: the record is missing or no JSON.
-    """
+    """How a prior was made. Raises RunError: the record is missing or no JSON."""
     path = folder / RECORD
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -293,12 +284,5 @@ def read_record(folder: Path = SHIPPED) -> dict[str, Any]:
 
 
 def shipped_decoder_sha256() -> str:
-    """Of the weights of the neural material that come with the package.
-
-    Raises:
-        RunError: they are missing.
-    """
-    try:
-        return hashlib.sha256(neural.SHIPPED.read_bytes()).hexdigest()
-    except OSError as error:
-        raise RunError(f"{neural.SHIPPED} can't be read: {error}; install the package again") from error
+    """Of the weights of the neural material that come with the package."""
+    return hashlib.sha256(neural.SHIPPED.read_bytes()).hexdigest()

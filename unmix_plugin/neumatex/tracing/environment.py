@@ -33,10 +33,6 @@ class Environment:
         """C."""
         return self.image.shape[2]
 
-    def to(self, device: torch.device | str) -> Environment:
-        """The same light on another device."""
-        return Environment(self.image.to(device), self.rotation_deg, self.exposure_stops)
-
     def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N C"]:
         """Radiance that comes from directions."""
         height, width, colours = self.image.shape
@@ -47,20 +43,18 @@ class Environment:
         column, row = left.long() % width, top.long()
         next_column, next_row = (column + 1) % width, (row + 1).clamp(max=height - 1)
         pixels = self._scaled_image.reshape(-1, colours)
-
-        def _pixel(row: Tensor, column: Tensor) -> Tensor:
-            return pixels.index_select(0, row * width + column)
-
-        upper = torch.lerp(_pixel(row, column), _pixel(row, next_column), right_share)
-        lower = torch.lerp(_pixel(next_row, column), _pixel(next_row, next_column), right_share)
+        upper, lower = (
+            torch.lerp(pixels[at * width + column], pixels[at * width + next_column], right_share)
+            for at in (row, next_row)
+        )
         return torch.lerp(upper, lower, low_share)
 
     def sample(self, uniforms: Float[Tensor, "N 2"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
         """Directions drawn about as the radiance is distributed, and their density in 1/sr.
 
-        A pixel is drawn by its mean radiance and solid angle; within it, directions are uniform in solid angle. The
-        distribution is inverted and not drawn from an alias table, which would be as fast but scatter numbers that
-        are evenly spread: with 160 samples a point the noise of pictures is half as large.
+        A pixel is drawn by its mean radiance and solid angle; within it, directions are uniform in solid angle. An
+        alias table would be as fast, but scatter numbers that are evenly spread: with 160 samples a point the noise of
+        pictures would be twice as large.
 
         Args:
             uniforms: In [0, 1); float64 ones place directions more finely within a pixel.
@@ -119,7 +113,7 @@ class Environment:
 
     @cached_property
     def _inversion(self) -> _PictureInversion:
-        return _PictureInversion.of(self._weights)
+        return _PictureInversion(self._weights)
 
 
 def solid_angles(height: int, width: int) -> Float64[Tensor, " H"]:
@@ -140,43 +134,28 @@ def directions_of_pixels(height: int, width: int) -> Float[Tensor, "H W 3"]:
     return torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), polar.cos()], dim=-1).float()
 
 
-@dataclass(frozen=True)
 class _PictureInversion:
-    """Cumulative shares of a picture's pixels."""
+    """Pixels drawn by their weights, by inversion of cumulative shares."""
 
-    rows: Float64[Tensor, " row_edges"]
-    """Share of all rows before each, from 0 to 1."""
-    columns: Float64[Tensor, "H column_edges"]
-    """In each row, the share of all pixels before each."""
-    ends: Float64[Tensor, " HW"]
-    """Share up to and with each pixel of its row, plus the row's index: one increasing list."""
-
-    @staticmethod
-    def of(weights: Float[Tensor, "H W"]) -> _PictureInversion:
-        """For weights of at least 0, not all of them 0."""
-        weights = weights.double()
-        rows, columns = _cumulative(weights.sum(dim=1)), _cumulative(weights)
+    def __init__(self, weights: Float64[Tensor, "H W"]) -> None:
+        """Weights are at least 0, not all of them 0."""
+        self._rows, self._columns = _cumulative(weights.sum(dim=1)), _cumulative(weights)
         indices = torch.arange(len(weights), dtype=torch.float64, device=weights.device)
-        return _PictureInversion(rows, columns, (columns[:, 1:] + indices[:, None]).reshape(-1))
+        # Share up to and with each pixel of its row, plus the row's index: one increasing list.
+        self._ends = (self._columns[:, 1:] + indices[:, None]).reshape(-1)
 
     def draw(
         self, uniforms: Float[Tensor, "N 2"]
     ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"], Float64[Tensor, " N"], Float64[Tensor, " N"]]:
-        """Pixels and places within them.
-
-        Args:
-            uniforms: For the row and the column, in [0, 1).
-        Returns:
-            Row, column, and how far down and across in the pixel, in [0, 1].
-        """
+        """Rows and columns, and how far down and across in the pixel, in [0, 1], by numbers in [0, 1)."""
         for_row, for_column = uniforms.double().T.contiguous()
-        width = self.columns.shape[1] - 1
-        row = torch.searchsorted(self.rows, for_row, right=True).clamp(1, len(self.rows) - 1) - 1
-        column = torch.searchsorted(self.ends, for_column + row, right=True) - row * width
+        rows, columns = self._rows, self._columns
+        width = columns.shape[1] - 1
+        row = torch.searchsorted(rows, for_row, right=True).clamp(1, len(rows) - 1) - 1
+        column = torch.searchsorted(self._ends, for_column + row, right=True) - row * width
         column = column.clamp(0, width - 1)
-        down = _within(for_row, self.rows[row], self.rows[row + 1])
-        across = _within(for_column, self.columns[row, column], self.columns[row, column + 1])
-        return row, column, down, across
+        down = _within(for_row, rows[row], rows[row + 1])
+        return row, column, down, _within(for_column, columns[row, column], columns[row, column + 1])
 
 
 def _cumulative(weights: Float64[Tensor, "*rows n"]) -> Float64[Tensor, "*rows n+1"]:

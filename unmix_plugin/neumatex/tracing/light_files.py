@@ -13,6 +13,7 @@ Source: Ward 1991, Real Pixels, Graphics Gems II; the run-length code of the Rad
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,46 +39,80 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)
 _FILES = (".csv", ".hdr", ".sli")
 
 
-def read_environment(path: Path, rotation_deg: float = 0.0, exposure_stops: float = 0.0) -> Environment:
-    """The light of a latitude-longitude picture.
+def read_environment(
+    path: Path,
+    rotation_deg: float = 0.0,
+    exposure_stops: float = 0.0,
+    bands: Bands | None = None,
+    lamp: Float64[np.ndarray, " B"] | None = None,
+) -> Environment:
+    """The light of a latitude-longitude picture, in colours or in bands.
 
     Args:
-        path: A .exr file with channels R, G, B (or Y), or a .hdr file; twice as wide as high.
+        path: A .exr file with channels R, G, B (or Y), or a .hdr file; twice as wide as high. With bands, channels of
+            a .exr file may be wavelengths.
         rotation_deg: Turns the light about +z, counter-clockwise seen from above.
         exposure_stops: Radiance is the picture's times 2 to this power.
+        bands: Of the pictures that it lit; None for colours.
+        lamp: Spectrum of light in colours, where there are bands.
     Raises:
         SceneError: the file is missing, damaged or of another kind, or has NaN, infinite or negative values, no light
-            at all, or another aspect.
+            at all, or another aspect; wavelengths that do not reach all bands; colours without a lamp for bands.
     """
     if not path.is_file():
         raise SceneError(f"{path}: there is no such environment map")
-    readers = {".exr": _read_exr, ".hdr": _read_hdr}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
+    suffix = path.suffix.lower()
+    if suffix not in ENVIRONMENT_SUFFIXES:
         raise SceneError(
             f"{path}: is not an environment map; convert it to one of {', '.join(ENVIRONMENT_SUFFIXES)}"
         )
-    image = reader(path)
+    image, is_spectral = _read_exr(path, bands) if suffix == ".exr" else (_read_hdr(path), False)
     _check_environment(path, image)
-    return Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
+    light = Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
+    if bands is None or is_spectral:
+        return light
+    if lamp is None:
+        raise SceneError(
+            f"{path}: is in colours, and the pictures have {len(bands)} bands, so the light's spectrum is not known; "
+            "give the lamp's with 'illuminant_path' in transforms.json or --pipeline.datamanager.lamp (a .csv with "
+            "wavelength,power, an ENVI spectral library, or a name such as D65), or an OpenEXR environment whose "
+            "channels are wavelengths"
+        )
+    return of_lamp(light, torch.from_numpy(lamp))
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
+    """An environment in three colours as one whose every direction has a lamp's spectrum, as bright as its colour."""
+    luminance = environment.image @ environment.image.new_tensor(_LUMINANCE)
+    return replace(environment, image=luminance[..., None] * lamp.to(luminance))
+
+
+def _read_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
+    """Colours, or where bands are wanted and there are channels of wavelengths, spectra at them; and whether they are
+    spectra."""
     from unmix_plugin.captures.readers.exr import channel_names
     from unmix_plugin.captures.readers.opening import open_spectral_file
-    from unmix_plugin.captures.spectral_file import ReadOptions
 
     try:
-        channels = channel_names(path)
-        names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
-        if names is None:
-            raise SceneError(
-                f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B"
-            )
-        planes = [open_spectral_file(path, ReadOptions(dataset=name)).read()[..., 0] for name in names]
+        channels = channel_names(path)  # refuses other files
+        file = open_spectral_file(path)
+        values, names, nm = file.read(), list(file.bands.names or ()), file.bands.wavelengths_nm
     except CaptureError as error:
         raise SceneError(str(error)) from error
-    return np.stack(3 // len(planes) * planes, axis=-1).astype(np.float32)
+    if bands is not None and nm is not None:
+        order = np.argsort(nm)
+        try:
+            spectra = resample_spectra(values[..., order].astype(np.float64), Bands(nm[order]), bands)
+        except SpectrumError as error:
+            raise SceneError(
+                f"{path}: its wavelengths and those of the pictures do not match: {error}"
+            ) from error
+        return spectra.astype(np.float32), True
+    colours = next((colours for colours in ("RGB", "Y") if set(colours) <= set(names)), None)
+    if colours is None:
+        raise SceneError(f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B")
+    planes = [values[..., names.index(colour)] for colour in colours]
+    return np.stack(3 // len(planes) * planes, axis=-1).astype(np.float32), False
 
 
 def _check_environment(path: Path, image: np.ndarray) -> None:
@@ -196,58 +231,8 @@ def read_lamp(lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
         SpectrumError: the file is missing, malformed or holds several spectra; a light that is not known; one that is
             not known at all bands, or zero in one of them.
     """
-    path = Path(lamp)
-    if path.suffix.lower() not in _FILES:
-        return _lit_everywhere(illuminant_power(parse_light(lamp), bands), lamp, bands)
-    library = MaterialLibrary(tuple(read_library(path)))
-    if len(library.names) != 1:
-        raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(library.names)}: {library.names}")
-    [table] = library.materials
-    try:
-        library.reflectance(table.name, bands)  # refuses bands in which the lamp was not measured
-    except SpectrumError as error:
-        raise SpectrumError(f"{path}: {error}") from error
-    known = np.isfinite(table.reflectance)
-    power = power_in_bands(table.reflectance[known], Bands(table.bands.centers_nm[known]), bands)
-    return _lit_everywhere(power, lamp, bands)
-
-
-def read_environment_of_bands(
-    path: Path,
-    bands: Bands,
-    lamp: Float64[np.ndarray, " B"] | None,
-    rotation_deg: float = 0.0,
-    exposure_stops: float = 0.0,
-) -> Environment:
-    """The light of a latitude-longitude picture in colours or of wavelengths; see `read_environment`.
-
-    Raises:
-        SceneError: as `read_environment`; wavelengths that do not reach all bands; colours without a lamp.
-    """
-    spectral = _read_wavelengths(path, bands) if path.suffix.lower() == ".exr" and path.is_file() else None
-    if spectral is not None:
-        _check_environment(path, spectral)
-        return Environment(torch.from_numpy(spectral), rotation_deg, exposure_stops)
-    colours = read_environment(path, rotation_deg, exposure_stops)
-    if lamp is None:
-        raise SceneError(
-            f"{path}: is in colours, and the pictures have {len(bands)} bands, so the light's spectrum is not known; "
-            "give the lamp's with 'illuminant_path' in transforms.json or --pipeline.datamanager.lamp (a .csv with "
-            "wavelength,power, an ENVI spectral library, or a name such as D65), or an OpenEXR environment whose "
-            "channels are wavelengths"
-        )
-    return of_lamp(colours, torch.from_numpy(lamp))
-
-
-def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
-    """An environment in three colours as one whose every direction has a lamp's spectrum, as bright as its colour."""
-    image = environment.image
-    luminance = image @ image.new_tensor(_LUMINANCE)
-    spectra = luminance[..., None] * lamp.to(image)
-    return Environment(spectra, environment.rotation_deg, environment.exposure_stops)
-
-
-def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -> Float64[np.ndarray, " B"]:
+    is_file = Path(lamp).suffix.lower() in _FILES
+    power = _power_of_table(Path(lamp), bands) if is_file else illuminant_power(parse_light(lamp), bands)
     if not (power > 0).all():
         dark = bands.centers_nm[int(np.argmin(power))]
         raise SpectrumError(
@@ -257,22 +242,14 @@ def _lit_everywhere(power: Float64[np.ndarray, " B"], lamp: str, bands: Bands) -
     return power / power.max()
 
 
-def _read_wavelengths(path: Path, bands: Bands) -> np.ndarray | None:
-    """Channels that are wavelengths, at the bands; None where there are none."""
-    from unmix_plugin.captures.readers.opening import open_spectral_file
-
+def _power_of_table(path: Path, bands: Bands) -> Float64[np.ndarray, " B"]:
+    library = MaterialLibrary(tuple(read_library(path)))
+    if len(library.names) != 1:
+        raise SpectrumError(f"{path}: a lamp has one spectrum; found {len(library.names)}: {library.names}")
+    [table] = library.materials
     try:
-        file = open_spectral_file(path)
-        if file.bands.wavelengths_nm is None:
-            return None
-        values = file.read().astype(np.float64)
-    except CaptureError as error:
-        raise SceneError(str(error)) from error
-    order = np.argsort(file.bands.wavelengths_nm)
-    try:
-        found = resample_spectra(values[..., order], Bands(file.bands.wavelengths_nm[order]), bands)
+        library.reflectance(table.name, bands)  # refuses bands in which the lamp was not measured
     except SpectrumError as error:
-        raise SceneError(
-            f"{path}: its wavelengths and those of the pictures do not match: {error}"
-        ) from error
-    return np.ascontiguousarray(found, dtype=np.float32)
+        raise SpectrumError(f"{path}: {error}") from error
+    known = np.isfinite(table.reflectance)
+    return power_in_bands(table.reflectance[known], Bands(table.bands.centers_nm[known]), bands)
