@@ -28,6 +28,7 @@ from torch import Tensor
 
 from unmix_plugin.engine import Cameras, upright_cameras
 from unmix_plugin.formats.exr import write_exr
+from unmix_plugin.formats.files import rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import write_glb
 from unmix_plugin.neumatex.demo.surfaces import LayeredSurface, SpectralSurface, demo_mesh, demo_surface
 from unmix_plugin.neumatex.tracing.built_in_lights import built_in_environment
@@ -52,7 +53,7 @@ _VIEWS_A_LIGHT = 3
 """Pictures under each light that training never sees."""
 _EVALUATION_INTERVAL = 8
 """Every so many views one is for evaluation, from the first on."""
-_LAMP, _OTHER_LAMP = "D50", "A"
+_LAMPS = ("D50", "A")
 """That light a spectral object in training, and elsewhere."""
 _SAMPLES, _EVALUATION_SAMPLES, _SPECTRAL_EVALUATION_SAMPLES = 64, 384, 160
 """Paths a pixel."""
@@ -127,9 +128,8 @@ class _Subject:
     generator: torch.Generator
     size: int
 
-    def cameras(self, views: int, first: int) -> Cameras:
-        radius = float(self.ray_mesh.mesh.vertices.norm(dim=-1).max())
-        return viewpoints(views, self.size, radius, first)
+    def cameras(self, views: int, first: int = 0) -> Cameras:
+        return viewpoints(views, self.size, float(self.ray_mesh.mesh.vertices.norm(dim=-1).max()), first)
 
     def picture(
         self, light: Environment, cameras: Cameras, index: int, samples: int
@@ -138,23 +138,41 @@ class _Subject:
         traced = TracedObject(self.ray_mesh, light, self.surface)
         return traced.picture(cameras, index, samples, _BOUNCES, _SUBPIXELS, self.generator)
 
+    def shown(
+        self, cameras: Cameras, index: int, of_parameters: Callable[[Tensor], Tensor]
+    ) -> tuple[Float[Tensor, "H W C"], Float[Tensor, "H W"]]:
+        """Means over what is seen in each pixel of a function of the material, 0 where nothing is; and alpha."""
+        hits = pixel_hits(self.ray_mesh, cameras, index, _SUBPIXELS)
+        values = of_parameters(self.surface.parameters(hits.points.positions))
+        return hits.image(values) / hits.alpha().clamp(min=1e-6)[..., None], hits.alpha()
+
     def in_each_light(
         self, folder: Path, lights: Sequence[str], views: int, seed: int, say: Say
     ) -> Iterator[tuple[Path, Environment, Cameras]]:
         """Where what is seen in each light is written, the light, and from where it is seen; that of training first."""
         for number, name in enumerate(lights):
             say(f"demo object: rendering light {number + 1} of {len(lights)} ({name})")
-            place = folder / "relit" / name if number else folder
-            first = 1000 + _VIEWS_A_LIGHT * number if number else 0
-            cameras = self.cameras(_VIEWS_A_LIGHT if number else views, first)
-            yield place, built_in_environment(name, seed), cameras
+            light = built_in_environment(name, seed)
+            if number:
+                cameras = self.cameras(_VIEWS_A_LIGHT, 1000 + _VIEWS_A_LIGHT * number)
+                yield folder / "relit" / name, light, cameras
+            else:
+                yield folder, light, self.cameras(views)
 
     def exposure(self, light: Environment, mean_radiance: float) -> Float[Tensor, ""]:
         """Factor of a light that gives the object a mean radiance."""
-        cameras = self.cameras(4, 0).resized(24, 24)
+        cameras = self.cameras(4).resized(24, 24)
         pictures = [self.picture(light, cameras, index, 16) for index in range(len(cameras))]
         radiance, alpha = (torch.stack(parts).sum() for parts in zip(*pictures, strict=True))
         return mean_radiance * light.num_colours * alpha / radiance
+
+    def write_mesh(self, path: Path, kinds: Sequence[str], to_rgb: Tensor | None = None) -> None:
+        """A glTF mesh with linear colours at its vertices, and the names of its materials."""
+        mesh = self.ray_mesh.mesh
+        colours = self.surface.family.base_colour(self.surface.parameters(mesh.vertices))
+        colours = colours if to_rgb is None else (colours @ to_rgb).clamp(0, 1)
+        parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
+        write_glb(path, *parts, {}, {"materials": list(kinds)})
 
 
 def write_object(
@@ -178,36 +196,24 @@ def write_object(
         say: Gets a line for each light.
     """
     subject = _Subject(RayMesh(mesh), surface, torch.Generator().manual_seed(seed), size)
-    colours = surface.family.base_colour(surface.parameters(subject.ray_mesh.mesh.vertices))
-    _write_mesh(folder / "mesh.glb", subject.ray_mesh.mesh, colours, surface.kinds)
+    subject.write_mesh(folder / "mesh.glb", surface.kinds)
     for place, light, cameras in subject.in_each_light(folder, lights, views, seed, say):
         light = Environment(light.image * subject.exposure(light, _MEAN_RADIANCE))
-        _write_pictures(place, subject, light, cameras, _EVALUATION_INTERVAL if place == folder else 1)
-    _write_base_colours(folder / "truth" / "base_colour", subject, subject.cameras(views, 0))
-
-
-def _write_pictures(
-    folder: Path, subject: _Subject, light: Environment, cameras: Cameras, evaluation_interval: int
-) -> None:
-    """Pictures under one light with transforms.json and the light itself."""
-    frames: list[dict[str, Any]] = []
-    for index in range(len(cameras)):
-        path = f"images/{index:03d}.exr"
-        samples = _SAMPLES if index % evaluation_interval else _EVALUATION_SAMPLES
-        radiance, alpha = subject.picture(light, cameras, index, samples)
-        _write_straight(folder / path, radiance, alpha)
-        frames.append({"file_path": path, "transform_matrix": transform_matrix(cameras, index)})
-    _write_channels(folder / "environment.exr", light.image)
-    keys = {"environment_path": "environment.exr", "tone_mapping": "linear", "frames": frames}
-    _write_json(folder, {**lens_entries(cameras), **keys})
-
-
-def _write_base_colours(folder: Path, subject: _Subject, cameras: Cameras) -> None:
-    """Base colours of evaluation views."""
-    for index in range(0, len(cameras), _EVALUATION_INTERVAL):
-        hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
-        colours = subject.surface.family.base_colour(subject.surface.parameters(hits.points.positions))
-        _write_straight(folder / f"{index:03d}.exr", hits.image(colours), hits.alpha())
+        frames: list[dict[str, Any]] = []
+        for index in range(len(cameras)):
+            path = f"images/{index:03d}.exr"
+            is_training = place == folder and index % _EVALUATION_INTERVAL
+            samples = _SAMPLES if is_training else _EVALUATION_SAMPLES
+            radiance, alpha = subject.picture(light, cameras, index, samples)
+            _write_picture(place / path, radiance / alpha.clamp(min=1e-6)[..., None], alpha)
+            frames.append({"file_path": path, "transform_matrix": transform_matrix(cameras, index)})
+        keys = {"environment_path": "environment.exr", "tone_mapping": "linear", "frames": frames}
+        _write_picture(place / "environment.exr", light.image)
+        _write_json(place, {**lens_entries(cameras), **keys})
+    cameras = subject.cameras(views)
+    for index in range(0, views, _EVALUATION_INTERVAL):
+        colours = subject.shown(cameras, index, surface.family.base_colour)
+        _write_picture(folder / "truth" / "base_colour" / f"{index:03d}.exr", *colours)
 
 
 def write_spectral_object(
@@ -225,15 +231,14 @@ def write_spectral_object(
     bands, ray_mesh = Bands.of(band_centers_nm(num_bands)), RayMesh(mesh)
     surface = SpectralSurface(seed, bands.centers_nm, ray_mesh.mesh.vertices)
     subject = _Subject(ray_mesh, surface, torch.Generator().manual_seed(seed), size)
-    colours = surface.family.base_colour(surface.parameters(ray_mesh.mesh.vertices)) @ rgb_matrix(bands)
-    _write_mesh(folder / "mesh.glb", ray_mesh.mesh, colours.clamp(0, 1), surface.names)
+    subject.write_mesh(folder / "mesh.glb", surface.names, rgb_matrix(bands))
     table = SpectraTable(bands, surface.names, surface.family.endmembers.double().numpy())
     write_spectra_csv(folder / "endmembers.csv", table)
-    truth = {"materials": list(surface.names), "endmembers_path": "endmembers.csv"}
     places = subject.in_each_light(folder, lights, views, seed, say)
     for number, (place, light, cameras) in enumerate(places):
-        lamp = _OTHER_LAMP if number % 2 else _LAMP
-        _write_cubes(place, subject, light, cameras, bands, lamp, {} if number else truth)
+        _write_cubes(
+            place, subject, light, cameras, bands, _LAMPS[number % 2], surface if number == 0 else None
+        )
 
 
 def _write_cubes(
@@ -243,25 +248,26 @@ def _write_cubes(
     cameras: Cameras,
     bands: Bands,
     lamp_name: str,
-    truth: dict[str, Any],
+    truth: SpectralSurface | None,
 ) -> None:
     """Cubes under one light with transforms.json, the light and the lamp; with truth, abundances too."""
-    lamp = read_lamp(lamp_name, bands)
+    lamp, to_rgb = read_lamp(lamp_name, bands), rgb_matrix(bands)
     light = of_lamp(colours, torch.from_numpy(lamp))
     factor = subject.exposure(light, _SPECTRAL_MEAN_RADIANCE)
     light, frames = Environment(light.image * factor), list[dict[str, Any]]()
     splits: dict[str, list[str]] = {"train_filenames": [], "val_filenames": []}
     for index in range(len(cameras)):
-        is_evaluation = bool(truth) and index % _EVALUATION_INTERVAL == 0
-        samples = _SPECTRAL_EVALUATION_SAMPLES if is_evaluation or not truth else _SAMPLES
+        is_training = truth is not None and index % _EVALUATION_INTERVAL
+        samples = _SAMPLES if is_training else _SPECTRAL_EVALUATION_SAMPLES
         radiance, alpha = subject.picture(light, cameras, index, samples)
-        frame = _write_view(folder, f"{index:03d}", radiance, alpha, rgb_matrix(bands))
-        splits["val_filenames" if is_evaluation else "train_filenames"].append(frame["file_path"])
-        if is_evaluation:
+        frame = _write_view(folder, f"{index:03d}", radiance, alpha, to_rgb)
+        splits["train_filenames" if is_training else "val_filenames"].append(frame["file_path"])
+        if truth is not None and not is_training:
             frame["abundance_file_path"] = f"abundances/{index:03d}.npy"
-            _save(folder / frame["abundance_file_path"], _abundances(subject, cameras, index))
+            shares, _ = subject.shown(cameras, index, truth.family.abundances)
+            _save(folder / frame["abundance_file_path"], shares)
         frames.append({**frame, "transform_matrix": transform_matrix(cameras, index)})
-    _write_channels(folder / "environment.exr", colours.image * factor)
+    _write_picture(folder / "environment.exr", colours.image * factor)
     write_spectra_csv(folder / "illuminant.csv", SpectraTable(bands, ("power",), lamp[None]))
     content = {
         **lens_entries(cameras),
@@ -271,8 +277,13 @@ def _write_cubes(
         "tone_mapping": "linear",
         "value_scale": 1.0,
     }
-    if truth:
-        content |= {"mesh_path": "mesh.glb", **truth, **splits, "test_filenames": splits["val_filenames"]}
+    if truth is not None:
+        content |= {
+            "mesh_path": "mesh.glb",
+            "materials": list(truth.names),
+            "endmembers_path": "endmembers.csv",
+        }
+        content |= {**splits, "test_filenames": splits["val_filenames"]}
     _write_json(folder, {**content, "frames": frames})
 
 
@@ -284,43 +295,18 @@ def _write_view(
     to_rgb: Float[Tensor, "B 3"],
 ) -> dict[str, Any]:
     """A cube, multiplied by alpha, and a picture with alpha; gives their entry, but for the pose."""
-    from PIL import Image
-
     frame = {"file_path": f"images/{name}.png", "hyperspectral_file_path": f"cubes/{name}.npy"}
     _save(folder / frame["hyperspectral_file_path"], radiance)
     straight = (radiance @ to_rgb).clamp(min=0) / alpha.clamp(min=1e-6)[..., None]
     picture = torch.cat([linear_to_srgb(straight).clamp(0, 1), alpha[..., None]], dim=-1)
-    path = folder / frame["file_path"]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((picture * 255).round().byte().numpy()).save(path)
+    write_file(folder / frame["file_path"], rgba_png_bytes((picture * 255).round().byte().numpy()))
     return frame
 
 
-def _abundances(subject: _Subject, cameras: Cameras, index: int) -> Float[Tensor, "H W K"]:
-    """Means of what is seen in each pixel; 0 where nothing is."""
-    surface = subject.surface
-    assert isinstance(surface, SpectralSurface)
-    hits = pixel_hits(subject.ray_mesh, cameras, index, _SUBPIXELS)
-    found = hits.image(surface.family.abundances(surface.parameters(hits.points.positions)))
-    return found / hits.alpha().clamp(min=1e-6)[..., None]
-
-
-def _write_straight(path: Path, premultiplied: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"]) -> None:
-    """RGBA whose colours are not multiplied by alpha; 0 where it is 0."""
-    straight = premultiplied / alpha.clamp(min=1e-6)[..., None]
-    _write_channels(path, torch.cat([straight, alpha[..., None]], dim=-1))
-
-
-def _write_channels(path: Path, image: Float[Tensor, "H W c"]) -> None:
-    """Channels R, G, B, A as far as there are."""
-    names = "RGBA"[: image.shape[-1]]
-    write_exr(path, {name: image[..., index].numpy() for index, name in enumerate(names)}, {})
-
-
-def _write_mesh(path: Path, mesh: Mesh, colours: Float[Tensor, "V 3"], kinds: Sequence[str]) -> None:
-    """A glTF mesh with linear colours at its vertices, and the names of its materials."""
-    parts = (mesh.vertices.numpy(), mesh.normals.numpy(), colours.numpy(), mesh.faces.numpy())
-    write_glb(path, *parts, {}, {"materials": list(kinds)})
+def _write_picture(path: Path, colours: Float[Tensor, "H W 3"], alpha: Tensor | None = None) -> None:
+    """Colours, not multiplied by alpha."""
+    channels = dict(zip("RGB", colours.unbind(dim=-1), strict=True)) | ({} if alpha is None else {"A": alpha})
+    write_exr(path, {name: channel.numpy() for name, channel in channels.items()}, {})
 
 
 def _write_json(folder: Path, content: dict[str, Any]) -> None:
