@@ -21,64 +21,36 @@ def value(text, dtype=torch.float64):
 
 
 @pytest.mark.parametrize(
-    "text",
+    "texts",
     [
-        "r800",
-        "r800-r670-r550",
-        "r800/r670/r550",
-        "r800-(r670-r550)",
-        "r800/(r670/r550)",
-        "r800+r670*r550",
-        "(r800+r670)*r550",
-        "r800/r670*r550",
-        "-r800**2",
-        "(-r800)**2",
-        "r800**-2",
-        "r800**-r670**2",
-        "2**r800**r670",
-        "(2**r800)**r670",
-        "r800*-r670",
-        "--r800",
-        "r800--r670",
-        "-r800*r670-r550",
-        "1/r550-1/r800",
-        "2.5*(r800-r670)/(r800+6*r670-7.5*r450+1)",
-        "1e-2*r800 + .5E1 + 3.",
-        " ( r800 -\tr670 ) / r550 ",
-        "sqrt(r800) + log(r670) * exp(-r550) - abs(r450-r800)",
-        "min(r800, r670, 0.1) + max(r550, r450**2)",
-        "max(min(r800, 1), r670/r550)",
+        ("r800", "r800-r670-r550", "r800/r670/r550", "r800-(r670-r550)", "r800/(r670/r550)"),
+        ("r800+r670*r550", "(r800+r670)*r550", "r800/r670*r550", "-r800**2", "(-r800)**2", "r800**-2"),
+        ("r800**-r670**2", "2**r800**r670", "(2**r800)**r670", "r800*-r670", "--r800", "r800--r670"),
+        ("-r800*r670-r550", "1/r550-1/r800", "2.5*(r800-r670)/(r800+6*r670-7.5*r450+1)"),
+        ("1e-2*r800 + .5E1 + 3.", " ( r800 -\tr670 ) / r550 ", "max(min(r800, 1), r670/r550)"),
+        ("sqrt(r800) + log(r670) * exp(-r550) - abs(r450-r800)", "min(r800, r670, 0.1) + max(r550, r450**2)"),
     ],
 )
-def test_operators_bind_as_in_python(text):
+def test_operators_bind_as_in_python(texts):
     names = {f"r{nm:g}": number for nm, number in VALUES.items()}
-    python = eval(text.strip(), {**vars(math), "abs": abs, "min": min, "max": max}, names)
-    assert float(value(text)) == pytest.approx(python, rel=1e-14)
+    for text in texts:
+        python = eval(text.strip(), {**vars(math), "abs": abs, "min": min, "max": max}, names)
+        assert float(value(text)) == pytest.approx(python, rel=1e-14), text
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "0*r800/(r670-r670)",
-        "1/(1/(r800-r800))",
-        "((r800-r800)/(r800-r800))**0",
-        "1**log(-r800)",
-        "max(r800, log(0))",
-        "exp(-exp(1e4*r800))",
-        "log(-r800)",
-        "sqrt(-r800)",
-        "(-r800)**0.5",
-        "0*r800**-1e999",
-        "r800*10**10**10",
-        "r800+1e300*1e300",
-        "r800*1e999",
-    ],
+UNDEFINED = (
+    *("0*r800/(r670-r670)", "1/(1/(r800-r800))", "((r800-r800)/(r800-r800))**0", "1**log(-r800)"),
+    *("max(r800, log(0))", "exp(-exp(1e4*r800))", "log(-r800)", "sqrt(-r800)", "(-r800)**0.5"),
+    *("0*r800**-1e999", "r800*10**10**10", "r800+1e300*1e300", "r800*1e999"),
 )
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_is_undefined_anywhere_in_a_formula_is_nan(text, dtype):
-    result = value(text, dtype)
-    assert result.dtype == dtype
-    assert result.isnan()
+def test_what_is_undefined_anywhere_in_a_formula_is_nan(dtype):
+    for text in UNDEFINED:
+        result = value(text, dtype)
+        assert result.dtype == dtype
+        assert result.isnan(), text
 
 
 @pytest.mark.parametrize(
@@ -105,33 +77,15 @@ def test_a_fault_is_shown_at_its_place_with_what_is_allowed(text, message):
         parse_formula(text)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "__import__('os').system('true')",
-        "r800.__class__",
-        "(r800).real",
-        "r800 if r800 else r670",
-        "1if r800 else 2",
-        "lambda: r800",
-        "[r800 for _ in r800]",
-        "r800; r670",
-        "r800 = 1",
-        "eval(r800)",
-        "r800 // 2",
-        "+r800",
-        "2r800",
-        "0x10*r800",
-        "r800, r670",
-        "r800(r670)",
-        "sqrt(**r800)",
-        "r800 + ...",
-        "r\uff18\uff10\uff10",
-        "\x00r800",
-        "sqrt(" * 90 + "r800",
-        "r800" + "+r800" * 100,
-    ],
+HOSTILE = (
+    *("__import__('os').system('true')", "r800.__class__", "(r800).real", "r800 if r800 else r670"),
+    *("1if r800 else 2", "lambda: r800", "[r800 for _ in r800]", "r800; r670", "r800 = 1", "eval(r800)"),
+    *("r800 // 2", "+r800", "2r800", "0x10*r800", "r800, r670", "r800(r670)", "sqrt(**r800)", "r800 + ..."),
+    *("r\uff18\uff10\uff10", "\x00r800", "sqrt(" * 90 + "r800", "r800" + "+r800" * 100),
 )
+
+
+@pytest.mark.parametrize("text", HOSTILE)
 def test_hostile_text_is_refused_at_once(text):
     start = time.process_time()  # not the clock on the wall: other work may run beside the tests
     with pytest.raises(ConfigError):
@@ -210,6 +164,8 @@ def test_between_centres_reflectance_is_exact_for_a_linear_spectrum():
     wavelengths = torch.tensor(bands.centers_nm)
     for nm in (400, 401, 415, 430, 477.25, 500, 649.5, 650):
         assert float(parse_index(f"r{nm}", bands)(2e-3 * wavelengths - 0.5)) == pytest.approx(2e-3 * nm - 0.5)
+    on_a_centre = parse_index("r400", bands)(torch.tensor([0.2, torch.nan, torch.nan, 0.1]))
+    assert float(on_a_centre) == pytest.approx(0.2)
 
 
 def test_half_a_spacing_beyond_the_outermost_centres_is_the_outermost_band():
@@ -221,24 +177,14 @@ def test_half_a_spacing_beyond_the_outermost_centres_is_the_outermost_band():
     assert parse_index("r552-r547", Bands.of([550]))(torch.tensor([[0.25]])).tolist() == [0]
 
 
-def test_a_wavelength_on_a_centre_does_not_read_the_neighbour():
-    index = parse_index("r500", Bands.of([500, 600, 700]))
-    assert float(index(torch.tensor([0.2, torch.nan, torch.nan]))) == pytest.approx(0.2)
-
-
-def test_spectra_of_another_sampling_are_refused():
-    with pytest.raises(SpectrumError, match=r"is made for 31 bands, 400-700 nm; found spectra of 61"):
-        parse_index("pri", VISIBLE)(torch.zeros(2, 61))
-
-
-def test_a_wavelength_that_the_bands_do_not_reach_is_refused():
+def test_a_wavelength_that_the_bands_do_not_reach_and_spectra_of_another_sampling_are_refused():
     message = "index ndvi needs 800 nm but the bands cover 395-705 nm; nothing is extrapolated; named ones .*: pri, "
     with pytest.raises(SpectrumError, match=message):
         parse_index(" NDVI ", VISIBLE)
-    with pytest.raises(SpectrumError, match=r"index r300/r900 needs 300, 900 nm but"):
-        parse_index("r300/r900", VISIBLE)
-    with pytest.raises(SpectrumError, match="reach: none"):
-        parse_index("ndvi", Bands.of([600, 610]))
+    with pytest.raises(SpectrumError, match=r"index r300/r900 needs 300, 900 nm but .* reach: none"):
+        parse_index("r300/r900", Bands.of([600, 610]))
+    with pytest.raises(SpectrumError, match=r"is made for 31 bands, 400-700 nm; found spectra of 61"):
+        parse_index("pri", VISIBLE)(torch.zeros(2, 61))
 
 
 def test_indices_of_a_sensor_are_those_whose_wavelengths_it_sees():
@@ -248,13 +194,12 @@ def test_indices_of_a_sensor_are_those_whose_wavelengths_it_sees():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("rays", [(), (0,), (1,), (2, 3)])
+@pytest.mark.parametrize("rays", [(), (0,), (2, 3)])
 def test_the_result_has_the_rays_and_the_type_of_the_input(rays, dtype):
     reflectance = torch.rand(*rays, len(FULL), dtype=dtype, generator=torch.Generator().manual_seed(1))
     for name in ("evi", "max(0.3, r800**2) / 2"):
         result = parse_index(name, FULL)(reflectance)
-        assert result.shape == rays
-        assert result.dtype == dtype
+        assert (result.shape, result.dtype) == (rays, dtype)
         assert result.isfinite().all()
 
 
