@@ -1,7 +1,11 @@
 """Synthetic linear mixtures for the tests of endmember extraction."""
 
+from itertools import combinations
+
 import torch
 from torch import Tensor
+
+from unmix_plugin.spectral.metrics import spectral_angle
 
 
 def smooth_endmembers(num_endmembers: int, num_bands: int = 24) -> Tensor:
@@ -24,3 +28,21 @@ def mixed_pixels(endmembers: Tensor, num_pixels: int, seed: int, max_abundance: 
 
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def surface_pixels(materials: Tensor, seed=0, per_material=60, per_pair=30, noise=0.0) -> Tensor:
+    """Pixels of surfaces: pure ones of each material and mixtures of every two, under random shading."""
+    generator = seeded(seed)
+    parts = [materials.repeat(per_material, 1)]
+    for first, second in combinations(range(len(materials)), 2):
+        share = torch.rand(per_pair, 1, dtype=torch.float64, generator=generator)
+        parts.append(share * materials[first] + (1 - share) * materials[second])
+    pixels = torch.cat(parts)
+    shading = 0.1 + 0.9 * torch.rand(len(pixels), 1, dtype=torch.float64, generator=generator)
+    spread = noise * torch.randn(pixels.shape, dtype=torch.float64, generator=generator)
+    return (shading * pixels + spread).clamp(min=1e-4)
+
+
+def worst_angle(found: Tensor, materials: Tensor) -> float:
+    """Largest angle of a material to the nearest found spectrum."""
+    return float(spectral_angle(materials[:, None].double(), found[None].double()).amin(1).max())

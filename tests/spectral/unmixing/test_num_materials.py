@@ -4,8 +4,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
-from tests.spectral.unmixing.surface_pixels import surface_pixels
+from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing.num_materials import _elbow, estimate_noise, hysime, propose_num_materials
 
@@ -46,30 +45,22 @@ def test_the_proposal_comes_with_its_evidence():
     assert [line.split()[0] for line in lines[1:13]] == [str(number) for number in range(1, 13)]
     assert [line.endswith("<- proposed") for line in lines[1:13]] == [number == 3 for number in range(1, 13)]
     assert f"HySime: {count.signal_dimensions} dimensions" in lines[-1]
+    few = propose_num_materials(smooth_endmembers(3).repeat(5, 1), seeded())  # of many bands: without HySime
+    assert (few.number, few.signal_dimensions) == (3, None)
+    assert "HySime" not in few.evidence()
 
 
-def test_few_pixels_of_many_bands_get_a_proposal_without_hysime():
-    pixels = smooth_endmembers(3).repeat(5, 1)
-    count = propose_num_materials(pixels, seeded())
-    assert count.number == 3
-    assert count.signal_dimensions is None
-    assert "HySime" not in count.evidence()
-
-
-@pytest.mark.parametrize(
-    ("distances", "number"),
-    [
-        ((0.003,), 1),
-        ((0.2, 0.19, 0.01), 1),
-        ((0.2, 0.1, 0.09, 0.01), 2),
-        ((0.2, 0.1, 0.05, 0.046), 3),
-        ((0.2, 0.1, 0.006, 0.0021), 3),
-        ((0.2, 0.1, 0.05, 0.02), 4),
-        ((0.0, 0.0), 1),
-    ],
-)
-def test_the_elbow_is_where_a_further_material_helps_little(distances, number):
-    assert _elbow(distances) == number
+def test_the_elbow_is_where_a_further_material_helps_little():
+    elbows = {
+        (0.003,): 1,
+        (0.0, 0.0): 1,
+        (0.2, 0.19, 0.01): 1,
+        (0.2, 0.1, 0.09, 0.01): 2,
+        (0.2, 0.1, 0.05, 0.046): 3,
+        (0.2, 0.1, 0.006, 0.0021): 3,
+        (0.2, 0.1, 0.05, 0.02): 4,
+    }
+    assert {distances: _elbow(distances) for distances in elbows} == elbows
 
 
 @settings(max_examples=15)
@@ -79,9 +70,12 @@ def test_hysime_counts_the_endmembers_of_linear_mixtures_in_noise(num_endmembers
     assert hysime(pixels + gaussian(pixels.shape, 1e-3, seed)) == num_endmembers
 
 
-def test_hysime_finds_nothing_in_noise_alone_and_everything_without_noise():
+def test_hysime_finds_nothing_in_noise_alone_and_everything_without_noise_in_enough_pixels():
     assert hysime(gaussian((3000, 12), 1.0)) == 0
     assert hysime(mixed_pixels(smooth_endmembers(4), 500, seed=1)) == 4
+    for bands, said in ((24, "found 24 pixels of 24 bands"), (1, "at least two bands")):
+        with pytest.raises(SpectrumError, match=said):
+            hysime(torch.rand(24, bands))
 
 
 def test_noise_of_each_band_is_told_from_what_other_bands_predict():
@@ -91,10 +85,3 @@ def test_noise_of_each_band_is_told_from_what_other_bands_predict():
     found = estimate_noise(pixels + noise)
     np.testing.assert_allclose(found.std(dim=0), deviations, rtol=0.2)
     assert float((found * noise).sum() / (found.norm() * noise.norm())) > 0.9
-
-
-def test_fewer_pixels_than_bands_are_too_few_for_hysime():
-    with pytest.raises(SpectrumError, match="found 24 pixels of 24 bands"):
-        hysime(torch.rand(24, 24))
-    with pytest.raises(SpectrumError, match="at least two bands"):
-        hysime(torch.rand(24, 1))

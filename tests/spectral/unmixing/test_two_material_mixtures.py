@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 from torch.testing import assert_close
 
-from tests.spectral.mixtures import seeded, smooth_endmembers
-from tests.spectral.unmixing.surface_pixels import surface_pixels
+from tests.spectral.mixtures import seeded, smooth_endmembers, surface_pixels, worst_angle
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.two_material_mixtures import (
     distances_to_pairs,
@@ -20,16 +18,12 @@ from unmix_plugin.spectral.unmixing.two_material_mixtures import (
 )
 
 
-def worst_angle(found, materials):
-    return float(spectral_angle(materials[:, None], found[None]).amin(1).max())
-
-
 @settings(max_examples=15)
 @given(st.integers(1, 6), st.integers(0, 100))
 def test_materials_are_found_among_more_mixtures_under_any_shading(num_endmembers, seed):
     materials = smooth_endmembers(num_endmembers)
     found = two_material_endmembers(surface_pixels(materials, seed).float(), num_endmembers, seeded(seed))
-    assert worst_angle(found.double(), materials) < 0.03
+    assert worst_angle(found, materials) < 0.03
     assert_close(found.norm(dim=1), torch.ones(num_endmembers))
 
 
@@ -55,19 +49,15 @@ def test_numbers_out_of_range_no_or_black_pixels_and_too_few_shapes_are_refused(
         two_material_endmembers(pixels, count, seeded())
 
 
-def test_a_material_inside_the_cone_of_the_others_is_found():
+def test_a_material_inside_the_cone_of_the_others_is_found_and_a_frequent_mixture_is_none():
     corners = smooth_endmembers(3)
     materials = torch.cat([corners, corners.mean(0, keepdim=True)])
     # Nothing but the three corners is needed to explain every pixel, if three may be mixed.
     pixels = surface_pixels(materials, noise=0.001)
     assert worst_angle(two_material_endmembers(pixels, 4, seeded()), materials) < 0.03
-
-
-def test_a_mixture_that_fills_more_pixels_than_a_material_is_no_endmember():
-    materials = smooth_endmembers(3)
-    blend = (0.5 * materials[0] + 0.5 * materials[1]).repeat(600, 1)
-    pixels = torch.cat([surface_pixels(materials, noise=0.002), blend])
-    assert worst_angle(two_material_endmembers(pixels, 3, seeded()), materials) < 0.03
+    blend = (0.5 * corners[0] + 0.5 * corners[1]).repeat(600, 1)
+    pixels = torch.cat([surface_pixels(corners, noise=0.002), blend])
+    assert worst_angle(two_material_endmembers(pixels, 3, seeded()), corners) < 0.03
 
 
 @given(st.integers(0, 100))
@@ -83,8 +73,7 @@ def test_distances_are_those_of_least_squares_on_each_pair(seed):
 
 
 def test_the_search_finds_the_best_set_that_brute_force_finds():
-    generator = seeded(3)
-    pixels = torch.rand(9, 5, dtype=torch.float64, generator=generator)
+    pixels = torch.rand(9, 5, dtype=torch.float64, generator=seeded(3))
     shapes = normalize(pixels, dim=1)
     distances = distances_to_pairs(shapes, shapes)
     best = min(
