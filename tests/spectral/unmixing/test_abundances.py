@@ -50,14 +50,6 @@ def test_mixtures_are_taken_apart_exactly():
     assert_close(fcls(shares @ endmembers, endmembers), shares, atol=1e-5, rtol=0)
 
 
-def test_the_same_endmember_twice_is_no_obstacle():
-    pixels, endmembers = random_problem(3)
-    twice = torch.cat([endmembers, endmembers])
-    amounts = nnls(pixels, twice)
-    assert float(amounts.min()) >= 0
-    assert_close(amounts @ twice, nnls(pixels, endmembers) @ endmembers, atol=1e-6, rtol=0)
-
-
 @given(st.integers(1, 6), st.integers(0, 200))
 def test_shares_lie_on_the_simplex_and_fit_no_worse_than_any_other_shares(num_endmembers, seed):
     pixels, endmembers = random_problem(num_endmembers, seed=seed)
@@ -91,15 +83,11 @@ def test_bad_input_is_refused_with_its_fault_and_none_gives_none(solve):
     assert (found.shape, found.dtype) == ((0, 3), torch.float32)
 
 
-def test_black_spectra_show_nothing():
-    _, endmembers = random_problem(4)
+def test_black_spectra_show_nothing_and_many_pixels_are_all_solved():
+    pixels, endmembers = random_problem(2, num_pixels=7)
     assert not nnls(torch.zeros(3, 9), endmembers.float()).any()
     assert not sparse_abundances(torch.zeros(2, 9), endmembers.float(), 0.02).any()
-
-
-def test_more_pixels_than_are_solved_at_a_time_are_all_solved():
-    pixels, endmembers = random_problem(2, num_pixels=7)
-    many = pixels.repeat(10_000, 1)
+    many = pixels.repeat(10_000, 1)  # more than are solved at a time
     assert_close(nnls(many, endmembers)[-7:], nnls(pixels, endmembers))
 
 
@@ -124,28 +112,25 @@ def test_abundances_of_mixtures_of_two_are_found_whatever_the_brightness_of_endm
     assert_close(found, torch.tensor([[0.0, share, 0.0, 1 - share, 0.0]]), atol=5e-3, rtol=0)
 
 
-def test_a_material_that_explains_less_than_the_penalty_is_left_out():
-    endmembers = endmembers_of(4)
-    nearly_pure = endmembers[:1] + 0.02 * endmembers[2:3]
-    assert int((sparse_abundances(nearly_pure, endmembers, 0.3) > 0).sum()) == 1
-    assert int((sparse_abundances(nearly_pure, endmembers, 0.0) > 0).sum()) > 1
-
-
-def test_no_spectrum_shows_more_than_three_materials_and_shares_sum_to_one():
+def test_spectra_show_at_most_three_materials_of_sum_one_and_none_that_explains_less_than_the_penalty():
     endmembers = endmembers_of(7)
     mixtures = torch.rand(200, 7, generator=seeded(1)) @ endmembers
     found = sparse_abundances(mixtures, endmembers, 0.001)
     assert_close(found.sum(dim=1), torch.ones(200))
     assert bool((found >= 0).all())
     assert int((found > 0).sum(dim=1).max()) <= 3
+    nearly_pure = endmembers[:1] + 0.02 * endmembers[2:3]
+    counts = [int((sparse_abundances(nearly_pure, endmembers, price) > 0).sum()) for price in (0.3, 0.0)]
+    assert counts[0] == 1 < counts[1]
 
 
-def test_endmembers_of_one_shape_are_no_error():
-    endmembers = endmembers_of(3)
-    twins = torch.cat([endmembers, endmembers[:1]])
-    found = sparse_abundances(endmembers, twins, 0.02)
-    assert bool(torch.isfinite(found).all())
-    assert_close(found.sum(dim=1), torch.ones(3))
+def test_the_same_endmember_twice_is_no_obstacle():
+    pixels, endmembers = random_problem(3)
+    twice = torch.cat([endmembers, endmembers])
+    amounts = nnls(pixels, twice)
+    assert float(amounts.min()) >= 0
+    assert_close(amounts @ twice, nnls(pixels, endmembers) @ endmembers, atol=1e-6, rtol=0)
+    assert_close(sparse_abundances(pixels, twice, 0.02).sum(dim=1), torch.ones(len(pixels)).double())
 
 
 def test_nearly_collinear_greys_are_told_apart_as_far_as_float32_spectra_allow():

@@ -38,14 +38,6 @@ def angles_to_materials(found, materials):
     return angles.amin(1)
 
 
-@pytest.mark.parametrize("method", ["vca", "nfindr"])
-@given(num_endmembers=st.integers(2, 6), seed=st.integers(0, 50))
-def test_extreme_pixels_have_the_shapes_of_the_materials_among_many_mixtures(method, num_endmembers, seed):
-    pixels, materials = shaded_scene(num_endmembers, seed=seed)
-    found = initialise_endmembers(pixels, num_endmembers, method, seeded(seed))
-    assert float(angles_to_materials(found, materials).max()) < 1e-3
-
-
 @pytest.mark.parametrize("method", METHODS)
 @settings(max_examples=25)
 @given(num_endmembers=st.integers(1, 6), seed=st.integers(0, 50))
@@ -53,6 +45,10 @@ def test_every_method_finds_materials_of_which_most_pixels_are_pure(method, num_
     pixels, materials = shaded_scene(num_endmembers, num_mixtures=5, seed=seed)
     found = initialise_endmembers(pixels, num_endmembers, method, seeded(seed))
     assert float(angles_to_materials(found, materials).max()) < 0.03
+    if method in ("vca", "nfindr") and num_endmembers > 1:  # which take extreme pixels
+        pixels, materials = shaded_scene(num_endmembers, seed=seed)
+        found = initialise_endmembers(pixels, num_endmembers, method, seeded(seed))
+        assert float(angles_to_materials(found, materials).max()) < 1e-3
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -79,11 +75,8 @@ def test_dark_and_saturated_pixels_have_no_say(method):
 
 
 def test_pixels_are_dropped_by_brightness_and_saturation_alone():
-    """Below a root mean square of 0.005 even the brightest are dark."""
     pixels = torch.tensor([[0.5, 0.5], [0.004, 0.004], [0.012, 0.012], [0.02, 0.02], [0.3, 1.0], [0.0, 0.0]])
     assert torch.equal(drop_uninformative_pixels(pixels), pixels[[0, 3]])
-    pixels = torch.tensor([[0.0049, 0.0049], [0.0051, 0.0051]])
-    assert torch.equal(drop_uninformative_pixels(pixels), pixels[1:])
 
 
 SOUND = shaded_scene(3)[0]
@@ -124,26 +117,18 @@ def test_many_pixels_are_thinned_by_the_generator(method, monkeypatch):
 TYPICAL = torch.tensor([0.1, 0.2, 0.4, 0.3, 0.2, 0.1])
 
 
-def test_bands_that_were_seen_stay_and_others_follow_the_typical_spectrum():
+def test_what_sensors_see_of_spectra_stays_and_other_bands_follow_the_typical_spectrum():
     brightness = torch.tensor([[0.5], [2.0]])
-    matrix = torch.eye(6)[[3, 1, 2]]
-    filled = fill_bands((brightness * TYPICAL) @ matrix.T, matrix, TYPICAL)
+    some = torch.eye(6)[[3, 1, 2]]
+    filled = fill_bands((brightness * TYPICAL) @ some.T, some, TYPICAL)
     assert_close(filled, brightness * TYPICAL, rtol=2e-2, atol=1e-3)
-
-
-def test_a_spectrum_of_another_shape_is_kept_where_it_was_seen():
-    matrix = torch.eye(6)[:4]
-    seen = torch.tensor([[0.4, 0.3, 0.2, 0.1]])
-    filled = fill_bands(seen, matrix, TYPICAL)
+    seen = torch.tensor([[0.4, 0.3, 0.2, 0.1]])  # of another shape
+    filled = fill_bands(seen, torch.eye(6)[:4], TYPICAL)
     assert_close(filled[:, :4], seen, rtol=0.1, atol=0.02)
     ratios = filled / TYPICAL
     assert_close(ratios[:, 4:], ratios[:, 3:4].expand(-1, 2), rtol=1e-3, atol=1e-3)
-
-
-def test_broad_channels_are_seen_again_as_they_were():
-    matrix = torch.tensor([[0.5, 0.5, 0, 0, 0, 0], [0, 0, 0.5, 0.5, 0, 0], [0, 0, 0, 0, 0.5, 0.5]])
-    seen = torch.tensor([[0.2, 0.3, 0.4]])
-    assert_close(fill_bands(seen, matrix, TYPICAL) @ matrix.T, seen, rtol=0.03, atol=5e-3)
+    broad, seen = torch.eye(3).repeat_interleave(2, dim=1) / 2, torch.tensor([[0.2, 0.3, 0.4]])
+    assert_close(fill_bands(seen, broad, TYPICAL) @ broad.T, seen, rtol=0.03, atol=5e-3)
 
 
 def test_a_typical_spectrum_agrees_with_all_sensors():

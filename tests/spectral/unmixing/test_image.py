@@ -64,12 +64,6 @@ def test_shares_of_area_and_of_light_differ_by_the_brightness_of_materials():
     assert shone.max() > own.max() + 0.2
 
 
-def test_the_number_of_materials_is_proposed_with_its_evidence():
-    found = unmix_image(image_of(smooth_endmembers(4)))
-    assert len(found.endmembers) == 4
-    assert "proposed" in found.evidence
-
-
 def test_pixels_outside_of_the_mask_take_no_part():
     cube = image_of(smooth_endmembers(3))
     mask = np.ones((40, 40), bool)
@@ -96,69 +90,47 @@ def test_what_an_array_masks_takes_no_part_though_its_numbers_are_finite():
     left[3:10] = True
     both = unmix_image(np.ma.masked_array(stored, some_bands), 3, mask=left)
     assert ((both.abundances.sum(axis=2) > 0) <= (left & ~hole)).all()
-    with pytest.raises(SpectrumError, match="leaves no pixel to unmix"):
-        unmix_image(np.ma.masked_array(stored, True), 3)
+
+
+CUBE = image_of(smooth_endmembers(3))
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"cube": [[[0.1, 0.2]]]}, "is a NumPy array; found list"),
+        ({"cube": CUBE.tolist()}, "is a NumPy array; found list"),
         ({"cube": torch.ones(4, 4, 3)}, "is a NumPy array; found Tensor"),
         ({"shares": "areas"}, "shares must be auto, area, light; found 'areas'"),
         ({"endmembers": "3"}, "endmembers must be a whole number or 'auto'; found '3'"),
         ({"endmembers": 3.0}, "endmembers must be a whole number or 'auto'; found 3.0"),
-        ({"endmembers": None}, "endmembers must be a whole number or 'auto'; found None"),
+        ({"cube": CUBE[:, :, 0]}, "rows, columns and bands"),
+        ({"cube": CUBE + 1j}, "real numbers; found complex128"),
+        ({"cube": -CUBE}, "the image is black"),
+        ({"cube": np.where(CUBE.max() * 0.9 < CUBE, np.nan, CUBE)}, "hold NaN or infinite values; leave"),
+        ({"cube": np.full_like(CUBE, 0.3)}, "only 1 distinct pixels .* ask for at most 1"),
+        ({"cube": CUBE[:, :, :2]}, "between 1 and the number of bands, 2; found 3"),
+        ({"endmembers": 0}, "between 1 and the number of bands"),
+        ({"endmembers": 12}, "at most [3-5] materials can be told apart; 12 were asked for"),
+        ({"mask": np.ones((3, 3), bool)}, "mask must be 40 x 40"),
+        ({"mask": np.zeros((40, 40), bool)}, "leaves no pixel"),
+        ({"cube": np.ma.masked_array(CUBE, True)}, "leaves no pixel"),
     ],
 )
-def test_arguments_of_another_type_are_refused(words, message):
+def test_what_cannot_be_unmixed_is_refused_with_one_message(words, message):
     plain = inspect.unwrap(unmix_image)  # types may be checked before, as tests are run
     with pytest.raises(SpectrumError, match=message):
-        plain(**{"cube": image_of(smooth_endmembers(3), 20), **words})
+        plain(**{"cube": CUBE, "endmembers": 3, **words})
 
 
-@pytest.mark.parametrize(
-    ("change", "count", "message"),
-    [
-        (lambda cube: cube[:, :, 0], 3, "rows, columns and bands"),
-        (lambda cube: cube + 1j, 3, "real numbers; found complex128"),
-        (lambda cube: 0 * cube, 3, "the image is black"),
-        (lambda cube: -cube, 3, "the image is black"),
-        (
-            lambda cube: np.where(cube > cube.max() * 0.9, np.nan, cube),
-            3,
-            "hold NaN or infinite values; leave",
-        ),
-        (lambda cube: np.full_like(cube, 0.3), 3, "only 1 distinct pixels .* ask for at most 1"),
-        (lambda cube: cube[3:4, 3:4], 2, "only 1 distinct pixels"),
-        (lambda cube: cube[:, :, :2], 3, "between 1 and the number of bands, 2; found 3"),
-        (lambda cube: cube, 0, "between 1 and the number of bands"),
-        (lambda cube: cube, 12, "at most [3-5] materials can be told apart; 12 were asked for"),
-    ],
-)
-def test_what_cannot_be_unmixed_is_refused_with_one_message(change, count, message):
-    cube = image_of(smooth_endmembers(3))
-    with pytest.raises(SpectrumError, match=message):
-        unmix_image(change(cube), count)
-    for mask, said in (
-        (np.ones((3, 3), bool), "mask must be 40 x 40"),
-        (np.zeros((40, 40), bool), "no pixel"),
-    ):
-        with pytest.raises(SpectrumError, match=said):
-            unmix_image(cube, 3, mask=mask)
-
-
-def test_one_material_and_a_constant_image_are_unmixed():
+def test_one_material_is_unmixed_and_a_number_proposed_with_its_evidence():
     cube = np.full((6, 6, 5), 0.4, np.float32) * np.linspace(0.2, 1, 5, dtype=np.float32)
     found = unmix_image(cube, 1)
     assert np.allclose(found.abundances, 1)
     assert np.allclose(found.confidence, 0.952, atol=1e-3)  # what all searches get wrong alike is left
     assert len(unmix_image(cube, "auto").endmembers) == 1
-
-
-def unmixed(pixels, seed=0):
-    found = unmix_image(pixels[None].numpy(), 3, seed=seed)
-    return torch.from_numpy(found.endmembers), torch.from_numpy(found.abundances[0])
+    four = unmix_image(image_of(smooth_endmembers(4)))
+    assert len(four.endmembers) == 4
+    assert "proposed" in four.evidence
 
 
 def landscape(dark, seed=0):
@@ -174,32 +146,28 @@ def landscape(dark, seed=0):
     return (shading * (shares @ dimmed) + noise).clamp(min=0).float(), dimmed
 
 
-def matched(found, materials):
-    angles = spectral_angle(materials[:, None].double(), found[None].double())
+def error_of(pixels, materials, true_materials, seed=0):
+    """Root mean square error of abundances, those in the order of the materials, and the largest angle to these."""
+    found = unmix_image(pixels[None].numpy(), 3, seed=seed)
+    angles = spectral_angle(materials[:, None].double(), torch.from_numpy(found.endmembers)[None].double())
     order = angles.argmin(dim=1)
     assert sorted(order.tolist()) == [0, 1, 2]
-    return order, angles.amin(dim=1)
+    truth = torch.linalg.lstsq(true_materials.T, pixels.double().T).solution.T.clamp(min=0)
+    truth = truth / truth.sum(dim=1, keepdim=True)
+    abundances = torch.from_numpy(found.abundances[0])[:, order].double()
+    return float((abundances - truth).square().mean().sqrt()), abundances, float(angles.amin(dim=1).max())
 
 
 def test_abundances_of_shaded_mixtures_are_found_whatever_the_seed():
     pixels, materials = landscape(dark=0.6)
-    truth = torch.linalg.lstsq(materials.T, pixels.double().T).solution.T.clamp(min=0)
-    truth = truth / truth.sum(dim=1, keepdim=True)
-    found = []
-    for seed in range(2):
-        endmembers, abundances = unmixed(pixels, seed)
-        order, angles = matched(endmembers, materials)
-        assert float(angles.max()) < 0.06
-        assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.08
-        found.append(abundances[:, order])
-    assert float((found[0] - found[1]).square().mean().sqrt()) < 0.02
+    (error, first, angle), (other_error, second, other_angle) = (
+        error_of(pixels, materials, materials, seed) for seed in range(2)
+    )
+    assert max(error, other_error) < 0.08
+    assert max(angle, other_angle) < 0.06
+    assert float((first - second).square().mean().sqrt()) < 0.02
 
 
 def test_a_nearly_black_material_is_counted_between_spectra_of_one_peak():
     pixels, materials = landscape(dark=0.05)
-    endmembers, abundances = unmixed(pixels)
-    order, _ = matched(endmembers, materials)
-    of_one_peak = materials / materials.amax(dim=1, keepdim=True)
-    truth = torch.linalg.lstsq(of_one_peak.T, pixels.double().T).solution.T.clamp(min=0)
-    truth = truth / truth.sum(dim=1, keepdim=True)
-    assert float((abundances[:, order].double() - truth).square().mean().sqrt()) < 0.06
+    assert error_of(pixels, materials, materials / materials.amax(dim=1, keepdim=True))[0] < 0.06

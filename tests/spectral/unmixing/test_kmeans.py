@@ -53,12 +53,6 @@ def test_every_pixel_is_with_its_nearest_centre_and_centres_are_mean_shapes():
     assert torch.equal((shapes @ centres.T).argmax(1), clusters)
 
 
-def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
-    shape = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
-    pixels = torch.linspace(0.01, 0.81, 101, dtype=torch.float64)[:, None] * shape
-    assert_close(normalised_kmeans(pixels, 1, seeded())[0][0], 0.77 * shape)
-
-
 @pytest.mark.parametrize(
     ("spectra", "pixels", "expected"),
     [
@@ -69,6 +63,9 @@ def test_an_endmember_is_as_bright_as_the_well_lit_pixels_of_its_cluster():
 def test_spectra_are_scaled_to_lit_pixels_and_keep_their_shape(spectra, pixels, expected):
     shapes, lit, scaled = (torch.tensor(x, dtype=torch.float64) for x in (spectra, pixels, expected))
     assert_close(scale_to_lit_pixels(shapes, lit, torch.tensor([0])), scaled)
+    shape = torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+    pixels = torch.linspace(0.01, 0.81, 101, dtype=torch.float64)[:, None] * shape
+    assert_close(normalised_kmeans(pixels, 1, seeded())[0][0], 0.77 * shape)
 
 
 def test_every_cluster_has_a_pixel_even_when_there_are_as_many_as_shapes_and_the_largest_comes_first():
