@@ -31,8 +31,11 @@ def mend(seen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     return is_bad, mended
 
 
-def test_nothing_is_bad_in_a_sound_image():
-    assert not mend(image())[0].any()
+def test_nothing_is_bad_in_a_sound_image_nor_a_feature_that_the_pixels_around_share():
+    seen = image()
+    assert not mend(seen)[0].any()
+    seen[10:14, 18:22, 9] += 0.5
+    assert not mend(seen)[0].any()
 
 
 def test_spikes_are_replaced_by_what_is_around_them():
@@ -61,23 +64,14 @@ def test_parts_of_an_image_have_the_bad_values_of_the_whole():
     seen[:, 11, 6] *= 0.2
     limits = deviation_limits(seen.flatten(0, 1))
     whole = repaired(seen, limits)
-    rows, columns, bands, values = [], [], [], []
+    parts = []
     for first in range(0, SIDE, 8):
         above, below = max(first - REACH_PX, 0), min(first + 8 + REACH_PX, SIDE)
-        found, instead = repaired(seen[above:below], limits, range(first - above, first + 8 - above))
-        rows.append(found[0] + above)
-        columns.append(found[1])
-        bands.append(found[2])
-        values.append(instead)
+        (rows, *others), values = repaired(seen[above:below], limits, range(first - above, first + 8 - above))
+        parts.append((rows + above, *others, values))
     assert len(whole[1]) == SIDE + 5
-    for parts, expected in zip((rows, columns, bands, values), (*whole[0], whole[1]), strict=True):
-        assert torch.equal(torch.cat(parts), expected)
-
-
-def test_a_feature_that_the_pixels_around_share_is_real():
-    seen = image()
-    seen[10:14, 18:22, 9] += 0.5
-    assert not mend(seen)[0].any()
+    for found, expected in zip(zip(*parts, strict=True), (*whole[0], whole[1]), strict=True):
+        assert torch.equal(torch.cat(found), expected)
 
 
 NOISY_BANDS, NUM_PIXELS = 20, 4000
@@ -99,12 +93,13 @@ def noisier(band: int, noise: float) -> torch.Tensor:
     return pixels
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.005, 0.05])
-def test_even_noise_leaves_all_weights_exactly_1(noise):
-    found = judge_bands(mixtures(noise))
-    assert torch.equal(found.weights, torch.ones(NOISY_BANDS))
-    assert not found.mostly_noise.any()
-    assert not found.dead.any()
+def test_even_noise_and_spikes_leave_all_weights_exactly_1():
+    spiked = mixtures()
+    spiked[::50, 4] += 0.5
+    for pixels in (mixtures(0.0), mixtures(), mixtures(0.05), spiked):
+        found = judge_bands(pixels)
+        assert torch.equal(found.weights, torch.ones(NOISY_BANDS))
+        assert not (found.mostly_noise | found.dead).any()
 
 
 def test_noise_is_measured_and_weighs_a_band_down_by_its_variance():
@@ -117,12 +112,6 @@ def test_noise_is_measured_and_weighs_a_band_down_by_its_variance():
     assert ratio[0] / ratio[1] == pytest.approx(4, rel=0.1)
 
 
-def test_spikes_do_not_make_a_band_noisy():
-    pixels = mixtures()
-    pixels[::50, 4] += 0.5
-    assert torch.equal(judge_bands(pixels).weights, torch.ones(NOISY_BANDS))
-
-
 def test_a_band_of_noise_alone_and_a_dead_one_are_named():
     pixels = mixtures()
     pixels[:, 3] = 0.2 + 0.1 * torch.randn(NUM_PIXELS, generator=torch.Generator().manual_seed(1))
@@ -133,13 +122,8 @@ def test_a_band_of_noise_alone_and_a_dead_one_are_named():
     assert float(found.weights[12] / found.weights[0]) == pytest.approx(1e-4, rel=1e-3)
 
 
-@pytest.mark.parametrize("pixels", [mixtures()[:, :3], mixtures()[:50]])
-def test_too_little_data_tells_nothing(pixels):
-    found = judge_bands(pixels)
-    assert torch.equal(found.weights, BandNoise.unknown(pixels.shape[1]).weights)
-
-
-def test_a_scene_of_dead_bands_counts_all_alike():
-    found = judge_bands(torch.full((500, NOISY_BANDS), 0.3))
+def test_too_little_data_and_a_scene_of_dead_bands_tell_nothing():
+    for pixels in (mixtures()[:, :3], mixtures()[:50], torch.full((500, NOISY_BANDS), 0.3)):
+        found = judge_bands(pixels)
+        assert torch.equal(found.weights, BandNoise.unknown(pixels.shape[1]).weights)
     assert found.dead.all()
-    assert torch.equal(found.weights, torch.ones(NOISY_BANDS))

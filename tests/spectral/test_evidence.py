@@ -55,15 +55,11 @@ def test_alpha_is_believed_unless_light_contradicts_it(value, alpha, trust, show
     assert bool(may_show_matter(spectra, alphas, 0.002)) == shows
 
 
-def test_only_dark_scenes_are_exposed():
+def test_only_dark_scenes_are_exposed_and_one_saturated_band_blows_a_pixel_out():
     assert exposure_of(torch.full((10, 3), 0.4)) == 1.0
     assert exposure_of(torch.full((10, 3), 0.02)) == pytest.approx(10.0)
     assert exposure_of(torch.zeros(10, 3)) == 100.0
-
-
-def test_one_saturated_band_makes_a_pixel_blown_out():
-    spectra = torch.tensor([[0.2, 0.95, 0.3], [0.2, 0.85, 0.3]])
-    assert is_blown_out(spectra).tolist() == [True, False]
+    assert is_blown_out(torch.tensor([[0.2, 0.95, 0.3], [0.2, 0.85, 0.3]])).tolist() == [True, False]
 
 
 def test_large_errors_grow_in_proportion_with_a_continuous_slope():

@@ -109,23 +109,16 @@ def test_a_channel_in_a_gap_of_the_bands_is_left_out_and_one_beside_it_is_as_wit
     np.testing.assert_allclose(seen.matrix[:35, 0], whole.matrix[:35, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize(("beyond", "is_kept"), [(0.009, True), (0.011, False)])
-def test_a_channel_may_have_a_hundredth_of_its_response_beyond_the_bands(beyond, is_kept):
-    both = sensor(
-        [500, 600, 600.001, 605, 605.001, 705 - 100 * (1 - beyond), 705 + 100 * beyond],
-        inside=[1, 1, 0, 0, 0, 0, 0],
-        over=[0, 0, 0, 0, 1, 1, 1],
-    )
-    seen = both.seen_by(BANDS)
-    assert ("over" in seen.names) == is_kept
-    assert len(seen.notes) == (not is_kept)
-    np.testing.assert_allclose(seen.matrix.sum(axis=0), 1)
-
-
-def test_a_file_is_a_sensor_named_after_it(tmp_path):
-    found = read_sensor(write(tmp_path, "wavelength,nir,red\n600,0,1\n650,0,1\n651,1,0\n700,1,0\n"))
-    assert found.name == "camera"
-    assert found.seen_by(BANDS).names == ("red", "nir")
+def test_a_channel_may_have_a_hundredth_of_its_response_beyond_the_bands():
+    for beyond, is_kept in ((0.009, True), (0.011, False)):
+        both = sensor(
+            [500, 600, 600.001, 605, 605.001, 705 - 100 * (1 - beyond), 705 + 100 * beyond],
+            inside=[1, 1, 0, 0, 0, 0, 0],
+            over=[0, 0, 0, 0, 1, 1, 1],
+        )
+        seen = both.seen_by(BANDS)
+        assert (("over" in seen.names), len(seen.notes)) == (is_kept, not is_kept)
+        np.testing.assert_allclose(seen.matrix.sum(axis=0), 1)
 
 
 @pytest.mark.parametrize(
@@ -134,11 +127,11 @@ def test_a_file_is_a_sensor_named_after_it(tmp_path):
         ("wavelength,a,b\n500,1,0\n600,1,0\n", "channel 'b' is zero at all wavelengths"),
         ("wavelength,a,b\n500,0,1\n550,1,0\n600,0,1\n", "'a' and 'b' have the same centre, 550 nm"),
         ("wavelength,a\n500,1\n", "at least two wavelengths"),
-        ("wavelength,a\n500,1\n600,-0.1\n", "not be negative; found -0.1 in 'a' at 600 nm"),
-        ("wavelength,a,a\n500,1,1\n600,0,1\n", "names of spectra must differ"),
         ("band,a\n500,1\n600,1\n", "first column must be headed 'wavelength'"),
     ],
 )
-def test_a_bad_file_is_refused_with_its_name(tmp_path, text, said):
+def test_a_file_is_a_sensor_named_after_it_and_a_bad_one_refused_with_its_name(tmp_path, text, said):
+    found = read_sensor(write(tmp_path, "wavelength,nir,red\n600,0,1\n650,0,1\n651,1,0\n700,1,0\n"))
+    assert (found.name, found.seen_by(BANDS).names) == ("camera", ("red", "nir"))
     with pytest.raises(SpectrumError, match=rf"camera\.csv: .*{said}"):
         read_sensor(write(tmp_path, text))

@@ -33,22 +33,14 @@ def test_all_but_two_percent_of_each_component_lie_between_black_and_full():
     assert colours.max() == 1
     inside = ((colours > 0) & (colours < 1)).double().mean(dim=0)
     torch.testing.assert_close(inside, torch.full((3,), 0.98).double(), atol=0.006, rtol=0)
-
-
-def test_the_map_of_one_picture_gives_a_spectrum_the_same_colour_in_any_other():
-    values, _ = spectra()
-    found = PcaColours.fit(values)
-    torch.testing.assert_close(found(values[:12].reshape(3, 4, 6)).reshape(12, 3), found(values)[:12])
-    torch.testing.assert_close(PcaColours.fit(values.flip(0)).axes, found.axes)
+    torch.testing.assert_close(PcaColours.fit(values.flip(0)).axes, PcaColours.fit(values).axes)
 
 
 def test_too_few_spectra_and_too_few_bands_give_black_where_there_is_nothing_to_tell():
     values, _ = spectra()
     assert not PcaColours.fit(values[:3])(values).any()
     colours = PcaColours.fit(values[:, :2])(values[:, :2])
-    assert colours.shape == (400, 3)
-    assert colours[:, :2].max() == 1
-    assert not colours[:, 2].any()
+    assert (colours[:, :2].max(), colours[:, 2].max()) == (1, 0)
 
 
 BANDS = 60

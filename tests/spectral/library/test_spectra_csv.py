@@ -23,12 +23,6 @@ def written(tmp_path, text, encoding="utf-8"):
     return path
 
 
-def test_a_file_has_a_wavelength_column_and_a_column_for_each_spectrum(tmp_path):
-    path = tmp_path / "e.csv"
-    write_spectra_csv(path, SMALL)
-    assert path.read_text() == 'wavelength,leaf,"soil, dry"\n400,0.1,0\n500,0.5,1\n600,0.2,2.5\n'
-
-
 @given(values=st.lists(st.floats(0, 10, width=32), min_size=6, max_size=6))
 def test_float32_spectra_survive_a_file_exactly(values, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "e.csv"
@@ -37,6 +31,7 @@ def test_float32_spectra_survive_a_file_exactly(values, tmp_path_factory):
     table = read_spectra_csv(path)
     np.testing.assert_array_equal(table.spectra.astype(np.float32), spectra)
     assert (table.bands, table.names) == (SMALL.bands, SMALL.names)
+    assert path.read_text().startswith('wavelength,leaf,"soil, dry"\n400,')
 
 
 def test_a_byte_order_mark_blank_lines_spaces_and_windows_line_ends_are_read(tmp_path):
@@ -77,12 +72,16 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_place(tmp_path, text, me
 
 
 def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
-    with pytest.raises(SpectrumError, match=r"nowhere.csv: can't read spectra: No such file"):
-        read_spectra_csv(tmp_path / "nowhere.csv")
-    with pytest.raises(SpectrumError, match="can't read spectra"):
-        read_spectra_csv(tmp_path)
-    with pytest.raises(SpectrumError, match="not a CSV file in UTF-8"):
-        read_spectra_csv(written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1"))
+    written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1")
+    for name, said in (
+        ("nowhere.csv", ": No such file"),
+        ("", ""),
+        ("spectra.csv", "not a CSV file in UTF-8"),
+    ):
+        with pytest.raises(
+            SpectrumError, match=said if "CSV" in said else f"{name}: can't read spectra{said}"
+        ):
+            read_spectra_csv(tmp_path / name)
 
 
 @given(
@@ -107,14 +106,10 @@ def test_resampling_interpolates_linearly_and_keeps_leading_axes():
         SpectraTable(SMALL.bands, SMALL.names, SMALL.spectra.T)
 
 
-@pytest.mark.parametrize(
-    ("centers", "message"),
-    [
-        ([390, 500], "10 nm below their range"),
-        ([500, 602.5], "2.5 nm above their range"),
-        ([399, 601], "1 nm below and 1 nm above their range"),
-    ],
-)
-def test_extrapolation_is_refused_with_the_distance(centers, message):
-    with pytest.raises(SpectrumError, match=message):
-        SMALL.resampled(Bands.of(centers))
+def test_extrapolation_is_refused_with_the_distance():
+    for centers, said in (
+        ([390, 500], "10 nm below"),
+        ([399, 601.5], "1 nm below and 1.5 nm above their range"),
+    ):
+        with pytest.raises(SpectrumError, match=said):
+            SMALL.resampled(Bands.of(centers))
