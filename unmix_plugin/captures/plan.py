@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,17 +15,19 @@ from jaxtyping import Float32
 from unmix_plugin import __version__
 from unmix_plugin.captures.calibration.references import is_srgb
 from unmix_plugin.captures.calibration.sensor import (
+    BRIGHT_PERCENTILE,
     Sensor,
-    choose_scale,
+    may_be_reflectance,
     prepare_sensor,
     sampled_rows,
-    with_one_exposure,
 )
+from unmix_plugin.captures.camera_tags import radiometric_model
+from unmix_plugin.captures.exposures import compare_exposures, exposure_of
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile
 from unmix_plugin.captures.writing.view_files import BackgroundRule, ViewRecipe, alpha_picture
-from unmix_plugin.errors import CaptureError, name_some
+from unmix_plugin.errors import CaptureError, ConfigError, name_some
 from unmix_plugin.scenes.backdrops import Backdrop, judge_backdrop
 from unmix_plugin.scenes.reading.faults import sha256_of
 from unmix_plugin.spectral.bands import Bands
@@ -43,7 +45,11 @@ _LEAST_WHITE, _MOST_BLACK = 0.5, 0.2
 _BORDER_SHARE = 0.02
 """Width of the border that a background is judged by, as a share of the view's."""
 _MOST_BORDER_PIXELS = 20000
-_BRIGHT_PERCENTILE = 99.0
+_BRIGHTEST_PERCENTILE = 99.0
+_MOST_ABOVE_ONE = 0.01
+"""Share of reflectances above 1 that is still taken for highlights."""
+_LEAST_BRIGHT = 0.05
+"""Bright values below this would lose digits if they were kept."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +119,8 @@ def make_plan(
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
         sensors[name] = prepare_sensor(name, same, options, references, every)
-    sensors = with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
-    scale, why = choose_scale(list(sensors.values()), options.scale)
+    sensors = _with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
+    scale, why = _choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = _choose_mask(views, options.mask)
     samples = {name: sensor.sample / np.float32(scale) for name, sensor in sensors.items()}
     backdrops: dict[str, Backdrop | None] = {}
@@ -177,6 +183,65 @@ def make_plan(
     )
 
 
+def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]) -> dict[str, Sensor]:
+    """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
+    each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
+
+    Args:
+        first: File of the first view of each.
+    """
+    bare = {name: one.calibration.exposure for name, one in sensors.items() if "white" not in one.evidence}
+    known = {name: exposure for name, exposure in bare.items() if exposure is not None}
+    rest = [name for name in bare if name not in known]
+    files = [
+        first[name]
+        for name in known or rest
+        if radiometric_model(first[name]) is None
+        # What is wrong with those of one sensor was said of it.
+        and (exposure_of(first[name]) is not None or "exposure_s" not in first[name].metadata)
+    ]
+    if len(bare) < 2 or not files:
+        return sensors
+    found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(may_be_reflectance, files)))
+    notes, warnings = found.notes if known or found.common is None else (), found.warnings
+    if known and rest:
+        unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
+        warnings += (f"{unlike}: values of these lenses or cameras may be off by a factor",)
+    brought, first_name = dict(sensors), next(iter(bare))
+    for name, exposure in known.items() if found.common is not None else ():
+        sensor, factor = sensors[name], (found.common / exposure).astype(np.float32)
+        calibration = replace(sensor.calibration, exposure=found.common)
+        brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
+    one = brought[first_name]
+    brought[first_name] = replace(one, notes=(*one.notes, *notes), warnings=(*one.warnings, *warnings))
+    return brought
+
+
+def _choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
+    """The scale and why.
+
+    Reflectances, and values of files that say what stands for 1, are kept unless many are above 1 or all are small;
+    others are divided by a high percentile. Raises CaptureError: nothing in the sampled pixels is above 0. Raises
+    ConfigError: the given scale is not above 0.
+    """
+    if given is not None:
+        if not (np.isfinite(given) and given > 0):
+            raise ConfigError(f"--scale {given:g}: expected a number above 0, what is written as 1")
+        return given, "given with --scale"
+    values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
+    bright = float(np.percentile(values, BRIGHT_PERCENTILE)) if len(values) else 0.0
+    if not bright > 0:
+        raise CaptureError(
+            f"{BRIGHT_PERCENTILE:g} % of the calibrated values are not above 0 (up to {values.max(initial=0):g}); "
+            "check the dark frame: is it as bright as the views?"
+        )
+    above = float((values > 1.0).mean())
+    if all(sensor.is_absolute for sensor in sensors) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
+        return 1.0, f"values are kept ({sensors[0].unit}); {above:.2%} of the sampled ones are above 1"
+    scale = float(f"{bright:.4g}")
+    return scale, f"the {BRIGHT_PERCENTILE:g}th percentile of the sampled values"
+
+
 # Matter and background: from files of the capture, from a background that is white or black, or from a backdrop that
 # nobody has named. The border of the views tells how bright a background is and how much it varies; a threshold
 # between it and the rest follows from that.
@@ -218,7 +283,7 @@ def _background_rule(
     border is not of this kind."""
     brightness = BackgroundRule.brightness(kind, border)
     everywhere = np.concatenate([BackgroundRule.brightness(kind, sample), brightness])
-    brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHT_PERCENTILE))
+    brightest = float(np.percentile(np.clip(everywhere, 0.0, 1.0), _BRIGHTEST_PERCENTILE))
     level = float(np.median(brightness))
     deviation = 1.4826 * float(np.median(np.abs(brightness - level)))
     distance = max(_DEVIATIONS * deviation, _LEAST_DISTANCE * brightest)

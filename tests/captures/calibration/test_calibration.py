@@ -88,9 +88,8 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     light[0, 3, 2] = 40
     white = open_reference(file_of(light), "white reference", file)
     dark = open_reference(file_of(np.full((1, WIDTH, BANDS), 50, np.uint16)), "dark frame", file)
-    found = Calibration(WHOLE, EVERY, dark=dark, white=replace(white, reflectance=np.ones(BANDS))).rows(
-        file, 0, HEIGHT
-    )
+    white = replace(white, dark=dark, reflectance=np.ones(BANDS))
+    found = Calibration(WHOLE, EVERY, dark=dark, white=white).rows(file, 0, HEIGHT)
     np.testing.assert_array_equal(found.missing, np.arange(WIDTH)[None, :] == 3 + np.zeros((HEIGHT, 1)))
     assert (found.values[:, 3] == 0).all()
     np.testing.assert_allclose(found.values[:, 4], (counts[:, 4] - 50.0) / 2950, rtol=1e-5)

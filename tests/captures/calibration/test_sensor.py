@@ -19,19 +19,15 @@ from unmix_plugin.captures.calibration.sensor import (
     _noise_shares,
     prepare_sensor,
     sampled_rows,
-    with_one_exposure,
 )
 from unmix_plugin.captures.options import ProcessOptions
+from unmix_plugin.captures.plan import _with_one_exposure as with_one_exposure
 from unmix_plugin.captures.spectral_file import CaptureView, Linear
 
 WAVELENGTHS_NM = np.linspace(400.0, 900.0, 12)
 GENERATOR = np.random.default_rng(0)
 SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
 MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
-
-
-def _unsaturated(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return values.astype(np.float32), np.zeros(values.shape, bool)
 
 
 def test_noise_is_found_beside_what_bands_share():
@@ -55,7 +51,8 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     values[:, 7] += 3.0 * GENERATOR.standard_normal(len(values)).astype(np.float32)
     saturated = np.zeros(values.shape, bool)
     saturated[: len(values) // 3, 9] = True
-    found, _ = _drop_found(_BandChoice(WAVELENGTHS_NM, {0: "named"}), (values[:, 1:], saturated[:, 1:]), 0.5)
+    choice = _BandChoice(WAVELENGTHS_NM, {0: "named"})
+    found = _drop_found(choice, (values[:, 1:], saturated[:, 1:]), 0.5, [])
     assert {band: reason.split(":")[0].split(" is ")[0] for band, reason in found.dropped.items()} == {
         0: "named",
         2: "dead",
@@ -68,14 +65,14 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
 def test_a_white_background_that_saturates_every_band_drops_none():
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), (MIXTURES, saturated), 0.5)[0].dropped == {}
+    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), (MIXTURES, saturated), 0.5, []).dropped == {}
 
 
 def test_bands_that_have_nothing_in_common_are_not_all_noise():
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
-    found, notes = _drop_found(_BandChoice(WAVELENGTHS_NM, {}), _unsaturated(independent), 0.3)
-    assert found.dropped == {}
-    assert notes == ("12 of 12 bands have noise above 30% of their signal; all are kept",)
+    sample, notes = (independent, np.zeros(independent.shape, bool)), []
+    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), sample, 0.3, notes).dropped == {}
+    assert notes == ["12 of 12 bands have noise above 30% of their signal; all are kept"]
 
 
 def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():

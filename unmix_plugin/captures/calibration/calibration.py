@@ -171,10 +171,9 @@ class Calibration:
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
         columns, bands = self.raster.columns, self.bands
         values = stated_values(file, whole, rows, bands)[:, columns]  # a new array, free to be changed
-        own_dark, white = self.own.get(file.path, (self.dark, self.white))
-        dark = None if own_dark is None else own_dark.rows(rows, columns, bands)
+        dark, white = self.own.get(file.path, (self.dark, self.white))
         if dark is not None:
-            values -= dark
+            values -= dark.rows(rows, columns, bands)
         factor, wanted, found = np.ones(1, np.float32), self.exposure, exposure_of(file)
         if file.path in self.own and white is not None and wanted is not None:
             wanted = exposure_of(white.file)  # its own white reference
@@ -186,8 +185,6 @@ class Calibration:
             light = white.rows(rows, columns, bands)
             if white.dark is not None:
                 light = light - white.dark.rows(rows, columns, bands)
-            elif dark is not None:
-                light = light - dark
             # NaN where the white is not above the dark.
             light = np.where(light > 0, light, np.float32(np.nan))
             factor = factor * (white.reflectance[bands].astype(np.float32) / light)

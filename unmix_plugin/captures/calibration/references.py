@@ -126,7 +126,7 @@ class Reference:
     reflectance: Float64[np.ndarray, " B"] | None = None
     """Of a white panel at every band of the file, above 0."""
     dark: Reference | None = None
-    """Of a white panel: the dark frame that was taken for it alone, in place of that of the views."""
+    """Of a white panel: the dark frame that was taken for it alone, otherwise that of the views."""
     rectangle: tuple[int, int, int, int] | None = None
     """First row and column, height and width of the part of a view that shows it; None for a file of its own."""
 
@@ -137,10 +137,11 @@ class Reference:
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
-    def signal(self, dark: Reference | None) -> Float64[np.ndarray, " B"]:
-        """Mean counts above its own dark, or that of the views, at each band of the file."""
-        own, dark = self.mean.astype(np.float64).mean(axis=(0, 1)), self.dark or dark
-        return own if dark is None else own - dark.signal(None)
+    @property
+    def signal(self) -> Float64[np.ndarray, " B"]:
+        """Mean counts above its dark at each band of the file."""
+        own = self.mean.astype(np.float64).mean(axis=(0, 1))
+        return own if self.dark is None else own - self.dark.signal
 
 
 def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
@@ -265,14 +266,15 @@ def _stretched(mean: Float32[np.ndarray, "1 V B"], width: int) -> Float32[np.nda
 
 
 def _as_white(
-    reference: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
+    panel: Reference, dark: Reference | None, reflectance: str, wavelengths_nm: Float64[np.ndarray, " B"]
 ) -> Reference:
-    """A white panel that is brighter than the dark, with its reflectance: a number, or that of a CSV file."""
-    light, dark = reference.signal(dark), reference.dark or dark
+    """A white panel that is brighter than its dark, with its reflectance: a number, or that of a CSV file."""
+    white = replace(panel, dark=panel.dark or dark)
+    light = white.signal
     if not (light > 0).mean() > 0.5:
-        dark_name = "0" if dark is None else f"the dark frame {dark.file.path}"
+        dark_name = "0" if white.dark is None else f"the dark frame {white.dark.file.path}"
         raise CaptureError(
-            f"{reference.file.path}: the white reference is not brighter than {dark_name} in "
+            f"{white.file.path}: the white reference is not brighter than {dark_name} in "
             f"{(light <= 0).mean():.0%} of its bands; are white and dark swapped?"
         )
     try:
@@ -293,7 +295,7 @@ def _as_white(
             f"--white-reflectance {reflectance} is {values.min():g} to {values.max():g}; expected a reflectance above "
             "0, such as 0.99 (per cent are divided by 100 first)"
         )
-    return replace(reference, reflectance=values)
+    return replace(white, reflectance=values)
 
 
 References: TypeAlias = tuple[Reference | None, Reference | None]
@@ -340,7 +342,7 @@ def find_references(
         key = (own_dark and own_dark.path, own_white and own_white.path)
         if key not in seen:
             its_dark = dark if own_dark is None else _open_reference(own_dark, "dark frame", view.cube)
-            its_white = white
+            its_white = white and replace(white, dark=white.dark or its_dark)
             if own_white is not None:
                 panel = _open_white(own_white, of_whites.get(own_white.path), view.cube)
                 its_white = _as_white(panel, its_dark, options.white_reflectance, wavelengths_nm)

@@ -27,11 +27,11 @@ from unmix_plugin.captures.calibration.references import (
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.exposures import Exposures, compare_exposures, exposure_of
+from unmix_plugin.captures.exposures import Exposures, compare_exposures
 from unmix_plugin.captures.header_values import in_ranges
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
-from unmix_plugin.errors import CaptureError, ConfigError, name_some
+from unmix_plugin.errors import CaptureError, name_some
 
 _ROWS_A_VIEW = 12
 _MOST_ALIKE = 4
@@ -57,11 +57,7 @@ _GAP, _LEFT_OUT = 3.0, 2.5
 and above which a range was left out: one band that is left out makes two steps of one, two make three."""
 _LEAST_WHITE = 0.01
 """Signal of the white reference in a band, as a share of the greatest, below which the band is too dark."""
-_BRIGHT_PERCENTILE = 99.9
-_MOST_ABOVE_ONE = 0.01
-"""Share of reflectances above 1 that is still taken for highlights."""
-_LEAST_BRIGHT = 0.05
-"""Bright values below this would lose digits if they were kept."""
+BRIGHT_PERCENTILE = 99.9
 _MOST_REFLECTANCE = 1.5
 """Of bright pixels with highlights."""
 
@@ -182,7 +178,7 @@ def prepare_sensor(
     files = [view.cube for view in views]
     first, binning = files[0], options.bin_bands
     model = radiometric_model(first)
-    choice, warnings = _stated_bands(files, options), []
+    choice, notes, warnings = _stated_bands(files, options), [], []
     (dark, white), own = find_references(views, choice.wavelengths_nm, options, references, all_views)
     pairs = list(own.values()) or [(dark, white)]
     whites = [one for _, one in pairs if one is not None]
@@ -193,12 +189,9 @@ def prepare_sensor(
     else:
         saturation, how = _find_saturation(files, choice.kept)
     lamp = None
-    for its_dark, used in pairs:
-        if used is not None:
-            signal = used.signal(its_dark)
-            lamp = signal / used.reflectance if lamp is None else lamp
-            choice, said = _lit_bands(choice, used, signal, saturation)
-            warnings += said
+    for used in whites:
+        lamp = used.signal / used.reflectance if lamp is None else lamp
+        choice = _lit_bands(choice, used, saturation, warnings)
     choice.require(binning, str(first.path))
     # A maker's calibration accounts for exposures already.
     exposures = Exposures()
@@ -207,15 +200,14 @@ def prepare_sensor(
         for file in files:
             its_dark, used = own.get(file.path, (dark, white))
             darks += [(its_dark.file, file)] if its_dark else []
-            of_white = used and (used.dark or its_dark)
-            darks += [(of_white.file, used.file)] if used and of_white else []
+            darks += [(used.dark.file, used.file)] if used and used.dark else []
         exposures = compare_exposures(
-            files, [one.file for one in whites], darks, is_srgb(first), _may_be_reflectance(first)
+            files, [one.file for one in whites], darks, is_srgb(first), may_be_reflectance(first)
         )
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
     calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
     sample = _draw_sample(files, calibration)
-    choice, noted = _drop_found(choice, sample, options.max_noise)
+    choice = _drop_found(choice, sample, options.max_noise, notes)
     choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
@@ -239,20 +231,20 @@ def prepare_sensor(
         _binned(sample[0][:, still_kept], binning),
         evidence | _evidence(views, choice, (dark, white), own),
         lamp,
-        (*exposures.notes, *noted),
+        (*exposures.notes, *notes),
         (*warnings, *exposures.warnings),
         bool(whites) or states_one,
         bool(whites) or (has_one and finished is not None),
     )
 
 
-def _may_be_reflectance(file: SpectralFile) -> bool:
+def may_be_reflectance(file: SpectralFile) -> bool:
     """Whether the values of sampled rows were brought to what stands for 1, perhaps."""
     if file.dtype.kind != "f" and file.linear is None:
         return False
     parts = [(_stored_pixels(file, row)[None], slice(row, row + 1)) for row in sampled_rows(file.shape[0])]
     values = np.concatenate([stated_values(file, *part).ravel() for part in parts])
-    return len(values) > 0 and bool(0.0 < np.percentile(values, _BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE)
+    return len(values) > 0 and bool(0.0 < np.percentile(values, BRIGHT_PERCENTILE) <= _MOST_REFLECTANCE)
 
 
 def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _BandChoice:
@@ -315,67 +307,6 @@ def _evidence(
     return found | ({"irradiance": light} if light else {})
 
 
-def with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile]) -> dict[str, Sensor]:
-    """The sensors with those brought to one exposure that have no white reference: lenses of a rig, which are exposed
-    each for its own band, or views of one camera in several sizes. The first one says what was done, or was not.
-
-    Args:
-        first: File of the first view of each.
-    """
-    bare = [name for name, sensor in sensors.items() if "white" not in sensor.evidence]
-    exposures = {name: sensors[name].calibration.exposure for name in bare}
-    known = {name: exposure for name, exposure in exposures.items() if exposure is not None}
-    rest = [name for name in bare if name not in known]
-    files = [
-        first[name]
-        for name in known or rest
-        if radiometric_model(first[name]) is None
-        # What is wrong with those of one sensor was said of it.
-        and (exposure_of(first[name]) is not None or "exposure_s" not in first[name].metadata)
-    ]
-    if len(bare) < 2 or not files:
-        return sensors
-    found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(_may_be_reflectance, files)))
-    notes, warnings = found.notes if known or found.common is None else (), found.warnings
-    if known and rest:
-        unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
-        warnings += (f"{unlike}: values of these lenses or cameras may be off by a factor",)
-    brought = dict(sensors)
-    if found.common is not None:
-        for name, exposure in known.items():
-            sensor, factor = sensors[name], (found.common / exposure).astype(np.float32)
-            calibration = replace(sensor.calibration, exposure=found.common)
-            brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
-    one = brought[bare[0]]
-    brought[bare[0]] = replace(one, notes=(*one.notes, *notes), warnings=(*one.warnings, *warnings))
-    return brought
-
-
-def choose_scale(sensors: Sequence[Sensor], given: float | None) -> tuple[float, str]:
-    """The scale and why.
-
-    Reflectances, and values of files that say what stands for 1, are kept unless many are above 1 or all are small;
-    others are divided by a high percentile. Raises CaptureError: nothing in the sampled pixels is above 0. Raises
-    ConfigError: the given scale is not above 0.
-    """
-    if given is not None:
-        if not (np.isfinite(given) and given > 0):
-            raise ConfigError(f"--scale {given:g}: expected a number above 0, what is written as 1")
-        return given, "given with --scale"
-    values = np.concatenate([sensor.sample.ravel() for sensor in sensors])
-    bright = float(np.percentile(values, _BRIGHT_PERCENTILE)) if len(values) else 0.0
-    if not bright > 0:
-        raise CaptureError(
-            f"{_BRIGHT_PERCENTILE:g} % of the calibrated values are not above 0 (up to {values.max(initial=0):g}); "
-            "check the dark frame: is it as bright as the views?"
-        )
-    above = float((values > 1.0).mean())
-    if all(sensor.is_absolute for sensor in sensors) and above <= _MOST_ABOVE_ONE and bright >= _LEAST_BRIGHT:
-        return 1.0, f"values are kept ({sensors[0].unit}); {above:.2%} of the sampled ones are above 1"
-    scale = float(f"{bright:.4g}")
-    return scale, f"the {_BRIGHT_PERCENTILE:g}th percentile of the sampled values"
-
-
 def sampled_rows(height: int) -> list[int]:
     """Rows spread evenly over an image.
 
@@ -418,19 +349,21 @@ def _stored_pixels(file: SpectralFile, row: int, bands: BandIndex = slice(None))
 
 
 def _lit_bands(
-    choice: _BandChoice, white: Reference, signal: Float64[np.ndarray, " B"], saturation: float | None
-) -> tuple[_BandChoice, list[str]]:
-    """The choice without bands in which a white reference is saturated or has no light, and warnings."""
-    clipped, warnings, path = _clipped_bands(white, saturation), [], white.file.path
+    choice: _BandChoice, white: Reference, saturation: float | None, warnings: list[str]
+) -> _BandChoice:
+    """The choice without bands in which a white reference is saturated or has no light."""
+    clipped, path = _clipped_bands(white, saturation), white.file.path
     advice = "take it again with a shorter exposure"
     if clipped.mean() > _MOST_SATURATED_WHITE:
         raise CaptureError(f"{path}: {clipped.mean():.0%} of the white reference is saturated; {advice}")
     if clipped.any():
         listed = name_some([f"{nm:g} nm" for nm in choice.wavelengths_nm[clipped]])
-        warnings = [f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"]
+        warnings.append(
+            f"{path.name}: the white is saturated in {listed}: these bands are left out; {advice}"
+        )
     choice = choice.without(clipped, "the white reference is saturated there")
-    is_dark = signal < _LEAST_WHITE * signal.max()
-    return choice.without(is_dark, "the white reference has no light there"), warnings
+    is_dark = white.signal < _LEAST_WHITE * white.signal.max()
+    return choice.without(is_dark, "the white reference has no light there")
 
 
 def _clipped_bands(white: Reference, saturation: float | None) -> Bool[np.ndarray, " B"]:
@@ -487,11 +420,9 @@ def _draw_sample(files: Sequence[SpectralFile], calibration: Calibration) -> _Sa
     return sample
 
 
-def _drop_found(
-    choice: _BandChoice, sample: _Sample, max_noise: float
-) -> tuple[_BandChoice, tuple[str, ...]]:
-    """Leave out bands that are dead, saturated or noisy in the sample, which has all that were kept; and notes."""
-    kept, notes, (values, saturated) = choice.kept, (), sample
+def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, notes: list[str]) -> _BandChoice:
+    """Leave out bands that are dead, saturated or noisy in the sample, which has all that were kept."""
+    kept, (values, saturated) = choice.kept, sample
     shares = saturated.mean(axis=0)
     is_saturated = shares > _MOST_SATURATED + np.median(shares)
     is_dead = np.ptp(values, axis=0) == 0
@@ -501,14 +432,14 @@ def _drop_found(
     is_noisy = noise > max_noise  # false for NaN
     if is_noisy.mean() > _MOST_NOISY:  # bands have little in common then, or the whole capture is noisy
         noisy = f"{is_noisy.sum()} of {len(kept)} bands have noise above {max_noise:.0%} of their signal"
-        notes = (f"{noisy}; all are kept",)
+        notes.append(f"{noisy}; all are kept")
         is_noisy[:] = False
     # The first reason that is found counts.
     reasons = {int(kept[i]): f"noise is {noise[i]:.0%} of the signal" for i in np.flatnonzero(is_noisy)}
     many = f"saturated in more than {_MOST_SATURATED:.0%} of sampled pixels"
     reasons |= dict.fromkeys(kept[is_saturated].tolist(), many)
     reasons |= dict.fromkeys(kept[is_dead].tolist(), "dead: the same value in every sampled pixel")
-    return _BandChoice(choice.wavelengths_nm, reasons | choice.dropped), notes
+    return _BandChoice(choice.wavelengths_nm, reasons | choice.dropped)
 
 
 def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B"]:
