@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
+import scipy.io
+import torch
 from PIL import Image
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -77,6 +81,16 @@ def write_band_file(
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels.astype(np.uint16)).save(path, format="TIFF", tiffinfo=directory)
     return path
+
+
+def gdal_tag(*entries: str) -> list[tuple[int, str, int, str, bool]]:
+    """GDAL's tag of a TIFF, with such entries."""
+    return [(42112, "s", 0, f"<GDALMetadata>{''.join(entries)}</GDALMetadata>", True)]
+
+
+def gdal_items(name: str, values: Any, more: str = "") -> str:
+    """Entries of one name, one a band, with more attributes."""
+    return "".join(f'<Item name="{name}" sample="{i}"{more}>{value}</Item>' for i, value in enumerate(values))
 
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12, "u4": 13, "i8": 14, "u8": 15}
@@ -155,3 +169,47 @@ def present(value: Any) -> Any:
     """A value that has to be there."""
     assert value is not None
     return value
+
+
+def matlab73(path, arrays):
+    """As MATLAB writes them: axes in reverse order, behind 512 bytes of its own."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            file[name] = np.asarray(array).T
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def hdf5(path, arrays, **attributes):
+    """Data sets in chunks, all with the same attributes."""
+    with h5py.File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, chunks=True, compression="gzip").attrs.update(attributes)
+
+
+def netcdf3(path, arrays):
+    with scipy.io.netcdf_file(path, "w") as file:
+        for name, array in arrays.items():
+            names = tuple(f"{name}_{axis}" for axis in range(array.ndim))
+            for dimension, length in zip(names, array.shape, strict=True):
+                file.createDimension(dimension, length)
+            file.createVariable(name, array.dtype.newbyteorder("="), names)[:] = array
+
+
+def tensors(path, arrays, **options):
+    torch.save({name: torch.tensor(array) for name, array in arrays.items()}, path, **options)
+
+
+ARRAY_WRITERS: dict[str, Callable[..., object]] = {
+    "v5.mat": scipy.io.savemat,
+    "compressed.mat": partial(scipy.io.savemat, do_compression=True),
+    "v73.mat": matlab73,
+    "cube.h5": hdf5,
+    "scaled.h5": partial(hdf5, scale_factor=0.01),
+    "cube.nc": netcdf3,
+    "cube.npz": lambda path, arrays: np.savez(path, **arrays),
+    "small.npz": lambda path, arrays: np.savez_compressed(path, **arrays),
+    "cube.pt": tensors,
+    "legacy.pt": partial(tensors, _use_new_zipfile_serialization=False),
+}
+"""By the name of a file: writes arrays by name."""

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.captures.file_factory import check_file, header_text, present, write_envi
+from tests.captures.file_factory import (
+    check_file,
+    gdal_items,
+    gdal_tag,
+    header_text,
+    present,
+    write_envi,
+)
+from tests.fuzz.capture_samples import SAMPLES
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
@@ -104,22 +112,32 @@ def listed(numbers):
     return "{" + ", ".join(f"{number:g}" for number in numbers) + "}"
 
 
-def gdal_items(**lists):
-    roles = {"scale": 'role="scale"', "offset": 'role="offset"'}
-    items = "".join(
-        f'<Item name="{name}" sample="{band}" {roles.get(name, "")}>{number}</Item>'
-        for name, numbers in lists.items()
-        for band, number in enumerate(numbers)
+def roles(**lists):
+    return gdal_tag(
+        *(
+            gdal_items(name, numbers, f' role="{name}"' * (name in ("scale", "offset")))
+            for name, numbers in lists.items()
+        )
     )
-    return [(42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>", True)]
+
+
+def xml(tag, bands, attribute=""):
+    """One element a band, with texts by name, numbered from 1 in an attribute if one is named."""
+    own = ""
+    for number, texts in enumerate(bands, start=1):
+        named = f' {attribute}="{number}"' if attribute else ""
+        own += f"<{tag}{named}>{''.join(f'<{name}>{text}</{name}>' for name, text in texts.items())}</{tag}>"
+    return f"<x><y><bandCharacterisation>{own}</bandCharacterisation></y></x>"
 
 
 def pam(*bands):
     """GDAL's file beside an image, with what it says of each of its first bands."""
-    own = "".join(
-        f'<PAMRasterBand band="{band}">{text}</PAMRasterBand>' for band, text in enumerate(bands, start=1)
-    )
-    return f"<PAMDataset>{own}</PAMDataset>"
+    return xml("PAMRasterBand", bands, "band")
+
+
+def enmap(nm, **columns):
+    bands = [{name: column[i] for name, column in columns.items()} for i in range(len(nm))]
+    return xml("bandID", [{"wavelengthCenterOfBand": nm[i]} | own for i, own in enumerate(bands)], "number")
 
 
 def calibrated_envi(folder, more):
@@ -145,10 +163,8 @@ def by_band(gains, offsets, prefix=""):
     return f"data {prefix}gain values = {listed(gains)}\ndata_{prefix}offset_values = {listed(offsets)}\n"
 
 
-AUX = pam(
-    *(f"<Offset>{offset}</Offset><Scale>{gain}</Scale>" for gain, offset in zip(GAINS, OFFSETS, strict=True))
-)
-OWN = gdal_items(scale=GAINS, offset=OFFSETS)
+AUX = pam(*({"Offset": OFFSETS[band], "Scale": GAINS[band]} for band in range(3)))
+OWN = roles(scale=GAINS, offset=OFFSETS)
 CALIBRATED = {
     "ENVI": lambda folder: calibrated_envi(folder, by_band(GAINS, OFFSETS)),
     "ENVI, reflectance": lambda folder: calibrated_envi(
@@ -156,12 +172,10 @@ CALIBRATED = {
     ),
     "roles of GDAL": lambda folder: write_tiff(folder, OWN),
     "names in GDAL's metadata": lambda folder: write_tiff(
-        folder, gdal_items(scale_factor=GAINS, add_offset=OFFSETS)
+        folder, roles(scale_factor=GAINS, add_offset=OFFSETS)
     ),
     "GDAL's file beside it": lambda folder: write_tiff(folder, aux=AUX),
-    "its own before unusable ones beside it": lambda folder: write_tiff(
-        folder, OWN, aux=pam("<Scale>0</Scale>")
-    ),
+    "its own before unusable ones beside it": lambda folder: write_tiff(folder, OWN, aux=pam({"Scale": 0})),
     "a header beside a TIFF": lambda folder: write_tiff(
         folder, hdr=header_text(CUBE, "bip", {}) + "file type = TIFF\n" + by_band(GAINS, OFFSETS)
     ),
@@ -195,81 +209,70 @@ def test_a_linear_calibration_of_the_whole_file(tmp_path, attributes, scale, val
 
 def test_gains_beside_a_file_that_cannot_be_used_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="gains from 0 to 1; expected finite numbers above 0"):
-        open_spectral_file(write_tiff(tmp_path, aux=pam("<Scale>0</Scale>")))
+        open_spectral_file(write_tiff(tmp_path, aux=pam({"Scale": 0})))
 
 
-def enmap_bands(nm, more=lambda _: ""):
-    bands = "".join(
-        f'<bandID number="{band + 1}"><wavelengthCenterOfBand>{value}</wavelengthCenterOfBand>{more(band)}</bandID>'
-        for band, value in enumerate(nm)
-    )
-    return f"<x><y><bandCharacterisation>{bands}</bandCharacterisation></y></x>"
-
-
-@pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        (
-            lambda band: (
-                f"<FWHMOfBand>7</FWHMOfBand><GainOfBand>{GAINS[band]}</GainOfBand>"
-                f"<OffsetOfBand>{OFFSETS[band]}</OffsetOfBand>"
-            ),
-            {"fwhm": 7, "calibrated": CUBE * GAINS + OFFSETS},
-        ),
-        *(
-            (lambda band, width=width: f"<FWHMOfBand>{7 if band else width}</FWHMOfBand>", {"fwhm": None})
-            for width in ("0", "-7", "inf")
-        ),
-    ],
-)
-def test_every_xml_beside_an_image_is_read(tmp_path, more, expected):
-    """EnMAP's, with widths that no band has left out, and GDAL's."""
-    image = write_tiff(
-        tmp_path,
-        name="a-SPECTRAL_IMAGE.TIF",
-        xml=enmap_bands((450, 550, 1650), more),
-        aux=pam("<NoDataValue>7</NoDataValue>"),
-    )
-    check_file(open_spectral_file(image), nm=[450, 550, 1650], no_data=(7,), **expected)
-
-
-def desis_band(number):
-    values = {
+THREE, FIVE = (450, 550, 1650), np.array([450, 550, 650, 1650, 2250])
+DESIS = [
+    {
         "bandNumber": number,
         "wavelengthCenterOfBand": 400 + 100 * number,
         "wavelengthWidthOfBand": 3,
         "gainOfBand": GAINS[number - 1],
         "offsetOfBand": OFFSETS[number - 1],
     }
-    return f"<band>{''.join(f'<{name}>{value}</{name}>' for name, value in values.items())}</band>"
+    for number in (2, 3, 1)
+]
+DESCRIBED = [
+    (
+        "",
+        enmap(THREE, FWHMOfBand=[7, 7, 7], GainOfBand=GAINS, OffsetOfBand=OFFSETS),
+        {"nm": THREE, "fwhm": 7, "calibrated": CUBE * GAINS + OFFSETS},
+    ),
+    *(
+        ("", enmap(THREE, FWHMOfBand=[width, 7, 7]), {"nm": THREE, "fwhm": None})  # a width that no band has
+        for width in ("0", "-7", "inf")
+    ),
+    ("", xml("band", DESIS), {"nm": [500, 600, 700], "fwhm": 3, "calibrated": CUBE * GAINS + OFFSETS}),
+    *(  # L1B: the first bands are those of the VNIR image, the last those of the SWIR image
+        (
+            detector,
+            enmap(FIVE, GainOfBand=range(1, 6)),
+            {"nm": FIVE[part], "calibrated": CUBE * np.arange(1, 6)[part], "warnings": ()},
+        )
+        for detector, part in (("_VNIR", slice(0, 3)), ("_SWIR", slice(2, 5)))
+    ),
+    *(
+        (
+            "",
+            enmap(nm),
+            {
+                "nm": None,
+                "linear": None,
+                "warning": f"a-METADATA.XML describes {len(nm)} bands, the image has 3: wavelengths and gains in it",
+            },
+        )
+        for nm in ((), FIVE[:2], FIVE[:4])
+    ),
+]
 
 
-def test_the_metadata_of_desis_describe_its_bands_by_their_numbers(tmp_path):
-    """As bandCharacterisation/band has them: value = gainOfBand * number + offsetOfBand."""
-    own = "".join(desis_band(number) for number in (2, 3, 1))
-    text = f"<hsi_doc><specific><bandCharacterisation>{own}</bandCharacterisation></specific></hsi_doc>"
-    image = write_tiff(tmp_path, name="a-SPECTRAL_IMAGE.tif", xml=text)
-    expected = {"nm": [500, 600, 700], "fwhm": 3, "calibrated": CUBE * GAINS + OFFSETS, "warnings": ()}
-    check_file(open_spectral_file(image), **expected)
+@pytest.mark.parametrize(("detector", "text", "expected"), DESCRIBED)
+def test_every_xml_beside_an_image_is_read_or_said_not_to_describe_its_bands(
+    tmp_path, detector, text, expected
+):
+    name = f"a-SPECTRAL_IMAGE{detector}.TIF"
+    image = write_tiff(tmp_path, name=name, xml=text, aux=pam({"NoDataValue": 7}))
+    check_file(open_spectral_file(image), no_data=(7,), **expected)
 
 
-@pytest.mark.parametrize(("detector", "first"), [("VNIR", 0), ("SWIR", 2)])
-def test_the_detectors_of_enmap_take_their_part_of_the_bands(tmp_path, detector, first):
-    """L1B: the first bands are those of the VNIR image, the last those of the SWIR image."""
-    nm = np.array([450, 550, 650, 1650, 2250])
-    text = enmap_bands(nm, lambda band: f"<GainOfBand>{band + 1}</GainOfBand>")
-    image = write_tiff(tmp_path, name=f"a-SPECTRAL_IMAGE_{detector}.TIF", xml=text)
-    gains = np.arange(1, 6)[first : first + 3]
-    check_file(open_spectral_file(image), nm=nm[first : first + 3], calibrated=CUBE * gains, warnings=())
-
-
-@pytest.mark.parametrize("nm", [(), (450, 550), (450, 550, 650, 1650)])
-def test_metadata_beside_an_image_that_do_not_describe_its_bands_are_said(tmp_path, nm):
-    image = write_tiff(tmp_path, name="a-SPECTRAL_IMAGE.TIF", xml=enmap_bands(nm))
-    warning = (
-        f"a-METADATA.XML describes {len(nm)} bands, the image has 3: wavelengths and gains in it are not used"
-    )
-    check_file(open_spectral_file(image), nm=None, linear=None, warning=warning)
+@pytest.mark.parametrize("name", [name for name in SAMPLES if name != "cube.hdr"])
+@pytest.mark.parametrize("share", [0.7, 0.3, 0.05])
+def test_files_that_are_cut_short_are_refused(tmp_path, name, share):
+    for data in SAMPLES[name]():
+        (tmp_path / name).write_bytes(data[: int(len(data) * share)])
+        with pytest.raises(CaptureError, match=name):
+            open_spectral_file(tmp_path / name).read()
 
 
 @pytest.fixture

@@ -136,17 +136,6 @@ def test_folders_that_are_no_image_are_refused(tmp_path):
         open_spectral_file(tmp_path)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_pictures_that_are_cut_short_are_refused(tmp_path, suffix):
-    path = tmp_path / f"a{suffix}"
-    Image.fromarray(RGB).save(path)
-    data = path.read_bytes()
-    for length in range(12, len(data) - 20, 9):
-        path.write_bytes(data[:length])
-        with pytest.raises(CaptureError, match=path.name):
-            open_spectral_file(path).read()
-
-
 def test_the_exposure_of_a_picture_is_that_of_its_exif(tmp_path):
     picture = Image.new("L", (3, 2))
     exif = picture.getexif()

@@ -9,7 +9,14 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import check_file, present, rows_and_bands_of, xmp_packet
+from tests.captures.file_factory import (
+    check_file,
+    gdal_items,
+    gdal_tag,
+    present,
+    rows_and_bands_of,
+    xmp_packet,
+)
 from unmix_plugin.captures.calibration.references import find_missing
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions, SpectralFile
@@ -85,22 +92,13 @@ def test_rows_as_pages_are_recognised_by_the_number_of_wavelengths_or_said(tmp_p
     check_file(file, values=CUBE.transpose(1, 0, 2))
 
 
-def gdal(*entries):
-    """GDAL's tag with such entries."""
-    return [(42112, "s", 0, f"<GDALMetadata>{''.join(entries)}</GDALMetadata>", True)]
-
-
-def items(name, values, more=""):
-    return "".join(f'<Item name="{name}" sample="{i}"{more}>{value}</Item>' for i, value in enumerate(values))
-
-
 NM, WIDE_NM = np.arange(400, 460, 10).tolist(), np.arange(400, 1000, 100).tolist()
 UM = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 PACKET = xmp_packet(
     {"Camera:BandName": "Red edge", "Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}
 )
 GAIN = '<Item name="gain">4</Item>'
-CAMERA_GAIN = gdal(GAIN, '<Item name="exposure_ms">10</Item>')
+CAMERA_GAIN = gdal_tag(GAIN, '<Item name="exposure_ms">10</Item>')
 EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
 EXIF_OF_GDAL = "".join(
     f'<Item name="EXIF_{name}">{value}</Item>'
@@ -110,19 +108,27 @@ TIMES = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06]
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
 WHOLE = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
 SAID = [
-    ({"extratags": gdal(items("wavelength", NM))}, {"nm": NM, "notes": ()}),
+    ({"extratags": gdal_tag(gdal_items("wavelength", NM))}, {"nm": NM, "notes": ()}),
     (
-        {"extratags": gdal(items("wavelength", UM), items("wavelength_units", ["Micrometers"] * 6))},
+        {
+            "extratags": gdal_tag(
+                gdal_items("wavelength", UM), gdal_items("wavelength_units", ["Micrometers"] * 6)
+            )
+        },
         {"nm": WIDE_NM, "notes": ()},
     ),
-    ({"extratags": gdal(items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"'))}, {"nm": WIDE_NM}),
+    ({"extratags": gdal_tag(gdal_items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"'))}, {"nm": WIDE_NM}),
     (
-        {"extratags": gdal(items("DESCRIPTION", [f"B{n % 7} ({n} nm)" for n in NM], ' role="description"'))},
+        {
+            "extratags": gdal_tag(
+                gdal_items("DESCRIPTION", [f"B{n % 7} ({n} nm)" for n in NM], ' role="description"')
+            )
+        },
         {"nm": NM},
     ),
     (
         {
-            "extratags": gdal(
+            "extratags": gdal_tag(
                 *(f'<Item name="Band_{i}">{n} Nanometers</Item>' for i, n in enumerate(NM, start=1))
             )
         },
@@ -130,7 +136,7 @@ SAID = [
     ),
     (
         {
-            "extratags": gdal(
+            "extratags": gdal_tag(
                 *(
                     f'<Item name="{name}">{{{", ".join(map(str, numbers))}}}</Item>'
                     for name, numbers in WHOLE.items()
@@ -142,8 +148,9 @@ SAID = [
     (
         {
             "extratags": [
-                *gdal(
-                    items("OFFSET", [0] * 6, ' role="offset"'), items("SCALE", [1e-4] * 6, ' role="scale"')
+                *gdal_tag(
+                    gdal_items("OFFSET", [0] * 6, ' role="offset"'),
+                    gdal_items("SCALE", [1e-4] * 6, ' role="scale"'),
                 ),
                 (42113, "s", 0, "65535", True),
             ]
@@ -178,21 +185,25 @@ SAID = [
         {"warning": "red, green and blue are taken as light, as stored"},
     ),
     (
-        {"image": COLOURS, "photometric": "rgb", "extratags": gdal(items("wavelength", NM[:3]))},
+        {"image": COLOURS, "photometric": "rgb", "extratags": gdal_tag(gdal_items("wavelength", NM[:3]))},
         {"warnings": ()},
     ),
     ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
-    ({"extratags": gdal(EXIF_OF_GDAL)}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
-    ({"extratags": gdal(items("EXIF_ExposureTime", TIMES))}, {"exposure_s": TIMES, "gain": None}),
+    ({"extratags": gdal_tag(EXIF_OF_GDAL)}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
+    ({"extratags": gdal_tag(gdal_items("EXIF_ExposureTime", TIMES))}, {"exposure_s": TIMES, "gain": None}),
     ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
-    ({"extratags": gdal(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
-    ({"extratags": gdal(items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
+    ({"extratags": gdal_tag(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
+    ({"extratags": gdal_tag(gdal_items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
     (
-        {"extratags": gdal(items("gain", [4] * 6), '<Item name="exposure_ms">10</Item>')},
+        {"extratags": gdal_tag(gdal_items("gain", [4] * 6), '<Item name="exposure_ms">10</Item>')},
         {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None},  # not of the camera, too
     ),
     (
-        {"extratags": gdal(GAIN, items("SCALE", [3] * 6, ' role="scale"'), '<Item name="tint">10</Item>')},
+        {
+            "extratags": gdal_tag(
+                GAIN, gdal_items("SCALE", [3] * 6, ' role="scale"'), '<Item name="tint">10</Item>'
+            )
+        },
         {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0},
     ),
 ]
@@ -207,7 +218,7 @@ def test_what_tags_say_of_the_image_is_used(tmp_path, options, expected):
 def test_numbered_bands_of_gdal_go_by_their_numbers_from_1(tmp_path, first, nm):
     numbered = sorted(f'<Item name="Band_{first + i}">{400 + 10 * i} Nanometers</Item>' for i in range(12))
     assert ["Band_10" in item for item in numbered].index(True) < 3  # GDAL lists it before Band_2
-    file = written(tmp_path, np.tile(CUBE, (1, 1, 2)), extratags=gdal(*numbered))
+    file = written(tmp_path, np.tile(CUBE, (1, 1, 2)), extratags=gdal_tag(*numbered))
     check_file(file, nm=nm)
 
 
@@ -237,17 +248,6 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path, below):
         file.write(CUBE, photometric="minisblack", planarconfig="contig", metadata=None)
         file.write(PLANES[0, ::2, ::2], subfiletype=1, metadata=None)
     check_file(open_spectral_file(tmp_path / "a.tif"), values=CUBE, warning="left out: 1 of 35 x 25 x 3")
-
-
-@pytest.mark.parametrize("storage", STORAGE)
-@pytest.mark.parametrize("arrangement", ARRANGEMENTS)
-def test_a_file_that_is_cut_short_is_refused(tmp_path, arrangement, storage):
-    path = write(tmp_path / "cube.tif", arrangement, storage)
-    for share in (0.9, 0.5, 0.1, 0.001):
-        data = path.read_bytes()
-        path.write_bytes(data[: int(len(data) * share)])
-        with pytest.raises(CaptureError, match=r"cube.tif: "):
-            open_spectral_file(path).read()
 
 
 def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path):
