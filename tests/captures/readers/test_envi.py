@@ -86,63 +86,58 @@ data ignore value = 65535
     assert file.warnings == ("the header has no byte order; taken as little-endian",)
 
 
+UNIT = "wavelength units = "
+NO_UNIT = {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}
+RANGES = {"nm": NM, "fwhm": [20, 20, 40, 100], "evidence": "ranges with the unit um"}
+SAID: dict[str, dict[str, Any]] = {
+    "wavelength = {0.4, 0.5, 0.6, 2.5}": {"nm": [400, 500, 600, 2500], "evidence": "as micrometres"},
+    "wavelength = {400, 500, 600, 700}": NO_UNIT,
+    "wavelength = {400 500\n600\n700}": NO_UNIT,
+    f"{UNIT}Micrometers\nwavelength = {{.4,.5,.6,.7}}": {"nm": NM, "evidence": "Micrometers"},
+    "wavelength = {8, 9, 10, 11}": {"nm": [8000, 9000, 10_000, 11_000]},
+    f"{UNIT}um\nwavelength = {{1, 2, 3, 4}}": {"nm": [1000, 2000, 3000, 4000]},
+    "band names = {a (400 nm), b 500 nm, 600 nm, 700nm}": {"nm": NM, "evidence": "a (400 nm)"},
+    "band names = {0.4 um, 0.5 um, 0.6 um, 0.7 um}": {"nm": NM, "evidence": "unit um"},
+    "band names = {A (0.39-0.41 um), B (0.49-0.51 um), C (0.58-0.62 um), D (0.65-0.75 um)}": RANGES,
+    "band names = {Blue-390-410nm, 490\u2013510 nm, 580nm to 620nm, 0.65 - 0.75 um}": {"nm": NM},
+    "band names = {A 400±16 nm, B 500 +/- 9 nm, 600(+/-9)nm, 700 nm ± 9 nm}": {"nm": NM, "fwhm": None},
+    "band names = {2021-05-400nm, view-450-500nm, img_1-600nm, 0650-700 nm}": {"nm": NM},
+    "band names = {300-400nm, 301-500nm, 302-600nm, 303-700nm}": {"nm": NM, "fwhm": None},
+    "band names = {400, 500, 600, 700}": {"nm": NM, "evidence": "increase and are taken as nm"},
+    "band names = {520-450 nm, 600-530 nm, 680-610 nm, 760-690 nm}": {"nm": None},
+    "band names = {1 nm, 2 nm, 3 nm, 4 nm}": {"nm": None},
+    "band names = {Band 201, Band 202, Band 203, Band 204}": {"nm": None},
+    "band names = {a, b, c, d}": {"nm": None, "names": "abcd"},
+    "band names = {450 nm, 460 nm, red, 480 nm}": {"nm": None},
+    "data ignore value = -9999 ; none measured": {"no_data": (-9999,)},
+    "data ignore value = {-9999, 0}": {"no_data": (-9999, 0), "warnings": ()},
+    "data ignore value = unset": {"warning": "'data ignore value' is unset, no number: not used"},
+    "sensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}": {"nm": NM},
+}
+LEFT_OUT = {
+    "wavelength = {400, 500, 600}": "are left out: 3 for 4 bands",
+    "wavelength = {400, nan, 600, 700}": "that of band 1 (from 0) is nan",
+    "wavelength = {400, x, 600, 700}": "are not a list of numbers",
+    "wavelength = {1, 2, 3, 40}": "with no unit can't be brought to nm",
+    "wavelength = {1, 2, 3, 4}": "1 to 4 with no unit count the bands",
+    "wavelength = {0, 1, 2, 3}": "0 to 3 with no unit count the bands",
+    f"{UNIT}Index\nwavelength = {{1, 2, 3, 4}}": "unit 'Index' can't be",
+    f"{UNIT}Micrometers\nwavelength = {{400, 500, 600, 700}}": "can't be in Micrometers",
+    f"{UNIT}nm\nwavelength = {{.4, .5, .6, .7}}": "can't be in nm",
+}
+WIDTHS = "FWHM are left out: they would be"
+NO_WIDTHS = {
+    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.0055, .0055, .0055, .0055}}": WIDTHS,
+    f"{UNIT}Micrometers\nwavelength = {{.5, .51, .52, .53}}\nfwhm = {{5.5, 5.5, 5.5, 5.5}}": WIDTHS,
+}
+
+
 @pytest.mark.parametrize(
     ("entries", "expected"),
     [
-        ("wavelength = {0.4, 0.5, 0.6, 2.5}", {"nm": [400, 500, 600, 2500], "evidence": "as micrometres"}),
-        ("wavelength = {400, 500, 600, 700}", {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}),
-        ("wavelength = {400 500\n600\n700}", {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}),
-        ("wavelength units = Micrometers\nwavelength = {.4,.5,.6,.7}", {"nm": NM, "evidence": "Micrometers"}),
-        ("band names = {a (400 nm), b 500 nm, 600 nm, 700nm}", {"nm": NM, "evidence": "a (400 nm)"}),
-        ("band names = {0.4 um, 0.5 um, 0.6 um, 0.7 um}", {"nm": NM, "evidence": "unit um"}),
-        (
-            "band names = {A (0.39-0.41 um), B (0.49-0.51 um), C (0.58-0.62 um), D (0.65-0.75 um)}",
-            {"nm": NM, "fwhm": [20, 20, 40, 100], "evidence": "ranges with the unit um"},
-        ),
-        ("band names = {Blue-390-410nm, 490\u2013510 nm, 580nm to 620nm, 0.65 - 0.75 um}", {"nm": NM}),
-        ("band names = {A 400±16 nm, B 500 +/- 9 nm, 600(+/-9)nm, 700 nm ± 9 nm}", {"nm": NM, "fwhm": None}),
-        ("band names = {2021-05-400nm, view-450-500nm, img_1-600nm, 0650-700 nm}", {"nm": NM}),
-        ("band names = {300-400nm, 301-500nm, 302-600nm, 303-700nm}", {"nm": NM, "fwhm": None}),
-        ("band names = {520-450 nm, 600-530 nm, 680-610 nm, 760-690 nm}", {"nm": None}),
-        ("band names = {1 nm, 2 nm, 3 nm, 4 nm}", {"nm": None}),
-        ("band names = {400, 500, 600, 700}", {"nm": NM, "evidence": "increase and are taken as nm"}),
-        ("wavelength = {400, 500, 600}", {"nm": None, "warning": "are left out: 3 for 4 bands"}),
-        ("wavelength = {400, nan, 600, 700}", {"nm": None, "warning": "that of band 1 (from 0) is nan"}),
-        ("wavelength = {400, x, 600, 700}", {"nm": None, "warning": "are not a list of numbers"}),
-        (
-            "wavelength units = Index\nwavelength = {1, 2, 3, 4}",
-            {"nm": None, "warning": "unit 'Index' can't be"},
-        ),
-        (
-            "wavelength units = Micrometers\nwavelength = {400, 500, 600, 700}",
-            {"nm": None, "warning": "can't be in Micrometers"},
-        ),
-        ("wavelength units = nm\nwavelength = {.4, .5, .6, .7}", {"nm": None, "warning": "can't be in nm"}),
-        ("wavelength = {1, 2, 3, 40}", {"nm": None, "warning": "with no unit can't be brought to nm"}),
-        *(
-            (f"wavelength = {{{numbers}}}", {"nm": None, "warning": f"{said} with no unit count the bands"})
-            for numbers, said in (("1, 2, 3, 4", "1 to 4"), ("0, 1, 2, 3", "0 to 3"))
-        ),
-        ("wavelength = {8, 9, 10, 11}", {"nm": [8000, 9000, 10_000, 11_000]}),
-        ("wavelength units = um\nwavelength = {1, 2, 3, 4}", {"nm": [1000, 2000, 3000, 4000]}),
-        ("band names = {Band 201, Band 202, Band 203, Band 204}", {"nm": None}),
-        ("band names = {a, b, c, d}", {"nm": None, "names": "abcd"}),
-        ("band names = {450 nm, 460 nm, red, 480 nm}", {"nm": None}),
-        (
-            "wavelength = {500, 510, 520, 530}\nwavelength units = nm\nfwhm = {.0055, .0055, .0055, .0055}",
-            {"fwhm": None, "warning": "FWHM are left out: they would be"},
-        ),
-        (
-            "wavelength = {.5, .51, .52, .53}\nwavelength units = Micrometers\nfwhm = {5.5, 5.5, 5.5, 5.5}",
-            {"fwhm": None, "warning": "FWHM are left out: they would be"},
-        ),
-        ("data ignore value = -9999 ; none measured", {"no_data": (-9999,)}),
-        ("data ignore value = {-9999, 0}", {"no_data": (-9999, 0), "warnings": ()}),
-        ("data ignore value = unset", {"warning": "'data ignore value' is unset, no number: not used"}),
-        (
-            "wavelength = {400, 500, 600, 700}\nsensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}",
-            {"nm": NM},
-        ),
+        *SAID.items(),
+        *((text, {"nm": None, "warning": said}) for text, said in LEFT_OUT.items()),
+        *((text, {"fwhm": None, "warning": "FWHM are left out: they would be"}) for text in NO_WIDTHS),
     ],
 )
 def test_what_a_header_says_of_bands_is_used_or_left_out_with_a_reason(tmp_path, entries, expected):
@@ -306,8 +301,7 @@ def test_a_faulty_header_of_numbers_is_refused_and_not_read_as_that_of_a_quick_l
 def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, other):
     header = write_envi(tmp_path / "s.hdr", CUBE, "bil")
     (tmp_path / "s").rename(tmp_path / "s.spe")
-    np.save(tmp_path / "s.npy", CUBE[:2])
-    (tmp_path / "s.npy").rename(tmp_path / f"s{other}")
+    (tmp_path / f"s{other}").write_bytes(b"another kind of file")
     check_file(open_spectral_file(header), values=CUBE)
     with pytest.raises(CaptureError, match="would both be the view 's'"):
         find_cubes(tmp_path, ReadOptions())

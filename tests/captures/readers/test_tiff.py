@@ -92,90 +92,70 @@ def test_rows_as_pages_are_recognised_by_the_number_of_wavelengths_or_said(tmp_p
     check_file(file, values=CUBE.transpose(1, 0, 2))
 
 
-NM, WIDE_NM = np.arange(400, 460, 10).tolist(), np.arange(400, 1000, 100).tolist()
-UM = [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+def gdal(*entries: str, **options: Any) -> dict[str, Any]:
+    """Options that write GDAL's entries."""
+    return {"extratags": gdal_tag(*entries)} | options
+
+
+def whole(name: str, value: object) -> str:
+    """An entry of the whole file."""
+    return f'<Item name="{name}">{value}</Item>'
+
+
+def described(text: str) -> dict[str, Any]:
+    return {"description": text, "metadata": None}
+
+
+NM, WIDE_NM, UM = [*range(400, 460, 10)], [*range(400, 1000, 100)], [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
 PACKET = xmp_packet(
     {"Camera:BandName": "Red edge", "Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}
 )
-GAIN = '<Item name="gain">4</Item>'
-CAMERA_GAIN = gdal_tag(GAIN, '<Item name="exposure_ms">10</Item>')
-EXPOSED = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
-EXIF_OF_GDAL = "".join(
-    f'<Item name="EXIF_{name}">{value}</Item>'
-    for name, value in (("ExposureTime", "(0.25)"), ("ISOSpeedRatings", "200"), ("FNumber", "(2.8) "))
-)
+XMP = {"image": PLANES[0], "extratags": [(700, "B", len(PACKET), PACKET, True)], "metadata": None}
+EXIF = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
+EXIF_OF_GDAL = [
+    whole("EXIF_ExposureTime", "(0.25)"),
+    whole("EXIF_ISOSpeedRatings", 200),
+    whole("EXIF_FNumber", "(2.8) "),
+]
+EXPOSED = {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}
 TIMES = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06]
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
-WHOLE = {"wavelength": NM, "fwhm": [5, 5, 5, 5, 5, 6], "bbl": [1, 1, 0, 1, 1, 1]}
-SAID = [
-    ({"extratags": gdal_tag(gdal_items("wavelength", NM))}, {"nm": NM, "notes": ()}),
+WIDTHS, GOOD = [5, 5, 5, 5, 5, 6], [1, 1, 0, 1, 1, 1]
+PLACES = [(33550, "d", 3, (2.0, 2.0, 0.0)), (33922, "d", 6, (0.0, 0.0, 0.0, 5e5, 4.5e6, 0.0))]
+SCALE, OFFSET = (
+    gdal_items("SCALE", [1e-4] * 6, ' role="scale"'),
+    gdal_items("OFFSET", [0] * 6, ' role="offset"'),
+)
+NO_DATA = (42113, "s", 0, "65535", True)
+NAMED = gdal_items("DESCRIPTION", [f"B{nm % 7} ({nm} nm)" for nm in NM], ' role="description"')
+GAIN, TINT, TIME = whole("gain", 4), whole("tint", 10), whole("exposure_ms", 10)
+SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
+    (gdal(gdal_items("wavelength", NM)), {"nm": NM, "notes": ()}),
     (
-        {
-            "extratags": gdal_tag(
-                gdal_items("wavelength", UM), gdal_items("wavelength_units", ["Micrometers"] * 6)
-            )
-        },
-        {"nm": WIDE_NM, "notes": ()},
+        gdal(gdal_items("wavelength", UM), gdal_items("wavelength_units", ["Micrometers"] * 6)),
+        {"nm": WIDE_NM},
     ),
-    ({"extratags": gdal_tag(gdal_items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"'))}, {"nm": WIDE_NM}),
+    (gdal(gdal_items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"')), {"nm": WIDE_NM}),
+    (gdal(NAMED), {"nm": NM}),
+    (gdal(*(whole(f"Band_{i}", f"{nm} Nanometers") for i, nm in enumerate(NM, start=1))), {"nm": NM}),
     (
-        {
-            "extratags": gdal_tag(
-                gdal_items("DESCRIPTION", [f"B{n % 7} ({n} nm)" for n in NM], ' role="description"')
-            )
-        },
-        {"nm": NM},
+        gdal(whole("wavelength", NM), whole("fwhm", WIDTHS), whole("bbl", GOOD)),
+        {"nm": NM, "fwhm": WIDTHS, "bad": [2]},
     ),
-    (
-        {
-            "extratags": gdal_tag(
-                *(f'<Item name="Band_{i}">{n} Nanometers</Item>' for i, n in enumerate(NM, start=1))
-            )
-        },
-        {"nm": NM},
-    ),
-    (
-        {
-            "extratags": gdal_tag(
-                *(
-                    f'<Item name="{name}">{{{", ".join(map(str, numbers))}}}</Item>'
-                    for name, numbers in WHOLE.items()
-                )
-            )
-        },
-        {"nm": NM, "fwhm": WHOLE["fwhm"], "bad": [2]},
-    ),
-    (
-        {
-            "extratags": [
-                *gdal_tag(
-                    gdal_items("OFFSET", [0] * 6, ' role="offset"'),
-                    gdal_items("SCALE", [1e-4] * 6, ' role="scale"'),
-                ),
-                (42113, "s", 0, "65535", True),
-            ]
-        },
-        {"scale": 10000.0, "no_data": (65535,)},
-    ),
+    ({"extratags": [*gdal_tag(OFFSET, SCALE), NO_DATA]}, {"scale": 10000.0, "no_data": (65535,)}),
     *(
-        ({"description": description, "metadata": None}, {"nm": NM, "evidence": "image description"})
-        for description in (
+        (described(text), {"nm": NM, "evidence": "image description"})
+        for text in (
             json.dumps({"wavelengths_nm": NM}),
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
             "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
             "wavelength = {400, 410, 420, 430, 440, 450}",
         )
     ),
-    (
-        {"image": PLANES[0], "extratags": [(700, "B", len(PACKET), PACKET, True)], "metadata": None},
-        {"nm": [717], "fwhm": [10], "names": ["Red edge"]},
-    ),
+    (XMP, {"nm": [717], "fwhm": [10], "names": ["Red edge"]}),
     ({"extratags": [(274, "H", 1, 6, True)]}, {"orientation": 6, "values": CUBE}),  # which is not followed
     ({"extratags": [(274, "H", 1, 1, True)]}, {"orientation": None, "geo_reference": None}),
-    (
-        {"extratags": [(33550, "d", 3, (2.0, 2.0, 0.0)), (33922, "d", 6, (0.0, 0.0, 0.0, 5e5, 4.5e6, 0.0))]},
-        {"geo_reference": "GeoTIFF"},
-    ),
+    ({"extratags": PLACES}, {"geo_reference": "GeoTIFF"}),
     (
         {"image": OPAQUE, "photometric": "rgb", "extrasamples": ["unassalpha"]},
         {"values": OPAQUE, "warning": "marked as opacity"},
@@ -184,26 +164,16 @@ SAID = [
         {"image": COLOURS, "photometric": "rgb"},
         {"warning": "red, green and blue are taken as light, as stored"},
     ),
+    (gdal(gdal_items("wavelength", NM[:3]), image=COLOURS, photometric="rgb"), {"warnings": ()}),
+    ({"image": CUBE.astype("i2"), "extratags": EXIF}, EXPOSED),
+    (gdal(*EXIF_OF_GDAL), EXPOSED),
+    (gdal(gdal_items("EXIF_ExposureTime", TIMES)), {"exposure_s": TIMES, "gain": None}),
+    (gdal(GAIN, TIME), {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
+    (gdal(GAIN, whole("offset", 2)), {"calibrated": CUBE * 4.0 + 2}),
+    # A gain that is applied is not of the camera, too.
+    (gdal(gdal_items("gain", [4] * 6), TIME), {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None}),
     (
-        {"image": COLOURS, "photometric": "rgb", "extratags": gdal_tag(gdal_items("wavelength", NM[:3]))},
-        {"warnings": ()},
-    ),
-    ({"image": CUBE.astype("i2"), "extratags": EXPOSED}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
-    ({"extratags": gdal_tag(EXIF_OF_GDAL)}, {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}),
-    ({"extratags": gdal_tag(gdal_items("EXIF_ExposureTime", TIMES))}, {"exposure_s": TIMES, "gain": None}),
-    ({"extratags": CAMERA_GAIN}, {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
-    ({"extratags": gdal_tag(GAIN, '<Item name="offset">2</Item>')}, {"calibrated": CUBE * 4.0 + 2}),
-    ({"extratags": gdal_tag(gdal_items("gain", [4] * 6))}, {"calibrated": CUBE * 4.0}),
-    (
-        {"extratags": gdal_tag(gdal_items("gain", [4] * 6), '<Item name="exposure_ms">10</Item>')},
-        {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None},  # not of the camera, too
-    ),
-    (
-        {
-            "extratags": gdal_tag(
-                GAIN, gdal_items("SCALE", [3] * 6, ' role="scale"'), '<Item name="tint">10</Item>'
-            )
-        },
+        gdal(GAIN, gdal_items("SCALE", [3] * 6, ' role="scale"'), TINT),
         {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0},
     ),
 ]
