@@ -202,43 +202,38 @@ def compare_exposures(
         is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
         may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
     """
+    files = (*views, *whites)
     known, of_whites = (
-        [exposure for file in files if (exposure := exposure_of(file)) is not None]
-        for files in (views, whites)
+        [e for file in some if (e := exposure_of(file)) is not None] for some in (views, whites)
     )
     differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
-    apertures = {"f_number" in file.metadata for file in (*views, *whites) if exposure_of(file) is not None}
+    apertures = {"f_number" in file.metadata for file in files if exposure_of(file) is not None}
     unit = "s times gain over the square of the f-number" if True in apertures else "s times gain"
     taken = f"were exposed {_in_words(known)} {unit}" if known else ""
     finished = [finished_by(file, by_name=not whites) for file in views]
     if None not in finished and not is_bent:
-        if not differs:
-            return Exposures()
         kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
-        return Exposures(notes=(f"views {taken}: {kept}",))
-    warnings, misfits = _missing_units([*views, *whites]), _misfits(views, whites)
-    warnings += misfits
+        return Exposures(notes=(f"views {taken}: {kept}",) if differs else ())
+    misfits = _misfits(views, whites)
+    warnings, why = [*_missing_units(files), *misfits], None
     if len(known) < len(views):
-        missing = (
-            f"{counted(len(views) - len(known), 'view')} without exposure time: exposures are not compared"
-        )
+        missing = counted(len(views) - len(known), "view")
         is_partial = bool(known or of_whites) and not misfits
-        return Exposures(warnings=(*warnings, missing) if is_partial else tuple(warnings))
-    if len(apertures) > 1:
-        lacking = [file.path.name for file in (*views, *whites) if "f_number" not in file.metadata]
-        unknown = f"the f-number of the lens is known of some files and not of {name_some(lacking)}"
-        return Exposures(
-            warnings=(*warnings, f"{unknown}: exposures are not compared; write it into all, or none")
-        )
-    if is_bent:
-        bent = f"pictures {taken}, which can't be undone as cameras bend the brightness of pictures: fix the exposure"
-        return Exposures(warnings=(*warnings, bent) if differs else tuple(warnings))
-    if may_be_finished and differs and not (whites or darks):
-        kept = (
+        why = f"{missing} without exposure time: exposures are not compared" * is_partial
+    elif len(apertures) > 1:
+        lacking = name_some([file.path.name for file in files if "f_number" not in file.metadata])
+        unknown = f"the f-number of the lens is known of some files and not of {lacking}"
+        why = f"{unknown}: exposures are not compared; write it into all, or none"
+    elif is_bent:
+        bent = "which can't be undone as cameras bend the brightness of pictures: fix the exposure"
+        why = f"pictures {taken}, {bent}" * differs
+    elif may_be_finished and differs and not (whites or darks):
+        why = (
             f"views {taken}: values are not divided by that, as they are at most about 1 and taken for reflectances. "
             "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
         )
-        return Exposures(warnings=(*warnings, kept))
+    if why is not None:
+        return Exposures(warnings=(*warnings, *filter(None, [why])))
     if len(of_whites) < len(whites) and differs and not misfits:
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
@@ -251,14 +246,11 @@ def compare_exposures(
             f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}: dark current "
             "grows with exposure, so take a dark frame at each"
         )
-    common, of_whom = np.median(known[0], keepdims=True), "that of the first view"
+    common, of_whom = np.median(known[0], keepdims=True), "the first view"
     if of_whites:
-        common, of_whom = (
-            of_whites[0],
-            "that of the white reference" if len(whites) == 1 else "that of its white reference",
-        )
+        common, of_whom = of_whites[0], f"{'the' if len(whites) == 1 else 'its'} white reference"
     is_same = len({tuple(exposure) for exposure in [*known, *of_whites, common]}) == 1
-    brought = f"views {taken}: each is brought to {of_whom}, {_in_words(of_whites or [common])}"
+    brought = f"views {taken}: each is brought to that of {of_whom}, {_in_words(of_whites or [common])}"
     return Exposures(common, () if is_same else (brought,), tuple(warnings))
 
 
@@ -275,25 +267,22 @@ def _in_words(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
 
 def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> list[str]:
     """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
-    stated = {
-        repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in (*views, *whites)
-    }
+    files = (*views, *whites)
+    stated = {repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in files}
     if whites and len(stated) == 1:
         return []
-    found = []
-    for file in (*views, *whites):
-        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")} - {
-            1,
-            file.shape[2],
-        }
-        if sizes and "exposure_s" in file.metadata:
-            found.append((file.path.name, max(sizes), file.shape[2]))
+    found: dict[str, tuple[int, int]] = {}
+    for file in files:
+        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")}
+        if (odd := sizes - {1, file.shape[2]}) and "exposure_s" in file.metadata:
+            found[file.path.name] = max(odd), file.shape[2]
     if not found:
         return []
-    names, numbers = name_some([name for name, *_ in found]), sorted({size for _, size, _ in found})
-    what = f"{' or '.join(map(str, numbers))} exposure times or gains for {counted(found[0][2], 'band')}"
-    said = f"{names}: {what}: exposures may differ and were not compared"
-    return [f"{said}. Give one number, or one a band, with points as decimal marks"]
+    numbers = " or ".join(str(size) for size in sorted({size for size, _ in found.values()}))
+    bands = counted(next(iter(found.values()))[1], "band")
+    said = f"{name_some([*found])}: {numbers} exposure times or gains for {bands}"
+    advice = "Give one number, or one a band, with points as decimal marks"
+    return [f"{said}: exposures may differ and were not compared. {advice}"]
 
 
 def _missing_units(files: Iterable[SpectralFile]) -> list[str]:

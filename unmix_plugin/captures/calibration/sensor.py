@@ -256,14 +256,10 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
             "with --wavelengths"
         )
-    choice = _BandChoice(wavelengths, {})
     marks = [one.bands.bad for one in files if one.bands.bad is not None]
-    if marks:
-        choice = choice.without(np.any(marks, axis=0), "marked as bad in the file")
-    if file.bands.fwhm_nm is not None:
-        broad = file.bands.is_broad
-        choice = choice.without(broad, f"wider than {MOST_WIDTH:.0%} of its wavelength: too broad for one")
-    choice = choice.without_repeated()
+    choice = _BandChoice(wavelengths, {}).without(np.any(marks, axis=0), "marked as bad in the file")
+    broad = f"wider than {MOST_WIDTH:.0%} of its wavelength: too broad for one"
+    choice = choice.without(file.bands.is_broad, broad).without_repeated()
     if options.drop_bands is not None:
         choice = choice.without(in_ranges(options.drop_bands, wavelengths), "named in --drop-bands")
     return choice
@@ -302,8 +298,10 @@ def _evidence(
         {"band": band, "wavelength_nm": float(choice.wavelengths_nm[band]), "reason": reason}
         for band, reason in sorted(choice.dropped.items())
     ]
-    models = [(view.name, radiometric_model(view.cube)) for view in views]
-    light = {name: model.irradiance for name, model in models if model and model.irradiance is not None}
+    models = {view.name: radiometric_model(view.cube) for view in views}
+    light = {
+        name: model.irradiance for name, model in models.items() if model and model.irradiance is not None
+    }
     return found | ({"irradiance": light} if light else {})
 
 
@@ -436,8 +434,8 @@ def _drop_found(choice: _BandChoice, sample: _Sample, max_noise: float, notes: l
         is_noisy[:] = False
     # The first reason that is found counts.
     reasons = {int(kept[i]): f"noise is {noise[i]:.0%} of the signal" for i in np.flatnonzero(is_noisy)}
-    many = f"saturated in more than {_MOST_SATURATED:.0%} of sampled pixels"
-    reasons |= dict.fromkeys(kept[is_saturated].tolist(), many)
+    often = f"saturated in more than {_MOST_SATURATED:.0%} of sampled pixels"
+    reasons |= dict.fromkeys(kept[is_saturated].tolist(), often)
     reasons |= dict.fromkeys(kept[is_dead].tolist(), "dead: the same value in every sampled pixel")
     return _BandChoice(choice.wavelengths_nm, reasons | choice.dropped)
 
