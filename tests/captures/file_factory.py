@@ -160,7 +160,7 @@ def rows_and_bands_of(file: SpectralFile, values: np.ndarray) -> None:
     assert (file.shape, file.dtype.newbyteorder("=")) == (values.shape, values.dtype.newbyteorder("="))
     np.testing.assert_array_equal(file.read(), values)
     assert file.read().dtype == values.dtype.newbyteorder("=")
-    for some, bands in ((slice(2, rows - 1, 2), np.array([last, 0, last])), (slice(-2, None), slice(1, 3))):
+    for some, bands in ((slice(2, rows - 1), np.array([last, 0, last])), (slice(-2, None), slice(1, 3))):
         np.testing.assert_array_equal(file.read(some, bands), values[some][..., bands])
     np.testing.assert_array_equal(file.read(slice(1, 1)), values[1:1])
 

@@ -175,8 +175,8 @@ def test_radiance_is_that_of_a_calculation_by_hand(
     radiance = model.apply(file.read().astype(np.float64), slice(None))
     expected = [[by_hand(int(pixels[y, x]), x, y) for x in range(SIZE[1])] for y in range(SIZE[0])]
     np.testing.assert_allclose(radiance[..., 0], expected, rtol=1e-5)
-    for rows in (slice(7, 19), slice(3, 30, 5)):
-        np.testing.assert_array_equal(model.apply(file.read(rows).astype(np.float64), rows), radiance[rows])
+    rows = slice(7, 19)
+    np.testing.assert_array_equal(model.apply(file.read(rows).astype(np.float64), rows), radiance[rows])
     assert (model.unit, model.irradiance) == (unit, irradiance and pytest.approx(irradiance))
     assert model.maker in model.description
 

@@ -25,10 +25,10 @@ from tests.captures.capture_factory import (
 from tests.captures.file_factory import present
 from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
-from unmix_plugin.captures.header_values import parse_wavelengths
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import ReadOptions
+from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.captures.file_factory import file_of, present
-from unmix_plugin.captures.exposures import exposure_of
+from unmix_plugin.captures.calibration.calibration import exposure_of
 from unmix_plugin.captures.readers.band_files import stack_bands
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile, linear_values
 from unmix_plugin.errors import CaptureError
@@ -99,5 +99,5 @@ def test_bands_that_are_not_there_are_an_index_error():
     values = np.random.default_rng(0).random((5, 7, 4))
     with pytest.raises(IndexError):
         file_of(values).read(bands=np.array([4]))
-    some = file_of(values).read(slice(0, 5, 2), slice(None, None, -1))
-    np.testing.assert_array_equal(some, values[::2, :, ::-1])
+    some = file_of(values).read(slice(1, 4), slice(None, None, -1))
+    np.testing.assert_array_equal(some, values[1:4, :, ::-1])

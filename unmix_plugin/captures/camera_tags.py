@@ -23,8 +23,8 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int
 
-from unmix_plugin.captures.header_values import PLUS_MINUS
 from unmix_plugin.captures.spectral_file import BandTable, SpectralFile
+from unmix_plugin.captures.wavelengths import PLUS_MINUS
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.limits import DEEPEST
 
@@ -206,7 +206,7 @@ class _RadiometricModel:
 
     def apply(self, values: Float[np.ndarray, "h W b"], rows: slice) -> Float32[np.ndarray, "h W b"]:
         """Radiance of stored numbers of some rows; a little below 0 where noise goes below the black level."""
-        y = (rows.start or 0) + (rows.step or 1) * np.arange(len(values))
+        y = (rows.start or 0) + np.arange(len(values))
         factor = self.factor_of(y[:, None], np.arange(values.shape[1])[None, :])
         return ((values - self.black_level) * factor[..., None]).astype(np.float32)
 

@@ -1,17 +1,17 @@
-"""What headers say of bands and of what numbers stand for, under many names and in many units; wavelengths also as a
-user writes them and in the names of bands, channels and files.
+"""What headers say of bands, of what numbers stand for, and of exposures, under many names and in many units.
 
 Every reader brings what a file says to *entries*: texts (of lists with commas), numbers or lists by name, in any case,
-with spaces or `_`. `state_bands` and `state_linear` look them up by one table of names; `check_bands` converts and
-checks. What is left out, and why, is appended to the reader's list of warnings.
+with spaces or `_`. `state_bands`, `state_linear` and `exposure_facts` look them up by one table of names; `check_bands`
+converts and checks. What is left out, and why, is appended to the reader's list of warnings.
+
+Specim writes `tint = 10.5` (milliseconds), others `integration time = 5 ms`, `exposure_us = 8000`, `Exposure Time (s)`.
+Only ratios between files count, so a missing unit matters only where some files have one.
 
 Notation: `B` bands; wavelengths in nm.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
-from unmix_plugin.captures.names import common_length
 from unmix_plugin.captures.spectral_file import BandTable, Linear, linear_values
-from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError
-from unmix_plugin.limits import read_bounded
-from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit, require_nanometres
+from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
+from unmix_plugin.errors import CaptureError
+from unmix_plugin.spectral.bands import are_band_numbers, nm_per_unit
 
 _CENTRES = re.compile(
     r"list_cw_[^_]*|bands|"
@@ -38,29 +36,6 @@ _UNIT_NAMES = ("{}_units", "{}_unit", "wavelength_units", "wavelength_unit")
 """Of wavelengths whose name is put in."""
 _DIVISOR = "reflectance_scale_factor"
 """Stored number of full reflectance, under the same name everywhere."""
-_DIGITS = r"\d+(?:[.,]\d+)?"
-_UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
-PLUS_MINUS = r"(?:±|\+ ?/? ?-)"
-"""Before half of a width, or how far a centre may be off."""
-_NUMBER = re.compile(rf"(?<![\d.,])({_DIGITS})")
-_WITH_UNIT = re.compile(rf"{_NUMBER.pattern}[ _-]?({_UNIT})", re.I)
-_AROUND = re.compile(
-    rf"{_NUMBER.pattern}(?:[ _-]?({_UNIT}))? ?\(? ?{PLUS_MINUS} ?{_DIGITS} ?\)?(?:[ _-]?({_UNIT}))?", re.I
-)
-_RANGE = re.compile(
-    rf"(?<![\d.,])({_DIGITS})(?:[ _]?{_UNIT})? ?(?:[-\u2013\u2014]|to) ?({_DIGITS})[ _-]?({_UNIT})", re.I
-)
-_WIDEST_RANGE = 3.0
-"""Greater over smaller end; a number farther from the one behind it counts files or is a date."""
-_THOUSANDS = re.compile(r"[1-9]\d?\d?,\d{3}")
-_LONGEST_NAME = 1000
-"""Longer texts are no names, and looking for counters in them takes long."""
-_COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
-"""What precedes a number that counts instead of measuring."""
-_USUAL_NM = (200.0, 3000.0)
-"""What a number without a unit must lie in to be taken for nm."""
-PLAUSIBLE_NM = (100.0, 30_000.0)
-"""Range of cameras, from the far ultraviolet to the thermal infrared."""
 _LEAST_WIDTH_NM = 0.05
 """Widths below this are in another unit than the wavelengths, as are those wider than these."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
@@ -322,182 +297,136 @@ def _nm_per_stated(values: np.ndarray, used: np.ndarray, stated: StatedBands) ->
     return factor, evidence
 
 
-def wavelengths_in_names(
-    names: Sequence[str],
-) -> tuple[Float64[np.ndarray, " B"], str, Float64[np.ndarray, " B"] | None] | None:
-    """Wavelengths out of names that each carry one: with a unit, or plain numbers that increase and can be nm.
+# Exposure time and gain.
 
-    Returns:
-        Centres in nm, with which unit or why they are taken for nm, and widths in nm where all names are ranges.
+_TIMES = {
+    "tint": 1e-3,
+    **dict.fromkeys(
+        ("integrationtime", "inttime", "exposure", "exposuretime", "shutter", "shuttertime"), 1e-3
+    ),
+    **dict.fromkeys(("exptime", "shutterspeed", "exifexposuretime"), 1.0),
+}
+"""Names of a time, and what a number without unit is in seconds: OpenEXR's expTime and EXIF's are in seconds."""
+_FACTS = {
+    **dict.fromkeys(_TIMES, "exposure_s"),
+    "gain": "gain",
+    "analoggain": "analog",
+    "analoguegain": "analog",
+    "digitalgain": "digital",
+    **dict.fromkeys(("exifisospeedratings", "exifisospeed"), "speed"),
+    "exiffnumber": "f_number",
+}
+"""What names say. A plain gain is the whole one; the others multiply each other."""
+_OF_EXIF = ("speed", "f_number")
+"""Facts that count beside a time, and are left out where they make no sense."""
+_OWNERS = ("camera", "sensor", "detector", "imager")
+"""Words before a name that change nothing."""
+_SECONDS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "msecs", "millisecond", "milliseconds"), 1e-3),
+    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "microsecond", "microseconds"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), 1e-9),
+}
+_LONGEST_VALUE = 64
+_MOST_DB = 200.0
+_VALUE = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?:/(\d+(?:\.\d*)?))?\s*([^\W\d]*)", re.I)
+"""`20`, `20 ms`, `1/50 s`."""
 
-    >>> wavelengths_in_names(["red 0.66 um", "red edge 0.705 um"])
-    (array([660., 705.]), 'with the unit um', None)
-    >>> wavelengths_in_names(["Blue (0.45-0.52 um)", "Red (0.63-0.69 um)"])
-    (array([485., 660.]), 'ranges with the unit um', array([70., 60.]))
-    >>> wavelengths_in_names(["Blue 450±16 nm", "NIR 840±26 nm"])[0]
-    array([450., 840.])
-    >>> wavelengths_in_names(["Band 1", "Band 2"])
+
+def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) -> dict[str, Any]:
+    """What entries of a file say of its exposure: metadata `exposure_s`, `gain` and `f_number`, and `exposure_evidence`
+    and `gain_evidence`, as far as they are known.
+
+    Args:
+        entries: Texts, numbers or lists (one number a band) by name; EXIF's begin with that word.
+        where: What they are, for people: `header field`.
+        warnings: What is not understood is appended.
+
+    >>> exposure_facts({"tint": "20"}, "header field", [])["exposure_s"]
+    0.02
+    >>> exposure_facts({"Exposure Time (us)": "500"}, "header field", [])["exposure_s"]
+    0.0005
     """
-    if not names or max(map(len, names)) > _LONGEST_NAME:
-        return None
-    ranges = [_ranges(name) for name in names]
-    steps = np.diff([found[0][0] for found in ranges]) if all(len(found) == 1 for found in ranges) else ()
-    # Equal or one apart, what stands before the hyphen is a date or counts.
-    if len(steps) and np.isin(np.round(steps, 6), (0.0, 1.0)).all():
-        ranges = [[] for _ in names]
-    stated = [_with_unit(name, found) for name, found in zip(names, ranges, strict=True)]
-    known = [one for one in stated if one is not None]
-    if len(known) == len(names):
-        centres, widths, units = zip(*known, strict=True)
-        fwhm = None if None in widths else np.array(widths)
-        return np.array(centres), f"{'' if fwhm is None else 'ranges '}with the unit {units[0]}", fwhm
-    plain = _varying_numbers(names)
-    if any(len(found) != 1 for found in plain):
-        return None
-    centres = np.array([float(found[0].replace(",", ".")) for found in plain])
-    low, high = _USUAL_NM
-    if (np.diff(centres) <= 0).any() or centres[0] < low or centres[-1] > high:
-        return None
-    return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm", None
-
-
-def _with_unit(
-    name: str, ranges: Sequence[tuple[float, float, str]]
-) -> tuple[float, float | None, str] | None:
-    """Centre and, of a range, width in nm, and the unit; None where a name has none or several, or what can't be."""
-    around = [(text, before or after) for text, before, after in _AROUND.findall(name) if before or after]
-    if not around and len(ranges) == 1:
-        low, high, unit = ranges[0]
-        return (round((low + high) / 2, 6), round(high - low, 6), unit) if low < high else None
-    found = around or _WITH_UNIT.findall(name)
-    centre = _nm(*found[0]) if len(found) == 1 else None
-    return None if centre is None else (centre, None, found[0][1])
-
-
-def _ranges(name: str) -> list[tuple[float, float, str]]:
-    """First and last wavelength in nm, and the unit, of each `450-520 nm` in a name."""
-    found = []
-    for match in _RANGE.finditer(name):
-        first, last = _nm(match[1], match[3]), _nm(match[2], match[3])
-        counts = _COUNTER.search(name, 0, match.start()) or re.match(r"0\d", match[1])
-        if first and last and not counts and max(first, last) <= _WIDEST_RANGE * min(first, last):
-            found.append((first, last, match[3]))
-    return found
-
-
-def _nm(text: str, unit: str) -> float | None:
-    """A number with its unit in nm; a comma parts thousands only where it can't be a decimal mark. None for what no
-    camera sees.
-
-    >>> _nm("0,450", "um"), _nm("1,002", "nm"), _nm("16", "nm")
-    (450.0, 1002.0, None)
-    """
-    texts = [text.replace(",", "."), text.replace(",", "") if _THOUSANDS.fullmatch(text) else "nan"]
-    values = [round(float(one) * (nm_per_unit(unit) or 1.0), 6) for one in texts]
-    return next((nm for nm in values if PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]), None)
-
-
-def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
-    """Of each name the numbers outside of what all names begin with and end in, except counters."""
-
-    begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
-    backwards = [name[::-1] for name in names]
-    end = len(backwards[0][: common_length(backwards)].rstrip("0123456789.,"))
-    return [
-        [
-            match[1]
-            for match in _NUMBER.finditer(name)
-            if begin <= match.start() and match.end() <= len(name) - end
-            if not _COUNTER.search(name, 0, match.start())
-        ]
-        for name in names
-    ]
-
-
-def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
-    """Band centres in nm from a list `620,555,503`, or from the column `wavelength` of a CSV file.
-
-    A file may also hold one bare number a line, or one line of numbers. Raises ConfigError: no such file, no numbers,
-    or numbers that are not wavelengths in nm.
-    """
-    try:
-        values = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        values = None
-    try:
-        if values is None:
-            values = np.array([float(word) for word in _read_words(Path(text))])
-    except ValueError as error:
-        raise ConfigError(
-            f"--wavelengths {text}: {error}; expected numbers in nm, such as 620,555,503, or a CSV file with a "
-            "column 'wavelength'"
-        ) from error
-    if not len(values):
-        raise ConfigError(f"--wavelengths {text} holds no numbers; expected band centres in nm")
-    if not np.isfinite(values).all():
-        raise ConfigError(f"--wavelengths {text} holds NaN or infinity; expected band centres in nm")
-    try:
-        require_nanometres(values)
-    except SpectrumError as error:
-        raise ConfigError(f"--wavelengths {text}: {error}") from error
-    return values
-
-
-def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
-    """Which bands a text such as `1350-1450,1900` names; a single wavelength names the nearest band.
-
-    Raises:
-        ConfigError: the text is not such a list, or a part of it names no band.
-
-    >>> in_ranges("500-600,700", np.array([450.0, 550.0, 650.0, 710.0]))
-    array([False,  True, False,  True])
-    """
-    named = np.zeros(len(wavelengths_nm), bool)
-    low, high = wavelengths_nm.min(), wavelengths_nm.max()
-    for part in text.split(","):
-        try:
-            ends = [float(word) for word in part.strip().split("-")]
-        except ValueError:
-            ends = []
-        if len(ends) not in (1, 2):
-            raise ConfigError(
-                f"--drop-bands {text}: '{part}' is not a wavelength or range; expected 1350-1450,1900"
-            )
-        if len(ends) == 1 and low <= ends[0] <= high:
-            found = np.zeros(len(named), bool)
-            found[np.argmin(np.abs(wavelengths_nm - ends[0]))] = True
+    found: dict[str, tuple[Any, str]] = {}
+    named = {name: _split(name) for name in entries}
+    units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
+    for key, (name, unit) in named.items():
+        what = _FACTS.get(name)
+        if what is None or unit == "unit":
+            continue
+        stated: Any = entries[key]  # one, or one a band
+        if isinstance(stated, str):
+            items = [item for item in re.split(r"[,;{}\[\]()]+", stated) if item.strip()]
         else:
-            found = (wavelengths_nm >= ends[0]) & (wavelengths_nm <= ends[-1])
-        if not found.any():
-            raise ConfigError(
-                f"--drop-bands {text}: no band in '{part.strip()}' nm; the bands lie at {low:g} to {high:g} nm"
-            )
-        named |= found
-    return named
+            items = [str(item) for item in np.asarray(stated).reshape(-1).tolist()]
+        values = [_quantity(item, unit or units.get(name, ""), name) for item in items]
+        known = [value for value in values if value is not None]
+        if what in _OF_EXIF and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
+            continue
+        if not known or len(known) < len(values):
+            said = f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood"
+            warnings.append(f"{said}: exposures may differ")
+        elif what not in found:
+            numbers = [number for number, _ in known]
+            has_unit = name.startswith("exif") or all(has_unit for _, has_unit in known)
+            taken = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if name in _TIMES else "a factor"
+            evidence = f"{where} '{key}'" + ("" if has_unit else f", no unit: taken as {taken}")
+            found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, evidence
+    return _combined(found, warnings)
 
 
-def _read_words(path: Path) -> list[str]:
-    try:
-        with io.TextIOWrapper(io.BytesIO(read_bounded(path)), "utf-8-sig", newline="") as file:
-            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(
-            f"--wavelengths {path}: neither a list of numbers, such as 620,555,503, nor a CSV file ({reason})"
-        ) from error
-    if not rows:
-        raise ConfigError(f"--wavelengths {path} is empty; expected a column 'wavelength'")
-    heads = [cell.lower() for cell in rows[0]]
-    column = next((i for i, cell in enumerate(heads) if cell.startswith("wavelength")), None)
-    columns = 1 if column is None else len(heads)
-    longer = next((row for row in rows if any(row[columns:])), None)
-    if longer is not None and (column is not None or len(rows) > 1):
-        expected = f"{columns}, as in the header, and a point as the decimal mark"
-        if column is None:
-            expected = "one number with a decimal point, or a header that names the column 'wavelength'"
-        raise ConfigError(
-            f"--wavelengths {path}: the line '{','.join(longer)[:40]}' has {len(longer)} cells; expected {expected}"
-        )
-    if column is not None:
-        return [row[column] if column < len(row) else "" for row in rows[1:]]
-    return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]
+def _combined(found: Mapping[str, tuple[Any, str]], warnings: list[str]) -> dict[str, Any]:
+    """Metadata of what was found, with one gain: EXIF's speed beside a time, the whole one, or the product of parts."""
+    facts: dict[str, Any] = {}
+    if "exposure_s" in found:
+        facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
+        facts |= {"f_number": found["f_number"][0]} if "f_number" in found else {}
+    wholes = (["speed"] if "exposure_s" in found else []) + ["gain"]
+    parts = [name for name in wholes if name in found][:1]
+    if parts := parts or [name for name in ("analog", "digital") if name in found]:
+        numbers, evidence = zip(*(found[name] for name in parts), strict=True)
+        if len({np.size(number) for number in numbers} - {1}) > 1:
+            warnings.append(f"{' and '.join(evidence)} are lists of different lengths: exposures may differ")
+        else:
+            facts["gain"] = np.multiply.reduce(np.broadcast_arrays(*numbers)).tolist()
+            facts["gain_evidence"] = " and ".join(evidence)
+    return facts
+
+
+def is_exposure(name: str) -> bool:
+    """Whether an entry of this name says something of the exposure."""
+    return _split(name)[0] in _FACTS
+
+
+def _split(key: str) -> tuple[str, str]:
+    """A name without what owns it, and the unit that it ends with.
+
+    >>> _split("Integration_Time [ms]"), _split("camera gain"), _split("exposure time units")
+    (('integrationtime', 'ms'), ('gain', ''), ('exposuretime', 'unit'))
+    """
+    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", key).lower())
+    unit = ""
+    if len(words) > 1 and (words[-1] in _SECONDS or words[-1] in ("unit", "units", "db")):
+        unit = words.pop().replace("units", "unit")
+    while len(words) > 1 and words[0] in _OWNERS:
+        words.pop(0)
+    return "".join(words), unit
+
+
+def _quantity(text: str, unit: str, name: str) -> tuple[float, bool] | None:
+    """A time in seconds, a gain as a factor or an f-number, and whether a unit was there; None for anything else."""
+    match = _VALUE.fullmatch(text.strip()) if len(text) <= _LONGEST_VALUE else None
+    if match is None:
+        return None
+    number = float(match[1]) / float(match[2] or 1) if float(match[2] or 1) else np.nan
+    unit = (match[3] or unit).strip().lower()
+    if name in _TIMES:
+        factor = _SECONDS.get(unit, None if unit else _TIMES[name])
+        return None if factor is None or not number > 0 else (float(f"{number * factor:.12g}"), bool(unit))
+    if unit == "db":
+        return (10.0 ** (number / 20.0), True) if abs(number) <= _MOST_DB else None
+    if unit or not number >= 0:
+        return None
+    if _FACTS[name] in _OF_EXIF:
+        return (number / 100 if _FACTS[name] == "speed" else number), True
+    return number or 1.0, False  # a gain of 0 without a unit can only be in decibels

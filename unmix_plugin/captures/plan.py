@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from unmix_plugin import __version__
+from unmix_plugin.captures.calibration.calibration import compare_exposures, exposure_of
 from unmix_plugin.captures.calibration.references import is_srgb
 from unmix_plugin.captures.calibration.sensor import (
     BRIGHT_PERCENTILE,
@@ -22,7 +23,6 @@ from unmix_plugin.captures.calibration.sensor import (
     sampled_rows,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.exposures import compare_exposures, exposure_of
 from unmix_plugin.captures.options import MaskKind, ProcessOptions, plain_options
 from unmix_plugin.captures.poses.pose_set import reading
 from unmix_plugin.captures.spectral_file import Capture, CaptureView, SpectralFile

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.calibration.calibration import Resampling
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
-from unmix_plugin.captures.header_values import parse_wavelengths
 from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
 from unmix_plugin.captures.poses.lens import Lens
@@ -34,6 +32,8 @@ from unmix_plugin.captures.spectral_file import (
     SpectralFile,
     require_comparable,
 )
+from unmix_plugin.captures.wavelengths import parse_wavelengths
+from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.captures.writing.scene_files import RECORD_NAME, write_scene_files
 from unmix_plugin.captures.writing.view_files import ViewRecord, write_view
 from unmix_plugin.engine.runs.atomic_files import (

@@ -28,7 +28,7 @@ Axes: TypeAlias = Literal["yxb", "byx", "ybx", "xyb", "bxy", "xby"]
 BandIndex: TypeAlias = slice | Int[np.ndarray, " b"]
 """Some bands: a slice, or their indices in any order."""
 _ReadPart: TypeAlias = Callable[[slice, BandIndex], Shaped[np.ndarray, "h W b"]]
-"""Stored numbers of some rows and bands."""
+"""Stored numbers of some rows, and of bands in rising order; slices have both ends and no step."""
 _MissingPart: TypeAlias = Callable[[slice, BandIndex], Bool[np.ndarray, "h W"]]
 """Pixels of some rows without a measurement in one of some bands."""
 
@@ -179,31 +179,31 @@ class SpectralFile:
         """Stored numbers of some rows and bands, in the machine's byte order.
 
         Args:
-            rows: With a step of at least 1.
+            rows: One after the other.
             bands: A slice, or indices in any order; negative ones count from the last band.
         Raises:
             CaptureError: the file is cut short or can't be read.
             IndexError: there is no such band.
         """
         height, width, num_bands = self.shape
-        rows = slice(*rows.indices(height))
-        if isinstance(bands, slice) and (bands.step is None or bands.step > 0):
-            bands = slice(*bands.indices(num_bands))
-        else:
-            bands = np.arange(num_bands)[bands]
-        if rows.step < 1:
-            raise IndexError(f"rows are read from the top down; got the step {rows.step}")
-        wanted = (len(range(height)[rows]), width, len(np.arange(num_bands)[bands]))
+        first, last, _ = rows.indices(height)
+        indices = np.arange(num_bands)[bands]
+        rising, order = np.unique(indices, return_inverse=True)
+        wanted = (max(0, last - first), width, len(rising))
         if 0 in wanted:
-            return np.zeros(wanted, self.dtype.newbyteorder("="))
+            return np.zeros((wanted[0], width, len(indices)), self.dtype.newbyteorder("="))
+        is_slice = len(rising) == len(indices) == rising[-1] - rising[0] + 1
         try:
-            values = self.read_part(rows, bands)
+            values = self.read_part(
+                slice(first, last), slice(rising[0], rising[-1] + 1) if is_slice else rising
+            )
         except CaptureError:
             raise
         except Exception as error:
             raise unreadable(self.path, error) from error
         if values.shape != wanted:
             raise CaptureError(f"{self.path}: reading gave an array of {values.shape}; expected {wanted}")
+        values = values if np.array_equal(rising, indices) else values[..., order]
         return np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("="))
 
     @property
@@ -215,9 +215,7 @@ class SpectralFile:
         return replace(
             self,
             shape=(self.dark_lines, *self.shape[1:]),
-            read_part=lambda rows, bands: self.read_part(
-                slice(begin + rows.start, begin + rows.stop, rows.step), bands
-            ),
+            read_part=lambda rows, bands: self.read_part(slice(begin + rows.start, begin + rows.stop), bands),
             dark_lines=0,
             missing_part=None,
         )

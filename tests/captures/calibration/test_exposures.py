@@ -16,7 +16,8 @@ from tests.captures.capture_factory import (
     write_poses,
 )
 from tests.captures.file_factory import file_of, present
-from unmix_plugin.captures.exposures import compare_exposures, exposure_facts, exposure_of
+from unmix_plugin.captures.calibration.calibration import compare_exposures, exposure_of
+from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.spectral_file import Linear
 
 

@@ -288,7 +288,7 @@ def test_pixels_of_0_in_a_mask_of_the_file_are_missing(tmp_path, dtype, options)
     opened = open_spectral_file(tmp_path / "a.tif")
     check_file(opened, values=CUBE, note="where the mask in page 1 is 0 count as not measured", warnings=())
     np.testing.assert_array_equal(find_missing(opened.read(), opened), ~mask)
-    rows, bands = slice(11, 60, 7), np.array([3])
+    rows, bands = slice(11, 60), np.array([3])
     np.testing.assert_array_equal(find_missing(opened.read(rows, bands), opened, rows, bands), ~mask[rows])
 
 

@@ -7,8 +7,9 @@ import pytest
 from PIL import Image
 
 from tests.captures.capture_factory import process, write_cube, write_poses
-from unmix_plugin.captures.calibration.calibration import CalibratedRows, Resampling
+from unmix_plugin.captures.calibration.calibration import CalibratedRows
 from unmix_plugin.captures.poses.lens import Lens, Points, bend_fisheye, bend_ftheta, fit_lens
+from unmix_plugin.captures.writing.resampling import Resampling
 
 WIDTH, HEIGHT = 128, 96
 

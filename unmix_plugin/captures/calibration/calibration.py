@@ -1,35 +1,33 @@
-"""From stored numbers to values: cropping, dark frame, white reference, exposure, binning; and into another lens.
+"""From stored numbers to values: cropping, dark frame, white reference, exposure, binning.
 
     value = (stored - dark) / (white - dark) * reflectance of the panel * exposure of white / exposure of view
 
 with what is not given left out. A white may have a dark frame of its own.
 
 Notation: `H x W` pixels and `B` bands of the file, of which `h` rows and `b` bands are read; `n x w` pixels and `c`
-bands of the result.
+bands of the result. Of exposures, `b` is 1, or the bands of a file.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
     find_missing,
+    finished_by,
     refuse_outside,
     stated_values,
 )
-from unmix_plugin.captures.exposures import exposure_of
 from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.spectral_file import SpectralFile
-from unmix_plugin.errors import ConfigError
+from unmix_plugin.errors import ConfigError, counted, name_some
 
 
 @dataclass(frozen=True)
@@ -196,94 +194,148 @@ class Calibration:
         return values.reshape(*values.shape[:-1], self.num_bands, self.bin_bands)
 
 
-# Pictures brought from the lens of their file into that of the scene, while they are written.
-#
-# Values are interpolated once, by cubic convolution, all bands alike: weights of 4 x 4 pixels, a sparse matrix. A pixel
-# is missing where the file's lens does not see it, or where one of the 2 x 2 pixels around it is missing.
-# Source: Keys 1981, Cubic convolution interpolation for digital image processing, with a = -1/2.
+# How long views and their references were exposed, and what becomes of it.
 
-_MOSTLY = 0.5
-"""Share of saturated pixels among the 2 x 2 around one, by their bilinear weights, from which it counts as one."""
+
+def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray, " b"] | None:
+    """Exposure time times gain, and over the square of the f-number if that is known, one number or one a band; None
+    where the file does not say the time.
+
+    Args:
+        to_light: Whether the aperture counts, which lets in light but no dark current.
+    """
+    time, gain = file.metadata.get("exposure_s"), file.metadata.get("gain", 1.0)
+    f_number = file.metadata.get("f_number", 1.0) if to_light else 1.0
+    try:
+        exposure = np.asarray(time, dtype=np.float64) * np.asarray(gain, dtype=np.float64)
+        exposure = np.atleast_1d(exposure / f_number**2)
+    except (TypeError, ValueError):
+        return None
+    is_usable = len(exposure) in (1, file.shape[2]) and np.isfinite(exposure).all() and (exposure > 0).all()
+    return exposure if is_usable else None
 
 
 @dataclass(frozen=True)
-class Resampling:
-    """Where each pixel of a view lies in its file."""
+class Exposures:
+    """What becomes of the exposures of views and references."""
 
-    at: Float64[np.ndarray, "H W 2"]
-    """Column and row, from the centre of the file's first pixel on."""
-    inside: Bool[np.ndarray, "H W"]
-    """Pixels that the file shows: not beyond the centres of its outermost pixels."""
-
-    @staticmethod
-    @lru_cache(maxsize=8)
-    def into(lens: Lens) -> Resampling:
-        """The resampling from the file's lens. Remembered, as the views of a camera share it."""
-        at = lens.file_pixels() - 0.5
-        last = np.array([lens.width - 1, lens.height - 1])
-        inside = np.all((at >= 0) & (at <= last), axis=-1)  # false for NaN
-        return Resampling(np.where(inside[..., None], at, 0.0), inside)
-
-    def rows(self, first: int, last: int, read: Callable[[int, int], CalibratedRows]) -> CalibratedRows:
-        """Rows `first` to `last` (excluded) of the view.
-
-        Args:
-            read: Gives rows of the file, from a first to a last (excluded).
-        """
-        at, inside = self.at[first:last], self.inside[first:last]
-        down, top, bottom = at[..., 1][inside], 0, 1  # rows of the file that these are made of
-        if len(down):
-            top, bottom = max(0, int(down.min()) - 1), min(len(self.at), int(down.max()) + 3)
-        part = read(top, bottom)
-        shape = part.missing.shape
-        at = at - (0, top)
-        around = _weights(at, shape, _linear)
-        missing = ~inside | ((around @ part.missing.ravel()).reshape(inside.shape) > 1e-6)
-        # Missing pixels have no value: the others take their weights.
-        weights = _weights(at, shape, _cubic)
-        bands = part.values.shape[-1]
-        values = weights @ part.values.reshape(-1, bands)
-        if part.missing.any():
-            values /= np.clip(weights @ ~part.missing.ravel(), 0.5, None)[:, None]
-        saturated = around @ part.saturated.reshape(-1, bands) >= _MOSTLY
-        values, saturated = (array.reshape(*inside.shape, bands) for array in (values, saturated))
-        values[missing] = 0.0
-        return CalibratedRows(values.astype(np.float32, copy=False), saturated & ~missing[..., None], missing)
-
-    def nearest(self, picture: Shaped[np.ndarray, "H W"], outside: int) -> Shaped[np.ndarray, "H W"]:
-        """A picture of labels or masks, each pixel that of the nearest one of the file."""
-        columns, rows = np.rint(self.at).astype(int).transpose(2, 0, 1)
-        return np.where(self.inside, picture[rows, columns], np.asarray(outside, picture.dtype))
-
-    def smooth(self, picture: Shaped[np.ndarray, "H W"]) -> Shaped[np.ndarray, "H W"]:
-        """A picture of whole numbers, interpolated linearly; 0 outside."""
-        found = _weights(self.at, picture.shape, _linear) @ picture.ravel()
-        return np.where(self.inside, np.rint(found).reshape(picture.shape), 0).astype(picture.dtype)
+    common: Float64[np.ndarray, " b"] | None = None
+    """What all are brought to (see `exposure_of`), one number or one a band; None where exposures are not compared."""
+    notes: tuple[str, ...] = ()
+    """What was done."""
+    warnings: tuple[str, ...] = ()
+    """What may be wrong."""
 
 
-def _linear(part: np.ndarray) -> np.ndarray:
-    """Weights of two neighbours of points that lie `part` of the way from the first to the second."""
-    return np.stack([1.0 - part, part], axis=-1)
+def compare_exposures(
+    views: Sequence[SpectralFile],
+    whites: Sequence[SpectralFile],
+    darks: Sequence[tuple[SpectralFile, SpectralFile]],
+    is_bent: bool,
+    may_be_finished: bool = False,
+) -> Exposures:
+    """The exposure of the white reference, to which views are brought; without one, that of the first view.
+
+    Args:
+        views: At least one.
+        whites: References of all views, or one a view.
+        darks: Each dark frame with a view or a white that it is subtracted from.
+        is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
+        may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
+    """
+    files = (*views, *whites)
+    known, of_whites = (
+        [e for file in some if (e := exposure_of(file)) is not None] for some in (views, whites)
+    )
+    differs = len({tuple(exposure) for exposure in known}) > 1 or any(len(exposure) > 1 for exposure in known)
+    apertures = {"f_number" in file.metadata for file in files if exposure_of(file) is not None}
+    unit = "s times gain over the square of the f-number" if True in apertures else "s times gain"
+    taken = f"were exposed {_in_words(known)} {unit}" if known else ""
+    finished = [finished_by(file, by_name=not whites) for file in views]
+    if None not in finished and not is_bent:
+        kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
+        return Exposures(notes=(f"views {taken}: {kept}",) if differs else ())
+    misfits = _misfits(views, whites)
+    warnings, why = [*_missing_units(files), *misfits], None
+    if len(known) < len(views):
+        missing = counted(len(views) - len(known), "view")
+        is_partial = bool(known or of_whites) and not misfits
+        why = f"{missing} without exposure time: exposures are not compared" * is_partial
+    elif len(apertures) > 1:
+        lacking = name_some([file.path.name for file in files if "f_number" not in file.metadata])
+        unknown = f"the f-number of the lens is known of some files and not of {lacking}"
+        why = f"{unknown}: exposures are not compared; write it into all, or none"
+    elif is_bent:
+        bent = "which can't be undone as cameras bend the brightness of pictures: fix the exposure"
+        why = f"pictures {taken}, {bent}" * differs
+    elif may_be_finished and differs and not (whites or darks):
+        why = (
+            f"views {taken}: values are not divided by that, as they are at most about 1 and taken for reflectances. "
+            "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
+        )
+    if why is not None:
+        return Exposures(warnings=(*warnings, *filter(None, [why])))
+    if len(of_whites) < len(whites) and differs and not misfits:
+        warnings.append(
+            f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
+        )
+    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
+    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
+    if unlike:
+        of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
+        warnings.append(
+            f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}: dark current "
+            "grows with exposure, so take a dark frame at each"
+        )
+    common, of_whom = np.median(known[0], keepdims=True), "the first view"
+    if of_whites:
+        common, of_whom = of_whites[0], f"{'the' if len(whites) == 1 else 'its'} white reference"
+    is_same = len({tuple(exposure) for exposure in [*known, *of_whites, common]}) == 1
+    brought = f"views {taken}: each is brought to that of {of_whom}, {_in_words(of_whites or [common])}"
+    return Exposures(common, () if is_same else (brought,), tuple(warnings))
 
 
-def _cubic(part: np.ndarray) -> np.ndarray:
-    """Weights of four neighbours of points that lie `part` of the way from the second to the third."""
-    powers = np.stack([np.ones_like(part), part, part**2, part**3], axis=-1)
-    return powers @ (0.5 * np.array([[0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]))
+def _in_words(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:
+    """The range of exposures.
+
+    >>> _in_words([np.array([0.01]), np.array([0.02])])
+    '0.01 to 0.02'
+    """
+    every = np.concatenate(list(exposures))
+    low, high = every.min(), every.max()
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
 
 
-def _weights(at: Float64[np.ndarray, "h W 2"], shape: tuple[int, int], kernel: Callable[[Any], Any]) -> Any:
-    """Matrix from the pixels of some rows of a file to those of the view; beyond an edge its pixels go on."""
-    from scipy import sparse
+def _misfits(views: Sequence[SpectralFile], whites: Sequence[SpectralFile]) -> list[str]:
+    """A warning where exposures are neither one number nor one a band, unless a white has the same ones."""
+    files = (*views, *whites)
+    stated = {repr((file.metadata.get("exposure_s"), file.metadata.get("gain"))) for file in files}
+    if whites and len(stated) == 1:
+        return []
+    found: dict[str, tuple[int, int]] = {}
+    for file in files:
+        sizes = {np.size(file.metadata.get(name, 1.0)) for name in ("exposure_s", "gain")}
+        if (odd := sizes - {1, file.shape[2]}) and "exposure_s" in file.metadata:
+            found[file.path.name] = max(odd), file.shape[2]
+    if not found:
+        return []
+    numbers = " or ".join(str(size) for size in sorted({size for size, _ in found.values()}))
+    bands = counted(next(iter(found.values()))[1], "band")
+    said = f"{name_some([*found])}: {numbers} exposure times or gains for {bands}"
+    advice = "Give one number, or one a band, with points as decimal marks"
+    return [f"{said}: exposures may differ and were not compared. {advice}"]
 
-    at = at.reshape(-1, 2)
-    base = np.floor(at).astype(int)
-    across, down = (kernel(at[:, axis] - base[:, axis]) for axis in (0, 1))
-    reach = across.shape[1]
-    steps = np.arange(reach) - (reach // 2 - 1)
-    columns = np.clip(base[:, :1] + steps, 0, shape[1] - 1)
-    rows = np.clip(base[:, 1:] + steps, 0, shape[0] - 1)
-    places = rows[:, :, None] * shape[1] + columns[:, None, :]
-    weights = (down[:, :, None] * across[:, None, :]).astype(np.float32)
-    ends = np.arange(len(at) + 1) * reach * reach
-    return sparse.csr_matrix((weights.ravel(), places.ravel(), ends), shape=(len(at), shape[0] * shape[1]))
+
+def _missing_units(files: Iterable[SpectralFile]) -> list[str]:
+    """Warnings where units are missing and matter."""
+    metadata = [file.metadata for file in files if "exposure_s" in file.metadata]
+    warnings = []
+    for what, kind in (("exposure", "exposure times"), ("gain", "gains")):
+        evidence = sorted({str(own.get(f"{what}_evidence", "")) for own in metadata} - {""})
+        guessed = [text for text in evidence if "no unit" in text]
+        gains = {repr(own.get("gain", 1.0)) for own in metadata}
+        if guessed and (len(guessed) < len(evidence) if what == "exposure" else len(gains) > 1):
+            warnings.append(
+                f"{kind} have no unit in some files ({'; '.join(evidence)}): values may be off by a factor"
+            )
+    return warnings

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
-from unmix_plugin.captures.calibration.calibration import Calibration, Raster
+from unmix_plugin.captures.calibration.calibration import Calibration, Exposures, Raster, compare_exposures
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -27,10 +27,9 @@ from unmix_plugin.captures.calibration.references import (
     stated_values,
 )
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.exposures import Exposures, compare_exposures
-from unmix_plugin.captures.header_values import in_ranges
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import MOST_WIDTH, BandIndex, CaptureView, SpectralFile
+from unmix_plugin.captures.wavelengths import in_ranges
 from unmix_plugin.errors import CaptureError, name_some
 
 _ROWS_A_VIEW = 12

@@ -14,10 +14,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unmix_plugin.captures.exposures import exposure_facts, is_exposure
 from unmix_plugin.captures.header_values import (
     GOOD,
     check_bands,
+    exposure_facts,
+    is_exposure,
     plain_names,
     says_bands,
     state_bands,

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import radiometric_model
-from unmix_plugin.captures.header_values import wavelengths_in_names
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandIndex, BandTable, Linear, SpectralFile, find_missing
+from unmix_plugin.captures.wavelengths import wavelengths_in_names
 from unmix_plugin.errors import CaptureError, name_some
 from unmix_plugin.limits import allow_parts
 

@@ -262,13 +262,10 @@ def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[Fo
 
     def take(axes: Axes, rows: slice, bands: BandIndex) -> np.ndarray:
         stored_axes = axes[::-1] if is_matlab else axes
-        wanted, order = bands, slice(None)
-        if not isinstance(bands, slice):  # h5py wants each index once, in rising order
-            wanted, order = np.unique(bands, return_inverse=True)
-        selection = {"y": rows, "x": slice(None), "b": wanted}
+        selection = {"y": rows, "x": slice(None), "b": bands}
         with import_extra("h5py").File(path, "r") as file:
             part = file[name][tuple(selection[axis] for axis in stored_axes)]
-        return part.transpose([stored_axes.index(axis) for axis in "yxb"])[..., order]
+        return part.transpose([stored_axes.index(axis) for axis in "yxb"])
 
     names = []  # of the axes, by NetCDF's dimension scales or by labels
     for dimension in item.dims:

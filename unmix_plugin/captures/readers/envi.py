@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unmix_plugin.captures.exposures import exposure_facts
-from unmix_plugin.captures.header_values import check_bands, listed, state_bands, state_linear
+from unmix_plugin.captures.header_values import check_bands, exposure_facts, listed, state_bands, state_linear
 from unmix_plugin.captures.spectral_file import BandIndex, ReadOptions, SpectralFile, take_part
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.envi import (

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from unmix_plugin.captures.exposures import exposure_facts
-from unmix_plugin.captures.header_values import PLAUSIBLE_NM, wavelengths_in_names
+from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.spectral_file import BandTable, ReadOptions, SpectralFile, loaded
+from unmix_plugin.captures.wavelengths import PLAUSIBLE_NM, wavelengths_in_names
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.limits import allow_decoded, allow_parts
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, parse_xmp
-from unmix_plugin.captures.exposures import exposure_facts
+from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     BandTable,

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
-from unmix_plugin.captures.exposures import exposure_facts
-from unmix_plugin.captures.header_values import StatedBands, check_bands, state_bands
+from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts, state_bands
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
 from unmix_plugin.captures.spectral_file import (
@@ -357,9 +356,8 @@ def _read_page(path: Path, page: TiffPage, stack: _Stack, rows: slice, samples: 
         image = np.memmap(path, stack.dtype, "r", page.dataoffsets[0], whole)[:, rows]
         chosen = image[0][..., samples] if num_planes == 1 else np.moveaxis(image[..., 0][samples], 0, -1)
         return np.array(chosen, order="C")
-    indices = np.arange(num_planes * num_samples)[samples]
-    planes = sorted(set(indices.tolist())) if num_planes > 1 else [0]
-    # (p, h, W, S): all rows from the first to the last of `rows`
+    planes = np.arange(num_planes)[samples].tolist() if num_planes > 1 else [0]
+    # (p, h, W, S): of each plane that is wanted
     block = np.full((len(planes), rows.stop - rows.start, width, num_samples), stack.fill, page.dtype)
     down, across = page.chunks[0], -(-width // page.chunks[1])
     per_plane = -(-height // down) * across
@@ -367,9 +365,7 @@ def _read_page(path: Path, page: TiffPage, stack: _Stack, rows: slice, samples: 
         for at, plane in enumerate(planes):
             for within in range(rows.start // down * across, -(-rows.stop // down) * across):
                 _decode_into(block[at], rows.start, file, page, plane * per_plane + within)
-    if num_planes == 1:
-        return block[0][:: rows.step][..., indices]
-    return np.moveaxis(block[..., 0], 0, -1)[:: rows.step][..., np.searchsorted(planes, indices)]
+    return block[0][..., samples] if num_planes == 1 else np.moveaxis(block[..., 0], 0, -1)
 
 
 def _decode_into(block: np.ndarray, first_row: int, file: Any, page: TiffPage, index: int) -> None:

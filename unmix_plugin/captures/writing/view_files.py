@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
-from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster, Resampling
+from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
 from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.writing.resampling import Resampling
 from unmix_plugin.engine.runs.atomic_files import whole_file, write_errors_as, write_file
 from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.files import indexed_png_bytes, rgba_png_bytes

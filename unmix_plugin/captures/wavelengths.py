@@ -1,0 +1,225 @@
+"""Wavelengths in words: in the names of bands, channels and files, and as a user writes them.
+
+Notation: `B` bands; wavelengths in nm.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from unmix_plugin.captures.names import common_length
+from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.limits import read_bounded
+from unmix_plugin.spectral.bands import nm_per_unit, require_nanometres
+
+_DIGITS = r"\d+(?:[.,]\d+)?"
+_UNIT = r"(?:nm|nanomet(?:er|re)s?|[uµμ]m|micromet(?:er|re)s?|microns?)(?![a-z])"
+PLUS_MINUS = r"(?:±|\+ ?/? ?-)"
+"""Before half of a width, or how far a centre may be off."""
+_NUMBER = re.compile(rf"(?<![\d.,])({_DIGITS})")
+_WITH_UNIT = re.compile(rf"{_NUMBER.pattern}[ _-]?({_UNIT})", re.I)
+_AROUND = re.compile(
+    rf"{_NUMBER.pattern}(?:[ _-]?({_UNIT}))? ?\(? ?{PLUS_MINUS} ?{_DIGITS} ?\)?(?:[ _-]?({_UNIT}))?", re.I
+)
+_RANGE = re.compile(
+    rf"(?<![\d.,])({_DIGITS})(?:[ _]?{_UNIT})? ?(?:[-\u2013\u2014]|to) ?({_DIGITS})[ _-]?({_UNIT})", re.I
+)
+_WIDEST_RANGE = 3.0
+"""Greater over smaller end; a number farther from the one behind it counts files or is a date."""
+_THOUSANDS = re.compile(r"[1-9]\d?\d?,\d{3}")
+_LONGEST_NAME = 1000
+"""Longer texts are no names, and looking for counters in them takes long."""
+_COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
+"""What precedes a number that counts instead of measuring."""
+_USUAL_NM = (200.0, 3000.0)
+"""What a number without a unit must lie in to be taken for nm."""
+PLAUSIBLE_NM = (100.0, 30_000.0)
+"""Range of cameras, from the far ultraviolet to the thermal infrared."""
+
+
+def wavelengths_in_names(
+    names: Sequence[str],
+) -> tuple[Float64[np.ndarray, " B"], str, Float64[np.ndarray, " B"] | None] | None:
+    """Wavelengths out of names that each carry one: with a unit, or plain numbers that increase and can be nm.
+
+    Returns:
+        Centres in nm, with which unit or why they are taken for nm, and widths in nm where all names are ranges.
+
+    >>> wavelengths_in_names(["red 0.66 um", "red edge 0.705 um"])
+    (array([660., 705.]), 'with the unit um', None)
+    >>> wavelengths_in_names(["Blue (0.45-0.52 um)", "Red (0.63-0.69 um)"])
+    (array([485., 660.]), 'ranges with the unit um', array([70., 60.]))
+    >>> wavelengths_in_names(["Blue 450±16 nm", "NIR 840±26 nm"])[0]
+    array([450., 840.])
+    >>> wavelengths_in_names(["Band 1", "Band 2"])
+    """
+    if not names or max(map(len, names)) > _LONGEST_NAME:
+        return None
+    ranges = [_ranges(name) for name in names]
+    steps = np.diff([found[0][0] for found in ranges]) if all(len(found) == 1 for found in ranges) else ()
+    # Equal or one apart, what stands before the hyphen is a date or counts.
+    if len(steps) and np.isin(np.round(steps, 6), (0.0, 1.0)).all():
+        ranges = [[] for _ in names]
+    stated = [_with_unit(name, found) for name, found in zip(names, ranges, strict=True)]
+    known = [one for one in stated if one is not None]
+    if len(known) == len(names):
+        centres, widths, units = zip(*known, strict=True)
+        fwhm = None if None in widths else np.array(widths)
+        return np.array(centres), f"{'' if fwhm is None else 'ranges '}with the unit {units[0]}", fwhm
+    plain = _varying_numbers(names)
+    if any(len(found) != 1 for found in plain):
+        return None
+    centres = np.array([float(found[0].replace(",", ".")) for found in plain])
+    low, high = _USUAL_NM
+    if (np.diff(centres) <= 0).any() or centres[0] < low or centres[-1] > high:
+        return None
+    return centres, f"no unit; {centres[0]:g} to {centres[-1]:g} increase and are taken as nm", None
+
+
+def _with_unit(
+    name: str, ranges: Sequence[tuple[float, float, str]]
+) -> tuple[float, float | None, str] | None:
+    """Centre and, of a range, width in nm, and the unit; None where a name has none or several, or what can't be."""
+    around = [(text, before or after) for text, before, after in _AROUND.findall(name) if before or after]
+    if not around and len(ranges) == 1:
+        low, high, unit = ranges[0]
+        return (round((low + high) / 2, 6), round(high - low, 6), unit) if low < high else None
+    found = around or _WITH_UNIT.findall(name)
+    centre = _nm(*found[0]) if len(found) == 1 else None
+    return None if centre is None else (centre, None, found[0][1])
+
+
+def _ranges(name: str) -> list[tuple[float, float, str]]:
+    """First and last wavelength in nm, and the unit, of each `450-520 nm` in a name."""
+    found = []
+    for match in _RANGE.finditer(name):
+        first, last = _nm(match[1], match[3]), _nm(match[2], match[3])
+        counts = _COUNTER.search(name, 0, match.start()) or re.match(r"0\d", match[1])
+        if first and last and not counts and max(first, last) <= _WIDEST_RANGE * min(first, last):
+            found.append((first, last, match[3]))
+    return found
+
+
+def _nm(text: str, unit: str) -> float | None:
+    """A number with its unit in nm; a comma parts thousands only where it can't be a decimal mark. None for what no
+    camera sees.
+
+    >>> _nm("0,450", "um"), _nm("1,002", "nm"), _nm("16", "nm")
+    (450.0, 1002.0, None)
+    """
+    texts = [text.replace(",", "."), text.replace(",", "") if _THOUSANDS.fullmatch(text) else "nan"]
+    values = [round(float(one) * (nm_per_unit(unit) or 1.0), 6) for one in texts]
+    return next((nm for nm in values if PLAUSIBLE_NM[0] <= nm <= PLAUSIBLE_NM[1]), None)
+
+
+def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
+    """Of each name the numbers outside of what all names begin with and end in, except counters."""
+
+    begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
+    backwards = [name[::-1] for name in names]
+    end = len(backwards[0][: common_length(backwards)].rstrip("0123456789.,"))
+    return [
+        [
+            match[1]
+            for match in _NUMBER.finditer(name)
+            if begin <= match.start() and match.end() <= len(name) - end
+            if not _COUNTER.search(name, 0, match.start())
+        ]
+        for name in names
+    ]
+
+
+def parse_wavelengths(text: str) -> Float64[np.ndarray, " B"]:
+    """Band centres in nm from a list `620,555,503`, or from the column `wavelength` of a CSV file.
+
+    A file may also hold one bare number a line, or one line of numbers. Raises ConfigError: no such file, no numbers,
+    or numbers that are not wavelengths in nm.
+    """
+    try:
+        values = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        values = None
+    try:
+        if values is None:
+            values = np.array([float(word) for word in _read_words(Path(text))])
+    except ValueError as error:
+        raise ConfigError(
+            f"--wavelengths {text}: {error}; expected numbers in nm, such as 620,555,503, or a CSV file with a "
+            "column 'wavelength'"
+        ) from error
+    if not len(values):
+        raise ConfigError(f"--wavelengths {text} holds no numbers; expected band centres in nm")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"--wavelengths {text} holds NaN or infinity; expected band centres in nm")
+    try:
+        require_nanometres(values)
+    except SpectrumError as error:
+        raise ConfigError(f"--wavelengths {text}: {error}") from error
+    return values
+
+
+def in_ranges(text: str, wavelengths_nm: Float64[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
+    """Which bands a text such as `1350-1450,1900` names; a single wavelength names the nearest band.
+
+    Raises:
+        ConfigError: the text is not such a list, or a part of it names no band.
+
+    >>> in_ranges("500-600,700", np.array([450.0, 550.0, 650.0, 710.0]))
+    array([False,  True, False,  True])
+    """
+    named = np.zeros(len(wavelengths_nm), bool)
+    low, high = wavelengths_nm.min(), wavelengths_nm.max()
+    for part in text.split(","):
+        try:
+            ends = [float(word) for word in part.strip().split("-")]
+        except ValueError:
+            ends = []
+        if len(ends) not in (1, 2):
+            raise ConfigError(
+                f"--drop-bands {text}: '{part}' is not a wavelength or range; expected 1350-1450,1900"
+            )
+        if len(ends) == 1 and low <= ends[0] <= high:
+            found = np.zeros(len(named), bool)
+            found[np.argmin(np.abs(wavelengths_nm - ends[0]))] = True
+        else:
+            found = (wavelengths_nm >= ends[0]) & (wavelengths_nm <= ends[-1])
+        if not found.any():
+            raise ConfigError(
+                f"--drop-bands {text}: no band in '{part.strip()}' nm; the bands lie at {low:g} to {high:g} nm"
+            )
+        named |= found
+    return named
+
+
+def _read_words(path: Path) -> list[str]:
+    try:
+        with io.TextIOWrapper(io.BytesIO(read_bounded(path)), "utf-8-sig", newline="") as file:
+            rows = [[cell.strip() for cell in row] for row in csv.reader(file) if any(map(str.strip, row))]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(
+            f"--wavelengths {path}: neither a list of numbers, such as 620,555,503, nor a CSV file ({reason})"
+        ) from error
+    if not rows:
+        raise ConfigError(f"--wavelengths {path} is empty; expected a column 'wavelength'")
+    heads = [cell.lower() for cell in rows[0]]
+    column = next((i for i, cell in enumerate(heads) if cell.startswith("wavelength")), None)
+    columns = 1 if column is None else len(heads)
+    longer = next((row for row in rows if any(row[columns:])), None)
+    if longer is not None and (column is not None or len(rows) > 1):
+        expected = f"{columns}, as in the header, and a point as the decimal mark"
+        if column is None:
+            expected = "one number with a decimal point, or a header that names the column 'wavelength'"
+        raise ConfigError(
+            f"--wavelengths {path}: the line '{','.join(longer)[:40]}' has {len(longer)} cells; expected {expected}"
+        )
+    if column is not None:
+        return [row[column] if column < len(row) else "" for row in rows[1:]]
+    return [cell for cell in rows[0] if cell] if len(rows) == 1 else [row[0] for row in rows]
