@@ -76,25 +76,20 @@ def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
         CaptureError: there are too few markers, or they contradict each other.
     """
     sightings, notes = _sightings(plan, options)
-    rasters = {view.name: plan.recipes[view.sensor].calibration.raster for view in plan.views}
-    lenses: dict[str, Lens] = {
-        view.sensor: rasters[view.name].lens(lens_of_view(view.lens, view))
-        for view in plan.views
-        if view.lens is not None
-    }
-    for sensor, lens in lenses.items():
+    lenses: dict[str, Lens | tuple[int, int]] = {}
+    for view in plan.views:
+        raster = plan.recipes[view.sensor].calibration.raster
+        if view.lens is None:
+            lenses.setdefault(view.sensor, (raster.width, raster.height))
+            continue
+        lenses[view.sensor] = lens = raster.lens(lens_of_view(view.lens, view))
         if lens.resampled_from is not None:
             raise CaptureError(
-                f"lens {sensor}: markers are not followed through it ({lens.said}); expected a lens of k1, k2, p1, p2: "
-                "undistort the images first, or give poses with --poses FILE"
+                f"lens {view.sensor}: markers are not followed through it ({lens.said}); expected a lens of k1, k2, "
+                "p1, p2: undistort the images first, or give poses with --poses FILE"
             )
-    found = poses_from_markers(
-        sightings,
-        {name: (raster.width, raster.height) for name, raster in rasters.items()},
-        options.marker_size,
-        {view.name: view.sensor for view in plan.views},
-        lenses,
-    )
+    sensor_of = {view.name: view.sensor for view in plan.views}
+    found = poses_from_markers(sightings, sensor_of, lenses, options.marker_size)
     return _in_files(plan, replace(found, notes=(*notes, *found.notes)))
 
 
@@ -166,36 +161,45 @@ def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str
     sightings: Sightings = {}
     notes: list[str] = []
     for sensor in plan.sensors:
-        views = [view for view in plan.views if view.sensor == sensor]
-        calibration = plan.recipes[sensor].calibration
-        chosen, band = _choose(views, calibration, family)
+        chosen, band = _choose(plan, sensor, family)
         if chosen is None:
             continue
-        pictures = {view.name: _light(view, calibration, [band])[0] for view in views}
-        found, said = find_markers(pictures, chosen)
+        calibration = plan.recipes[sensor].calibration
+        views = [view for view in plan.views if view.sensor == sensor]
+        found, said = find_markers(
+            {view.name: _light(view, calibration, [band])[0] for view in views}, chosen
+        )
         sightings |= found
-        light = "the mean of all bands" if band is None else f"{plan.sensors[sensor].centers_nm[band]:g} nm"
-        where = light if band is None else f"the band at {light}"
+        where = (
+            "the mean of all bands"
+            if band is None
+            else f"the band at {plan.sensors[sensor].centers_nm[band]:g} nm"
+        )
         notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *said]
     if not sightings:
-        others = _other_families(plan) if family is not None else ""
-        asked = "no markers are" if family is None else f"no markers of {family} are"
+        asked, others = "no markers", []
+        if family is not None:
+            asked = f"no markers of {family}"
+            others = [other for sensor in plan.sensors if (other := _choose(plan, sensor, None)[0])]
+        hint = "".join(f", but some of {other} are: give --marker-family {other}" for other in others[:1])
         raise CaptureError(
-            f"{asked} in the pictures{others}; expected sharp ones, with a white rim, at least 20 pixels wide"
+            f"{asked} are in the pictures{hint}; expected sharp ones, with a white rim, at least 20 pixels wide"
         )
     return {view.name: sightings.get(view.name, {}) for view in plan.views}, notes
 
 
-def _choose(
-    views: Sequence[CaptureView], calibration: Calibration, family: str | None
-) -> tuple[str | None, int | None]:
-    """The family, and the band (None is the mean of all) in which some views show the most markers."""
-    count = calibration.num_bands
+def _choose(plan: Plan, sensor: str, family: str | None) -> tuple[str | None, int | None]:
+    """The family, and the band (None is the mean of all) in which some views of a sensor show the most markers."""
+    views = [view for view in plan.views if view.sensor == sensor]
+    calibration = plan.recipes[sensor].calibration
     bands: list[int | None] = [None]
-    bands += dict.fromkeys(np.linspace(0, count - 1, min(_SAMPLE_BANDS, count)).astype(int).tolist())
-    places = np.linspace(0, len(views) - 1, min(_SAMPLE_VIEWS, len(views))).astype(int).tolist()
-    sample = [_light(views[place], calibration, bands) for place in dict.fromkeys(places)]
-    family = family or _family_of(sample)
+    bands += _spread(calibration.num_bands, _SAMPLE_BANDS)
+    sample = [_light(views[place], calibration, bands) for place in _spread(len(views), _SAMPLE_VIEWS)]
+    for index in (0, len(bands) // 2):  # the mean of all bands, or, if there is nothing in it, the middle one
+        if family is None:
+            counts = count_markers([pictures[index] for pictures in sample[::2]])
+            most = max(counts, key=lambda kind: counts[kind])
+            family = most if counts[most] else None
     if family is None:
         return None, None
     counts = [count_markers([pictures[i] for pictures in sample], family)[family] for i in range(len(bands))]
@@ -203,24 +207,9 @@ def _choose(
     return (family, bands[best]) if counts[best] else (None, None)
 
 
-def _family_of(sample: Sequence[Float32[np.ndarray, "C H W"]]) -> str | None:
-    """The family of most markers in the means of all bands, or, if there is none, in the middle one of the bands."""
-    for index in (0, sample[0].shape[0] // 2):
-        counts = count_markers([pictures[index] for pictures in sample[::2]])
-        name = max(counts, key=lambda kind: counts[kind])
-        if counts[name]:
-            return name
-    return None
-
-
-def _other_families(plan: Plan) -> str:
-    """Which families are there instead, for a message."""
-    for sensor in plan.sensors:
-        views = [view for view in plan.views if view.sensor == sensor]
-        chosen, _ = _choose(views, plan.recipes[sensor].calibration, None)
-        if chosen is not None:
-            return f", but some of {chosen} are: give --marker-family {chosen}"
-    return ""
+def _spread(count: int, most: int) -> list[int]:
+    """Some numbers below `count`, evenly over all."""
+    return list(dict.fromkeys(np.linspace(0, count - 1, min(most, count)).astype(int).tolist()))
 
 
 def _light(

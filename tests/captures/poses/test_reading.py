@@ -257,7 +257,10 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO.*undistort"),
         ({"ftheta_p0": 0.0, "fl_x": 300.0}, "'ftheta_p1' is 0; expected pixels per radian"),
         ({"ftheta_p0": "steep"}, "'ftheta_p0' to 'ftheta_p5' are .*expected 6 numbers"),
-        ({"camera_model": "FISHEYE624", "distortion_params": [0] * 6}, "FISHEYE624 are a list of 6; expected 12 numbers"),
+        (
+            {"camera_model": "FISHEYE624", "distortion_params": [0] * 6},
+            "FISHEYE624 are a list of 6; expected 12 numbers",
+        ),
         ({"applied_transform": np.diag([2, 1, 1, 1])[:3].tolist()}, "'applied_transform'.*a rotation"),
         ({"applied_scale": 0}, "'applied_scale' is 0"),
         ({"metres_per_unit": -1}, "'metres_per_unit' is -1; expected 1e-9 to 1e9"),

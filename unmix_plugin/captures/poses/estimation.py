@@ -53,7 +53,7 @@ _GAIN = 0.02
 """Part of the reprojection error that distortion has to remove to be kept."""
 _GREATEST_BEND = 0.1
 """Of half the diagonal: what distortion may move the corner of a picture by."""
-_LOG, _RESULT, _REPORT, _DRAWN = "colmap.log", "result.json", "report.txt", "worst-matches.png"
+_LOG, _RESULT, _REPORT, _DRAWN = "colmap.log", "found.json", "report.txt", "worst-matches.png"
 _FEW_FEATURES, _FEW_MATCHES = 400, 60
 """Of a view, and with the view that shares most with it, below which these are what is missing."""
 _STILL_PX, _MOSTLY_STILL = 1.5, 0.5
@@ -98,6 +98,7 @@ def estimate_poses(
     Raises:
         CaptureError: pycolmap is not installed, or fewer than half of the views, or than 3, could be registered.
     """
+    from PIL import Image
     from scipy.ndimage import binary_erosion
 
     require_pycolmap()
@@ -105,19 +106,21 @@ def estimate_poses(
         raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_WHAT_TO_DO}")
     ordered = sorted(pictures, key=natural_order)
     files = {name: f"{index:06d}.png" for index, name in enumerate(ordered)}
-    _write_pictures(folder, {files[name]: picture for name, picture in pictures.items()}, "images")
+    shown = {"images": {files[name]: picture for name, picture in pictures.items()}}
     if masks is not None:
-        shown = {
+        shown["masks"] = {
             f"{files[name]}.png": 255 * binary_erosion(mask, iterations=_RIM_PX).astype(np.uint8)
             for name, mask in masks.items()
         }
-        _write_pictures(folder, shown, "masks")
+    digest = hashlib.sha256()  # what tells whether an earlier try looked at the same
+    for kind, own in shown.items():
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        for name, pixels in own.items():
+            Image.fromarray(pixels).save(folder / kind / name)
+            digest.update(f"{kind}/{name} {pixels.shape}".encode() + pixels.tobytes())
     sensors: dict[str, list[str]] = {}
     for name in ordered:
         sensors.setdefault((sensor_of or {}).get(name, ""), []).append(files[name])
-    digest = hashlib.sha256()  # what tells whether an earlier try looked at the same
-    for path in sorted([*(folder / "images").glob("*.png"), *(folder / "masks").glob("*.png")]):
-        digest.update(f"{path.parent.name}/{path.name}".encode() + path.read_bytes())
     settings = {
         "folder": str(folder.resolve()),
         "sensors": list(sensors.values()),
@@ -128,15 +131,6 @@ def estimate_poses(
     }
     found = _run(settings, folder)
     return _best(found["models"], found["views"], files, folder)
-
-
-def _write_pictures(folder: Path, pictures: Mapping[str, UInt8[np.ndarray, "..."]], kind: str) -> None:
-    from PIL import Image
-
-    place = folder / kind
-    place.mkdir(parents=True, exist_ok=True)
-    for name, pixels in pictures.items():
-        Image.fromarray(pixels).save(place / name)
 
 
 def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -150,11 +144,9 @@ def _run(settings: dict[str, Any], folder: Path) -> dict[str, Any]:
     command = [sys.executable, "-m", "unmix_plugin.captures.poses.estimation", str(asked)]
     with (folder / _LOG).open("wb") as log:
         ran = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, check=False)
-    status = ran.returncode
-    if status != 0 or not result.is_file():
-        lines = (folder / _LOG).read_text("utf-8", "replace").strip().splitlines()
-        last = lines[-1].strip() if lines else "without a word"
-        raise CaptureError(f"COLMAP stopped with status {status} ({last}); see {folder / _LOG}")
+    if ran.returncode != 0 or not result.is_file():
+        *_, last = ["without a word", *(folder / _LOG).read_text("utf-8", "replace").strip().splitlines()]
+        raise CaptureError(f"COLMAP stopped with status {ran.returncode} ({last}); see {folder / _LOG}")
     return json.loads(result.read_text(encoding="utf-8"))
 
 
@@ -176,45 +168,38 @@ def _best(
     error = f"a mean reprojection error of {best['error_px']:.2f} px"
     notes = [f"COLMAP registered {registered} of {len(files)} views with {error}"]
     if missing:
-        matches = ", ".join(f"{name} ({_most_matches(views[files[name]])})" for name in missing[:_MOST_WORST])
+        matches = ", ".join(f"{name} ({views[files[name]]['most']})" for name in missing[:_MOST_WORST])
         notes.append(f"views without pose: {name_some(missing)}; matches with the nearest view: {matches}")
     notes += poses.notes
     return replace(poses, cameras=cameras, source="estimated by COLMAP", has_world=False, notes=tuple(notes))
 
 
-def _most_matches(view: dict[str, Any]) -> int:
-    """With the view that shares most with this one."""
-    return max((matches for matches, _ in view["matches"].values()), default=0)
-
-
 def _explain(views: dict[str, Any], files: Mapping[str, str], folder: Path) -> tuple[str, str]:
     """What was found of features and matches, and what to try, most likely first; writes report and picture."""
     names = {file: name for name, file in files.items()}
-    order = sorted(views, key=lambda file: _most_matches(views[file]))
-    features = float(np.median([view["features"] for view in views.values()]))
-    usual = float(np.median([_most_matches(view) for view in views.values()]))
-    pairs = [pair for view in views.values() for pair in view["matches"].values()]
-    still = sum(count for _, count in pairs) / max(1, sum(matches for matches, _ in pairs))
-    tries = [_SMALLER_STEPS, _TEXTURE, _STILL]
-    if features < _FEW_FEATURES:
-        tries.sort(key=lambda what: what != _TEXTURE)
-    if still > _MOSTLY_STILL:
-        tries.sort(key=lambda what: what != _STILL)
-    worst = ", ".join(f"{names[file]} ({_most_matches(views[file])})" for file in order[:_MOST_WORST])
-    evidence = (
-        f"In the mean of all bands, views have {features:.0f} features and share {usual:.0f} with the view nearest to "
-        f"them (medians; {_FEW_FEATURES} and {_FEW_MATCHES} or more serve); the fewest: {worst}"
+    order = sorted(views, key=lambda file: views[file]["most"])
+    features, usual, still, matched = (
+        [view[key] for view in views.values()] for key in ("features", "most", "still", "matched")
     )
-    if still > _MOSTLY_STILL:
-        evidence += f"; {still:.0%} of the matches stand still in the picture, as a background does"
+    share = sum(still) / max(1, sum(matched))
+    tries = [_SMALLER_STEPS, _TEXTURE, _STILL]
+    if np.median(features) < _FEW_FEATURES:
+        tries.sort(key=lambda what: what != _TEXTURE)
+    worst = ", ".join(f"{names[file]} ({views[file]['most']})" for file in order[:_MOST_WORST])
+    evidence = (
+        f"In the mean of all bands, views have {np.median(features):.0f} features and share {np.median(usual):.0f} "
+        f"with the view nearest to them (medians; {_FEW_FEATURES} and {_FEW_MATCHES} or more serve); the fewest: "
+        f"{worst}"
+    )
+    if share > _MOSTLY_STILL:
+        tries.sort(key=lambda what: what != _STILL)
+        evidence += f"; {share:.0%} of the matches stand still in the picture, as a background does"
     lines = ["Poses could not be estimated.", "", evidence + ".", "", "Try, the most likely first:"]
     lines += [f"- {what}" for what in (*tries, _OTHER_POSES)]
     lines += ["", "view: features, matches with the view that shares most, its name"]
     for file in order:
-        others = views[file]["matches"]
-        best = max(others, key=lambda other: others[other][0], default=None)
-        partner = "no other view" if best is None else names[best]
-        lines.append(f"{names[file]}: {views[file]['features']}, {_most_matches(views[file])}, {partner}")
+        view, partner = views[file], names.get(views[file]["best"], "no other view")
+        lines.append(f"{names[file]}: {view['features']}, {view['most']}, {partner}")
     (folder / _REPORT).write_text("\n".join(lines) + "\n", encoding="utf-8")
     _draw_worst(folder, views, order[:_MOST_WORST])
     return evidence, "; ".join(tries)
@@ -226,21 +211,18 @@ def _draw_worst(folder: Path, views: dict[str, Any], worst: Sequence[str]) -> No
 
     rows = []
     for file in worst:
-        others = views[file]["matches"]
-        best = max(others, key=lambda other: others[other][0], default=file)
-        with Image.open(folder / "images" / file) as first, Image.open(folder / "images" / best) as second:
+        best = folder / "images" / (views[file]["best"] or file)
+        with Image.open(folder / "images" / file) as first, Image.open(best) as second:
             row = Image.new("RGB", (first.width + second.width, max(first.height, second.height)))
             row.paste(first.convert("RGB"), (0, 0))
             row.paste(second.convert("RGB"), (first.width, 0))
             draw = ImageDraw.Draw(row)
-            for x, y, other_x, other_y in views[file].get("lines", []):
+            for x, y, other_x, other_y in views[file]["lines"]:
                 draw.line((x, y, other_x + first.width, other_y), fill=(255, 0, 200))
         rows.append(row)
     sheet = Image.new("RGB", (max(row.width for row in rows), sum(row.height for row in rows)))
-    top = 0
-    for row in rows:
-        sheet.paste(row, (0, top))
-        top += row.height
+    for index, row in enumerate(rows):
+        sheet.paste(row, (0, sum(above.height for above in rows[:index])))
     sheet.save(folder / _DRAWN)
 
 
@@ -274,7 +256,7 @@ def contrast_picture(
 
 
 def _reconstruct(path: Path) -> None:
-    """Reconstruct, and write `result.json`: folder, registered images and reprojection error of each model; and
+    """Reconstruct, and write `found.json`: folder, registered images and reprojection error of each model; and
     features and matches of each image. Those of an earlier try of the same pictures are gone on with.
 
     The settings: `folder`, which holds `images` (and `masks`: IMAGE.png, black where no features are wanted, where
@@ -304,13 +286,13 @@ def _reconstruct(path: Path) -> None:
 
 
 def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
-    """By image: its features; by other image, verified matches and how many of them stand still; and, as `lines`, the
-    matched points x, y, x, y of the pair with the most."""
+    """By image: its `features`; verified matches with all others (`matched`) and how many of them stand `still`; and of
+    the pair with the `most`, the other image (`best`) and matched points x, y, x, y (`lines`)."""
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         points = {number: opened.read_keypoints(number)[:, :2] for number in names}
-        views = {name: {"features": len(points[number]), "matches": {}} for number, name in names.items()}
-        most = dict.fromkeys(names.values(), 0)
+        nothing = {"matched": 0, "still": 0, "most": 0, "best": None, "lines": []}
+        views = {name: {"features": len(points[number]), **nothing} for number, name in names.items()}
         pairs, geometries = opened.read_two_view_geometries()
         for pair, geometry in zip(pairs, geometries, strict=True):
             first, second = pycolmap.pair_id_to_image_pair(pair)
@@ -318,10 +300,11 @@ def _matches_of_views(pycolmap: Any, database: Path) -> dict[str, Any]:
             ends = points[first][inliers[:, 0]], points[second][inliers[:, 1]]
             still = int((np.linalg.norm(ends[0] - ends[1], axis=1) < _STILL_PX).sum())
             for here, there, own, other in ((first, second, *ends), (second, first, *ends[::-1])):
-                views[names[here]]["matches"][names[there]] = (len(inliers), still)
-                if len(inliers) > most[names[here]]:
-                    most[names[here]] = len(inliers)
-                    views[names[here]]["lines"] = np.hstack([own, other]).round(1).tolist()[:200]
+                view = views[names[here]]
+                view |= {"matched": view["matched"] + len(inliers), "still": view["still"] + still}
+                if len(inliers) > view["most"]:
+                    lines = np.hstack([own, other]).round(1).tolist()[:200]
+                    view |= {"most": len(inliers), "best": names[there], "lines": lines}
     return views
 
 

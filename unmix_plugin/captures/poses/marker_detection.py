@@ -84,8 +84,7 @@ def count_markers(
     """
     cv2 = require_opencv()
     families = _TRIED if family is None else (family,)
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(0), _parameters(cv2))
-    detector.setDictionaries([_dictionary(cv2, name) for name in families])
+    detector = _detector(cv2, families)
     seen: Counter[tuple[int, int]] = Counter()
     for picture in pictures:
         _, numbers, _, which = detector.detectMarkersMultiDict(_stretched(cv2, picture)[0])
@@ -108,8 +107,8 @@ def find_markers(
         Those of each view, and a sentence on markers that were left out because a picture shows two of a number.
     """
     cv2 = require_opencv()
-    dictionary = _dictionary(cv2, family)
-    detector = cv2.aruco.ArucoDetector(dictionary, _parameters(cv2))
+    detector = _detector(cv2, [family])
+    cells = detector.getDictionary().markerSize + 2
     found: Sightings = {}
     doubled: Counter[int] = Counter()
     for name, picture in pictures.items():
@@ -122,7 +121,7 @@ def find_markers(
         for number, quad in zip(listed, corners, strict=True):
             if counts[number] == 1:
                 first = (np.asarray(quad, np.float64).reshape(4, 2) + 0.5) / factor
-                refined = _refine(picture, first, dictionary.markerSize + 2)
+                refined = _refine(picture, first, cells)
                 found[name] |= {} if refined is None else {number: refined}
     if not doubled:
         return found, []
@@ -130,14 +129,13 @@ def find_markers(
     return found, [f"markers of one number twice in a picture, left out there: {numbers}"]
 
 
-def _dictionary(cv2: Any, family: str) -> Any:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
-
-
-def _parameters(cv2: Any) -> Any:
+def _detector(cv2: Any, families: Sequence[str]) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return parameters
+    known = [cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family)) for family in families]
+    detector = cv2.aruco.ArucoDetector(known[0], parameters)
+    detector.setDictionaries(known)
+    return detector
 
 
 def _stretched(cv2: Any, picture: Float32[np.ndarray, "H W"]) -> tuple[UInt8[np.ndarray, "h w"], int]:

@@ -59,6 +59,11 @@ class MarkerMap:
             pixels[own] = lens.pixels_of(ideal[own].reshape(-1, 2)).reshape(-1, 4, 2)
         return pixels - seen.corners
 
+    def misses(self, seen: Seen) -> Float64[np.ndarray, " S"]:
+        """Root mean square distance of each sighting's corners; infinite where its view or marker is not known."""
+        squares = (self.errors(seen) ** 2).sum(axis=-1).mean(axis=-1)
+        return np.sqrt(np.nan_to_num(squares, nan=np.inf))
+
 
 def solve(
     found: MarkerMap,
@@ -127,8 +132,3 @@ def transformed(
 ) -> Float64[np.ndarray, "*n P 3"]:
     """Points in the coordinates that transforms lead to."""
     return points @ np.swapaxes(transforms[..., :3, :3], -1, -2) + transforms[..., None, :3, 3]
-
-
-def rms(errors: Float64[np.ndarray, "S 4 2"]) -> Float64[np.ndarray, " S"]:
-    """Root mean square distance of each sighting's corners."""
-    return np.sqrt((errors**2).sum(axis=-1).mean(axis=-1))

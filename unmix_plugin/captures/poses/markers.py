@@ -27,7 +27,6 @@ from unmix_plugin.captures.poses.marker_map import (
     MarkerMap,
     Seen,
     Transforms,
-    rms,
     solve,
     transformed,
 )
@@ -58,33 +57,30 @@ _ONE_PLANE = np.cos(np.radians(10.0))
 
 def poses_from_markers(
     sightings: Sightings,
-    sizes_px: Mapping[str, tuple[int, int]],
+    sensor_of: Mapping[str, str],
+    lenses: Mapping[str, Lens | tuple[int, int]],
     marker_size: float | None = None,
-    sensor_of: Mapping[str, str] | None = None,
-    lenses: Mapping[str, Lens] | None = None,
 ) -> PoseSet:
     """Where pictures were taken from, by the markers in them.
 
     Args:
         sightings: Markers of every view; views without any count as not posed.
-        sizes_px: Width and height of each view.
+        sensor_of: Sensor of each view; views of one have one lens.
+        lenses: By sensor, where they are known; otherwise width and height of its pictures, and they are estimated.
         marker_size: Side of a marker, metres; without it 1 is the side of a marker.
-        sensor_of: Sensor of each view; views of one have one lens. None is one for all.
-        lenses: By sensor, where they are known; others are estimated.
     Raises:
         CaptureError: OpenCV is not installed, fewer than three views see markers that belong together, the markers
             have several sizes, or they moved against each other.
     """
     require_opencv()
-    sensor_of, lenses = sensor_of or {}, lenses or {}
-    sensors = sorted({sensor_of.get(name, "") for name in sightings})
-    followed, folded = _followed(sightings, {name: lenses.get(sensor_of.get(name, "")) for name in sightings})
-    seen = _gather(followed, {name: sensors.index(sensor_of.get(name, "")) for name in sightings})
-    first = []
-    for sensor in sensors:
-        width, height = next(size for name, size in sizes_px.items() if sensor_of.get(name, "") == sensor)
-        first.append(lenses.get(sensor) or Lens(width, height, (0.0, 0.0), (width / 2, height / 2)))
-    free = np.array([sensor not in lenses and index in seen.sensor for index, sensor in enumerate(sensors)])
+    sensors = sorted({sensor_of[name] for name in sightings})
+    given = [lenses[sensor] for sensor in sensors]
+    seen, folded = _gather(sightings, {name: sensors.index(sensor_of[name]) for name in sightings}, given)
+    first = [
+        lens if isinstance(lens, Lens) else Lens(*lens, (0.0, 0.0), (lens[0] / 2, lens[1] / 2))
+        for lens in given
+    ]
+    free = np.array([not isinstance(lens, Lens) and i in seen.sensor for i, lens in enumerate(given)])
     found, kept = _adjust(_begin(seen, first, free), seen, free)
     _refuse_several_sizes(found, seen, kept)
     found = replace(found, sizes=np.ones(len(found.sizes)))
@@ -92,47 +88,44 @@ def poses_from_markers(
     _refuse_moved(found, seen, kept)
     found = _with_distortion(found, seen.part(kept), free)
     poses = _pose_set(found, seen, kept, sightings, marker_size, free)
-    said = f"{counted(folded, 'sighting')} of markers left out where a lens folds its picture over"
-    return replace(poses, notes=(*poses.notes, said)) if folded else poses
+    return replace(poses, notes=(*poses.notes, folded)) if folded else poses
 
 
-def _followed(sightings: Sightings, lens_of: Mapping[str, Lens | None]) -> tuple[Sightings, int]:
-    """Sightings whose corners known lenses can follow, and the number of the others."""
+def _gather(
+    sightings: Sightings, sensor_of: Mapping[str, int], lenses: Sequence[Lens | tuple[int, int]]
+) -> tuple[Seen, str]:
+    """Sightings of markers that at least two views have, at least three views of them; and what is left out, as known
+    lenses can't follow it."""
     followed: Sightings = {}
     for name, markers in sightings.items():
-        lens = lens_of[name]
-        seen = {
-            n: corners for n, corners in markers.items() if not lens or lens.ideal_of(corners) is not None
-        }
-        followed[name] = seen
+        lens, followed[name] = lenses[sensor_of[name]], {}
+        for number, corners in markers.items():
+            if not isinstance(lens, Lens) or lens.ideal_of(corners) is not None:
+                followed[name][number] = corners
     lost = sum(len(markers) - len(followed[name]) for name, markers in sightings.items())
-    if lost and (left := sum(map(bool, followed.values()))) < _LEAST_VIEWS:
-        where = f"{counted(lost, 'sighting')} of markers, which leaves {left} of {len(followed)} views"
-        raise CaptureError(f"a lens folds its picture over at {where}: calibrate it again")
-    return followed, lost
-
-
-def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
-    """Sightings of markers that at least two views have, at least three views of them."""
-    views_of = Counter(number for markers in sightings.values() for number in markers)
+    left_out = f"{counted(lost, 'sighting')} of markers left out where a lens folds its picture over"
+    views_of = Counter(number for markers in followed.values() for number in markers)
     shared = {number for number, count in views_of.items() if count > 1}
-    views = [name for name, markers in sightings.items() if shared & set(markers)]
+    views = [name for name, markers in followed.items() if shared & set(markers)]
     if len(views) < _LEAST_VIEWS:
-        alone = sum(bool(markers) for markers in sightings.values())
+        alone = sum(bool(markers) for markers in followed.values())
         raise CaptureError(
             f"markers are seen in {alone} of {len(sightings)} views, the same ones in {len(views)}; expected at least "
             f"{_LEAST_VIEWS}: take the board into every picture, larger or sharper, or give --poses estimate"
+            + f" ({left_out}: calibrate it again)"
+            * (lost > 0)
         )
     numbers = sorted(shared)
     rows = [
         (index, numbers.index(number), corners)
         for index, name in enumerate(views)
-        for number, corners in sightings[name].items()
+        for number, corners in followed[name].items()
         if number in shared
     ]
-    view, marker, corners = zip(*rows, strict=True)
+    view, marker, corners = (np.array(column) for column in zip(*rows, strict=True))
     sensors = np.array([sensor_of[name] for name in views])
-    return Seen(tuple(views), tuple(numbers), np.array(view), np.array(marker), np.array(corners), sensors)
+    seen = Seen(tuple(views), tuple(numbers), view, marker, corners, sensors)
+    return seen, left_out if lost else ""
 
 
 # The map's beginning: poses of single squares, and what they agree on.
@@ -140,18 +133,17 @@ def _gather(sightings: Sightings, sensor_of: Mapping[str, int]) -> Seen:
 
 def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> MarkerMap:
     """A map with the focal length that explains the corners best."""
-    factors = _FOCAL_FACTORS if free.any() else (1.0,)
     begun: list[tuple[float, float, MarkerMap]] = []
-    for factor in factors:
+    for factor in _FOCAL_FACTORS if free.any() else (1.0,):
         tried = tuple(
             replace(lens, focal_px=(factor * max(lens.width, lens.height),) * 2) if is_free else lens
             for lens, is_free in zip(lenses, free, strict=True)
         )
         start = _Chain(seen, tried).grow()
-        usable = _usable(start, seen)
+        misses = start.misses(seen)
+        usable = np.isfinite(misses)
         if usable.sum() >= _LEAST_VIEWS:
-            misses = np.minimum(rms(start.errors(seen.part(usable))), _WORST_PX)
-            begun.append((float(usable.mean()), float(misses.mean()), start))
+            begun.append((float(usable.mean()), float(np.minimum(misses[usable], _WORST_PX).mean()), start))
     if not begun:
         raise CaptureError(
             "the markers of the views do not belong together; take several of them, the whole board, into every picture"
@@ -161,16 +153,11 @@ def _begin(seen: Seen, lenses: Sequence[Lens], free: Bool[np.ndarray, " L"]) -> 
     tried_out = [_adjust(begun[index][2], seen, free, steps=15)[0] for _, index in ranked[:3]]
 
     def robust_cost(found: MarkerMap) -> float:
-        usable = _usable(found, seen)
-        return float(np.minimum(rms(found.errors(seen.part(usable))), _WORST_PX).mean() / usable.mean())
+        misses = found.misses(seen)
+        usable = np.isfinite(misses)
+        return float(np.minimum(misses[usable], _WORST_PX).mean() / usable.mean())
 
     return min(tried_out, key=robust_cost)
-
-
-def _usable(found: MarkerMap, seen: Seen) -> Bool[np.ndarray, " S"]:
-    """Sightings whose view and marker are in the map."""
-    cameras, markers = found.camera_from_world[seen.view], found.world_from_marker[seen.marker]
-    return np.isfinite(cameras[:, 0, 0] + markers[:, 0, 0])
 
 
 class _Chain:
@@ -200,7 +187,12 @@ class _Chain:
             marker = self._place_next()
         poses = np.full((len(self._options), 4, 4), np.nan)
         for view, options in enumerate(self._options):
-            if len(options) == 1 or (len(options) > 1 and self._is_clear(view)):
+            if len(options) > 1:
+                (sighting,) = self._known(view)
+                first, second = self._misses(options @ self._placed[self._seen.marker[sighting]], sighting)
+                if second <= _CLEAR * first:
+                    continue
+            if len(options):
                 poses[view] = options[0]
         return MarkerMap(poses, self._placed, np.ones(len(self._placed)), self._lenses)
 
@@ -247,12 +239,6 @@ class _Chain:
         self._placed[marker] = candidates[int(np.sum(misses, axis=0).argmin())]
         return marker
 
-    def _is_clear(self, view: int) -> bool:
-        """Whether the first pose of a view with one marker fits much better than the second."""
-        (sighting,) = self._known(view)
-        first, second = self._misses(self._squares[sighting], sighting)
-        return bool(second > _CLEAR * first)
-
 
 def _square_poses(ideal: Float64[np.ndarray, "4 2"]) -> Float64[np.ndarray, "2 4 4"]:
     """Both poses of a square of side 1, the better first."""
@@ -286,10 +272,9 @@ def _adjust(
     found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"], same_size: bool = False, steps: int = 60
 ) -> tuple[MarkerMap, Bool[np.ndarray, " S"]]:
     """The map that explains most sightings, and which these are."""
-    usable = _usable(found, seen)
+    usable = np.isfinite(found.misses(seen))
     found = solve(found, seen.part(usable), free, same_size, loss="soft_l1", steps=steps)
-    misses = np.full(len(usable), np.inf)
-    misses[usable] = rms(found.errors(seen.part(usable)))
+    misses = found.misses(seen)
     kept = misses < max(_OUTLIER_PX, _OUTLIER_FACTOR * float(np.median(misses[usable])))
     return solve(found, seen.part(kept), free, same_size, steps=steps), kept
 
@@ -299,7 +284,7 @@ def _with_distortion(found: MarkerMap, seen: Seen, free: Bool[np.ndarray, " L"])
     if not free.any():
         return found
     bent = solve(found, seen, free, same_size=True, bent=True)
-    before, after = (float(np.sqrt(np.mean(one.errors(seen) ** 2))) for one in (found, bent))
+    before, after = (float(np.sqrt(np.mean(one.misses(seen) ** 2))) for one in (found, bent))
     return bent if after < (1.0 - _GAIN) * before else found
 
 
@@ -319,21 +304,23 @@ def _refuse_several_sizes(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, "
 
 
 def _refuse_moved(found: MarkerMap, seen: Seen, kept: Bool[np.ndarray, " S"]) -> None:
-    usable = _usable(found, seen)
-    misses, lost = rms(found.errors(seen.part(usable))), ~kept[usable]
+    misses = found.misses(seen)
+    usable = np.isfinite(misses)
+    lost = usable & ~kept
     diagonal = max(float(np.hypot(lens.width, lens.height)) for lens in found.lenses)
-    typical, limit = float(np.median(misses)), max(_MOST_OFF_PX, _MOST_OFF * diagonal)
-    if typical <= limit and lost.mean() <= _MOST_LEFT_OUT:
+    typical, limit = float(np.median(misses[usable])), max(_MOST_OFF_PX, _MOST_OFF * diagonal)
+    if typical <= limit and lost.sum() <= _MOST_LEFT_OUT * usable.sum():
         return
     found_is = f"corners are off by {typical:.2g} px in the median (at most {limit:.2g} is expected)"
     if typical <= limit:
-        count = len(seen.numbers)
-        share = np.bincount(seen.marker[usable & ~kept], minlength=count)
-        share = share / np.maximum(np.bincount(seen.marker[usable], minlength=count), 1)
+        lost_of, seen_of = (
+            np.bincount(seen.marker[those], minlength=len(seen.numbers)) for those in (lost, usable)
+        )
+        share = lost_of / np.maximum(seen_of, 1)
         numbers = [str(seen.numbers[index]) for index in np.argsort(-share) if share[index] > _MOST_LEFT_OUT]
         found_is = (
-            f"{lost.mean():.0%} of the sightings are off, by {np.median(misses[lost]):.3g} px in the median, most of "
-            f"them of the markers {name_some(numbers)}"
+            f"{lost.sum() / usable.sum():.0%} of the sightings are off, by {np.median(misses[lost]):.3g} px in the "
+            f"median, most of them of the markers {name_some(numbers)}"
         )
     raise CaptureError(
         f"markers did not keep their places: {found_is}; expected boards that are fixed to the object: cover those "
@@ -358,7 +345,7 @@ def _pose_set(
         pose, lens = np.linalg.inv(found.camera_from_world[view]), found.lenses[seen.sensor[view]]
         camera = PosedCamera(np.column_stack([pose[:3, :3] @ FLIP, pose[:3, 3]]), lens)
         cameras[seen.views[view]] = camera.moved(to_board)
-    error = float(np.sqrt(np.mean(rms(found.errors(seen.part(kept))) ** 2)))
+    error = float(np.sqrt(np.mean(found.misses(seen)[kept] ** 2)))
     found_in = f"{counted(len(markers), 'marker')} in {len(seen.view[kept])} sightings"
     gave = f"markers gave poses of {len(cameras)} of {len(sightings)} views: {found_in}"
     notes = [f"{gave}, corners off by {error:.2f} px (root mean square)"]
