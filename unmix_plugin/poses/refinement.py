@@ -136,6 +136,7 @@ class PoseRefinement(nn.Module):
     gauge: Tensor
     is_free: Tensor
     carved: Tensor
+    """Whether space was carved by the corrected cameras."""
     counts: Tensor
     first: Tensor
     rows: Tensor
@@ -157,10 +158,6 @@ class PoseRefinement(nn.Module):
         self.register_buffer("gauge", torch.zeros(6 * total, 7))
         self.register_buffer("is_free", torch.ones(len(rows), dtype=torch.bool))
         self.register_buffer("carved", torch.zeros((), dtype=torch.bool))
-        self.is_carved = False
-        """Whether space was carved by the corrected cameras; the buffer keeps it, but reading that from a GPU in
-        each step would take time."""
-        self.register_load_state_dict_post_hook(_after_loading)
         self.register_buffer("counts", counts, persistent=False)
         self.register_buffer("first", counts.cumsum(0) - counts, persistent=False)
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
@@ -182,11 +179,6 @@ class PoseRefinement(nn.Module):
         sight = 0.5 * box.size.max() / distances
         self.bound.copy_(LARGEST_STEP * (sight / _SMALLEST_SIGHT).clamp(max=1.0))
         self.gauge.copy_(similarities(offsets, self.reach, self.scale))
-
-    def finish_carving(self) -> None:
-        """Note that space was carved by the corrected cameras."""
-        self.carved.fill_(True)
-        self.is_carved = True
 
     def free_steps(self) -> Float[Tensor, "M 6"]:
         """Steps without what moves all views alike; 0 for views that were undone."""
@@ -326,7 +318,3 @@ class PoseRefinement(nn.Module):
         views = torch.full((len(heights),), view, device=heights.device)
         poses = self._moved(cameras, steps, views, heights)
         return KeyPoses(poses, heights, (len(heights),))
-
-
-def _after_loading(poses: PoseRefinement, _: object) -> None:
-    poses.is_carved = bool(poses.carved)

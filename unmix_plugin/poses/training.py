@@ -56,6 +56,7 @@ class PoseTraining:
         """`poses` is None where they are taken as they are."""
         self._config, self._poses = config, poses
         self._cameras: Cameras | None = None
+        self._is_carved = False
         self._fineness = 0.0
 
     def begin(
@@ -87,9 +88,11 @@ class PoseTraining:
             return None
         if self._cameras is None:
             self._cameras = data.train_cameras.to(self._poses.steps.device)
-        if self._poses.is_carved or not self._is_fine or not isinstance(data, _CarvesAgain):
+            self._is_carved = bool(self._poses.carved)  # once: reading it from a GPU takes time
+        if self._is_carved or not self._is_fine or not isinstance(data, _CarvesAgain):
             return None
-        self._poses.finish_carving()
+        self._is_carved = True
+        self._poses.carved.fill_(True)
         return data.carved_by(self._poses.refined(data.train_cameras))
 
     def corrected(self, rays: RayBundle) -> CorrectedRays:
