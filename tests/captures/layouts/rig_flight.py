@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.captures.file_factory import write_band_file
+from tests.captures.file_factory import present, write_band_file
+from unmix_plugin.captures.poses.lens import Lens
 
 WIDTH, HEIGHT = 64, 48
 PX_A_MM = 20.0
@@ -84,18 +85,12 @@ def radiance(x: np.ndarray, y: np.ndarray, lens: LensOfRig) -> np.ndarray:
 
 
 def rays(lens: LensOfRig) -> np.ndarray:
-    """Directions in the axes of OpenGL of all pixel centres, by OpenCV's model, solved with fixed-point steps."""
-    focal, (cx, cy) = lens.focal_mm * PX_A_MM, (WIDTH / 2 + 0.7, HEIGHT / 2 - 0.4)
-    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    bent_x, bent_y = (columns - cx) / focal, (rows - cy) / focal
-    x, y = bent_x.copy(), bent_y.copy()
-    k1, k2, k3, p1, p2 = lens.distortion
-    for _ in range(50):
-        square = x**2 + y**2
-        factor = 1 + k1 * square + k2 * square**2 + k3 * square**3
-        x = (bent_x - 2 * p1 * x * y - p2 * (square + 2 * x**2)) / factor
-        y = (bent_y - 2 * p2 * x * y - p1 * (square + 2 * y**2)) / factor
-    return np.stack([x, -y, -np.ones_like(x)], axis=-1)
+    """Directions in the axes of OpenGL of all pixel centres."""
+    focal, (k1, k2, k3, p1, p2) = lens.focal_mm * PX_A_MM, lens.distortion
+    center = (WIDTH / 2 + 0.7, HEIGHT / 2 - 0.4)
+    own = Lens(WIDTH, HEIGHT, (focal, focal), center, (k1, k2, p1, p2), (k3, 0.0))
+    x, y = present(own.ideal_of(own.file_pixels().reshape(-1, 2))).T
+    return np.stack([x, -y, -np.ones_like(x)], axis=-1).reshape(HEIGHT, WIDTH, 3)
 
 
 def image(index: int, lens: LensOfRig) -> np.ndarray:

@@ -1,10 +1,8 @@
 """The lens in the tags against OpenCV's and Pix4D's formulas, written out point by point."""
 
 import json
-import math
 import shutil
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -29,6 +27,7 @@ from tests.captures.layouts.rig_flight import (
 from tests.captures.layouts.rig_flight import (
     tags as tags_of,
 )
+from tests.captures.poses.pose_factory import by_hand
 from unmix_plugin.captures.layouts.rig import _splits_of, find_rig, lens_of
 from unmix_plugin.captures.names import natural_order
 from unmix_plugin.captures.poses.lens import Lens
@@ -274,41 +273,13 @@ def file_with(xmp, exif=EXIF) -> SpectralFile:
     return replace(file_of(nothing, metadata={"xmp": xmp, "exif": exif}), path=Path("a.tif"))
 
 
-def project(lens: Lens, x, y):
-    """Through the lens that we keep, pixel centres at 0.5."""
-    (k1, k2, k3, k4), (p1, p2) = lens.radial, lens.distortion[2:]
-    square = x * x + y * y
-    factor = 1 + k1 * square + k2 * square**2 + k3 * square**3 + k4 * square**4
-    bent_x = x * factor + 2 * p1 * x * y + p2 * (square + 2 * x * x)
-    bent_y = y * factor + 2 * p2 * x * y + p1 * (square + 2 * y * y)
-    return lens.focal_px[0] * bent_x + lens.center_px[0], lens.focal_px[1] * bent_y + lens.center_px[1]
+GRID = np.stack(np.meshgrid(np.linspace(-0.8, 0.8, 161), np.linspace(-0.65, 0.65, 131)), -1).reshape(-1, 2)
 
 
-def worst_px(lens: Lens, expected) -> float:
+def worst_px(lens: Lens, expected: np.ndarray) -> float:
     """Greatest distance over directions that fall on the image."""
-    worst = 0.0
-    for x in np.linspace(-0.8, 0.8, 161):
-        for y in np.linspace(-0.65, 0.65, 131):
-            u, v = expected(x, y)
-            if 0 <= u <= LENS_WIDTH and 0 <= v <= LENS_HEIGHT:
-                worst = max(worst, math.dist(project(lens, x, y), (u, v)))
-    return worst
-
-
-def perspective_by_hand(x, y, focal=1449.36, k3=-0.023):
-    square = x * x + y * y
-    factor = 1 - 0.097 * square + 0.14 * square**2 + k3 * square**3
-    bent_x = x * factor + 2 * 0.0003 * x * y + 0.0007 * (square + 2 * x * x)
-    bent_y = y * factor + 2 * 0.0007 * x * y + 0.0003 * (square + 2 * y * y)
-    return focal * bent_x + 2.35 * 266.667 + 0.5, focal * bent_y + 1.8 * 266.667 + 0.5
-
-
-def dji_by_hand(x, y):
-    square = x * x + y * y
-    factor = 1 + 0.008 * square - 0.042 * square**2 - 0.06 * square**3
-    bent_x = x * factor - 2 * 0.0004 * x * y + 0.0002 * (square + 2 * x * x)
-    bent_y = y * factor + 2 * 0.0002 * x * y - 0.0004 * (square + 2 * y * y)
-    return 2200.5 * bent_x + 640.0 - 4.25 + 0.5, 2199.5 * bent_y + 480.0 + 7.5 + 0.5
+    inside = ((expected >= 0) & (expected <= (LENS_WIDTH, LENS_HEIGHT))).all(axis=1)
+    return float(np.linalg.norm(lens.pixels_of(GRID) - expected, axis=1)[inside].max())
 
 
 def in_plane(unit, resolution):
@@ -317,28 +288,29 @@ def in_plane(unit, resolution):
 
 NO_THIRD = {"Camera:PerspectiveDistortion": ["-0.097", "0.14", "0", "0.0003", "0.0007"]}
 IN_MM = {"Camera:PerspectiveFocalLength": "5.435"}
+BENT = {"radial": (-0.097, 0.14, -0.023), "tangential": (0.0003, 0.0007)}
+BENT |= {"focal": (1449.36, 1449.36), "center": (2.35 * 266.667 + 0.5, 1.8 * 266.667 + 0.5)}
+BENT_MM = BENT | {"focal": (5.435 * 266.667, 5.435 * 266.667)}
+BENT_DJI = {"radial": (0.008, -0.042, -0.06), "tangential": (-0.0004, 0.0002)}
+BENT_DJI |= {"focal": (2200.5, 2199.5), "center": (640.0 - 4.25 + 0.5, 480.0 + 7.5 + 0.5)}
 
 
 @pytest.mark.parametrize(
-    ("tags", "exif", "by_hand"),
+    ("tags", "exif", "expected"),
     [
-        (PERSPECTIVE, EXIF, perspective_by_hand),
-        (PERSPECTIVE | NO_THIRD, EXIF, partial(perspective_by_hand, k3=0.0)),
-        (PERSPECTIVE | IN_MM, EXIF, partial(perspective_by_hand, focal=5.435 * 266.667)),  # told by its size
-        (
-            PERSPECTIVE | IN_MM | {"Camera:PerspectiveFocalLengthUnits": "mm"},
-            EXIF,
-            partial(perspective_by_hand, focal=5.435 * 266.667),
-        ),
-        (PERSPECTIVE, in_plane(2, 266.667 * 25.4), perspective_by_hand),
-        (PERSPECTIVE, in_plane(3, 2666.67), perspective_by_hand),
-        (PERSPECTIVE, in_plane(4, 266.667), perspective_by_hand),
-        (DJI, {}, dji_by_hand),
+        (PERSPECTIVE, EXIF, BENT),
+        (PERSPECTIVE | NO_THIRD, EXIF, BENT | {"radial": (-0.097, 0.14)}),
+        (PERSPECTIVE | IN_MM, EXIF, BENT_MM),  # told by its size
+        (PERSPECTIVE | IN_MM | {"Camera:PerspectiveFocalLengthUnits": "mm"}, EXIF, BENT_MM),
+        (PERSPECTIVE, in_plane(2, 266.667 * 25.4), BENT),
+        (PERSPECTIVE, in_plane(3, 2666.67), BENT),
+        (PERSPECTIVE, in_plane(4, 266.667), BENT),
+        (DJI, {}, BENT_DJI),
     ],
 )
-def test_a_lens_of_tags_sees_what_formulas_of_their_makers_say(tags, exif, by_hand):
+def test_a_lens_of_tags_sees_what_formulas_of_their_makers_say(tags, exif, expected):
     lens = present(lens_of(file_with(tags, exif))[0])
-    assert worst_px(lens, by_hand) < 0.1
+    assert worst_px(lens, by_hand(GRID, **expected)) < 0.1
     assert lens.said == ""
 
 
@@ -350,25 +322,18 @@ def test_a_picture_that_dji_has_dewarped_has_no_distortion():
         assert ("DewarpFlag 1" in lens.said) == (flag == "1")
 
 
-def fisheye_by_hand(x, y):
-    radius = math.hypot(x, y)
-    theta = 2 / math.pi * math.atan(radius)
-    bent = theta - 0.025 * theta**2 + 0.15 * theta**3
-    across, down = (bent / radius * x, bent / radius * y) if radius else (0.0, 0.0)
-    return (
-        1640.0 * across + 1.5 * down + 2.42299 * 266.667 + 0.5,
-        -0.5 * across + 1638.0 * down + 1.850154 * 266.667 + 0.5,
-    )
-
-
 def test_a_fisheye_becomes_the_nearest_lens_and_pixels_are_brought_into_it():
     lens = present(lens_of(file_with(FISHEYE))[0])
-    worst = worst_px(lens, fisheye_by_hand)
+    radius = np.linalg.norm(GRID, axis=1)
+    theta = 2 / np.pi * np.arctan(radius)
+    bent = theta - 0.025 * theta**2 + 0.15 * theta**3
+    directions = GRID / np.maximum(radius, 1e-12)[:, None]
+    expected = (bent[:, None] * directions) @ np.array([[1640.0, -0.5], [1.5, 1638.0]])
+    expected += np.array([2.42299, 1.850154]) * 266.667 + 0.5
+    worst = worst_px(lens, expected)
     assert 0.3 < worst < 4.0
     assert lens.resampled_from is not None
-    ideal = np.random.default_rng(0).uniform([-0.45, -0.35], [0.45, 0.35], (50, 2))
-    by_hand = [fisheye_by_hand(x, y) for x, y in ideal]
-    np.testing.assert_allclose(lens.resampled_from(ideal), by_hand, atol=0.01)
+    np.testing.assert_allclose(lens.resampled_from(GRID), expected, atol=0.01)
     said = float(lens.said.split("nearer than ")[1].split()[0])
     assert said == pytest.approx(worst, rel=0.3)
 

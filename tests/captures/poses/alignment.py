@@ -38,27 +38,23 @@ class Alignment:
         return float(np.sqrt(np.mean(self.errors_px**2)))
 
 
-def align_poses(
-    estimated: PoseSet,
-    truth: PoseSet,
-    names: dict[str, str] | None = None,
-    points: Float64[np.ndarray, "P 3"] | None = None,
-) -> Alignment:
+def align_poses(estimated: PoseSet, truth: PoseSet, names: dict[str, str] | None = None) -> Alignment:
     """Find the similarity after which the estimated cameras see points where the true ones do, and what is left.
+
+    Points are the sparse ones of the true poses or of the estimated ones, or some around where the cameras look.
 
     Args:
         names: True name of each estimated one; None where both are the same.
-        points: In the true world, less its offset; None takes the sparse points of the true poses, or of the estimated
-            ones, or points around where the cameras look.
     """
     pairs = names or {name: name for name in estimated.cameras}
     shared = {a: b for a, b in pairs.items() if a in estimated.cameras and b in truth.cameras}
     assert len(shared) >= 3
     mine, theirs = [estimated.cameras[a] for a in shared], [truth.cameras[b] for b in shared.values()]
     first, reach = _first_guess(_stacked(mine), _stacked(theirs))
-    if points is None and (points := truth.points) is None:
-        found = estimated.points
-        points = _around(_stacked(theirs), reach) if found is None else first.to_scene(found)
+    points = truth.points
+    if points is None:
+        around = _around(_stacked(theirs), reach)
+        points = around if estimated.points is None else first.to_scene(estimated.points)
     points = points[:: max(1, len(points) // 400)]
     wanted = np.stack([camera.pixels_of(points) for camera in theirs])
     sizes = np.array([[c.lens.width, c.lens.height] for c in theirs if c.lens is not None])[:, None]
@@ -77,16 +73,16 @@ def align_poses(
     def off(way: Placement) -> Float64[np.ndarray, "N P 2"]:
         return np.stack([camera.moved(way).pixels_of(points) for camera in mine]) - wanted
 
-    scales = 1e-3 * np.array([1, 1, 1, 1, reach, reach, reach])
-    errors = lambda step: np.nan_to_num(off(changed(step))[seen].ravel(), nan=1e4)  # noqa: E731
-    best = changed(least_squares(errors, np.zeros(7), x_scale=scales).x)
+    def errors(step: np.ndarray) -> np.ndarray:
+        return np.nan_to_num(off(changed(step))[seen].ravel(), nan=1e4)
+
+    best = changed(least_squares(errors, np.zeros(7), x_scale=[1e-3] * 4 + [1e-3 * reach] * 3).x)
     squared = np.where(seen, (off(best) ** 2).sum(axis=-1), np.nan)
     found, true = _stacked([camera.moved(best) for camera in mine]), _stacked(theirs)
     turns = Rotation.from_matrix(found[:, :, :3].transpose(0, 2, 1) @ true[:, :, :3]).magnitude()
     places = np.linalg.norm(found[:, :, 3] - true[:, :, 3], axis=1)
-    return Alignment(
-        best, tuple(shared.values()), np.sqrt(np.nanmean(squared, axis=1)), np.degrees(turns), places
-    )
+    errors_px = np.sqrt(np.nanmean(squared, axis=1))
+    return Alignment(best, tuple(shared.values()), errors_px, np.degrees(turns), places)
 
 
 def _stacked(cameras: list[PosedCamera]) -> Float64[np.ndarray, "N 3 4"]:

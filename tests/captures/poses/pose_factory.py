@@ -65,6 +65,26 @@ def pixels_in_file(found: PoseSet, ideal: np.ndarray) -> np.ndarray:
     return lens.resampled_from(ideal) if lens.resampled_from else lens.pixels_of(ideal)
 
 
+def by_hand(
+    ideal: np.ndarray, focal, center, radial=(), tangential=(0.0, 0.0), growth=(), skew=0.0, is_fisheye=False
+) -> np.ndarray:
+    """Where OpenCV's and Metashape's manuals say that ideal points are seen; p1, p2 in OpenCV's order."""
+    x, y = ideal.T
+    if is_fisheye:
+        radius = np.hypot(x, y)
+        x, y = (axis * np.arctan(radius) / np.maximum(radius, 1e-12) for axis in (x, y))
+    squared, (p1, p2) = x**2 + y**2, tangential
+    factor = 1 + sum(term * squared**power for power, term in enumerate(radial, 1))
+    grown = 1 + sum(term * squared**power for power, term in enumerate(growth, 1))
+    bent_x = x * factor + grown * (2 * p1 * x * y + p2 * (squared + 2 * x**2))
+    bent_y = y * factor + grown * (2 * p2 * x * y + p1 * (squared + 2 * y**2))
+    return np.column_stack([focal[0] * bent_x + skew * bent_y, focal[1] * bent_y]) + center
+
+
+IDEAL = np.random.default_rng(0).uniform([-0.55, -0.4], [0.55, 0.4], (40, 2))
+"""Ideal points that the lenses of these files see."""
+
+
 def llff_table(poses, hwf=(480.0, 640.0, 500.0)):
     rows = []
     for pose in poses:

@@ -3,8 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import FLIP, LENS, assert_same_poses, ring
@@ -134,27 +132,3 @@ def test_a_damaged_file_is_refused_by_name_before_anything_is_allocated(tmp_path
     (tmp_path / name).write_bytes(spoil((tmp_path / name).read_bytes()))
     with pytest.raises(CaptureError, match=message):
         read_poses(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("model")
-    make_model().write_binary(folder)
-    return {name: (folder / name).read_bytes() for name in ("cameras.bin", "images.bin", "points3D.bin")}
-
-
-@given(st.sampled_from(["cameras.bin", "images.bin", "points3D.bin"]), st.data())
-def test_damaged_binaries_are_read_or_refused(written, tmp_path_factory, name, data):
-    folder = tmp_path_factory.mktemp("fuzz")
-    for other, content in written.items():
-        (folder / other).write_bytes(content)
-    content = bytearray(written[name])
-    for _ in range(data.draw(st.integers(0, 3))):
-        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
-    cut = data.draw(st.integers(0, len(content)))
-    (folder / name).write_bytes(bytes(content[:cut]))
-    try:
-        found = read_poses(folder)
-    except CaptureError:
-        return
-    assert all(np.isfinite(camera.camera_to_world).all() for camera in found.cameras.values())

@@ -34,22 +34,25 @@ def board(columns: int = 4, rows: int = 3) -> dict[int, np.ndarray]:
     return {number: SQUARE + np.array(place) for number, place in enumerate(places)}
 
 
-def cameras(count: int = 8, lens: Lens = LENS) -> PoseSet:
-    """Around the board, at several heights."""
+BOARD = board()
+
+
+def cameras(count: int = 8, lens: Lens = LENS, corners: dict[int, np.ndarray] = BOARD) -> PoseSet:
+    """Around the board, at several heights; the corners are its points."""
     found = {}
     for index in range(count):
         angle, height = 2.1 * index, 0.25 + 0.06 * (index % 4)
         place = np.array([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.3 + height])
         found[f"view_{index}"] = PosedCamera(look_at(place, np.array([0.0, 0.0, 0.3]))[:3], lens)
-    return PoseSet(found, "the truth")
+    return PoseSet(found, "the truth", np.concatenate(list(corners.values())))
 
 
-def seen(truth: PoseSet, corners: dict[int, np.ndarray], noise_px: float = 0.1) -> dict[str, dict]:
-    """What every camera sees of the markers, each with an error."""
+def seen(truth: PoseSet, corners: dict[int, np.ndarray] = BOARD) -> dict[str, dict]:
+    """What every camera sees of the markers, each with an error of a tenth of a pixel."""
     generator = np.random.default_rng(0)
     return {
         name: {
-            number: camera.pixels_of(points) + noise_px * generator.normal(size=(4, 2))
+            number: camera.pixels_of(points) + 0.1 * generator.normal(size=(4, 2))
             for number, points in corners.items()
         }
         for name, camera in truth.cameras.items()
@@ -77,7 +80,7 @@ def picture(camera: PosedCamera, corners: dict[int, np.ndarray], family: str = F
 
 
 def test_corners_are_found_to_a_few_hundredths_of_a_pixel():
-    truth, corners = cameras(4, PINHOLE), board()
+    truth, corners = cameras(4, PINHOLE), BOARD
     pictures = {name: picture(camera, corners) for name, camera in truth.cameras.items()}
     found, notes = find_markers(pictures, FAMILY)
     assert notes == []
@@ -94,7 +97,7 @@ def test_corners_are_found_to_a_few_hundredths_of_a_pixel():
 @pytest.mark.slow
 def test_the_family_is_that_of_the_markers():
     truth = cameras(2, PINHOLE).cameras.values()
-    shown = [picture(camera, board(), "DICT_APRILTAG_36H11") for camera in truth]
+    shown = [picture(camera, BOARD, "DICT_APRILTAG_36H11") for camera in truth]
     counts = count_markers(shown)
     assert max(counts, key=lambda name: counts[name]) == "DICT_APRILTAG_36H11"
     assert counts["DICT_APRILTAG_36H11"] >= 20
@@ -120,9 +123,9 @@ def test_a_number_twice_in_a_picture_is_left_out_and_said():
 
 
 def test_poses_lens_scale_and_up_follow_from_markers():
-    truth, corners = cameras(), board()
-    found = solved(seen(truth, corners))
-    aligned = align_poses(found, truth, points=np.concatenate(list(corners.values())))
+    truth = cameras()
+    found = solved(seen(truth))
+    aligned = align_poses(found, truth)
     assert aligned.names == tuple(truth.cameras)
     assert aligned.rms_px < 0.15
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
@@ -137,15 +140,15 @@ def test_poses_lens_scale_and_up_follow_from_markers():
 
 
 def test_a_lens_that_is_given_stays_and_markers_may_lie_anywhere():
-    truth = cameras()
     turns = Rotation.from_euler("xyz", np.random.default_rng(1).uniform(-0.5, 0.5, (12, 3))).as_matrix()
     corners = {
         number: points.mean(axis=0) + np.array([0, 0, 0.02 * (number % 3)]) + SQUARE @ turns[number].T
-        for number, points in board().items()
+        for number, points in BOARD.items()
     }
+    truth = cameras(corners=corners)
     found = solved(seen(truth, corners), lens=LENS, marker_size=None)
     assert {camera.lens for camera in found.cameras.values()} == {LENS}
-    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+    assert align_poses(found, truth).rms_px < 0.15
     assert not found.has_world
     assert found.metres_per_unit is None
     assert any("no scale: give --marker-size" in note for note in found.notes)
@@ -153,8 +156,8 @@ def test_a_lens_that_is_given_stays_and_markers_may_lie_anywhere():
 
 @pytest.mark.slow
 def test_wrong_sightings_are_left_out_and_views_without_markers_named():
-    truth, corners = cameras(), board()
-    sightings = seen(truth, corners)
+    truth = cameras()
+    sightings = seen(truth)
     sightings["view_1"][3] = sightings["view_1"][3] + 9.0
     sightings["view_5"] = {}
     sensor_of = dict.fromkeys(sightings, "rgb") | {"nir_0": "nir", "nir_1": "nir"}
@@ -164,17 +167,17 @@ def test_wrong_sightings_are_left_out_and_views_without_markers_named():
     assert "views without enough markers: view_5, nir_0, nir_1" in found.notes
     assert any("1 sighting of markers left out" in note for note in found.notes)
     assert not any("focal length" in note for note in found.notes)
-    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+    assert align_poses(found, truth).rms_px < 0.15
 
 
 def test_sightings_where_a_lens_folds_its_picture_over_are_left_out():
     lens = replace(LENS, distortion=(-0.5, 0.0, 0.0, 0.0))
-    truth, corners = cameras(lens=lens), board()
+    truth = cameras(lens=lens)
     in_the_corner = np.array([[300.0, 220.0], [318.0, 220.0], [318.0, 238.0], [300.0, 238.0]])
-    sightings = seen(truth, corners)
+    sightings = seen(truth)
     sightings["view_1"][3] = in_the_corner
     found = solved(sightings, lens=lens)
-    assert align_poses(found, truth, points=np.concatenate(list(corners.values()))).rms_px < 0.15
+    assert align_poses(found, truth).rms_px < 0.15
     assert "1 sighting of markers left out where a lens folds its picture over" in found.notes
     with pytest.raises(
         CaptureError,
@@ -186,41 +189,38 @@ def test_sightings_where_a_lens_folds_its_picture_over_are_left_out():
 def test_a_board_in_one_view_only_is_refused():
     truth = cameras()
     sightings: dict[str, dict] = {name: {} for name in truth.cameras}
-    sightings["view_2"] = seen(truth, board())["view_2"]
+    sightings["view_2"] = seen(truth)["view_2"]
     with pytest.raises(CaptureError, match="seen in 1 of 8 views, the same ones in 0; expected at least 3"):
         solved(sightings)
 
 
 @pytest.mark.slow
 def test_markers_of_two_sizes_are_refused_by_number():
-    truth, corners = cameras(), board()
-    corners[7] = corners[7].mean(axis=0) + 1.5 * SQUARE
+    truth, corners = cameras(), BOARD | {7: BOARD[7].mean(axis=0) + 1.5 * SQUARE}
     with pytest.raises(CaptureError, match=r"several sizes: over the usual one, 7 \(1\.[45]"):
         solved(seen(truth, corners))
 
 
 @pytest.mark.slow
 def test_boards_that_moved_against_each_other_are_refused():
-    truth, corners = cameras(), board()
-    moved = {
-        number: points + np.array([0.02, 0.01, 0.0]) * (number > 5) for number, points in corners.items()
-    }
-    before, after = seen(truth, corners), seen(truth, moved)
+    truth = cameras()
+    moved = {number: points + np.array([0.02, 0.01, 0.0]) * (number > 5) for number, points in BOARD.items()}
+    before, after = seen(truth), seen(truth, moved)
     sightings = {name: (before if index < 4 else after)[name] for index, name in enumerate(truth.cameras)}
     with pytest.raises(CaptureError, match="markers did not keep their places"):
         solved(sightings)
 
 
 def test_markers_give_scale_and_up_to_poses_that_have_none():
-    truth, corners = cameras(), board()
+    truth = cameras()
     tilted = replace(elsewhere(truth), has_world=False)
-    found = metric_poses(tilted, seen(truth, corners), SIDE)
-    aligned = align_poses(found, truth, points=np.concatenate(list(corners.values())))
+    found = metric_poses(tilted, seen(truth), SIDE)
+    aligned = align_poses(found, truth)
     assert aligned.similarity.scale == pytest.approx(1.0, abs=0.005)
     np.testing.assert_allclose(aligned.similarity.rotation[2], [0, 0, 1], atol=5e-3)
     assert found.has_world
     with pytest.raises(CaptureError, match="none of them seen by two cameras that agree"):
-        metric_poses(tilted, {"view_0": seen(truth, corners)["view_0"]}, SIDE)
+        metric_poses(tilted, {"view_0": seen(truth)["view_0"]}, SIDE)
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +229,7 @@ def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("capture")
     truth = cameras(6, PINHOLE)
     for name, camera in truth.cameras.items():
-        light = picture(camera, board())
+        light = picture(camera, BOARD)
         grey = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
         Image.fromarray(np.dstack([np.round(255 * grey).astype(np.uint8)] * 3)).save(path / f"{name}.png")
     return path, truth

@@ -11,12 +11,14 @@ from tests.captures.poses.pose_factory import (
     BROWN,
     CALIBRATION,
     FLIP,
+    IDEAL,
     METASHAPE_CALIBRATION,
     ORIENTATION,
     PERSPECTIVE,
     RADIAL,
     as_json,
     assert_same_poses,
+    by_hand,
     lens_of,
     metashape_document,
     pixels_in_file,
@@ -75,54 +77,61 @@ def test_the_similarity_leads_to_geocentric_coordinates_with_an_offset(tmp_path,
     np.testing.assert_allclose(found.up, middle / np.linalg.norm(middle), atol=1e-4)
 
 
-def test_metashapes_p1_and_b1_are_ours_in_its_own_order(tmp_path):
-    found = read_metashape(tmp_path, ring(), terms="<k1>0.1</k1><p1>0.01</p1><p2>0.02</p2><b1>2</b1>")
-    lens = lens_of(found)
-    x, y, squared = 0.3, -0.2, 0.13
-    bent_x = x * (1 + 0.1 * squared) + 0.01 * (squared + 2 * x**2) + 2 * 0.02 * x * y
-    bent_y = y * (1 + 0.1 * squared) + 0.02 * (squared + 2 * y**2) + 2 * 0.01 * x * y
-    mine = lens.pixels_of(np.array([[x, y]]))
-    np.testing.assert_allclose(mine, [[323 + bent_x * 502, 236 + bent_y * 500]])
+OLD = METASHAPE_CALIBRATION.replace("<f>500</f><cx>3</cx><cy>-4</cy>", "<fx>500</fx><fy>510</fy>")
+CORNERED = "<cx>323</cx><cy>236</cy><p1>0.003</p1><p2>-0.002</p2>"
+TAKEN = "p1, p2 beside <fx>, <fy> are taken as OpenCV's "
+GROWING = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"
+GROWN = {"radial": (0.01,), "tangential": (-0.002, 0.003), "growth": (8, -3)}
+USUAL = {"focal": (500, 500), "center": (323, 236)}
+FIRST = {"focal": (500, 510)}
+"""Of PhotoScan's old form, which counts the principal point from the corner."""
 
 
-def test_photoscans_old_form_counts_the_principal_point_from_the_corner(tmp_path):
-    old = METASHAPE_CALIBRATION.replace("<f>500</f><cx>3</cx><cy>-4</cy>", "<fx>500</fx><fy>510</fy>{terms}")
-    for terms, center in (("<cx>323</cx><cy>236</cy>", (323, 236)), ("", (320, 240))):
-        lens = lens_of(read_metashape(tmp_path, ring(), calibration=old.format(terms=terms, kind="frame")))
-        assert (lens.focal_px, lens.center_px) == ((500, 510), center)
+@pytest.mark.parametrize(
+    ("written", "lens", "note"),
+    [
+        (  # in Metashape's own order
+            {"terms": "<k1>0.1</k1><p1>0.01</p1><p2>0.02</p2><b1>2</b1>"},
+            USUAL | {"focal": (502, 500), "radial": (0.1,), "tangential": (0.02, 0.01)},
+            "",
+        ),
+        ({"terms": GROWING}, USUAL | GROWN, "Metashape with p3, p4"),
+        ({"terms": GROWING, "kind": "fisheye"}, USUAL | GROWN | {"is_fisheye": True}, "Metashape fisheye"),
+        ({"terms": "<b2>80</b2>"}, USUAL | {"skew": 80}, "pixels are interpolated"),
+        (  # 2 mm over those of pixels
+            {"calibration": "", "kind": "fisheye"},
+            {"focal": (500, 400), "center": (320, 240), "is_fisheye": True},
+            "Metashape fisheye",
+        ),
+        ({"calibration": OLD, "terms": "<p1>0</p1><p2>0</p2>"}, FIRST | {"center": (320, 240)}, ""),
+        ({"calibration": OLD, "terms": "<cx>323</cx><cy>236</cy>"}, FIRST | {"center": (323, 236)}, ""),
+        (
+            {"calibration": OLD, "terms": CORNERED},
+            FIRST | {"center": (323, 236), "tangential": (0.003, -0.002)},
+            TAKEN + "p1, p2",
+        ),
+        (
+            {"calibration": OLD, "terms": CORNERED + "<p3>8</p3><p4>0</p4>"},
+            FIRST | {"center": (323, 236), "tangential": (-0.002, 0.003), "growth": (8,)},
+            TAKEN + "p2, p1",
+        ),
+    ],
+)
+def test_metashapes_lenses_see_what_its_manuals_say(tmp_path, written, lens, note):
+    found = read_metashape(tmp_path, ring(), **written)
+    atol = 0.1 if lens_of(found).said else 1e-9
+    np.testing.assert_allclose(pixels_in_file(found, IDEAL), by_hand(IDEAL, **lens), atol=atol)
+    assert any(note in said for said in found.notes) == bool(note)
+    assert sum(TAKEN in said for said in found.notes) == (TAKEN in note)
 
 
-@pytest.mark.parametrize(("more", "is_swapped"), [("", False), ("<p3>8</p3><p4>0</p4>", True)])
-def test_photoscans_old_form_has_p1_and_p2_in_opencvs_order_until_p3_came(tmp_path, more, is_swapped):
-    terms = f"<fx>500</fx><fy>500</fy><cx>323</cx><cy>236</cy><p1>0.003</p1><p2>-0.002</p2>{more}"
-    old = METASHAPE_CALIBRATION.replace("<f>500</f><cx>3</cx><cy>-4</cy>{terms}", terms)
-    found = read_metashape(tmp_path, ring(), calibration=old)
-    x, y, squared = 0.3, 0.2, 0.13
-    growth = 1 + 8 * squared if more else 1
-    p1, p2 = (-0.002, 0.003) if is_swapped else (0.003, -0.002)  # OpenCV's
-    bent_x = x + growth * (2 * p1 * x * y + p2 * (squared + 2 * x**2))
-    bent_y = y + growth * (2 * p2 * x * y + p1 * (squared + 2 * y**2))
-    seen = pixels_in_file(found, np.array([[x, y]]))
-    np.testing.assert_allclose(seen, [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1)
-    taken = "p1, p2 beside <fx>, <fy> are taken as OpenCV's " + ("p2, p1" if is_swapped else "p1, p2")
-    assert sum(taken in note for note in found.notes) == 1
-    plain = old.replace("0.003", "0").replace("-0.002", "0")
-    assert not any("p1, p2" in note for note in read_metashape(tmp_path, ring(), calibration=plain).notes)
-
-
-@pytest.mark.parametrize("kind", ["fisheye", "spherical"])
-def test_a_sensor_without_calibration_keeps_its_type(tmp_path, kind):
-    found = read_metashape(tmp_path, ring(), kind=kind, calibration="")
-    x, y = 0.3, 0.2
-    ideal = np.array([[x, y]])
-    if kind == "spherical":
-        angles = np.array([[np.arctan(x), np.arctan2(y, np.hypot(x, 1))]])
-        expected = (320, 240) + angles * (640 / (2 * np.pi), 480 / np.pi)
-    else:
-        radius = np.hypot(x, y)
-        expected = (320, 240) + ideal * np.arctan(radius) / radius * (500, 400)  # 2 mm over those of pixels
-    np.testing.assert_allclose(pixels_in_file(found, ideal), expected, atol=0.1)
-    assert any(f"Metashape {kind}" in note for note in found.notes)
+def test_a_sensor_without_calibration_keeps_its_type(tmp_path):
+    found = read_metashape(tmp_path, ring(), kind="spherical", calibration="")
+    x, y = IDEAL.T
+    angles = np.column_stack([np.arctan(x), np.arctan2(y, np.hypot(x, 1))])
+    expected = (320, 240) + angles * (640 / (2 * np.pi), 480 / np.pi)
+    np.testing.assert_allclose(pixels_in_file(found, IDEAL), expected, atol=0.1)
+    assert any("Metashape spherical" in note for note in found.notes)
     with pytest.raises(CaptureError, match="of the type equisolid_fisheye; expected frame"):
         read_metashape(tmp_path, ring(), kind="equisolid_fisheye", calibration="")
 
@@ -135,37 +144,11 @@ def test_a_rolling_shutter_is_said_not_to_be_followed(tmp_path, value):
     assert all("sensor lens: 'rolling_shutter' is set and not followed" in text for text in warnings)
 
 
-@pytest.mark.parametrize("kind", ["frame", "fisheye"])
-def test_tangential_terms_grow_by_p3_and_p4(tmp_path, kind):
-    terms = "<k1>0.01</k1><p1>0.003</p1><p2>-0.002</p2><p3>8</p3><p4>-3</p4>"
-    found = read_metashape(tmp_path, ring(), terms=terms, kind=kind)
-    x, y, squared = 0.3, 0.2, 0.13  # of the bent point; a fisheye sees the angle, a frame camera its tangent
-    growth = 1 + 8 * squared - 3 * squared**2
-    bent_x = x * (1 + 0.01 * squared) + growth * (0.003 * (squared + 2 * x**2) - 2 * 0.002 * x * y)
-    bent_y = y * (1 + 0.01 * squared) + growth * (-0.002 * (squared + 2 * y**2) + 2 * 0.003 * x * y)
-    radius = squared**0.5
-    ideal = np.array([[x, y]]) * (np.tan(radius) / radius if kind == "fisheye" else 1.0)
-    np.testing.assert_allclose(
-        pixels_in_file(found, ideal), [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1
-    )
-    said = "Metashape fisheye" if kind == "fisheye" else "Metashape with p3, p4"
-    assert any(said in note for note in found.notes)
-
-
 def test_terms_that_are_not_known_are_named(tmp_path):
     terms = "<p3>8</p3><k5>0.1</k5><k6>0</k6><date>2019-05-01</date>"
     found = read_metashape(tmp_path, ring(), terms=terms)
     assert found.notes == ("sensor lens: numbers that are not known and not used: k5",)
     assert lens_of(found).distortion == (0, 0, 0, 0)
-
-
-def test_pixels_are_interpolated_where_skew_is_large(tmp_path):
-    sheared = read_metashape(tmp_path, ring(), terms="<b2>80</b2>")
-    assert any("pixels are interpolated" in note for note in sheared.notes)
-    x, y = 0.3, 0.2
-    seen = lens_of(sheared).resampled_from(np.array([[x, y]]))
-    plain = lens_of(read_metashape(tmp_path, ring())).pixels_of(np.array([[x, y]]))
-    np.testing.assert_allclose(seen - plain, [[80 * y, 0.0]], atol=0.5)
 
 
 @pytest.mark.parametrize("off", ["false", "0"])
@@ -249,15 +232,9 @@ def test_orientations_of_a_project_are_read_with_their_calibration(tmp_path):
 def test_distortion_in_pixels_about_its_own_centre_is_ours_within_half_a_pixel(tmp_path, distortion, p1):
     found = read_poses(write_micmac(tmp_path, distortion.format(a="-2e-7")))
     lens = present(found.cameras["view_0.png"].lens)
-    ideal = np.random.default_rng(0).uniform([-0.55, -0.4], [0.55, 0.4], (40, 2))
-    away = 500 * ideal + [-1.5, -2.5]
-    x, y, squared = *away.T, (away**2).sum(1)
-    factor = 1 - 2e-7 * squared - 1e-14 * squared**2
-    bent = np.column_stack([x * factor + p1 * (squared + 2 * x**2), y * factor + 2 * p1 * x * y])
-    wanted = bent + np.array([322.5, 241.5])
-    mine = lens.pixels_of(ideal)
-    np.testing.assert_allclose(mine, wanted, atol=0.5)
-    assert np.abs(500 * ideal + [321, 239] - wanted).max() > 3
+    wanted = by_hand(500 * IDEAL - (1.5, 2.5), (1, 1), (322.5, 241.5), (-2e-7, -1e-14), (0.0, p1))
+    np.testing.assert_allclose(lens.pixels_of(IDEAL), wanted, atol=0.5)
+    assert np.abs(500 * IDEAL + [321, 239] - wanted).max() > 3
 
 
 def affinity(shift, axis="1 0"):

@@ -13,59 +13,60 @@ def named(*names):
     return PoseSet(dict(zip(names, cameras, strict=True)), "poses")
 
 
-def match(poses, *views):
-    """The name of the camera that each view gets, and the notes."""
-    names = {id(camera): name for name, camera in poses.cameras.items()}
-    cameras, notes, _ = match_poses(poses, views)
-    return {view: names[id(camera)] for view, camera in cameras.items()}, notes
+@pytest.mark.parametrize(
+    ("cameras", "views", "expected", "said"),
+    [
+        (  # folders and suffixes do not count where names are unique
+            ["images/a.jpg", "C:\\pictures\\b.JPG", "c"],
+            {"a": [], "view-b": ["cubes/b.hdr"], "c": ["cubes/c.npy"]},
+            {"a": "images/a.jpg", "view-b": "C:\\pictures\\b.JPG", "c": "c"},
+            ["3 of 3 views were matched by name"],
+        ),
+        (
+            ["raw/left/1.tif", "raw/right/1.tif"],
+            {"left_1": ["x/left/1.npy"], "right_1": ["x/right/1.npy"]},
+            {"left_1": "raw/left/1.tif", "right_1": "raw/right/1.tif"},
+            ["2 of 2"],
+        ),
+        (  # a stem that several views share matches none of them
+            ["left/1.tif", "2.tif"],
+            {"a": ["x/1.npy"], "b": ["y/1.npy"], "2": []},
+            {"2": "2.tif"},
+            ["1 of 3", "views without pose: a, b", "1 camera without view: left/1", "share the name of a, b"],
+        ),
+        (  # nothing in common but a number
+            ["rgb_0009.png", "rgb_0010.png", "rgb_0011.png"],
+            {"cube-10-refl": [], "cube-9-refl": []},
+            {"cube-10-refl": "rgb_0010.png", "cube-9-refl": "rgb_0009.png"},
+            ["2 of 2", "1 camera without view: rgb_0011.png"],
+        ),
+        (["#0000", "#0001"], {"b": [], "a": []}, {"a": "#0000", "b": "#0001"}, ["by their order"]),
+        (  # by names as texts, which is said where numbers go otherwise
+            ["#0000", "#0001", "#0002"],
+            {"v1": [], "v2": [], "v10": []},
+            {"v1": "#0000", "v10": "#0001", "v2": "#0002"},
+            ["by their order", "names were sorted as texts: v1, v10, v2"],
+        ),
+    ],
+)
+def test_views_get_the_cameras_of_their_names_and_what_is_odd_is_said(cameras, views, expected, said):
+    poses = named(*cameras)
+    found, notes, _ = match_poses(poses, list(views.items()))
+    assert set(found) == set(expected)
+    assert all(found[view] is poses.cameras[name] for view, name in expected.items())
+    assert [text in note for text, note in zip(said, notes, strict=True)] == [True] * len(said)
 
 
-def test_folders_and_suffixes_do_not_count_where_names_are_unique():
-    poses = named("images/a.jpg", "C:\\pictures\\b.JPG", "c")
-    found, notes = match(poses, ("a", []), ("view-b", ["cubes/b.hdr"]), ("c", ["cubes/c.npy"]))
-    assert found == {"a": "images/a.jpg", "view-b": "C:\\pictures\\b.JPG", "c": "c"}
-    assert notes == ["3 of 3 views were matched by name"]
-
-
-def test_equal_file_names_are_told_apart_by_their_folder():
-    poses = named("raw/left/1.tif", "raw/right/1.tif")
-    found, _ = match(poses, ("left_1", ["x/left/1.npy"]), ("right_1", ["x/right/1.npy"]))
-    assert found == {"left_1": "raw/left/1.tif", "right_1": "raw/right/1.tif"}
-
-
-def test_a_stem_that_several_views_share_matches_none_of_them():
-    poses = named("left/1.tif", "2.tif")
-    found, notes = match(poses, ("a", ["x/1.npy"]), ("b", ["y/1.npy"]), ("2", []))
-    assert found == {"2": "2.tif"}
-    assert notes[1:3] == ["views without pose: a, b", "1 camera without view: left/1.tif"]
-    assert "share the name of a, b" in notes[3]
-
-
-def test_names_with_nothing_in_common_but_a_number_match_by_it():
-    poses = named("rgb_0009.png", "rgb_0010.png", "rgb_0011.png")
-    found, notes = match(poses, ("cube-10-refl", []), ("cube-9-refl", []))
-    assert found == {"cube-10-refl": "rgb_0010.png", "cube-9-refl": "rgb_0009.png"}
-    assert notes[-1] == "1 camera without view: rgb_0011.png"
-
-
-def test_cameras_without_names_go_by_order_and_need_as_many_views():
-    poses = named("#0000", "#0001")
-    assert match(poses, ("b", []), ("a", []))[0] == {"a": "#0000", "b": "#0001"}
-    with pytest.raises(CaptureError, match="2 poses without names and 3 views"):
-        match(poses, ("a", []), ("b", []), ("c", []))
-
-
-def test_no_match_at_all_names_both_sides():
-    with pytest.raises(CaptureError, match=r"views are called p, q, the cameras of poses x\.png, y\.png"):
-        match(named("x.png", "y.png"), ("p", []), ("q", []))
-
-
-def test_poses_without_names_go_by_names_as_texts_which_is_said_where_numbers_go_otherwise():
-    poses = named("#0000", "#0001", "#0002")
-    found, notes = match(poses, ("v1", []), ("v2", []), ("v10", []))
-    assert found == {"v1": "#0000", "v10": "#0001", "v2": "#0002"}
-    assert "names were sorted as texts: v1, v10, v2" in notes[1]
-    assert len(match(poses, ("v1", []), ("v2", []), ("v3", []))[1]) == 1
+@pytest.mark.parametrize(
+    ("cameras", "views", "message"),
+    [
+        (["#0000", "#0001"], "abc", "2 poses without names and 3 views"),
+        (["x.png", "y.png"], "pq", r"views are called p, q, the cameras of poses x\.png, y\.png"),
+    ],
+)
+def test_names_that_do_not_fit_at_all_are_refused(cameras, views, message):
+    with pytest.raises(CaptureError, match=message):
+        match_poses(named(*cameras), [(view, []) for view in views])
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,10 @@ from PIL import Image
 from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import (
     FLIP,
+    IDEAL,
     LENS,
     assert_same_poses,
+    by_hand,
     lens_of,
     llff_table,
     metashape_document,
@@ -151,29 +153,13 @@ def test_a_fisheye_of_instant_ngp_is_one(tmp_path):
 
 
 def test_a_fisheye_with_tangential_terms_is_the_one_that_metashape_writes(tmp_path):
-    content = transforms(
-        ring(),
-        camera_model="OPENCV_FISHEYE",
-        fl_x=500,
-        fl_y=500,
-        cx=323,
-        cy=236,
-        k1=0.1,
-        k2=0.02,
-        p1=0.02,
-        p2=-0.01,
-    )
-    terms = "<k1>0.1</k1><k2>0.02</k2><p1>-0.01</p1><p2>0.02</p2>"  # Metashape's order is the other one
-    (tmp_path / "cameras.xml").write_text(metashape_document(ring(), kind="fisheye", terms=terms))
-    x, y, squared = 0.3, 0.2, 0.13  # of the length of the angle from the axis
-    ideal = np.array([[x, y]]) * math.tan(squared**0.5) / squared**0.5
-    factor = 1 + 0.1 * squared + 0.02 * squared**2
-    bent_x = x * factor + 2 * 0.02 * x * y - 0.01 * (squared + 2 * x**2)
-    bent_y = y * factor + 0.02 * (squared + 2 * y**2) - 2 * 0.01 * x * y
+    center, terms = {"cx": 323, "cy": 236}, {"k1": 0.1, "k2": 0.02, "p1": 0.02, "p2": -0.01}
+    content = transforms(ring(), camera_model="OPENCV_FISHEYE", fl_x=500, fl_y=500, **center, **terms)
+    written = "<k1>0.1</k1><k2>0.02</k2><p1>-0.01</p1><p2>0.02</p2>"  # Metashape's order is the other one
+    (tmp_path / "cameras.xml").write_text(metashape_document(ring(), kind="fisheye", terms=written))
+    expected = by_hand(IDEAL, (500, 500), (323, 236), (0.1, 0.02), (0.02, -0.01), is_fisheye=True)
     for found in (read(tmp_path, content), read_poses(tmp_path / "cameras.xml")):
-        np.testing.assert_allclose(
-            pixels_in_file(found, ideal), [[323 + 500 * bent_x, 236 + 500 * bent_y]], atol=0.1
-        )
+        np.testing.assert_allclose(pixels_in_file(found, IDEAL), expected, atol=0.1)
 
 
 REFUSED = dict.fromkeys(("latlong", "equirectangular", "orthographic", "from_mitsuba"), True)
