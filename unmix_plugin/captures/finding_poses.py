@@ -177,11 +177,11 @@ def _sightings(plan: Plan, options: ProcessOptions) -> tuple[Sightings, list[str
         )
         notes += [f"{sensor + ': ' if sensor else ''}markers of {chosen} found in {where}", *said]
     if not sightings:
-        asked, others = "no markers", []
+        asked, hint = "no markers", ""
         if family is not None:
-            asked = f"no markers of {family}"
-            others = [other for sensor in plan.sensors if (other := _choose(plan, sensor, None)[0])]
-        hint = "".join(f", but some of {other} are: give --marker-family {other}" for other in others[:1])
+            asked, tried = f"no markers of {family}", (_choose(plan, sensor, None) for sensor in plan.sensors)
+            if other := next((found for found, _ in tried if found), None):
+                hint = f", but some of {other} are: give --marker-family {other}"
         raise CaptureError(
             f"{asked} are in the pictures{hint}; expected sharp ones, with a white rim, at least 20 pixels wide"
         )
@@ -197,9 +197,9 @@ def _choose(plan: Plan, sensor: str, family: str | None) -> tuple[str | None, in
     sample = [_light(views[place], calibration, bands) for place in _spread(len(views), _SAMPLE_VIEWS)]
     for index in (0, len(bands) // 2):  # the mean of all bands, or, if there is nothing in it, the middle one
         if family is None:
-            counts = count_markers([pictures[index] for pictures in sample[::2]])
-            most = max(counts, key=lambda kind: counts[kind])
-            family = most if counts[most] else None
+            found = count_markers([pictures[index] for pictures in sample[::2]])
+            most, count = max(found.items(), key=lambda each: each[1])
+            family = most if count else None
     if family is None:
         return None, None
     counts = [count_markers([pictures[i] for pictures in sample], family)[family] for i in range(len(bands))]
