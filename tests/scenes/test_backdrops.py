@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,9 +104,19 @@ def pictures(light: Light, matter: bool = True) -> tuple[list[np.ndarray], list[
     return images, covers
 
 
-def judge(images: list[np.ndarray]) -> Backdrop | None:
+EVERYWHERE = np.ones((HEIGHT, WIDTH), bool)
+
+
+def judge(images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Backdrop | None:
     sample = np.concatenate([image[::5, ::3].reshape(-1, BANDS) for image in images])
-    return judge_backdrop(images, [np.ones((HEIGHT, WIDTH), bool)] * len(images), sample)
+    return judge_backdrop(images, [known] * len(images), sample)
+
+
+def seen_in(image: np.ndarray, images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Any:
+    """The backdrop of some views, and what it looks like in one."""
+    backdrop = judge(images, known)
+    assert backdrop is not None
+    return backdrop, backdrop.find(backdrop.features(image), known)
 
 
 @pytest.mark.parametrize("name", BACKDROPS)
@@ -115,7 +126,7 @@ def test_a_plain_backdrop_is_found_said_and_cut_out_with_soft_edges(name: str):
     assert backdrop is not None
     assert name not in ("black", "grey", "white") or backdrop.in_words.startswith(name)
     for image, cover in zip(images, covers, strict=True):
-        seen = backdrop.find(backdrop.features(image), np.ones((HEIGHT, WIDTH), bool))
+        seen = backdrop.find(backdrop.features(image), EVERYWHERE)
         assert seen is not None
         opacity = seen.opacity(~seen.shown)
         assert ((opacity > 0.5) != (cover > 0.5)).mean() < 0.012
@@ -128,10 +139,7 @@ def test_a_plain_backdrop_is_found_said_and_cut_out_with_soft_edges(name: str):
 
 def test_what_the_backdrop_looks_like_is_known_where_matter_hides_it():
     images, covers = pictures(BACKDROPS["a gradient"])
-    backdrop = judge(images)
-    assert backdrop is not None
-    seen = backdrop.find(backdrop.features(images[0]), np.ones((HEIGHT, WIDTH), bool))
-    assert seen is not None
+    backdrop, seen = seen_in(images[0], images)
     hidden = covers[0] == 1
     expected = BACKDROPS["a gradient"](0, np.random.default_rng(0))[hidden]
     np.testing.assert_allclose(backdrop.spectra(seen.behind[hidden]), expected, atol=0.03)
@@ -153,11 +161,8 @@ def test_plain_ground_with_little_on_it_is_no_backdrop():
 
 
 def test_a_view_that_matter_fills_keeps_all_of_it():
-    images, _ = pictures(BACKDROPS["grey"])
-    backdrop = judge(images)
-    assert backdrop is not None
     close = textured(np.random.default_rng(0), 0.35, 0.75).astype(np.float32)
-    seen = backdrop.find(backdrop.features(close), np.ones((HEIGHT, WIDTH), bool))
+    _, seen = seen_in(close, pictures(BACKDROPS["grey"])[0])
     assert seen is None or not seen.shown.any()
 
 
@@ -166,22 +171,13 @@ def test_matter_that_reaches_the_border_stays():
     stand = textured(np.random.default_rng(4), 0.3, 0.6).astype(np.float32)
     for image in images:
         image[50:, 40:70] = stand[50:, 40:70]
-    backdrop = judge(images)
-    assert backdrop is not None
-    seen = backdrop.find(backdrop.features(images[0]), np.ones((HEIGHT, WIDTH), bool))
-    assert seen is not None
+    _, seen = seen_in(images[0], images)
     assert not seen.shown[50:, 41:69].any()
 
 
 def test_pixels_without_a_measurement_are_not_the_backdrop():
     images, _ = pictures(BACKDROPS["black"])
-    known = np.ones((HEIGHT, WIDTH), bool)
-    known[:, :4] = False
-    sample = np.concatenate([image[::5, ::3].reshape(-1, BANDS) for image in images])
-    backdrop = judge_backdrop(images, [known] * VIEWS, sample)
-    assert backdrop is not None
-    seen = backdrop.find(backdrop.features(images[0]), known)
-    assert seen is not None
+    _, seen = seen_in(images[0], images, EVERYWHERE & (COLUMNS >= 4))
     assert not seen.shown[:, :4].any()
     assert seen.shown[:, 4:8].all()
 
