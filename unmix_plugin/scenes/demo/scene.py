@@ -66,14 +66,7 @@ _TRANSFORMS = "transforms.json"
 
 
 def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) -> None:
-    """Refuse numbers out of bounds.
-
-    Args:
-        what: What is made, for the message.
-        numbers: By name of the flag: the value and its bounds, both allowed.
-    Raises:
-        ConfigError: a number is out of bounds.
-    """
+    """Refuse numbers out of bounds: by name of the flag the value and its bounds, both allowed. Raises ConfigError."""
     for name, (value, (low, high)) in numbers.items():
         if not low <= value <= high:
             raise ConfigError(f"--{name} of {what} must be {low} to {high}; found {value}")
@@ -81,13 +74,10 @@ def check_bounds(what: str, numbers: Mapping[str, tuple[int, tuple[int, int]]]) 
 
 @contextmanager
 def staging_for(directory: Path, what: str, overwrite: bool) -> Iterator[Path]:
-    """A temporary folder in which to build what then moves to `directory`.
+    """A temporary folder in which to build what then moves to `directory`, which messages call `what`.
 
-    Args:
-        what: What is made, for messages.
-        overwrite: Whether a folder with something in it is accepted.
     Raises:
-        ConfigError: a folder with something in it, or no folder at all.
+        ConfigError: a folder with something in it that is not to be overwritten, or no folder at all.
         SceneError: the folder can't be written, or the disk is full.
     """
     if directory.exists() and not directory.is_dir():
@@ -120,17 +110,8 @@ def written_once(
     is_complete: Callable[[Path], bool],
     remedy: str = "set XDG_CACHE_HOME to a folder with room that can be written",
 ) -> Path:
-    """A folder of a cache, written on first use and again if a file of it is missing.
-
-    Args:
-        target: The folder.
-        what: What is made, for the message.
-        write: Makes it in a folder that is not there yet.
-        is_complete: Whether a folder holds all of it.
-        remedy: What to do where the folder can't be written, for the message.
-    Raises:
-        SceneError: the cache can't be written.
-    """
+    """A folder of a cache, written on first use and again if it is not complete; messages call it `what`. Raises
+    SceneError: the cache can't be written."""
     if is_complete(target):
         return target
     try:
@@ -156,11 +137,7 @@ def _why(error: OSError) -> str:
 
 
 def demo_cameras(size: int, views: int, angle_deg: float = _VIEW_ANGLE_DEG) -> Cameras:
-    """Cameras on a dome around the table, azimuths spread by the golden angle.
-
-    Args:
-        angle_deg: Between the left and right edge of a picture.
-    """
+    """Cameras on a dome around the table, azimuths spread by the golden angle; pictures `angle_deg` wide."""
     i = np.arange(views)
     azimuths = i * np.pi * (3 - np.sqrt(5))
     # A second irrational stride decouples elevation from order, so that every 4th view samples the whole dome.
@@ -238,10 +215,14 @@ def _open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
     return found
 
 
-def _patches(period: float, seed: float, fade: float = np.inf) -> Blend:
-    """Smooth patches of a surface, about `period` of its own units wide, which fade at distances around `fade`."""
+def _patches(
+    period: float, seed: float, fade: float = np.inf, half_sizes: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> Blend:
+    """Smooth patches of a surface, about `period` wide, which fade at distances around `fade`; both in units of the
+    shape's own coordinates, or of the scene for a shape of these half sizes."""
 
     def blend(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+        points = points * np.asarray(half_sizes, np.float32)
         x, y = (points[:, :2] * (2 * np.pi / period)).T
         z = points[:, 2] * (2 * np.pi / period)
         waves = np.sin(x + seed) * np.sin(y + z) + np.sin(0.37 * x - 0.61 * y + z + seed)
@@ -295,16 +276,10 @@ def _room() -> list[Thing]:
     return [
         Thing(
             Placement("box", center, half),
-            Surface(first, second, _in_world(half, _patches(0.9, 1.3 * index))),
+            Surface(first, second, _patches(0.9, 1.3 * index, half_sizes=half)),
         )
         for index, (center, half, first, second) in enumerate(slabs)
     ]
-
-
-def _in_world(half_sizes: tuple[float, float, float], blend: Blend) -> Blend:
-    """A blend of points in scene units, though a shape's own coordinates are over its half sizes."""
-    sizes = np.asarray(half_sizes, np.float32)
-    return lambda points: blend(points * sizes)
 
 
 def _room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
@@ -318,24 +293,15 @@ def _room_cameras(size: int, views: int, seed: int = 11) -> Cameras:
     return upright_cameras(positions, backward, size, np.deg2rad(_PHONE_ANGLE_DEG))
 
 
-_TABLE = Place(THINGS, demo_cameras)
-"""The table before nothing."""
+_TABLE = Place(THINGS, demo_cameras)  # before nothing
 _WORLD = Place((*THINGS, _ground(), *_far_things()), demo_cameras, _open_sky)
-"""The table on a ground that runs to the horizon, with huts and trees, under a sky."""
 _ROOM = Place((*THINGS, *_room(), _ground(), *_far_things(20, seed=8)), _room_cameras, _open_sky)
-"""The table in a room with windows onto the same world."""
 PLACES: Mapping[str, Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
 
 
 def demo_scene_path(cache_dir: Path | None = None) -> Path:
-    """The folder of the default demo scene, written on first use and again if a file of it is missing.
-
-    Args:
-        cache_dir: Where to keep it; None is `unmix-nerf` in XDG_CACHE_HOME or ~/.cache. A changed generator writes
-            into a new folder.
-    Raises:
-        SceneError: the cache can't be written.
-    """
+    """The folder of the default demo scene, in `user_cache` unless another is given, written on first use and again if
+    a file of it is missing; a changed generator writes into a new one. Raises SceneError: it can't be written."""
     target = (cache_dir or user_cache()) / f"demo-{_generator_hash()}" / "demo"
     return written_once(
         target,
@@ -359,11 +325,9 @@ def make_demo_scene(
     """Write a demo scene. It is built beside the folder and moved in when complete.
 
     Args:
-        directory: Made if absent, parents too.
         overwrite: Whether a folder with something in it is accepted: an older demo scene there is replaced, other
             files stay.
         illuminant: What the scene is lit by: the name of a known light, or a CSV file (wavelength,power).
-        place: What there is to see, and from where.
     Raises:
         ConfigError: a number out of bounds; a folder with something in it, or no folder at all.
         SpectrumError: an unknown light, or one that is not known at all bands.
@@ -408,7 +372,21 @@ def _write_scene(
         cube = radiance_cube(view, spectra, lamp)
         frames.append(_write_view(folder, frame_name(index), view, cube, to_rgb, place.sky is None))
         frames[-1]["transform_matrix"] = transform_matrix(cameras, index)
-    content = _header(cameras, sampling) | _splits(views) | {"frames": frames}
+    train, evaluation = (
+        [frame["file_path"] for frame in frames if Path(frame["file_path"]).name.startswith(split)]
+        for split in ("train", "eval")
+    )
+    content = {
+        **lens_entries(cameras),
+        "wavelengths": sampling.centers_nm.tolist(),
+        "materials": list(MATERIALS),
+        "illuminant_path": "illuminant.csv",
+        "endmembers_path": "endmembers.csv",
+        "train_filenames": train,
+        "val_filenames": evaluation,
+        "test_filenames": evaluation,
+        "frames": frames,
+    }
     (folder / _TRANSFORMS).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
@@ -439,24 +417,6 @@ def _write_view(
     return entry
 
 
-def _header(cameras: Cameras, bands: Bands) -> dict[str, Any]:
-    return {
-        **lens_entries(cameras),
-        "wavelengths": bands.centers_nm.tolist(),
-        "materials": list(MATERIALS),
-        "illuminant_path": "illuminant.csv",
-        "endmembers_path": "endmembers.csv",
-    }
-
-
-def _splits(views: int) -> dict[str, list[str]]:
-    names = [frame_name(index) for index in range(views)]
-    train, evaluation = (
-        [f"images/{name}.png" for name in names if name.startswith(s)] for s in ("train", "eval")
-    )
-    return {"train_filenames": train, "val_filenames": evaluation, "test_filenames": evaluation}
-
-
 def _move_files(built: Path, directory: Path) -> None:
     """Put a scene into a folder in place of an older one, transforms.json last: a scene is whole or not there."""
     directory.mkdir(exist_ok=True)
@@ -473,10 +433,7 @@ def _move_files(built: Path, directory: Path) -> None:
 
 def user_cache() -> Path:
     """Where generated data is kept, by the XDG base directory specification: XDG_CACHE_HOME counts only if absolute.
-
-    Raises:
-        SceneError: it is not set, and there is no home folder.
-    """
+    Raises SceneError: it is not set, and there is no home folder."""
     configured = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
         return (configured if configured.is_absolute() else Path.home() / ".cache") / "unmix-nerf"

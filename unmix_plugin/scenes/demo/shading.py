@@ -26,14 +26,10 @@ from unmix_plugin.spectral.colour.conversion import illuminant_power
 
 MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 """Six patches of the ColorChecker chart; the spectral angle between any two under the lamp is at least 0.45 rad."""
-
-_PATCHES = ("white 9.5 (.05 D)", "red", "yellow", "green", "cyan", "purple")
-
+_PATCHES = ("white 9.5 (.05 D)", *MATERIALS[1:])
 _RANGE_NM = (400.0, 700.0)
-
 LAMP = "D50"
 """CIE illuminant of the lamp and of the sky."""
-
 Blend = Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, " P"]]
 """Share of the second material at points in a shape's own coordinates."""
 
@@ -61,14 +57,7 @@ def reflectances(wavelengths_nm: Float[np.ndarray, " B"]) -> Float[np.ndarray, "
 def lamp_power(
     wavelengths_nm: Float[np.ndarray, " B"], illuminant: str | Path = LAMP
 ) -> Float[np.ndarray, " B"]:
-    """Relative power of the lamp and of the sky, which share one spectrum: largest value 1.
-
-    Args:
-        wavelengths_nm: Band centres.
-        illuminant: Name of a known light, or a CSV file, as `spectral.colour.conversion.illuminant_power` takes it.
-    Raises:
-        SpectrumError: an unknown light, or one that is not known at all bands.
-    """
+    """Relative power of the lamp and of the sky, which share one spectrum: largest value 1; see `illuminant_power`."""
     return illuminant_power(illuminant, Bands.of(wavelengths_nm))
 
 
@@ -136,10 +125,8 @@ _BOUNCE_SHARE = 0.35
 """What a surface that faces down receives, as a share of the open sky."""
 _COAT_REFLECTANCE = 0.05
 """Fresnel reflectance of the clear coats at normal incidence."""
-
 _SUBPIXELS = 3
 """Rays along each side of a pixel."""
-
 _RAYS_AT_ONCE = 2**14
 """So many, where an image has fewer pixels: numpy takes as long for a few as for thousands."""
 
@@ -213,13 +200,7 @@ def render_view(
     lamp: tuple[float, float, float] = _LAMP_POSITION,
     sky: Sky | None = None,
 ) -> ViewCoefficients:
-    """Look at the scene through one camera with `subpixels`^2 rays a pixel.
-
-    Args:
-        things: What there is.
-        lamp: Middle of the lamp's disc.
-        sky: What shows behind it; None is black.
-    """
+    """Look at things through one camera with `subpixels`^2 rays a pixel; `lamp` is the middle of its disc."""
     count = subpixels**2
     pixels = cameras.height * cameras.width
     coverage = np.zeros(pixels, dtype=np.float32)
@@ -228,7 +209,8 @@ def render_view(
     at_once = max(1, _RAYS_AT_ONCE // pixels)
     for first in range(0, count, at_once):
         numbers = range(first, min(first + at_once, count))
-        rays = [cameras.image_rays(index, _offset(i, subpixels)) for i in numbers]
+        offsets = [((i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels) for i in numbers]
+        rays = [cameras.image_rays(index, offset) for offset in offsets]
         origins, directions = (
             np.concatenate([getattr(one, name).numpy() for one in rays]) for name in ("origins", "directions")
         )
@@ -236,12 +218,8 @@ def render_view(
         hits = _trace(origins, directions, lamps, things, lamp)
         if sky is not None:
             hits.diffuse[~hits.is_hit] = sky(directions[~hits.is_hit])
-        for total, values in (
-            (coverage, hits.is_hit),
-            (abundances, hits.abundances),
-            (diffuse, hits.diffuse),
-            (specular, hits.specular),
-        ):
+        seen = (hits.is_hit, hits.abundances, hits.diffuse, hits.specular)
+        for total, values in zip((coverage, abundances, diffuse, specular), seen, strict=True):
             total += values.reshape(len(numbers), *total.shape).sum(axis=0)
     shape = (cameras.height, cameras.width)
     return ViewCoefficients(
@@ -252,11 +230,6 @@ def render_view(
     )
 
 
-def _offset(i: int, subpixels: int) -> tuple[float, float]:
-    """Where in its pixel the i-th ray goes through, (x, y) in [0, 1]."""
-    return (i % subpixels + 0.5) / subpixels, (i // subpixels + 0.5) / subpixels
-
-
 def _trace(
     origins: Float[np.ndarray, "R 3"],
     directions: Float[np.ndarray, "R 3"],
@@ -264,12 +237,8 @@ def _trace(
     things: Sequence[Thing] = THINGS,
     lamp_middle: tuple[float, float, float] = _LAMP_POSITION,
 ) -> _Hits:
-    """What each ray sees first, lit by one point of the lamp and by the sky. Directions have length 1.
-
-    Args:
-        lamps: These points.
-        lamp_middle: Of the lamp's disc, where highlights come from.
-    """
+    """What each ray sees first, lit by one point of the lamp and by the sky; highlights come from the lamp's middle.
+    Directions have length 1."""
     placements = [thing.placement for thing in things]
     distances, nearest = first_hits(placements, origins, directions)
     is_hit = np.isfinite(distances)
@@ -381,12 +350,14 @@ def _coat_highlight(
 
 _LATTICE = 96
 """Cells along each side of the random block, after which it repeats."""
-
 _OCTAVES = ((6.0, 0.25), (17.0, 0.3), (45.0, 0.45))
 """Cells per scene unit, and share of the sum. The smallest cells are 3 pixels of a view of 400."""
-
 _CONTRAST = (0.35, 0.65)
 """Sums below the first are one material alone, above the second the other."""
+_SECOND = ("red", "yellow", "white", "yellow", "green")
+"""The second material of each of `THINGS`: its own, but for the last, which is of one material."""
+_STRENGTH = (1.0, 0.8, 0.8, 0.8, 0.9)
+"""How far speckles replace the pattern of each thing, in [0, 1]."""
 
 
 def speckled_things() -> Sequence[Thing]:
@@ -397,20 +368,8 @@ def speckled_things() -> Sequence[Thing]:
     )
 
 
-_SECOND = ("red", "yellow", "white", "yellow", "green")
-"""The second material of each of `THINGS`: its own, but for the last, which is of one material."""
-
-_STRENGTH = (1.0, 0.8, 0.8, 0.8, 0.9)
-"""How far speckles replace the pattern of each thing, in [0, 1]."""
-
-
 def _solid_noise(points: Float[np.ndarray, "P 3"], seed: int) -> Float32[np.ndarray, " P"]:
-    """Smooth random values in [0, 1], the same for the same place.
-
-    Args:
-        points: In units of the scene.
-        seed: Another one gives another pattern.
-    """
+    """Smooth random values in [0, 1], the same for the same place, in units of the scene, and seed."""
     from scipy.ndimage import map_coordinates
 
     total = np.zeros(len(points), np.float32)

@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 _Primitive = Literal["sphere", "cylinder", "box"]
-
 _SELF_HIT_DISTANCE = 1e-4
 """A ray that starts on a surface meets it again within this distance, scene units, by rounding alone."""
 
@@ -86,11 +85,7 @@ def dot(a: Float[np.ndarray, "P C"], b: Float[np.ndarray, "P C"]) -> Float[np.nd
 def first_hits(
     placements: Sequence[Placement], origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
 ) -> tuple[Float[np.ndarray, " R"], Int[np.ndarray, " R"]]:
-    """The nearest surface along each ray.
-
-    Returns:
-        Distances (inf where nothing is hit) and which placement was hit (meaningless there).
-    """
+    """Distance of the nearest surface along each ray (inf where nothing is hit), and which placement it is of."""
     distances = np.stack([placement.entry_distances(origins, directions) for placement in placements])
     return distances.min(axis=0), distances.argmin(axis=0)
 
