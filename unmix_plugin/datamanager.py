@@ -31,7 +31,7 @@ from unmix_plugin.scenes.evidence import (
     relative_power,
     rig_warnings,
 )
-from unmix_plugin.scenes.geometry.carving import carve, mask_warning, share_explained
+from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, mask_warning, share_explained
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
@@ -66,12 +66,7 @@ class HyperspectralDataManager(DataManager):
     """
 
     def __init__(
-        self,
-        config: HyperspectralDataManagerConfig,
-        *,
-        data: Path,
-        device: torch.device,
-        seed: int = 0,
+        self, config: HyperspectralDataManagerConfig, *, data: Path, device: torch.device, seed: int = 0
     ) -> None:
         """
         Raises:
@@ -93,20 +88,17 @@ class HyperspectralDataManager(DataManager):
         generator = step_generator(self.seed, step)
         rays, measured = [], []
         for drawn in self._pixels.draw(self._pixels_for(self._num_rays), generator, step, self._shares):
-            trust = self._evidence.trust(drawn)
-            surfaces = self._surfaces.points(drawn) if self._surfaces.is_known else None
             rays.append(self._rays.through(drawn, self._subpixels, generator))
-            measured.append(
-                MeasuredPixels(
-                    drawn.sensor if self.scene.is_rig else None,
-                    len(rays[-1]),
-                    drawn.spectra,
-                    drawn.alpha,
-                    drawn.numbers,
-                    trust,
-                    surfaces,
-                )
+            own = MeasuredPixels(
+                sensor=drawn.sensor if self.scene.is_rig else None,
+                num_rays=len(rays[-1]),
+                spectra=drawn.spectra,
+                alpha=drawn.alpha,
+                pixels=drawn.numbers,
+                alpha_trust=self._evidence.trust(drawn),
+                surfaces=self._surfaces.points(drawn),
             )
+            measured.append(own)
         return RayBundle.join(rays), to_batch(measured)
 
     def eval_image(self, index: int) -> tuple[Cameras, dict[str, Tensor]]:
@@ -138,30 +130,28 @@ class HyperspectralDataManager(DataManager):
         self._num_rays = num_rays
 
     def get_training_callbacks(self) -> list[TrainingCallback]:
-        """Cast more rays through a pixel once the first part of the training is over.
-
-        Asked for before the training clock starts, hence the place to read the training pixels.
-        """
+        """Cast more rays through a pixel once the first part of the training is over. Asked for before the training
+        clock starts, hence the place to read the training pixels."""
         _ = self._pixels
         return [TrainingCallback(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, self._choose_subpixels)]
 
     def metadata(self) -> dict[str, Any]:
         """Bands, light and kind of the scene, and the size of the carving grid."""
-        illuminant = self.scene.illuminant
+        scene = self.scene
         return {
-            "wavelengths_nm": self.scene.wavelengths_nm.tolist(),
-            "illuminant": None if illuminant is None else illuminant.tolist(),
-            "has_alpha": self.scene.has_alpha,
-            "is_unbounded": self.scene.is_unbounded,
-            "has_backdrop": self.scene.has_backdrop,
+            "wavelengths_nm": scene.wavelengths_nm.tolist(),
+            "illuminant": None if scene.illuminant is None else scene.illuminant.tolist(),
+            "has_alpha": scene.has_alpha,
+            "is_unbounded": scene.is_unbounded,
+            "has_backdrop": scene.has_backdrop,
             "grid_resolution": self.options.grid_resolution,
             "pixel_size": min(self._rays.pixel_sizes.values()),
             "subpixels": self._final_subpixels,
             "num_train_views": len(self.train_cameras),
             "num_train_pixels": self._num_train_pixels,
-            **({} if self.scene.fwhm_nm is None else {"fwhm_nm": self.scene.fwhm_nm.tolist()}),
+            **({} if scene.fwhm_nm is None else {"fwhm_nm": scene.fwhm_nm.tolist()}),
             **({} if self.train_cameras.key_poses is None else {"line_rows": list(self._knots.rows)}),
-            **({"sensors": [sensor.to_json() for sensor in self.scene.sensors]} if self.scene.is_rig else {}),
+            **({"sensors": [sensor.to_json() for sensor in scene.sensors]} if scene.is_rig else {}),
         }
 
     def initial_data(self) -> Mapping[str, np.ndarray]:
@@ -226,9 +216,7 @@ class HyperspectralDataManager(DataManager):
     def warnings(self) -> list[str]:
         """Poses that seem to follow another convention, cameras far off or at one place, masks that contradict
         each other, a backdrop, sensors that share no band or no place with another, and bad bands and values."""
-        wrong_poses = check_scene_poses(self.scene)
-        found = [self._carved[1] if wrong_poses is None else wrong_poses, *self._pixels.notes]
-        found += self.scene.warnings
+        found = [check_scene_poses(self.scene) or self._carved[1], *self._pixels.notes, *self.scene.warnings]
         found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         if self.scene.has_backdrop:
@@ -271,7 +259,7 @@ class HyperspectralDataManager(DataManager):
         return AlphaEvidence(self._pixels, self.scene.has_alpha and not self.options.trust_alpha)
 
     @cached_property
-    def _carved(self) -> tuple[Bool[np.ndarray, "R R R"], str | None]:
+    def _carved(self) -> tuple[Cells, str | None]:
         """Where something may be, and what to say of masks that contradict each other; all pixels are read for it."""
         foreground = self._foreground
         hull = self._surfaces.carved(carve(self.scene, self.options.grid_resolution, foreground))
@@ -280,7 +268,7 @@ class HyperspectralDataManager(DataManager):
         return hull, mask_warning(self.scene, foreground)
 
     @property
-    def _foreground(self) -> list[Bool[np.ndarray, "_ _"]] | None:
+    def _foreground(self) -> Masks | None:
         """For each training view True where something may be, by alpha or by a backdrop; None where neither tells."""
         if self.scene.has_alpha:
             return self._evidence.foreground()
@@ -288,7 +276,7 @@ class HyperspectralDataManager(DataManager):
 
     @cached_property
     def _surfaces(self) -> SurfaceEvidence:
-        return SurfaceEvidence(self.scene)
+        return SurfaceEvidence(self.scene, self.device)
 
     def _pixels_for(self, num_rays: int) -> int:
         return max(1, num_rays // self._subpixels**2)
@@ -319,7 +307,7 @@ class HyperspectralDataManager(DataManager):
             opaque = self._pixels.sample_opaque(sensor, _MOST_INITIAL_PIXELS, self.seed, kept)
         return exposure_of(opaque)
 
-    def _light(self, reachable: Bool[np.ndarray, "R R R"]) -> dict[str, np.ndarray]:
+    def _light(self, reachable: Cells) -> dict[str, np.ndarray]:
         """Judged by the views of the sensor that took most; and where the lamp is if it moves with the camera."""
         if not self.scene.has_alpha:
             return {"light": np.array(self._judge_matched())}

@@ -56,10 +56,7 @@ class MovingLamp(nn.Module):
     first_place: Tensor
 
     def __init__(self, lamp: Lamp) -> None:
-        """
-        Args:
-            lamp: Where training starts.
-        """
+        """Start where a lamp is."""
         super().__init__()
         self.frame: LampFrame = lamp.frame
         for name, values in (("middle", lamp.middle), ("axis", lamp.axis), ("first_place", lamp.place)):

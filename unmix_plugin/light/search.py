@@ -26,6 +26,7 @@ from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light.lamp import Lamp, LampFrame, MovingLamp, Triple
+from unmix_plugin.scenes.geometry.carving import Cells
 from unmix_plugin.scenes.geometry.lighting import Places, coarse_hull, seen_places
 
 LEAST_SHARE = 0.15
@@ -69,11 +70,7 @@ class _LampEvidence:
 
     @staticmethod
     def of(
-        cameras: Cameras,
-        places: Places,
-        seen: Float[Tensor, "P N"],
-        hull: Bool[np.ndarray, "R R R"],
-        box: SceneBox,
+        cameras: Cameras, places: Places, seen: Float[Tensor, "P N"], hull: Cells, box: SceneBox
     ) -> _LampEvidence:
         """Of places that enough views see; arguments as `seen_places` gives and takes them."""
         known = seen.isfinite() & (seen.isfinite().sum(dim=1, keepdim=True) >= FEWEST_VIEWS)
@@ -117,18 +114,11 @@ class _LampEvidence:
 
 
 def find_lamp(
-    cameras: Cameras,
-    log_shading: list[Float[np.ndarray, "H W"]],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
+    cameras: Cameras, log_shading: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
 ) -> Lamp | None:
-    """The lamp that explains most of the changes of brightness; None where none explains enough, its
-    shadows explain nothing, or halves of the places find different lamps.
-
-    Args:
-        cameras, hull, box: As of `seen_places`.
-        log_shading: Log brightness of each view, as far as it is not that of a pixel's colour.
-    """
+    """The lamp that explains most of the changes of brightness, given as of `seen_places` and as far as they are not
+    those of a pixel's colour; None where none explains enough, its shadows explain nothing, or halves of the places
+    find different lamps."""
     places, seen = seen_places(cameras, log_shading, hull, box)
     seen, is_even = seen.clamp(min=DARKEST_LOG), torch.arange(len(seen)) % 2 == 0
     found: list[Candidate] = []

@@ -98,11 +98,8 @@ def bias_free_network(*widths: int) -> nn.Sequential:
 
 
 def rows_of_outputs(network: nn.Sequential, *inputs: Float[Tensor, "S _"]) -> Float[Tensor, "O S"]:
-    """What a bias-free network gives, an output a row: products with few columns take twice as long.
-
-    Args:
-        inputs: Side by side the network's inputs, which joining would cost time.
-    """
+    """What a bias-free network gives, an output a row: products with few columns take twice as long. Its inputs come
+    side by side, as joining them would cost time."""
     return torch.cat([_rows_of_part(network, *part) for part in _parts(*inputs)], dim=1)
 
 
@@ -164,12 +161,7 @@ class LampShading(nn.Module):
     first_normal: Tensor
 
     def __init__(self, num_features: int, width: int, upwards: Float[Tensor, "3"]) -> None:
-        """
-        Args:
-            num_features: G.
-            width: Of the hidden layer.
-            upwards: Unit vector that all normals are near at first.
-        """
+        """Of G features, with so wide a hidden layer and normals that are all near a unit vector `upwards` at first."""
         super().__init__()
         self.register_buffer("first_normal", _FIRST_NORMAL * upwards, persistent=False)
         self.network = bias_free_network(num_features, width, 4)
@@ -234,11 +226,8 @@ def lamplight(
     """What of a lamp's light reaches samples of rays from `origins`.
 
     Only the visible part is differentiable in the lamp's place: shading would move it to where wrong normals want it.
-
-    Args:
-        skips: 0 in the cells of the box that cast shadows; in others what `skip_distances` says.
-        detail: How sharp they are.
-        generator: Draws two points beside the lamp's middle for each sample; None takes four fixed ones.
+    Cells whose `skips` are 0 cast shadows, in others it is what `skip_distances` says. A generator draws two points
+    beside the lamp's middle for each sample; None takes four fixed ones.
     """
     origins, positions = origins.detach(), positions.detach()
     middle = lamp.positions(origins)

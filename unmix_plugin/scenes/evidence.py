@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from unmix_plugin.scenes.geometry.carving import Cells, Masks
 from unmix_plugin.scenes.geometry.lighting import local_log_brightness
 from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
@@ -57,7 +58,7 @@ class AlphaEvidence:
         """How far the alpha of drawn pixels can be trusted, 0 or 1."""
         return alpha_trust(pixels.spectra, pixels.alpha, self._levels[pixels.sensor])
 
-    def foreground(self) -> list[Bool[np.ndarray, "_ _"]]:
+    def foreground(self) -> Masks:
         """For each training view True on pixels that may show something, or are not valid."""
         found: dict[int, np.ndarray] = {}
         for block in self._blocks:
@@ -71,23 +72,19 @@ class AlphaEvidence:
         return [found[camera] for camera in sorted(found)]
 
     def log_brightness(self) -> tuple[list[int], list[Float[np.ndarray, "H W"]]]:
-        """The views of the sensor that took most, and of each the logarithm of its brightness.
-
-        NaN where a pixel is not opaque, not valid or saturated.
-        """
+        """The views of the sensor that took most, and of each the logarithm of its brightness; NaN where a pixel is not
+        opaque, not valid or saturated."""
         block = self._largest_block
         return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
-
-    @property
-    def _largest_block(self) -> PixelBlock:
-        """Of the sensor that took most views."""
-        return max(self._blocks, key=lambda block: len(block.cameras))
 
     def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
         """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
         block = self._largest_block
-        colours = _ColourGroups.of(block)
-        return [local_log_brightness(seen) for seen in block.pictures(colours.shading)]
+        return [local_log_brightness(seen) for seen in block.pictures(_ColourGroups.of(block).shading)]
+
+    @property
+    def _largest_block(self) -> PixelBlock:
+        return max(self._blocks, key=lambda block: len(block.cameras))
 
 
 @dataclass(frozen=True)
@@ -104,24 +101,17 @@ class _ColourGroups:
         """From some of a block's opaque pixels."""
         from scipy.cluster.vq import kmeans2  # slow to import
 
-        stride = max(1, len(block) // _PIXELS_TO_GROUP)
-        chosen = torch.arange(0, len(block), stride)
-        valid, on_device = block.valid[chosen], chosen.to(block.alpha.device)
-        spectra = block.spectra(on_device)
-        spectra = spectra[_is_clear(spectra, block.alpha[on_device], valid.to(spectra.device))]
+        chosen = torch.arange(0, len(block), max(1, len(block) // _PIXELS_TO_GROUP))
+        valid, chosen = block.valid[chosen].to(block.alpha.device), chosen.to(block.alpha.device)
+        spectra = block.spectra(chosen)
+        spectra = spectra[_is_clear(spectra, block.alpha[chosen], valid)]
         if len(spectra) < _COLOUR_GROUPS:
             return _ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
-        rng = np.random.default_rng(0)
-        middles, group = kmeans2(
-            normalize(spectra, dim=-1).cpu().numpy(), _COLOUR_GROUPS, minit="++", rng=rng
-        )
-        bright = brightness(spectra)
-        best = [
-            torch.quantile(bright[mask], _LIT_BEST)
-            if bool((mask := torch.from_numpy(group == k)).any())
-            else 1.0
-            for k in range(_COLOUR_GROUPS)
-        ]
+        directions, rng = normalize(spectra, dim=-1).cpu().numpy(), np.random.default_rng(0)
+        middles, group = kmeans2(directions, _COLOUR_GROUPS, minit="++", rng=rng)
+        bright, groups = brightness(spectra), torch.from_numpy(group).to(spectra.device)
+        own = [bright[groups == k] for k in range(_COLOUR_GROUPS)]
+        best = [torch.quantile(each, _LIT_BEST) if len(each) else 1.0 for each in own]
         return _ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
 
     def shading(self, spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
@@ -168,10 +158,8 @@ def band_weights(scene: Scene, noise: dict[int, BandNoise]) -> Float[np.ndarray,
 
 
 def relative_power(scene: Scene, opaque: Float[Tensor, "R B"]) -> float:
-    """Of brightness, by which squared errors are divided.
-
-    Without alpha black may be nothing at all, so that errors of dark pixels must not count more: 0.
-    """
+    """Of brightness, by which squared errors are divided. Without alpha black may be nothing at all, so that errors of
+    dark pixels must not count more: 0."""
     knows_empty = scene.has_alpha and not scene.is_unbounded
     return relative_power_of(opaque) if knows_empty else 0.0
 
@@ -186,12 +174,10 @@ def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) 
             (found.mostly_noise, "mostly noise", "hardly count in training"),
             (found.dead, "dead", "show one value everywhere and hardly count in training"),
         ):
-            if bool(chosen.any()):
-                named = ", ".join(f"{nm:g}" for nm in bands[chosen.numpy()])
-                verb = "bands at {} nm{} are {}" if int(chosen.sum()) > 1 else "band {} nm{} is {}"
-                said.append(
-                    f"{verb.format(named, whose, what)}: its errors {why}; leave it out where you can"
-                )
+            named = ", ".join(f"{nm:g}" for nm in bands[chosen.numpy()])
+            which = f"bands at {named} nm{whose} are" if "," in named else f"band {named} nm{whose} is"
+            if named:
+                said.append(f"{which} {what}: its errors {why}; leave it out where you can")
     if bad_share > _FEWEST_BAD:
         said.append(
             f"{bad_share:.2g} of all measured values stand out from the bands and pixels around them (stripes, "
@@ -200,12 +186,9 @@ def noise_warnings(scene: Scene, noise: dict[int, BandNoise], bad_share: float) 
     return said
 
 
-def rig_warnings(scene: Scene, reachable: Bool[np.ndarray, "R R R"]) -> list[str]:
-    """Sensors of a rig that share no band with another, or look at other parts of the scene.
-
-    Args:
-        reachable: Cells of the scene box where something may be.
-    """
+def rig_warnings(scene: Scene, reachable: Cells) -> list[str]:
+    """Sensors of a rig that share no band with another, or look at other parts of the scene: of cells where something
+    may be."""
     used = {scene.frames[view].sensor for view in scene.train_indices}
     alone = lonely_sensors(scene.sensors, used)
     said = []
@@ -222,9 +205,7 @@ def rig_warnings(scene: Scene, reachable: Bool[np.ndarray, "R R R"]) -> list[str
     return said
 
 
-def _overlaps(
-    scene: Scene, sensors: list[int], reachable: Bool[np.ndarray, "R R R"]
-) -> list[tuple[str, float]]:
+def _overlaps(scene: Scene, sensors: list[int], reachable: Cells) -> list[tuple[str, float]]:
     """Names of sensors, and of the places that each sees the share that another sees too."""
     cells = np.argwhere(reachable)
     cells = cells[:: max(1, -(-len(cells) // _MOST_POINTS))]
@@ -232,10 +213,9 @@ def _overlaps(
     points = scene.scene_box.aabb[0] + unit * scene.scene_box.size
     seen = {sensor: _seen(scene, sensor, points) for sensor in sensors}
     found = []
-    for sensor in sensors if len(sensors) > 1 else []:
+    for sensor, own in seen.items() if len(sensors) > 1 else ():
         others = np.any([seen[other] for other in sensors if other != sensor], axis=0)
-        share = float((seen[sensor] & others).sum() / max(seen[sensor].sum(), 1))
-        found.append((scene.sensors[sensor].name, share))
+        found.append((scene.sensors[sensor].name, float((own & others).sum() / max(own.sum(), 1))))
     return found
 
 

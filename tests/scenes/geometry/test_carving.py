@@ -4,6 +4,7 @@ Masks that contradict each other are told from masks that fit together.
 """
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,29 +15,36 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.scenes.geometry.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
-from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses
+from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses, set_frame
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
-from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.demo.scene import make_demo_scene
+from unmix_plugin.scenes.evidence import AlphaEvidence
 from unmix_plugin.scenes.geometry.bounds import find_bounds
 from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
-    _foreground_mask,
     _needed_witnesses,
     carve_box,
     foreground_rays,
     mask_warning,
     share_through,
 )
+from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
 
 
-def centres(box: SceneBox, cells: int) -> np.ndarray:
+def centres(cells: int) -> np.ndarray:
     steps = (np.arange(cells) + 0.5) / cells
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1)
-    return box.aabb[0].numpy() + grid * box.size.numpy()
+    return BOX.aabb[0].numpy() + grid * BOX.size.numpy()
+
+
+def seen_by(cameras: Cameras, index: int, cells: int, margin_px: float, nearest: float) -> np.ndarray:
+    """Cells whose centre lies in a view widened by a margin, beyond a depth."""
+    pixels, depths = cameras.project(torch.from_numpy(centres(cells).reshape(-1, 3)).float(), index)
+    inside = ((pixels >= -margin_px) & (pixels <= SIDE + margin_px)).all(-1) & (depths > nearest)
+    return inside.reshape(cells, cells, cells).numpy()
 
 
 @settings(max_examples=15)
@@ -44,7 +52,7 @@ def centres(box: SceneBox, cells: int) -> np.ndarray:
 def test_the_hull_holds_every_cell_that_a_ball_touches_and_not_many_more(views, radius, cells):
     poses = ring_poses(views)
     hull = carve_box(make_cameras(poses), ball_matter(poses, radius), BOX, cells)
-    distances = np.linalg.norm(centres(BOX, cells), axis=-1)
+    distances = np.linalg.norm(centres(cells), axis=-1)
     assert hull[distances < radius].all()
     if views == 12 and cells >= 20:
         assert not hull[distances > radius + 0.45].any()
@@ -58,7 +66,7 @@ def test_cells_are_indexed_x_y_z_from_the_smallest_corner():
         pose[:3, 3] -= ball_at  # the ball stays in the images of cameras that move with it
     cameras = make_cameras(poses)
     hull = carve_box(cameras, [ball_alpha(pose, 0.25, SIDE, SIDE, FOCAL) > 0 for pose in moved], BOX, 32)
-    middle = centres(BOX, 32)[hull].mean(axis=0)
+    middle = centres(32)[hull].mean(axis=0)
     np.testing.assert_allclose(middle, ball_at, atol=0.1)
 
 
@@ -73,63 +81,50 @@ def test_refining_finds_exactly_what_testing_every_cell_finds(monkeypatch):
 
 @pytest.mark.parametrize("lens", [(-0.3, 0.1, 0.0, 0.0), (0.2, 0.0, 0.01, -0.01)])
 def test_the_hull_holds_the_ball_through_a_bent_lens_too(lens):
-    poses = ring_poses(8)
-    cameras = make_cameras(poses, lens)
-    radius, cells = 0.5, 40
+    cameras, radius = make_cameras(ring_poses(8), lens), 0.5
     foreground = []
-    for index in range(len(poses)):
-        rays = [cameras.image_rays(index, (x, y)) for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)]
+    for index in range(8):
         hits = []
-        for bundle in rays:
+        for x, y in product((0.1, 0.5, 0.9), repeat=2):
+            bundle = cameras.image_rays(index, (x, y))
             along = -(bundle.directions * bundle.origins).sum(-1)
             hits.append((bundle.origins**2).sum(-1) - along**2 < radius**2)
         foreground.append(torch.stack(hits).any(dim=0).reshape(SIDE, SIDE).numpy())
-    hull = carve_box(cameras, foreground, BOX, cells)
-    distances = np.linalg.norm(centres(BOX, cells), axis=-1)
-    assert hull[distances < radius].all()
-    assert hull.mean() < 4.0 * (distances < radius).mean()
+    hull = carve_box(cameras, foreground, BOX, 40)
+    inside = np.linalg.norm(centres(40), axis=-1) < radius
+    assert hull[inside].all()
+    assert hull.mean() < 4.0 * inside.mean()
 
 
 def test_without_alpha_exactly_the_cells_in_front_of_some_camera_stay():
-    poses = [look_at(np.array([0.0, -2.0, 0.2]), np.array([0.3, 0.0, 0.0]))]
-    cameras = make_cameras(poses)
+    cameras = make_cameras([look_at(np.array([0.0, -2.0, 0.2]), np.array([0.3, 0.0, 0.0]))])
     kept = carve_box(cameras, None, BOX, 24)
-    points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
-    pixels, depths = cameras.project(points, 0)
-    seen = (((pixels >= 0) & (pixels <= SIDE)).all(-1) & (depths > 0.1)).reshape(24, 24, 24).numpy()
+    seen, near = seen_by(cameras, 0, 24, 0, 0.1), seen_by(cameras, 0, 24, 6, -0.2)
     assert kept[seen].all()
-    far_out = (((pixels < -6) | (pixels > SIDE + 6)).any(-1) | (depths < -0.2)).reshape(24, 24, 24).numpy()
-    assert not kept[far_out].any()
-    assert seen.any()
-    assert far_out.any()
-
-
-def test_a_resolution_of_one_is_a_single_cell_and_less_is_refused():
-    poses = ring_poses(4)
-    assert carve_box(make_cameras(poses), ball_matter(poses, 0.5), BOX, 1).tolist() == [[[True]]]
-    with pytest.raises(ValueError, match="resolution must be at least 1"):
-        carve_box(make_cameras(poses), None, BOX, 0)
+    assert not kept[~near].any()
+    assert 0 < seen.mean() < near.mean() < 1
 
 
 def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
     folder = make_scene(tmp_path / "scene")
-    mask = np.zeros((16, 20), np.uint8)
-    mask[:, :10] = 255
+    mask = np.where(np.arange(20) < 10, 255, 0).astype(np.uint8)[None].repeat(16, 0)
     Image.fromarray(mask).save(folder.root / "mask.png")
-    before = load_scene(folder.root)
-    folder.edit(lambda c: c["frames"][1].update(mask_path="mask.png"))
-    after = load_scene(folder.root)
-    assert _foreground_mask(after, 1)[:, 10:].all()
-    assert np.array_equal(_foreground_mask(after, 1)[:, :10], _foreground_mask(before, 1)[:, :10])
-    assert np.array_equal(_foreground_mask(after, 2), _foreground_mask(before, 2))
+    scene = load_scene(folder.edit(set_frame(1, mask_path="mask.png")).root)
+    masked, other, *_ = AlphaEvidence(
+        PixelTable(scene, torch.device("cpu"), scene.train_indices), True
+    ).foreground()
+    assert masked[:, 10:].all()
+    for view, shown in ((1, masked[:, :10]), (2, other)):
+        alpha = scene.alpha(view)
+        assert alpha is not None
+        assert np.array_equal(shown, alpha[:, : shown.shape[1]] > 0)
 
 
 def test_the_box_of_a_room_seen_from_one_side_holds_what_all_cameras_look_at(tmp_path):
     positions = [np.array([x, -3.6, z]) for x in (-0.6, 0.0, 0.6) for z in (-0.5, 0.5)]
     cameras = make_cameras([look_at(position, np.zeros(3)) for position in positions])
     box = find_bounds(tmp_path, cameras, None)
-    corners = torch.tensor([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    assert box.contains(corners).all()
+    assert box.contains(torch.tensor(list(product((-1.0, 1.0), repeat=3)))).all()
     assert (box.size < 3.2).all()
     assert not box.contains(torch.tensor(np.stack(positions)).float()).any()
 
@@ -137,8 +132,7 @@ def test_the_box_of_a_room_seen_from_one_side_holds_what_all_cameras_look_at(tmp
 def test_parallel_cameras_get_a_box_in_front_of_them_that_they_share(tmp_path):
     positions = [np.array([x, -3.0, 0.0]) for x in (-0.5, 0.0, 0.5)]
     cameras = make_cameras([look_at(p, p + np.array([0.0, 1.0, 0.0])) for p in positions])
-    box = find_bounds(tmp_path, cameras, None)
-    middle = box.aabb.mean(dim=0)
+    middle = find_bounds(tmp_path, cameras, None).aabb.mean(dim=0)
     assert middle[1] > -2.0
     pixels, depths = cameras.project(middle[None], 1)
     assert (depths > 0).all()
@@ -155,39 +149,30 @@ def test_a_single_camera_or_two_at_one_place_still_get_a_box(tmp_path, count):
 
 @pytest.mark.parametrize("has_alpha", [True, False])
 def test_the_model_box_is_centred_and_its_longest_edge_is_two(tmp_path, has_alpha):
-    poses = ring_poses(7)
-    for pose in poses:
-        pose[:3, 3] = pose[:3, 3] + np.array([500.0, -20.0, 3.0])  # far from the world's origin
-    plain = ring_poses(7)
-    folder = make_scene(tmp_path / "scene", frames=7, alpha=has_alpha, poses=plain)
-    folder.edit(
-        lambda c: [
-            f.update(transform_matrix=pose.tolist()) for f, pose in zip(c["frames"], poses, strict=True)
-        ]
-    )
+    away = np.array([500.0, -20.0, 3.0])  # far from the world's origin
+    folder = make_scene(tmp_path / "scene", frames=7, alpha=has_alpha)
+    for index, pose in enumerate(ring_poses(7)):
+        pose[:3, 3] += away
+        folder.edit(set_frame(index, transform_matrix=pose.tolist()))
     scene = load_scene(folder.root)
     low, high = scene.scene_box.aabb.numpy()
     np.testing.assert_allclose(low, -high, atol=1e-6)
     assert (high - low).max() == pytest.approx(2.0)
     world = scene.normalisation.to_world(scene.scene_box.aabb.double().numpy())
-    assert ((world[0] < [500.0, -20.0, 3.0]) & (world[1] > [500.0, -20.0, 3.0])).all()
+    assert ((world[0] < away) & (world[1] > away)).all()
 
 
 def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
-    poses = [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
-    cameras = make_cameras(poses)
+    cameras = make_cameras(
+        [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
+    )
     foreground = [np.ones((SIDE, SIDE), bool)] * 3
     kept = [carve_box(cameras, foreground, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
-    points = torch.from_numpy(centres(BOX, 24).reshape(-1, 3)).float()
-    count = torch.zeros(len(points))
-    for index in range(3):
-        pixels, depths = cameras.project(points, index)
-        count += ((pixels >= 0) & (pixels <= SIDE)).all(-1) & (depths > 0.1)
+    count = np.sum([seen_by(cameras, index, 24, 0, 0.1) for index in range(3)], axis=0)
     for n, cells in enumerate(kept, start=1):
-        assert cells.reshape(-1)[(count >= n).numpy()].all()
+        assert cells[count >= n].all()
     assert kept[0].sum() > kept[1].sum() > kept[2].sum() > 0
-    assert (kept[0] >= kept[1]).all()
-    assert (kept[1] >= kept[2]).all()
+    assert ((kept[0] >= kept[1]) & (kept[1] >= kept[2])).all()
 
 
 def test_views_of_two_sizes_carve_and_bound_the_same_ball():
@@ -204,7 +189,7 @@ def test_views_of_two_sizes_carve_and_bound_the_same_ball():
         for pose, (side, _), scale in zip(poses, sizes, scales, strict=True)
     ]
     hull = carve_box(mixed, foreground, BOX, 32)
-    distances = np.linalg.norm(centres(BOX, 32), axis=-1)
+    distances = np.linalg.norm(centres(32), axis=-1)
     assert hull[distances < radius].all()
     assert not hull[distances > 1.0].any()
     box = find_bounds(Path("scene"), mixed, foreground).aabb.numpy()
@@ -265,7 +250,7 @@ def turned(scene: Scene, size: float) -> Scene:
 
 @pytest.mark.parametrize(("turn", "is_told"), [(0.0, False), (0.002, False), (0.1, True)])
 def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_alarm(demo, turn, is_told):
-    masks = [_foreground_mask(demo, index) for index in demo.train_indices]
-    warning = mask_warning(turned(demo, turn), masks)
+    alphas = [demo.alpha(index) for index in demo.train_indices]
+    warning = mask_warning(turned(demo, turn), [alpha > 0 for alpha in alphas if alpha is not None])
     assert (warning is not None) == is_told
     assert warning is None or ("contradict each other" in warning and "--poses refine" in warning)

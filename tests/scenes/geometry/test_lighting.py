@@ -7,35 +7,14 @@ import torch
 from tests.scenes.geometry.ball_views import BOX, RADIUS, SIDE, ball_matter, ball_views, make_cameras
 from tests.scenes.scene_factory import ring_poses
 from unmix_plugin.scenes.geometry.carving import carve_box
-from unmix_plugin.scenes.geometry.lighting import (
-    _foretold_share,
-    _gain_spread,
-    _view_gains,
-    judge_light,
-    seen_places,
-)
-
-
-def gain_spread(views):
-    places, seen = seen_places(*views)
-    followed = seen.isfinite().sum(dim=1) >= 4
-    return _gain_spread(views[0], places.positions[followed], seen[followed])
+from unmix_plugin.scenes.geometry.lighting import _view_gains, judge_light
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_a_light_that_moves_with_the_camera_is_told_from_a_fixed_one(noise):
-    moving, fixed = ball_views(True, noise), ball_views(False, noise)
-    assert _foretold_share(moving[0], *seen_places(*moving)) > 0.1
-    assert _foretold_share(fixed[0], *seen_places(*fixed)) < 0.0
-    assert (judge_light(*moving), judge_light(*fixed)) == ("camera", "fixed")
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_views_of_different_exposure_are_told_from_views_of_one(noise):
+def test_lights_that_move_with_the_camera_or_differ_in_exposure_are_told_from_a_fixed_one(noise):
     log_gains = np.log(np.random.default_rng(1).uniform(0.8, 1.2, 16))
-    views = ball_views(False, noise, log_gains)
-    assert gain_spread(views) == pytest.approx(log_gains.std(), rel=0.5)
-    assert judge_light(*views) == "per-view"
+    views = (ball_views(True, noise), ball_views(False, noise), ball_views(False, noise, log_gains))
+    assert [judge_light(*each) for each in views] == ["camera", "fixed", "per-view"]
 
 
 def test_gains_are_found_exactly_where_places_differ_by_nothing_else():
@@ -49,16 +28,10 @@ def test_gains_are_found_exactly_where_places_differ_by_nothing_else():
     assert _view_gains(seen).isnan().tolist() == [index == 3 for index in range(8)]
 
 
-def test_few_views_of_different_exposure_are_left_alone():
+def test_too_few_views_or_dark_ones_say_nothing():
     views = ball_views(False, log_gains=np.log(np.linspace(0.8, 1.2, 16)))
-    few = (views[0][:10], views[1][:10], *views[2:])
-    assert judge_light(*few) == "fixed"
-
-
-def test_too_few_views_say_nothing():
-    poses = ring_poses(6)
-    blank = [np.zeros((SIDE, SIDE)) for _ in poses]
-    hull = carve_box(make_cameras(poses), ball_matter(poses, RADIUS), BOX, 32)
-    dark = (make_cameras(poses), [image * np.nan for image in blank])
-    for shape in (hull, np.zeros((32, 32, 32), bool)):
-        assert judge_light(*dark, shape, BOX) == "fixed"
+    assert judge_light(views[0][:10], views[1][:10], *views[2:]) == "fixed"
+    cameras, dark = make_cameras(ring_poses(6)), [np.full((SIDE, SIDE), np.nan)] * 6
+    hull = carve_box(cameras, ball_matter(ring_poses(6), RADIUS), BOX, 32)
+    assert judge_light(cameras, dark, hull, BOX) == "fixed"
+    assert judge_light(cameras, dark, hull & False, BOX) == "fixed"

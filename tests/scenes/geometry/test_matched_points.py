@@ -51,23 +51,18 @@ def test_matched_places_lie_on_the_ground_at_the_depths_of_their_cameras(cameras
         assert torch.allclose(depths, found.depths[of_view], rtol=1e-3)
 
 
-def test_large_views_are_thinned_out_and_their_places_stay_where_they_are(monkeypatch):
+def test_places_stay_where_they_are_in_views_thinned_out_and_beside_pixels_that_are_not_valid(monkeypatch):
     cameras = flight_cameras(flight_poses())
+    views = ground_views(cameras)
+    for view in views:
+        view[::31, ::29], view[150:, 160:] = np.nan, np.inf
+    found = find_matched_points(views_of(cameras, views))
+    assert found is not None
+    assert above_ground(found.places).abs().quantile(0.9) < 0.1
     monkeypatch.setattr("unmix_plugin.scenes.geometry.matched_points.LONGEST_SIDE_PX", WIDTH // 2)
     found = find_matched_points(views_of(cameras))
     assert found is not None
     assert above_ground(found.places).mean().abs() < 0.02
-
-
-def test_pixels_that_are_not_valid_are_no_features():
-    cameras = flight_cameras(flight_poses())
-    views = ground_views(cameras)
-    for view in views:
-        view[::31, ::29] = np.nan
-        view[150:, 160:] = np.inf
-    found = find_matched_points(views_of(cameras, views))
-    assert found is not None
-    assert above_ground(found.places).abs().quantile(0.9) < 0.1
 
 
 def test_what_masks_leave_out_is_no_feature_and_does_not_tell_exposures():
@@ -144,15 +139,9 @@ def test_a_flight_is_read_as_a_bounded_scene_on_the_ground_by_what_its_masks_lea
     for index, (pose, view) in enumerate(zip(flight_poses(), ground_views(cameras), strict=True)):
         for band in (0, 1):
             np.save(tmp_path / f"{index}_{band}.npy", (0.2 + 0.4 * view * (band + 1)).clip(0, 1))
-            frames.append(
-                {
-                    "hyperspectral_file_path": f"{index}_{band}.npy",
-                    "mask_path": "mask.png",
-                    "sensor": f"lens {band}",
-                    "bands": [band],
-                    "transform_matrix": pose.tolist(),
-                }
-            )
+            frame = {"hyperspectral_file_path": f"{index}_{band}.npy", "mask_path": "mask.png"}
+            own = {"sensor": f"lens {band}", "bands": [band], "transform_matrix": pose.tolist()}
+            frames.append(frame | own)
     content = {"wavelengths": [500, 600], "fl_x": FOCAL, "frames": frames}
     content["test_filenames"] = [frame["hyperspectral_file_path"] for frame in frames[4:6]]
     (tmp_path / "transforms.json").write_text(json.dumps(content))

@@ -1,18 +1,14 @@
 """Distances that views agree on, and the cells that views look through."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
 
+from tests.scenes.demo.demo_parts import one_ray_a_pixel
 from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
-from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.scene import _WORLD, make_demo_scene
-from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shapes import first_hits
 from unmix_plugin.scenes.geometry.carving import carve
 from unmix_plugin.scenes.geometry.surface_evidence import (
@@ -33,10 +29,9 @@ CPU = torch.device("cpu")
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Objects on a ground under a sky."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
-        folder = tmp_path_factory.mktemp("world") / "scene"
-        make_demo_scene(folder, 64, 3, 24, place=_WORLD)
+    folder = tmp_path_factory.mktemp("world") / "scene"
+    with one_ray_a_pixel():
+        make_demo_scene(folder, 64, 3, 24, place=PLACES["world"])
     return folder
 
 
@@ -49,14 +44,14 @@ def scene(folder):
 @pytest.fixture(scope="module")
 def evidence(scene):
     """Where its surfaces are."""
-    return SurfaceEvidence(scene)
+    return SurfaceEvidence(scene, CPU)
 
 
 def true_distances(scene, rays):
     """To the first surface, model units; inf where there is the sky."""
     origins = scene.normalisation.to_world(rays.origins.double().numpy()).astype(np.float32)
     directions = (rays.directions.numpy() @ scene.normalisation.rotation).astype(np.float32)
-    found, _ = first_hits([thing.placement for thing in _WORLD.things], origins, directions)
+    found, _ = first_hits([thing.placement for thing in PLACES["world"].things], origins, directions)
     return torch.from_numpy(found) * scene.normalisation.scale
 
 
@@ -83,12 +78,11 @@ def share_right(scene, cameras, views, depths):
         coords = torch.stack(torch.meshgrid(at[1], at[0], indexing="xy"), dim=-1).flatten(0, 1)
         rays = cameras.generate_rays(torch.full((len(coords),), view), coords)
         is_known = torch.isfinite(found).flatten()
-        true = true_distances(scene, rays).clamp(max=1e4)
-        places = [
+        one, other = (
             space.to_unit(rays.origins + t[:, None] * rays.directions)[is_known]
-            for t in (found.flatten().nan_to_num(posinf=0.0), true)
-        ]
-        right.append(64 * (places[0] - places[1]).norm(dim=-1) < 3)
+            for t in (found.flatten().nan_to_num(posinf=0.0), true_distances(scene, rays).clamp(max=1e4))
+        )
+        right.append(64 * (one - other).norm(dim=-1) < 3)
         known.append(is_known)
     return float(torch.cat(known).float().mean()), float(torch.cat(right).float().mean())
 
@@ -98,28 +92,18 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
     """`edge`: by how many times larger the pictures are, with noise in each pixel that means over pixels remove."""
     train = list(scene.train_indices[:12])
     cameras = scene.cameras[train]
-    large = Cameras(
-        cameras.camera_to_world,
-        edge * cameras.focal_px,
-        edge * cameras.center_px,
-        cameras.distortion,
-        edge * cameras.width,
-        edge * cameras.height,
-    )
-    generator = np.random.default_rng(0)
-    gains = np.exp(generator.uniform(-spread, spread, len(train))).astype(np.float32)
+    gains = np.exp(np.random.default_rng(0).uniform(-spread, spread, len(train))).astype(np.float32)
 
-    def read_view(view, part):
+    def read(view, part):
         cube = scene.cube(train[view]).repeat(edge, axis=0).repeat(edge, axis=1)
-        noise = (
-            0.0 if edge == 1 else 0.15 * np.random.default_rng(view).standard_normal(cube.shape, np.float32)
-        )
+        noise = 0.15 * (edge > 1) * np.random.default_rng(view).standard_normal(cube.shape, np.float32)
         return (gains[view] * cube + noise)[part]
 
-    depths = _sweep_depths(Views(large, read_view), scene.scene_box)
+    views = Views(cameras.resized(edge * cameras.width, edge * cameras.height), read)
+    depths = _sweep_depths(views, scene.scene_box)
     assert depths is not None
     assert depths.stride == 2 * (1 if edge == 1 else 3)
-    share, right = share_right(scene, large, [0, 5, 10], depths)
+    share, right = share_right(scene, views.cameras, [0, 5, 10], depths)
     assert share > 0.3
     assert right > 0.85
 
@@ -159,8 +143,7 @@ def test_cells_that_views_look_through_are_carved_and_those_with_surfaces_are_no
 
 def test_a_bounded_scene_has_no_evidence_of_surfaces(folder):
     scene = load_scene(folder, SceneOptions(world="bounded"))
-    evidence = SurfaceEvidence(scene)
-    assert not evidence.is_known
+    evidence = SurfaceEvidence(scene, CPU)
     reachable = carve(scene, 16)
     assert evidence.carved(reachable) is reachable
 
@@ -184,11 +167,7 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (1, 1000)])
 def test_views_of_a_pixel_or_a_row_are_too_small_to_be_swept(scene, size):
-    cameras = scene.cameras[list(scene.train_indices)]
-    height, width = size
-    small = Cameras(
-        cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion, width, height
-    )
+    small = scene.cameras[list(scene.train_indices)].resized(size[1], size[0])
     pixels = np.random.default_rng(0).random((*size, 3), np.float32)
     assert _sweep_depths(Views(small, lambda view, part: (pixels + 0.01 * view)[part]), BOX) is None
 

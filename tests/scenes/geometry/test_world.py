@@ -1,18 +1,17 @@
 """What distinguishes an unbounded world from a closed box, and which of its cells are carved."""
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from tests.scenes.demo.demo_parts import one_ray_a_pixel
 from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.errors import SceneError
-from unmix_plugin.scenes.demo import scene as demo_scene
-from unmix_plugin.scenes.demo.scene import _ROOM, _TABLE, _WORLD, make_demo_scene
-from unmix_plugin.scenes.demo.shading import render_view
+from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.geometry.carving import _carve_world
 from unmix_plugin.scenes.geometry.view_agreement import _WorldEvidence
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -24,11 +23,10 @@ BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     """Small scenes of each place."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo_scene, "render_view", partial(render_view, subpixels=1))
-        root = tmp_path_factory.mktemp("places")
-        for name, place, size in (("table", _TABLE, 48), ("world", _WORLD, 48), ("room", _ROOM, 72)):
-            make_demo_scene(root / name, size, 3, 16, place=place)
+    root = tmp_path_factory.mktemp("places")
+    with one_ray_a_pixel():
+        for name, size in (("table", 48), ("world", 48), ("room", 72)):
+            make_demo_scene(root / name, size, 3, 16, place=PLACES[name])
     return root
 
 
@@ -45,23 +43,21 @@ def test_what_goes_on_behind_the_box_is_found_from_the_views(folders, name, is_u
     assert as_told.world_reason is None
 
 
-def test_a_room_whose_inside_explains_all_pixels_is_bounded():
-    assert not _WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850).goes_on
-    assert _WorldEvidence(num_pixels=1000, num_inside=600, num_behind=300, num_explained=850).goes_on
-    assert _WorldEvidence(num_pixels=1000, num_inside=300, num_behind=10, num_explained=350).goes_on
-    assert not _WorldEvidence(0, 0, 0, 0).goes_on
-
-
-def test_places_matched_outside_the_box_tell_of_a_world_behind_it_too():
+def test_a_world_goes_on_where_pixels_or_matched_places_tell_of_more_than_a_closed_box():
     closed = _WorldEvidence(num_pixels=1000, num_inside=900, num_behind=20, num_explained=850)
+    assert not closed.goes_on
+    assert not _WorldEvidence(0, 0, 0, 0).goes_on
+    assert replace(closed, num_inside=600, num_behind=300).goes_on
+    assert replace(closed, num_inside=300, num_behind=10, num_explained=350).goes_on
     assert "end with its box" in closed.in_words()
     within, beyond = torch.tensor([0.5, -0.9, 1.1]), torch.tensor([0.0, 2.0, 0.0])
-    found = closed.with_places(BOX, torch.stack([within] * 9 + [beyond]))
-    assert not found.goes_on
-    assert "1 of 10 places matched between views lie outside it" in found.in_words()
-    found = closed.with_places(BOX, torch.stack([within] * 8 + [beyond] * 2))
-    assert found.goes_on
-    assert "go on behind the scene box: 2 of 10 places" in found.in_words()
+    for num_beyond, said in (
+        (1, "1 of 10 places matched between views lie outside"),
+        (2, "go on behind the scene box: 2"),
+    ):
+        found = closed.with_places(BOX, torch.stack([within] * (10 - num_beyond) + [beyond] * num_beyond))
+        assert found.goes_on == (num_beyond == 2)
+        assert said in found.in_words()
 
 
 def test_a_world_behind_what_is_transparent_is_refused(folders):

@@ -57,7 +57,8 @@ def test_the_box_and_the_hull_hold_what_the_sweeps_show(lines):
     assert (corners[0] < -0.55).all()
     assert (corners[1] > 0.55).all()
     assert (np.abs(corners) < 2.0).all()
-    hull = carve(lines, 32)
+    alphas = [lines.alpha(index) for index in lines.train_indices]
+    hull = carve(lines, 32, [alpha > 0 for alpha in alphas if alpha is not None])
     steps = (np.arange(32) + 0.5) / 32
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1)
     distance = np.linalg.norm(corners[0] + grid * (corners[1] - corners[0]), axis=-1)

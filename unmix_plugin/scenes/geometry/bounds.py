@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -26,10 +26,13 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
+    Cells,
+    Masks,
     carve_box,
     count_views,
     foreground_rays,
     share_through,
+    unit_centres,
 )
 from unmix_plugin.scenes.geometry.matched_points import MatchedPoints
 
@@ -59,20 +62,14 @@ _SEEN_CELLS = 32
 
 
 def find_bounds(
-    root: Path,
-    cameras: Cameras,
-    foreground: list[Bool[np.ndarray, "_ _"]] | None,
-    points: MatchedPoints | None = None,
+    root: Path, cameras: Cameras, foreground: Masks | None, points: MatchedPoints | None = None
 ) -> SceneBox:
-    """The box that the training views show.
+    """The box that the training views show, in their cameras' space, which has coordinates of order 1.
 
     Args:
         root: Scene folder, for messages.
-        cameras: Training cameras, in coordinates of order 1.
         foreground: For each view True where it may show something; None where there is no alpha.
         points: By the numbers of these cameras, places that views agree on, for cameras that do not look at one place.
-    Returns:
-        The box in the cameras' space.
     Raises:
         SceneError: with alpha, no place is opaque in all views that see it: poses and pictures contradict.
     """
@@ -147,7 +144,7 @@ def _cube_of_views(cameras: Cameras) -> tuple[Float64[np.ndarray, "3"], float]:
     return middle + direction / length * depth, half
 
 
-def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> SceneBox:
+def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Cells) -> SceneBox:
     """The extent of the hull in a box, without its far ends that few cameras see, if the images allow.
 
     Where views are cropped the hull has long arms that reach from the subject to the edge of what is seen.
@@ -165,11 +162,11 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Bool[np.nda
 
 def _count_views(cameras: Cameras, box: SceneBox, cells: int) -> Int64[np.ndarray, "R R R"]:
     """How many cameras see the centre of each cell."""
-    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
-    return count_views(cameras, box.aabb[0] + unit * box.size).view(cells, cells, cells).numpy()
+    points = box.aabb[0] + unit_centres(cells) * box.size
+    return count_views(cameras, points).view(cells, cells, cells).numpy()
 
 
-def _extent(box: SceneBox, kept: Bool[np.ndarray, "R R R"], margin_cells: int) -> SceneBox:
+def _extent(box: SceneBox, kept: Cells, margin_cells: int) -> SceneBox:
     """The smallest box around the kept cells, wider by a margin but never beyond the old box."""
     low, size = box.aabb[0].double().numpy(), box.size.double().numpy()
     new_low, new_high = np.zeros(3), np.zeros(3)

@@ -18,13 +18,17 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras, distort, undistort
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
 from unmix_plugin.scenes.scene import Scene
 
+Cells = Bool[np.ndarray, "R R R"]
+"""Cells of a box that may be occupied."""
+Masks = list[Bool[np.ndarray, "_ _"]]
+"""For each view True on pixels that may show something."""
 _MAX_RAYS = 20_000
 """Pixels that are asked for whether a hull explains them."""
 MIN_EXPLAINED = 0.999
@@ -69,31 +73,23 @@ _BLOCK_POINTS = 1 << 16
 
 
 def carve(
-    scene: Scene,
-    resolution: int,
-    foreground: list[Bool[np.ndarray, "_ _"]] | None = None,
-    cameras: Cameras | None = None,
-) -> Bool[np.ndarray, "R R R"]:
+    scene: Scene, resolution: int, foreground: Masks | None = None, cameras: Cameras | None = None
+) -> Cells:
     """Cells of the scene box, or of the world contracted around it, that may be occupied.
 
     Args:
-        scene: With alpha its hull is carved; without, what hardly any training camera sees.
         resolution: Cells along each edge of the box.
-        foreground: For each training view True on pixels that may show something; None takes them from alpha.
+        foreground: For each training view True on pixels that may show something, whose hull is carved; None carves
+            what hardly any training camera sees.
         cameras: Of the training views; None takes those of the scene.
-    Returns:
-        True where something may be.
     """
-    indices = list(scene.train_indices)
-    cameras, box = scene.cameras[indices] if cameras is None else cameras, scene.scene_box
+    cameras, box = scene.cameras[list(scene.train_indices)] if cameras is None else cameras, scene.scene_box
     if scene.is_unbounded:
         return _carve_world(cameras, box, resolution)
-    if not scene.has_alpha and foreground is None:
-        fewest_views = max(1, math.ceil(_FAIR_SHARE_OPEN * len(indices)))
-        return carve_box(cameras, None, box, resolution, fewest_views)
     if foreground is None:
-        foreground = [_foreground_mask(scene, index) for index in indices]
-    fair = max(1, math.ceil(_FAIR_SHARE * len(indices)))
+        fewest_views = max(1, math.ceil(_FAIR_SHARE_OPEN * len(cameras)))
+        return carve_box(cameras, None, box, resolution, fewest_views)
+    fair = max(1, math.ceil(_FAIR_SHARE * len(cameras)))
     rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
     witnesses = _needed_witnesses(cameras, foreground, box, rays)
     kept = carve_box(cameras, foreground, box, resolution, fair, witnesses)
@@ -102,9 +98,7 @@ def carve(
     return carve_box(cameras, foreground, box, resolution, witnesses=witnesses)
 
 
-def _needed_witnesses(
-    cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]], box: SceneBox, rays: RayBundle
-) -> int:
+def _needed_witnesses(cameras: Cameras, foreground: Masks, box: SceneBox, rays: RayBundle) -> int:
     """Views that must agree that a cell is empty, so that the hull explains what single views show.
 
     A hole in one mask carves away what all other views see; where masks are good, one view is enough. Where things move
@@ -120,34 +114,28 @@ def _needed_witnesses(
     return _WITNESSES[int(np.argmax(shares))]
 
 
-def _foreground_mask(scene: Scene, index: int) -> Bool[np.ndarray, "H W"]:
-    """Pixels of a view that may show something: not fully transparent, or not to be trusted."""
-    alpha = scene.alpha(index)
-    valid = scene.valid_mask(index)
-    return ~valid if alpha is None else (alpha > 0.0) | ~valid
-
-
 def carve_box(
     cameras: Cameras,
-    foreground: list[Bool[np.ndarray, "_ _"]] | None,
+    foreground: Masks | None,
     box: SceneBox,
     resolution: int,
     fewest_views: int = 1,
     witnesses: int = 1,
-) -> Bool[np.ndarray, "R R R"]:
+) -> Cells:
     """Cells of a box that may be occupied, by the given views.
 
     Args:
         cameras: One a view, in the space of the box.
         foreground: For each view True on pixels that may show something; None where there is no alpha.
-        box: What is divided into cells.
-        resolution: Cells along each edge, >= 1.
         fewest_views: Views that must see a cell for it to stay.
         witnesses: Views that must look through a cell for it to go.
     """
-    if resolution < 1:
-        raise ValueError(f"resolution must be at least 1; got {resolution}")
-    views = [_view(cameras, i, None if foreground is None else foreground[i]) for i in range(len(cameras))]
+    views = [
+        (_LineView if cameras.is_line_camera(index) else _View)(
+            cameras, index, foreground and foreground[index]
+        )
+        for index in range(len(cameras))
+    ]
     near = _NEAR_DEPTH * 0.5 * float(box.size.max())
     sizes = [resolution]
     while sizes[-1] % 2 == 0 and sizes[-1] > COARSEST_CELLS:
@@ -156,31 +144,28 @@ def carve_box(
     for cells in reversed(sizes):
         if kept.shape[0] != cells:
             kept = kept.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
+        low, size = box.aabb[0].numpy(), box.size.numpy()
         candidates = np.flatnonzero(kept)
         for first in range(0, len(candidates), _BLOCK_CELLS):
             block = candidates[first : first + _BLOCK_CELLS]
-            kept.reshape(-1)[block] = _may_be_occupied(
-                block, cells, views, box, near, fewest_views, witnesses
-            )
+            index = np.stack(np.unravel_index(block, kept.shape)).astype(np.float32)
+            centres = low[:, None] + (index + np.float32(0.5)) * (size / np.float32(cells))[:, None]
+            half = size * np.float32(0.5 / cells)
+            kept.reshape(-1)[block] = _may_be_occupied(centres, half, near, views, fewest_views, witnesses)
     return kept
 
 
 def _may_be_occupied(
-    flat_cells: Int64[np.ndarray, " M"],
-    cells: int,
-    views: list[_View | _LineView],
-    box: SceneBox,
+    centres: Float32[np.ndarray, "3 M"],
+    half: Float32[np.ndarray, "3"],
     near: float,
+    views: list[_View | _LineView],
     fewest_views: int,
     witnesses: int,
 ) -> Bool[np.ndarray, " M"]:
-    low, size = box.aabb[0].numpy(), box.size.numpy()
-    index = np.stack(np.unravel_index(flat_cells, (cells, cells, cells))).astype(np.float32)
-    centres = low[:, None] + (index + np.float32(0.5)) * (size / np.float32(cells))[:, None]
-    half = size * np.float32(0.5 / cells)
-    seen_by = np.zeros(len(flat_cells), dtype=np.int64)
-    looked_through = np.zeros(len(flat_cells), dtype=np.int64)
-    alive = np.arange(len(flat_cells))
+    """Of cells with these centres, half as wide as `half`; views see nothing nearer than `near`."""
+    seen_by, looked_through = np.zeros((2, centres.shape[1]), dtype=np.int64)
+    alive = np.arange(centres.shape[1])
     for view in views:
         # With alpha every cell left is looked at by every view; without, only those too few have seen yet.
         looked_at = alive if view.covered is not None else alive[seen_by[alive] < fewest_views]
@@ -189,29 +174,34 @@ def _may_be_occupied(
         if looks_through is not None:
             looked_through[alive] += looks_through
             alive = alive[looked_through[alive] < witnesses]
-    result = np.zeros(len(flat_cells), dtype=bool)
+    result = np.zeros(centres.shape[1], dtype=bool)
     result[alive] = seen_by[alive] >= fewest_views
     return result
 
 
-def _view(cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> _View | _LineView:
-    covered = None
-    if foreground is not None:
+class _Covered:
+    """Running sums of foreground pixels, so that any rectangle of a view is counted with four look-ups."""
+
+    def __init__(self, foreground: Bool[np.ndarray, "H W"]) -> None:
         height, width = foreground.shape
         sums = np.zeros((height + 1, width + 1), dtype=np.int32)
         np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
-        covered = sums.reshape(-1)
-    kind = _LineView if cameras.is_line_camera(index) else _View
-    return kind(cameras, index, covered)
+        self._sums, self._columns = sums.reshape(-1), width + 1
+
+    def is_empty(
+        self, low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"]
+    ) -> Bool[np.ndarray, " M"]:
+        """Whether rectangles within the view, rounded outwards, hold no foreground."""
+        (x0, y0), (x1, y1) = low.astype(np.int32), high.astype(np.int32) + 1
+        # One array of row-major corner numbers and `take` cost a third of two-dimensional indexing.
+        y0, y1, sums = y0 * self._columns, y1 * self._columns, self._sums
+        return sums.take(y1 + x1) - sums.take(y0 + x1) - sums.take(y1 + x0) + sums.take(y0 + x0) == 0
 
 
 class _View:
-    """One camera with the running sum of its foreground pixels, so that any rectangle is counted with four look-ups."""
+    """One camera."""
 
-    covered: Int32[np.ndarray, " pixels"] | None
-    """Sums over rectangles from the first pixel, (H + 1) x (W + 1) of them, row after row; None without alpha."""
-
-    def __init__(self, cameras: Cameras, index: int, covered: Int32[np.ndarray, " pixels"] | None) -> None:
+    def __init__(self, cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> None:
         pose = cameras.camera_to_world[index].numpy()
         # OpenCV axes here (x right, y down, z forward), so that image and depth have the signs of pixels
         self._axes = (pose[:, :3] * np.array([1.0, -1.0, -1.0], dtype=np.float32)).T
@@ -219,9 +209,9 @@ class _View:
         self._focal = cameras.focal_px[index].numpy()[:, None]
         self._center = cameras.center_px[index].numpy()[:, None]
         self._distortion = cameras.distortion[index] if cameras.is_distorted else None
-        self._columns, self._rows = cameras.size(index)
+        self._sides = np.array(cameras.size(index), dtype=np.float32)[:, None]
         self._low, self._high = self._ideal_bounds()
-        self.covered = covered
+        self.covered = None if foreground is None else _Covered(foreground)
 
     def judge(
         self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"], near: float
@@ -244,30 +234,21 @@ class _View:
         low, high = low.take(chosen, axis=1), high.take(chosen, axis=1)
         if self._distortion is not None:
             low, high = _bend(low, high, self._distortion)
-        # One array of row-major corner numbers and `take` cost a third of two-dimensional indexing.
         low = low * self._focal + (self._center - _PIXEL_MARGIN)
         high = high * self._focal + (self._center + _PIXEL_MARGIN)
-        fits = np.flatnonzero(
-            (low[0] >= 0.0) & (low[1] >= 0.0) & (high[0] < self._columns) & (high[1] < self._rows)
-        )
-        x0, y0 = low.take(fits, axis=1).astype(np.int32)
-        x1, y1 = high.take(fits, axis=1).astype(np.int32) + 1
-        y0, y1 = y0 * (self._columns + 1), y1 * (self._columns + 1)
-        sums = self.covered
-        count = sums.take(y1 + x1) - sums.take(y0 + x1) - sums.take(y1 + x0) + sums.take(y0 + x0)
+        fits = np.flatnonzero((low >= 0.0).all(axis=0) & (high < self._sides).all(axis=0))
         empty = np.zeros(len(nearest), dtype=bool)
-        empty[chosen[fits]] = count == 0
+        empty[chosen[fits]] = self.covered.is_empty(low.take(fits, axis=1), high.take(fits, axis=1))
         return sees, empty
 
     def _ideal_bounds(self) -> tuple[Float32[np.ndarray, "2 1"], Float32[np.ndarray, "2 1"]]:
         """Bounds of the image in ideal coordinates, from its border; far outside them a lens model folds over."""
-        sides = np.array([[self._columns], [self._rows]], dtype=np.float32)
         if self._distortion is None:
-            return -self._center / self._focal, (sides - self._center) / self._focal
+            return -self._center / self._focal, (self._sides - self._center) / self._focal
         along = np.linspace(0.0, 1.0, _BORDER_POINTS, dtype=np.float32)
         ends = np.repeat(np.array([0.0, 1.0], dtype=np.float32), _BORDER_POINTS)
         both = np.tile(along, 2)
-        border = np.concatenate([np.stack([both, ends]), np.stack([ends, both])], axis=1) * sides
+        border = np.concatenate([np.stack([both, ends]), np.stack([ends, both])], axis=1) * self._sides
         bent = torch.from_numpy(((border - self._center) / self._focal).T.copy())
         ideal = undistort(bent, self._distortion).numpy()
         return ideal.min(axis=0)[:, None], ideal.max(axis=0)[:, None]
@@ -292,10 +273,10 @@ class _LineView:
     It reaches along the line by its width and across it as fast as the camera moves there.
     """
 
-    def __init__(self, cameras: Cameras, index: int, covered: Int32[np.ndarray, " pixels"] | None) -> None:
+    def __init__(self, cameras: Cameras, index: int, foreground: Bool[np.ndarray, "H W"] | None) -> None:
         self._camera = cameras[index]
         self._columns, self._rows = cameras.size(index)
-        self.covered = covered
+        self.covered = None if foreground is None else _Covered(foreground)
         y = torch.arange(self._rows + 1, dtype=torch.float32)
         poses = self._camera.poses_at(torch.zeros(len(y), dtype=torch.int64), y)
         up, back, places = poses[1:, :, 1], poses[:-1, :, 2], poses[:, :, 3]
@@ -317,17 +298,13 @@ class _LineView:
         sees = (high[0] > 0) & (low[0] < self._columns) & (depths.numpy() > near)
         if self.covered is None:
             return sees, None
-        inside = (low >= 0).all(axis=0) & (high[0] < self._columns) & (high[1] < self._rows)
-        chosen = np.flatnonzero(inside)
-        x0, y0 = low[:, chosen].astype(np.int32)
-        x1, y1 = high[:, chosen].astype(np.int32) + 1
-        sums = self.covered.reshape(self._rows + 1, self._columns + 1)
-        empty = np.zeros(len(inside), dtype=bool)
-        empty[chosen] = sums[y1, x1] - sums[y0, x1] - sums[y1, x0] + sums[y0, x0] == 0
+        chosen = np.flatnonzero((low >= 0).all(axis=0) & (high[0] < self._columns) & (high[1] < self._rows))
+        empty = np.zeros(len(sees), dtype=bool)
+        empty[chosen] = self.covered.is_empty(low[:, chosen], high[:, chosen])
         return sees, empty
 
 
-def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]]) -> RayBundle:
+def foreground_rays(cameras: Cameras, foreground: Masks) -> RayBundle:
     """Rays through foreground pixels, evenly thinned out to at most `_MAX_RAYS`."""
     flat = np.flatnonzero(np.concatenate([mask.reshape(-1) for mask in foreground]))
     chosen = flat[:: max(1, -(-len(flat) // _MAX_RAYS))]
@@ -339,7 +316,7 @@ def foreground_rays(cameras: Cameras, foreground: list[Bool[np.ndarray, "_ _"]])
     return cameras.generate_rays(torch.from_numpy(views), coords)
 
 
-def share_through(rays: RayBundle, box: SceneBox, hull: Bool[np.ndarray, "R R R"]) -> float:
+def share_through(rays: RayBundle, box: SceneBox, hull: Cells) -> float:
     """Share of the rays that meet a cell of the hull; 0 without rays."""
     if len(rays) == 0:
         return 0.0
@@ -361,11 +338,10 @@ def _without_specks(foreground: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H 
     return binary_opening(foreground, np.ones((2, 2), dtype=bool))
 
 
-def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.ndarray, "R R R"]:
+def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Cells:
     """Cells of the world contracted around a box that enough training cameras see; arguments as `carve_box` has."""
     cells = min(resolution, _WORLD_CELLS)
-    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
-    points = UnitSpace(box, is_unbounded=True).from_unit(unit)
+    points = UnitSpace(box, is_unbounded=True).from_unit(unit_centres(cells))
     seen_by = torch.cat([count_views(cameras, part) for part in points.split(_BLOCK_POINTS)])
     positions = cameras.camera_to_world[:, :, 3]
     limit = _NEAR_DISTANCE * float((positions - box.aabb.mean(dim=0)).norm(dim=-1).median())
@@ -376,8 +352,18 @@ def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Bool[np.nd
     kept = (seen_by >= torch.where(nearest < limit, near, far)).view(1, 1, cells, cells, cells)
     # A cell counts by its centre, so those beside one that is seen may be seen in part.
     grown = torch.nn.functional.max_pool3d(kept.float(), 3, stride=1, padding=1)[0, 0] > 0
-    index = torch.arange(resolution) * cells // resolution
-    return grown[index][:, index][:, :, index].numpy()
+    return refined(grown, resolution).numpy()
+
+
+def unit_centres(cells: int) -> Float[Tensor, "M 3"]:
+    """Centres of the cells of a unit cube, so many along each edge; x outermost."""
+    return (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
+
+
+def refined(grid: Bool[Tensor, "r r r"], resolution: int) -> Bool[Tensor, "R R R"]:
+    """The same grid in more cells."""
+    index = torch.arange(resolution) * len(grid) // resolution
+    return grid[index][:, index][:, :, index]
 
 
 def count_views(cameras: Cameras, points: Float[Tensor, "P 3"]) -> Int64[Tensor, " P"]:
@@ -390,26 +376,20 @@ def count_views(cameras: Cameras, points: Float[Tensor, "P 3"]) -> Int64[Tensor,
     return count
 
 
-def share_explained(
-    scene: Scene,
-    hull: Bool[np.ndarray, "R R R"],
-    foreground: list[Bool[np.ndarray, "_ _"]],
-    cameras: Cameras,
-) -> float:
+def share_explained(scene: Scene, hull: Cells, foreground: Masks, cameras: Cameras) -> float:
     """Share of the training views' foreground behind which a hull in the scene's box has something."""
     rays = foreground_rays(cameras, [_without_specks(mask) for mask in foreground])
     return share_through(rays, scene.scene_box, hull)
 
 
-def mask_warning(scene: Scene, foreground: list[Bool[np.ndarray, "_ _"]]) -> str | None:
+def mask_warning(scene: Scene, foreground: Masks) -> str | None:
     """What to say of masks that look through what others show; None if none do. For bounded scenes with alpha.
 
     They do where poses are off by more than a few pixels, and where masks err.
     """
     cameras = scene.cameras[list(scene.train_indices)]
-    share = share_explained(
-        scene, carve_box(cameras, foreground, scene.scene_box, _WITNESS_CELLS), foreground, cameras
-    )
+    hull = carve_box(cameras, foreground, scene.scene_box, _WITNESS_CELLS)
+    share = share_explained(scene, hull, foreground, cameras)
     if share >= _LEAST_AGREEMENT:
         return None
     return (

@@ -28,6 +28,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
+from unmix_plugin.scenes.geometry.carving import Cells
 
 _NUM_PLACES = 2000
 """Places that are followed."""
@@ -60,7 +61,7 @@ class Places:
     """Unit vectors, outwards."""
 
 
-def _hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
+def _hull_places(hull: Cells, box: SceneBox) -> Places:
     """Evenly thinned-out cells on the surface of a hull, with their normals."""
     from scipy import ndimage  # slow to import
 
@@ -78,18 +79,10 @@ def _hull_places(hull: Bool[np.ndarray, "R R R"], box: SceneBox) -> Places:
 
 
 def seen_places(
-    cameras: Cameras,
-    log_brightness: list[Float[np.ndarray, "H W"]],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
+    cameras: Cameras, log_brightness: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
 ) -> tuple[Places, Float[Tensor, "P N"]]:
-    """Places on the hull, and the logarithm of their brightness in each view; NaN where a view does not see one.
-
-    Args:
-        cameras: Of the views.
-        log_brightness: Of each view, NaN on pixels that say nothing: background, saturated ones.
-        hull: Cells that may be occupied, of the box.
-    """
+    """Places on a hull in a box, and the logarithm of their brightness in each view; NaN where a view does not see one,
+    or its picture is NaN: background, saturated pixels."""
     hull = coarse_hull(hull)
     places = _hull_places(hull, box)
     seen = [
@@ -98,7 +91,7 @@ def seen_places(
     return places, torch.stack(seen, dim=1)
 
 
-def coarse_hull(hull: Bool[np.ndarray, "R R R"]) -> Bool[np.ndarray, "r r r"]:
+def coarse_hull(hull: Cells) -> Bool[np.ndarray, "r r r"]:
     """The hull in fewer cells, each occupied if one of its parts is."""
     factor = hull.shape[0] // _LARGEST_HULL
     if factor < 2 or hull.shape[0] % factor:
@@ -119,12 +112,7 @@ def local_log_brightness(seen: Float[Tensor, "H W"]) -> Float[np.ndarray, "H W"]
 
 
 def _looked_up(
-    cameras: Cameras,
-    index: int,
-    image: Float[np.ndarray, "H W"],
-    places: Places,
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
+    cameras: Cameras, index: int, image: Float[np.ndarray, "H W"], places: Places, hull: Cells, box: SceneBox
 ) -> Float[Tensor, " P"]:
     """What a view shows of the places, NaN where it does not see them."""
     coords, depths = cameras.project(places.positions, index)
@@ -139,10 +127,7 @@ def _looked_up(
 
 
 def _is_hidden(
-    positions: Float[Tensor, "P 3"],
-    towards: Float[Tensor, "P 3"],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
+    positions: Float[Tensor, "P 3"], towards: Float[Tensor, "P 3"], hull: Cells, box: SceneBox
 ) -> Bool[Tensor, " P"]:
     """Places with hull before them."""
     cells, kept = hull.shape[0], torch.from_numpy(hull)
@@ -160,10 +145,7 @@ _FoundLight = Literal["fixed", "camera", "per-view"]
 
 
 def judge_light(
-    cameras: Cameras,
-    log_brightness: list[Float[np.ndarray, "H W"]],
-    hull: Bool[np.ndarray, "R R R"],
-    box: SceneBox,
+    cameras: Cameras, log_brightness: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
 ) -> _FoundLight:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
@@ -179,20 +161,14 @@ def judge_exposure(
     """Whether views differ in exposure; fixed where too little is seen to tell.
 
     Args:
-        cameras: Of the views.
         positions: Of places on surfaces.
-        seen: Logarithm of the brightness of each place in each view, NaN where a view does not see it. Two views that
-            see a place are enough.
+        seen: Logarithm of the brightness of each place in each view, NaN where a view does not see it; two are enough.
     """
     return "per-view" if _gain_spread(cameras, positions, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
 def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
-    """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen.
-
-    Args:
-        places, seen: As `seen_places` gives them.
-    """
+    """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen."""
     if len(places.positions) == 0:
         return 0.0
     rotations = cameras.camera_to_world[:, :, :3]

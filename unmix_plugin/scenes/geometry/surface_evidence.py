@@ -23,6 +23,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
+from unmix_plugin.scenes.geometry.carving import Cells, refined, unit_centres
 from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
     ThinnedViews,
@@ -78,12 +79,8 @@ class _SweptDepths:
 
 
 def _sweep_depths(views: Views, box: SceneBox) -> _SweptDepths | None:
-    """Distances of the pixels of all views, or of `_MOST_VIEWS`; None if views are too few, too small or too plain.
-
-    Args:
-        views: All of one size, each with one pose. The distances of pixels that don't count stay unknown.
-        box: In the cameras' space.
-    """
+    """Distances of the pixels of all views, or of `_MOST_VIEWS`, in a box of their cameras' space; None if views are
+    too few, too small or too plain. All have one size and one pose each. Pixels that don't count stay unknown."""
     cameras, count = views.cameras, min(len(views.cameras), _MOST_VIEWS)
     chosen = np.linspace(0, len(cameras) - 1, count).round().astype(int).tolist()
     if count < NUM_AGREEING + 1:
@@ -186,17 +183,10 @@ def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"])
 
 
 def _seen_through(depths: _SweptDepths, cameras: Cameras, box: SceneBox, cells: int) -> Bool[Tensor, "C C C"]:
-    """Cells of the contracted world that are empty.
-
-    Args:
-        depths: Of views of `cameras`.
-        cameras: Of the training views.
-        box: That the world is contracted around.
-        cells: Along each edge.
-    """
+    """Cells of the world contracted around a box that are empty, so many along each edge, by depths of views of
+    `cameras`."""
     space = UnitSpace(box, is_unbounded=True)
-    unit = (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
-    points = space.from_unit(unit)
+    points = space.from_unit(unit_centres(cells))
     radii = space.centred(points).abs().amax(dim=-1).clamp(min=1.0)
     margins = _MARGIN * 4.0 / cells * float(space.half_edge) * radii.square()
     through, surfaces = torch.zeros(2, len(points))
@@ -226,44 +216,37 @@ def _looked_up(
 class SurfaceEvidence:
     """Distances of pixels that views agree on, and the space that they show to be empty."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known."""
+    def __init__(self, scene: Scene, device: torch.device) -> None:
+        """Compare the training views; of rigs and line cameras, and of bounded scenes, nothing is known.
+
+        Args:
+            device: Of the pixels that will be asked for.
+        """
         views = Views.of(scene)
         self._cameras, self._box = views.cameras, scene.scene_box
-        self._placed: tuple[Cameras, Tensor, Tensor] | None = None
         is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
         self._depths = _sweep_depths(views, scene.scene_box) if is_compared else None
+        if self._depths is not None:
+            swept = torch.full((len(self._cameras),), -1)
+            swept[list(self._depths.views)] = torch.arange(len(self._depths.views))
+            self._placed = self._cameras.to(device), swept.to(device), self._depths.distances.to(device)
 
-    @property
-    def is_known(self) -> bool:
-        """Whether views could be compared."""
-        return self._depths is not None
-
-    def carved(self, reachable: Bool[np.ndarray, "X X X"]) -> Bool[np.ndarray, "X X X"]:
+    def carved(self, reachable: Cells) -> Cells:
         """Cells that may be occupied, without those that views look through."""
         if self._depths is None:
             return reachable
         cells = min(len(reachable), _CELLS)
-        index = torch.arange(len(reachable)) * cells // len(reachable)
         empty = _seen_through(self._depths, self._cameras, self._box, cells)
-        return reachable & ~empty[index][:, index][:, :, index].numpy()
+        return reachable & ~refined(empty, len(reachable)).numpy()
 
-    def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"]:
-        """Places that drawn pixels show, model space; NaN where unknown."""
-        assert self._depths is not None
-        if (
-            self._placed is None or self._placed[1].device != pixels.corners.device
-        ):  # of one training, all of one
-            swept = torch.full((len(self._cameras),), -1)
-            swept[list(self._depths.views)] = torch.arange(len(self._depths.views))
-            device = pixels.corners.device
-            self._placed = self._cameras.to(device), swept.to(device), self._depths.distances.to(device)
+    def points(self, pixels: DrawnPixels) -> Float[Tensor, "R 3"] | None:
+        """Places that drawn pixels show, model space, NaN where unknown; None where views could not be compared."""
+        if self._depths is None:
+            return None
         cameras, swept, distances = self._placed
         rays = cameras.generate_rays(pixels.cameras, pixels.corners + 0.5)
         columns, rows = (pixels.corners // self._depths.stride).unbind(-1)
-        rows, columns = (
-            at.clamp(max=side - 1) for at, side in zip((rows, columns), distances.shape[1:], strict=True)
-        )
+        rows, columns = rows.clamp(max=distances.shape[1] - 1), columns.clamp(max=distances.shape[2] - 1)
         view = swept[pixels.cameras]
         found = distances[view, rows, columns].masked_fill(view < 0, torch.inf)
         known = torch.where(torch.isfinite(found), found, torch.nan)

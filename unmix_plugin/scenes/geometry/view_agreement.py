@@ -90,10 +90,7 @@ def check_scene_poses(scene: Scene) -> str | None:
 def compare_conventions(poses: _Poses, views: Views) -> dict[str, float]:
     """How little the views agree under each convention, against unrelated pixels (1); inf where they share nothing.
 
-    Of line cameras nothing is said: no single pose tells what one saw.
-
-    Args:
-        poses: As the scene gives them; those of the views' cameras don't count.
+    Of line cameras nothing is said: no single pose tells what one saw. Poses are those given, not the cameras'.
     """
     found = None if views.cameras.key_poses is not None else _compare(poses, views, _busy_pixels)
     if found is None:
@@ -213,12 +210,7 @@ def _local_change(image: Float[Tensor, "h w F"]) -> Float[Tensor, "h w"]:
 
 
 def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str | None:
-    """A warning if all cameras stand at one place.
-
-    Args:
-        positions: Of the cameras, of a line camera at several rows; model space.
-        box: Of the scene.
-    """
+    """A warning if all cameras, of a line camera at several rows, stand at one place."""
     apart = np.linalg.norm(positions - positions[0], axis=1).max()
     away = np.linalg.norm(np.abs(box.aabb.cpu().numpy() - positions[0]).max(axis=0))
     if apart > _SMALLEST_BASE * away:
@@ -309,10 +301,8 @@ def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
 
 
 def _spread_pixels(image: Float[Tensor, "h w F"], _: torch.Generator) -> Int[Tensor, " P"]:
-    """Of each of `_TILES` x `_TILES` parts of an image the pixel where it changes most; row-major numbers (P,).
-
-    An image of fewer pixels along an edge has as many parts there as pixels.
-    """
+    """Of each of `_TILES` x `_TILES` parts of an image, or as many as it has pixels along an edge, the pixel where it
+    changes most; row-major numbers."""
     change = _local_change(image)
     down, across = (min(_TILES, side) for side in change.shape)
     height, width = change.shape[0] // down, change.shape[1] // across
