@@ -61,12 +61,8 @@ class PixelBlock:
     def __init__(
         self, scene: Scene, views: tuple[int, ...], cameras: tuple[int, ...], device: torch.device
     ) -> None:
-        """Read to a device what is known of all pixels beside their spectra.
-
-        Args:
-            views: Frames of the scene, all of one sensor.
-            cameras: Which view of the table each is.
-        """
+        """Read to a device what is known of all pixels of some frames beside their spectra; `cameras` says which view
+        of the table each is."""
         self.sensor = scene.frames[views[0]].sensor
         self._scene, self._views, self.cameras = scene, views, cameras
         self._width, self._height = scene.cameras.size(views[0])
@@ -134,11 +130,7 @@ class PixelBlock:
             self.pool = PixelPool(self.valid, self.pixel_bytes, num_bytes, self._read_range)
 
     def hold_projected(self, projection: Projection, limits: Float[Tensor, " b"] | None) -> None:
-        """Read all values, and hold of each pixel its components in a subspace.
-
-        Args:
-            limits: As `mend` takes them; None replaces nothing.
-        """
+        """Read all values, mended with limits, and hold of each pixel its components in a subspace."""
         projected = ProjectedPixels(projection, len(self), self.alpha.device)
         for first in range(0, len(self), self._size):
             for top, image, places, values in self._looked_through(first, limits):
@@ -147,11 +139,8 @@ class PixelBlock:
         self._projected = projected
 
     def mend(self, limits: Float[Tensor, " b"]) -> None:
-        """Replace stripes and spikes by what is around them, of values held in memory.
-
-        Args:
-            limits: As `deviation_limits` gives them.
-        """
+        """Replace stripes and spikes by what is around them, of values held in memory; limits as of
+        `deviation_limits`."""
         assert self._values is not None
         views = self._values.view(-1, self._height, self._width, self.num_channels)
         for row, view in enumerate(views):
@@ -168,12 +157,8 @@ class PixelBlock:
     ) -> Iterator[
         tuple[int, Float[Tensor, "n W b"], tuple[Int[Tensor, " values"], ...], Float[Tensor, " values"]]
     ]:
-        """First row, some rows of spectra from there on, places of bad values in these and what is around them.
-
-        Args:
-            first: The first pixel of a view.
-            limits: As `mend` takes them; None finds none.
-        """
+        """First row, some rows of spectra from there on, places of bad values in these and what is around them; of a
+        view, by its first pixel. Without limits none is bad."""
         none = torch.zeros(0, dtype=torch.int64)
         reach = 0 if limits is None else REACH_PX
         for top, bottom in self._row_ranges():
@@ -225,11 +210,8 @@ class PixelBlock:
         return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole)
 
     def pictures(self, of: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Iterator[Tensor]:
-        """What a function makes of each view, (H, W), a few rows at a time; on the CPU.
-
-        Args:
-            of: From spectra (n, b), alpha and which pixels are valid (n) to n values.
-        """
+        """What a function makes of each view, (H, W), a few rows at a time, on the CPU; it gets spectra (n, b), alpha
+        and which pixels are valid (n)."""
         for first in range(0, len(self), self._size):
             parts = []
             for top, bottom in self._row_ranges():
@@ -239,12 +221,8 @@ class PixelBlock:
             yield torch.cat(parts).view(self._height, self._width)
 
     def take(self, pixels: Int[Tensor, " R"], first: int, stored: Tensor | None = None) -> DrawnPixels:
-        """Some pixels by their index in the block, on any device.
-
-        Args:
-            first: Number of the block's first pixel.
-            stored: Their values as they are stored, where they were read already.
-        """
+        """Some pixels by their index in the block, whose first pixel has the number `first`, on any device; `stored`
+        are their values as they are stored, where they were read already."""
         pixels = pixels.to(self.alpha.device)
         spectra = self.spectra(pixels) if stored is None else self._scaled(stored).to(self.alpha.device)
         within = pixels % self._size
@@ -258,11 +236,8 @@ class PixelBlock:
         )
 
     def _stored(self, view: int, part: Part) -> Tensor:
-        """Values (pixels, b) of a part of a view.
-
-        Raises:
-            SceneError: the file has changed since the scene was checked.
-        """
+        """Values (pixels, b) of a part of a view. Raises SceneError: the file has changed since the scene was
+        checked."""
         try:
             cube = self._scene.stored_cube(view, part) if self._is_compact else self._scene.cube(view, part)
         except (OSError, ValueError) as error:

@@ -40,13 +40,8 @@ class Projection:
 
     @staticmethod
     def of(pixels: Float[Tensor, "N b"], num_components: int | None) -> Projection:
-        """Judged by the even ones of some pixels, of a subspace that the odd ones are in.
-
-        Args:
-            num_components: None finds how many are needed.
-        Raises:
-            SpectrumError: too few pixels, or too many components.
-        """
+        """Judged by the even ones of some pixels, of a subspace that the odd ones are in; None finds how many
+        components are needed. Raises SpectrumError: too few pixels, or too many components."""
         subspace = find_subspace(pixels[1::2], num_components)
         seen = pixels[::2]
         residuals = subspace.residuals(seen, subspace.components(seen))

@@ -198,18 +198,10 @@ class PixelTable:
         return [None if bool(b.valid.all()) else b.valid.nonzero()[:, 0].int() for b in self.blocks]
 
     def draw(
-        self,
-        count: int,
-        generator: torch.Generator,
-        step: int = 0,
-        shares: Mapping[int, float] | None = None,
+        self, count: int, generator: torch.Generator, step: int = 0, shares: Mapping[int, float] | None = None
     ) -> tuple[DrawnPixels, ...]:
-        """Random valid pixels, in one group for each sensor that some of them are of.
-
-        Args:
-            step: Of the training; what pixels on disk are drawn from moves on with it.
-            shares: Of the pixels drawn, by sensor; None draws all valid ones evenly.
-        """
+        """Random valid pixels, in one group for each sensor that some of them are of: by shares of the pixels drawn, or
+        evenly. What pixels on disk are drawn from moves on with the step of the training."""
         counts = [count]
         if len(self.blocks) != 1 or self.blocks[0].pool is not None:
             counts = self._counts(count, generator, self.shares if shares is None else shares)
@@ -278,10 +270,8 @@ class PixelRays:
     def shares(self, valid: Mapping[int, float]) -> dict[int, float]:
         """Of the pixels of a batch, by sensor: in proportion to the area that the pixels of its views cover.
 
-        Drawn evenly, the pixels of a sharp sensor, which are many, would leave hardly any of a coarse one.
-
-        Args:
-            valid: Of all valid pixels, the share of each sensor.
+        Drawn evenly (`valid`, shares of all), the pixels of a sharp sensor, which are many, would leave hardly any of a
+        coarse one.
         """
         areas = {sensor: share * self.pixel_sizes[sensor] ** 2 for sensor, share in valid.items()}
         return {sensor: area / sum(areas.values()) for sensor, area in areas.items()}

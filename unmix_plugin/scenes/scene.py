@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -20,14 +21,13 @@ from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.config_json import config_from_json
 from unmix_plugin.scenes.backdrops import BeforeBackdrop
 from unmix_plugin.scenes.placement import METRES_KEY, Normalisation, Placement
-from unmix_plugin.scenes.reading.cubes import map_array, read_cube, read_invalid
+from unmix_plugin.scenes.reading.cubes import Part, map_array, read_cube, read_invalid
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 from unmix_plugin.scenes.reading.images import read_colour, read_labels, read_mask
 from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.sensor import SceneSensor
 
 _COMPARED = ("wavelengths_nm", "frames", "train_indices", "eval_indices", "cameras", "normalisation")
-_OF_RIGS = ("sensors", "frame_sensors")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ class Scene:
         """What took a view."""
         return self.sensors[self.frames[index].sensor]
 
-    def cube(self, index: int, part: tuple[slice | np.ndarray, ...] = ()) -> Float32[np.ndarray, "*pixels b"]:
+    def cube(self, index: int, part: Part = ()) -> Float32[np.ndarray, "*pixels b"]:
         """Spectra of a view in [0, 1], as its sensor sees them.
 
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
@@ -133,10 +133,8 @@ class Scene:
         """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""
         return map_array(self.frames[index].cube_path).dtype.str[1:]
 
-    def stored_cube(
-        self, index: int, part: tuple[slice | np.ndarray, ...] = ()
-    ) -> Shaped[np.ndarray, "*pixels b"]:
-        """A cube as it is stored, before any division, in the machine's byte order; `part` as NumPy indexes it."""
+    def stored_cube(self, index: int, part: Part = ()) -> Shaped[np.ndarray, "*pixels b"]:
+        """A cube as it is stored, before any division, in the machine's byte order."""
         stored = map_array(self.frames[index].cube_path)[part]
         return np.array(stored, dtype=stored.dtype.newbyteorder("="), order="C")
 
@@ -146,35 +144,35 @@ class Scene:
         Cubes are expected as rendered over black, that is multiplied by alpha (premultiplied): a pixel half covered
         by an object holds half its radiance. So is the light behind `srgb`, before its gamma encoding.
         """
-        path = self.frames[index].image_path
-        if not self.has_alpha or path is None:
-            return None
-        return read_colour(path, self._size(index))[..., 3].astype(np.float32) / np.float32(255.0)
+        picture = self._picture(index) if self.has_alpha else None
+        return None if picture is None else picture[..., 3]
 
     def srgb(self, index: int) -> Float32[np.ndarray, "H W 3"] | None:
         """sRGB picture of a view in [0, 1], as stored (gamma-encoded); None if it has none."""
+        picture = self._picture(index)
+        return None if picture is None else picture[..., :3]
+
+    def _picture(self, index: int) -> Float32[np.ndarray, "H W C"] | None:
         path = self.frames[index].image_path
-        if path is None:
-            return None
-        return read_colour(path, self._size(index))[..., :3].astype(np.float32) / np.float32(255.0)
+        return (
+            None
+            if path is None
+            else read_colour(path, self._size(index)).astype(np.float32) / np.float32(255)
+        )
 
     def labels(self, index: int) -> UInt8[np.ndarray, "H W"] | None:
         """Material index of each pixel, 255 = unlabelled; None if the view has no labels."""
         path = self.frames[index].label_path
         return None if path is None else read_labels(path, self._size(index))
 
-    def valid_mask(
-        self, index: int, part: tuple[slice | np.ndarray, ...] = ()
-    ) -> Bool[np.ndarray, "*pixels"]:
-        """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`); `part` as NumPy
-        indexes it, by default (H, W)."""
-        path = self.frames[index].mask_path
+    def valid_mask(self, index: int, part: Part = ()) -> Bool[np.ndarray, "*pixels"]:
+        """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`)."""
+        path, options = self.frames[index].mask_path, self.options
         valid = np.ones(self._size(index), bool) if path is None else read_mask(path, self._size(index))
-        valid = valid[part]
-        if self.options.invalid_pixels != "refuse":
-            path, options = self.frames[index].cube_path, self.options
-            valid = valid & ~read_invalid(path, options.value_scale, options.invalid_pixels, part)
-        return valid
+        if options.invalid_pixels == "refuse":
+            return valid[part]
+        cube_path = self.frames[index].cube_path
+        return valid[part] & ~read_invalid(cube_path, options.value_scale, options.invalid_pixels, part)
 
     def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:
         """True abundances of a view; None if it has none."""
@@ -183,11 +181,12 @@ class Scene:
 
     def summary(self) -> dict[str, Any]:
         """What a run has to record of the scene, as JSON-able values."""
-        rig = {
-            "sensors": [sensor.to_json() for sensor in self.sensors],
-            "frame_sensors": [frame.sensor for frame in self.frames],
-        }
-        rig = rig if self.is_rig else {}
+        own: dict[str, Any] = {} if self.metres_per_unit is None else {METRES_KEY: self.metres_per_unit}
+        if (
+            self.is_rig
+        ):  # nothing for the scenes of one ordinary camera, so that their records stay as they are
+            own["sensors"] = [sensor.to_json() for sensor in self.sensors]
+            own["frame_sensors"] = [frame.sensor for frame in self.frames]
         return {
             "root": str(self.root),
             "wavelengths_nm": self.wavelengths_nm.tolist(),
@@ -200,8 +199,7 @@ class Scene:
             "material_names": None if self.material_names is None else list(self.material_names),
             "illuminant": None if self.illuminant is None else self.illuminant.tolist(),
             "endmembers": None if self.endmembers is None else self.endmembers.tolist(),
-            **({} if self.metres_per_unit is None else {METRES_KEY: self.metres_per_unit}),
-            **rig,  # nothing for the scenes of one ordinary camera, so that their records stay as they are
+            **own,
             "has_alpha": self.has_alpha,
             "is_unbounded": self.is_unbounded,
             "has_backdrop": self.has_backdrop,
@@ -225,7 +223,7 @@ def scene_identity(summary: Mapping[str, Any]) -> dict[str, Any]:
     """
     hashes = dict(summary.get("input_hashes") or {})
     hashes.pop(FILE_NAME, None)
-    rig = {key: summary[key] for key in _OF_RIGS if key in summary}
+    rig = {key: summary[key] for key in ("sensors", "frame_sensors") if key in summary}
     return {**{key: summary.get(key) for key in _COMPARED}, **rig, "files": hashes}
 
 
@@ -269,24 +267,17 @@ class _RecordedScene:
     options: SceneOptions = SceneOptions()
 
 
-_LEAST_SIZE = 1e-12
-"""Sizes below are none: what is divided by them leaves float32."""
+_LEAST_SIZE = 1e-12  # what is divided by less leaves float32
 
 
 def check_recorded_scene(values: Mapping[str, Any]) -> None:
-    """Refuse metadata or a summary that no data manager wrote.
-
-    Raises:
-        ValueError: an entry is of the wrong type, or a number out of its range.
-        KeyError, IndexError, TypeError: a sensor is damaged.
-        ConfigError: the same, found by `config_from_json`.
-    """
+    """Refuse metadata or a summary that no data manager wrote. Raises ValueError, ConfigError: an entry is of the wrong
+    type, or a number out of its range; KeyError, IndexError, TypeError: a sensor is damaged."""
     known = {entry.name: values[entry.name] for entry in fields(_RecordedScene) if entry.name in values}
     scene = config_from_json(known, _RecordedScene(), "the scene")
-    bands = len(scene.wavelengths_nm)
-    steps = zip(scene.wavelengths_nm, scene.wavelengths_nm[1:], strict=False)
+    bands, normalisation = len(scene.wavelengths_nm), scene.normalisation
     rules = {
-        "wavelengths above 0 nm that increase": all(0 < low < high for low, high in steps),
+        "wavelengths above 0 nm that increase": all(0 < a < b for a, b in pairwise(scene.wavelengths_nm)),
         "widths above 0 nm, one a band": scene.fwhm_nm is None
         or (len(scene.fwhm_nm) == bands and min(scene.fwhm_nm, default=0) > 0),
         "an illuminant with a value a band, none negative": scene.illuminant is None
@@ -301,11 +292,8 @@ def check_recorded_scene(values: Mapping[str, Any]) -> None:
         or (len(scene.line_rows) == scene.num_train_views and all(0 <= n <= 65536 for n in scene.line_rows)),
         "a name for each endmember": None in (scene.material_names, scene.endmembers)
         or len(scene.material_names or ()) == len(scene.endmembers or ()),
-        "a rotation of 3 x 3 and a scale above 0": scene.normalisation is None
-        or (
-            scene.normalisation.scale > _LEAST_SIZE
-            and all(len(row) == 3 for row in scene.normalisation.rotation)
-        ),
+        "a rotation of 3 x 3 and a scale above 0": normalisation is None
+        or (normalisation.scale > _LEAST_SIZE and all(len(row) == 3 for row in normalisation.rotation)),
     }
     broken = [rule for rule, holds in rules.items() if not holds]
     for sensor in values.get("sensors", ()):

@@ -230,10 +230,8 @@ def _read_scaled(path: Path, value_scale: float | None, part: Part) -> Float32[n
 
 
 def _find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "*pixels"]:
-    """Pixels of (..., B) values, already divided, that can't be used: NaN, infinite or negative in some band.
-
-    With `clip` negative values count as 0 and don't make a pixel invalid.
-    """
+    """Pixels of (..., B) values, already divided, that can't be used: NaN, infinite or (unless they are clipped)
+    negative in some band."""
     sound = np.isfinite(values)
     return ~np.all(sound if invalid_pixels == "clip" else sound & (values >= 0.0), axis=-1)
 
@@ -256,13 +254,8 @@ def check_cubes(
     invalid_pixels: InvalidPixels,
     faults: Faults,
 ) -> tuple[list[Size | None], list[_CubeValues | None]]:
-    """Check shapes and types against sizes and sensors, then every value.
-
-    Args:
-        operators: Of each frame, (channels, B); None where unknown.
-    Returns:
-        Sizes of the frames' images, None where nothing tells one, and what sound cubes hold.
-    """
+    """Check shapes and types against sizes and sensors (operators of (channels, B)), then every value; gives the sizes
+    of the frames' images, None where nothing tells one, and what sound cubes hold."""
     sizes: list[Size | None] = []
     sound: list[Path | None] = []
     shared: tuple[Size, str] | None = None

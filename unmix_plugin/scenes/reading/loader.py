@@ -133,12 +133,7 @@ def read_endmembers(
 
 
 def _assemble(
-    root: Path,
-    entry: SceneEntry,
-    checked: CheckedFiles,
-    truth: _Truth,
-    split: Split,
-    options: SceneOptions,
+    root: Path, entry: SceneEntry, checked: CheckedFiles, truth: _Truth, split: Split, options: SceneOptions
 ) -> Scene:
     space = find_model_space(root, entry, checked, split.train, options)
     before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, entry.warnings
