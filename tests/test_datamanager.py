@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +35,29 @@ def scene_folder(tmp_path_factory) -> Path:
 
 def make(folder: Path, seed: int = 0, **settings) -> HyperspectralDataManager:
     return replace(CONFIG, **settings).setup(data=folder, device=torch.device("cpu"), seed=seed)
+
+
+def edit_scene(folder: Path, change: Callable[[dict], object]) -> Path:
+    """Change transforms.json in place."""
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    return folder
+
+
+def without_pictures(content: dict) -> None:
+    for frame in content["frames"]:
+        frame["file_path"] = None
+    for key in ("train_filenames", "val_filenames", "test_filenames"):
+        del content[key]
+
+
+def edit_cubes(folder: Path, change: Callable[[str, np.ndarray], np.ndarray]) -> Path:
+    for path in sorted((folder / "cubes").iterdir()):
+        cube = np.load(path)
+        np.save(path, change(path.stem, cube).astype(cube.dtype))
+    return folder
 
 
 def test_a_batch_is_a_function_of_seed_and_step(scene_folder):
@@ -78,14 +102,8 @@ def test_batches_from_disk_depend_on_seed_and_step_and_hold_what_was_measured(sc
 
 
 def test_masked_and_invalid_pixels_are_never_drawn(scene_folder, tmp_path):
-    folder = tmp_path / "holes"
-    shutil.copytree(scene_folder, folder)
-    names = json.loads((folder / "transforms.json").read_text())["frames"]
-    for frame in names:
-        path = folder / frame["hyperspectral_file_path"]
-        cube = np.load(path)
-        cube[:, :8] = np.nan
-        np.save(path, cube)
+    folder = Path(shutil.copytree(scene_folder, tmp_path / "holes"))
+    edit_cubes(folder, lambda _, cube: np.where(np.arange(16)[:, None] < 8, np.nan, cube))
     with pytest.raises(SceneError, match=r"(?s)NaN.*leave these out with --invalid-pixels mask"):
         make(folder)
     manager = make(folder, scene=SceneOptions(invalid_pixels="mask"))
@@ -164,19 +182,17 @@ def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_o
 
 
 def test_poses_of_another_convention_are_warned_of_when_a_run_starts(tmp_path):
-    folder = make_scene(tmp_path / "bare", alpha=False)
+    def turn(content):
+        without_pictures(content)
+        for frame in content["frames"]:
+            pose = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+            frame["transform_matrix"] = pose.tolist()
+
     make_demo_scene(tmp_path / "demo", size=48, bands=6, views=12)
-    path = tmp_path / "demo" / "transforms.json"
-    content = json.loads(path.read_text())
-    for frame in content["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])).tolist()
-        frame["file_path"] = None
-    for key in ("train_filenames", "val_filenames", "test_filenames"):
-        del content[key]
-    path.write_text(json.dumps(content))
-    (warning,) = make(tmp_path / "demo").warnings()
+    (warning,) = make(edit_scene(tmp_path / "demo", turn)).warnings()
     assert "the poses look like camera to world, OpenCV axes" in warning
-    assert not any("poses" in said for said in make(folder.root).warnings())
+    bare = make_scene(tmp_path / "bare", alpha=False)
+    assert not any("poses" in said for said in make(bare.root).warnings())
 
 
 def scene_record(manager: HyperspectralDataManager) -> SceneRecord:
@@ -194,8 +210,7 @@ def test_a_run_goes_on_with_the_scene_as_another_machine_rounds_it(tmp_path):
     def round_otherwise(content):
         for frame in content["frames"]:
             pose = np.array(frame["transform_matrix"])
-            pose[:3] = np.nextafter(pose[:3], 9.0)
-            frame["transform_matrix"] = pose.tolist()
+            frame["transform_matrix"] = [*np.nextafter(pose[:3], 9.0).tolist(), pose[3].tolist()]
 
     manager = make(folder.edit(round_otherwise).root)
     check_same_scene(record, manager, run)
@@ -218,9 +233,9 @@ def test_views_of_many_pixels_are_seen_by_one_ray_a_pixel(scene_folder, monkeypa
 
 def test_light_outside_a_mask_counts_as_evidence(scene_folder, tmp_path):
     """A hole in one mask, through which the cube still shows matter, is neither trusted nor carved."""
-    folder = tmp_path / "holed"
-    shutil.copytree(scene_folder, folder)
-    frame = make(folder).scene.frames[make(folder).scene.train_indices[0]]
+    folder = Path(shutil.copytree(scene_folder, tmp_path / "holed"))
+    scene = make(folder).scene
+    frame = scene.frames[scene.train_indices[0]]
     assert frame.image_path is not None
     picture = np.array(Image.open(frame.image_path))
     holed = np.zeros_like(picture[..., 3], dtype=bool)
@@ -244,12 +259,15 @@ def test_noise_stripes_and_spikes_are_found_and_named(tmp_path):
     assert sound.warnings() == []
     assert (sound.initial_data()["band_weights"] == 1).all()
     generator = np.random.default_rng(0)
-    for path in sorted((folder / "cubes").glob("train_*.npy")):
-        cube = np.load(path).astype(np.float32)
-        cube[..., 5] = generator.uniform(0, 0.5, cube.shape[:2])
-        cube[:, 16, 11] *= 0.1
-        cube[20, 12, 13] = 1.0
-        np.save(path, cube.astype(np.float16))
+
+    def spoil(name: str, cube: np.ndarray) -> np.ndarray:
+        if name.startswith("train"):
+            cube[..., 5] = generator.uniform(0, 0.5, cube.shape[:2])
+            cube[:, 16, 11] *= 0.1
+            cube[20, 12, 13] = 1.0
+        return cube
+
+    edit_cubes(folder, spoil)
     manager = make(folder)
     noisy, bad = manager.warnings()
     assert f"band {manager.scene.wavelengths_nm[5]:g} nm is mostly noise" in noisy
@@ -263,19 +281,13 @@ def test_noise_stripes_and_spikes_are_found_and_named(tmp_path):
 def before_grey_paper(folder: Path) -> Path:
     """The demo scene without alpha, before a grey backdrop that is brighter to the right."""
     make_demo_scene(folder, size=48, bands=6, views=12)
-    for picture in sorted((folder / "images").iterdir()):
-        path = folder / "cubes" / f"{picture.stem}.npy"
-        alpha = np.asarray(Image.open(picture))[..., 3:] / 255.0
-        paper = np.linspace(0.3, 0.4, 48)[None, :, None]
-        cube = np.load(path)
-        np.save(path, (cube + (1 - alpha) * paper).astype(cube.dtype))
-    content = json.loads((folder / "transforms.json").read_text())
-    for frame in content["frames"]:
-        frame["file_path"] = None
-    for key in ("train_filenames", "val_filenames", "test_filenames"):
-        del content[key]
-    (folder / "transforms.json").write_text(json.dumps(content))
-    return folder
+    paper = np.linspace(0.3, 0.4, 48)[None, :, None]
+
+    def stand_before(name: str, cube: np.ndarray) -> np.ndarray:
+        alpha = np.asarray(Image.open(folder / "images" / f"{name}.png"))[..., 3:] / 255.0
+        return cube + (1 - alpha) * paper
+
+    return edit_scene(edit_cubes(folder, stand_before), without_pictures)
 
 
 def test_what_stands_before_a_plain_backdrop_is_carved_without_alpha(tmp_path):
@@ -288,6 +300,8 @@ def test_what_stands_before_a_plain_backdrop_is_carved_without_alpha(tmp_path):
     assert own < 1.3 * expected
     own, expected = (float(x.initial_data()["exposure"]) for x in (manager, with_alpha))
     assert own == pytest.approx(expected, rel=0.1)
+    as_told = make(tmp_path / "paper", scene=SceneOptions(world="bounded"))
+    assert not as_told.metadata()["has_backdrop"]
     (warning,) = manager.warnings()
     assert "share a plain backdrop: it is learnt as what lies behind the scene" in warning
     found = manager.scene.before_backdrop
@@ -298,29 +312,21 @@ def test_what_stands_before_a_plain_backdrop_is_carved_without_alpha(tmp_path):
         assert before[opaque].mean() > 0.99
 
 
-@pytest.mark.parametrize("world", ["bounded", "unbounded"])
-def test_a_world_that_is_asked_for_has_no_backdrop(tmp_path, world):
-    folder = before_grey_paper(tmp_path / "paper")
-    manager = make(folder, scene=SceneOptions(world=world))
-    assert not manager.metadata()["has_backdrop"]
-
-
 @pytest.mark.parametrize("how", ["masked out", "without values"])
 def test_a_backdrop_is_found_beside_pixels_that_dont_count_and_they_are_not_looked_through(tmp_path, how):
     """The left half of every view is noise that a mask leaves out, or has no values."""
     folder, generator = before_grey_paper(tmp_path / "paper"), np.random.default_rng(0)
-    content = json.loads((folder / "transforms.json").read_text())
-    Image.fromarray(np.where(np.arange(48) < 20, 0, 255).astype(np.uint8)[None].repeat(48, 0)).save(
-        folder / "mask.png"
-    )
-    for frame in content["frames"]:
-        path = folder / frame["hyperspectral_file_path"]
-        cube = np.load(path)
-        cube[:, :20] = generator.uniform(0, 1, (48, 20, 6)) if how == "masked out" else np.nan
-        np.save(path, cube)
-        if how == "masked out":
-            frame["mask_path"] = "mask.png"
-    (folder / "transforms.json").write_text(json.dumps(content))
+    is_masked, is_left = how == "masked out", np.arange(48) < 20
+    Image.fromarray(np.where(is_left, 0, 255).astype(np.uint8)[None].repeat(48, 0)).save(folder / "mask.png")
+
+    def spoil(_: str, cube: np.ndarray) -> np.ndarray:
+        return np.where(is_left[:, None], generator.uniform(0, 1, cube.shape) if is_masked else np.nan, cube)
+
+    def mask(content):
+        for frame in content["frames"]:
+            frame["mask_path"] = "mask.png" if is_masked else None
+
+    edit_scene(edit_cubes(folder, spoil), mask)
     scene = make(folder, scene=SceneOptions(invalid_pixels="mask")).scene
     assert scene.before_backdrop is not None
     for before in scene.before_backdrop.masks():

@@ -107,12 +107,17 @@ def cast_shadows(model: UnmixModel, opaque: torch.Tensor) -> None:
     model.grid.opaque_skips.copy_(skip_distances(opaque != 0))
 
 
+def lit_by(numbers: tuple[float, ...], cells: int = 8) -> UnmixModel:
+    """A model whose light moves with the camera."""
+    config = replace(CONFIG, light="camera", lamp=numbers)
+    model = config.setup(scene_box=BOX, metadata={**make_model().metadata, "grid_resolution": cells})
+    assert isinstance(model, UnmixModel)
+    return model
+
+
 def model_with_lamp() -> UnmixModel:
     """A model whose lamp has a wall in its way, on the side of x > 0.5."""
-    metadata = {**make_model().metadata, "grid_resolution": 64}
-    config = replace(CONFIG, light="camera", lamp=NUMBERS)
-    model = config.setup(scene_box=BOX, metadata=metadata)
-    assert isinstance(model, UnmixModel)
+    model = lit_by(NUMBERS, 64)
     with torch.no_grad():
         data = {**initial_data(), "reachable": np.ones((64, 64, 64), bool)}
         model.initialise(data, torch.Generator().manual_seed(0))
@@ -206,23 +211,16 @@ def test_the_lamp_follows_from_the_data(numbers, words):
     config, reasons = UnmixModelConfig(num_endmembers=3).resolve_auto(lambda: data, torch.Generator())
     assert config.lamp == numbers
     assert words in reasons
-    config = replace(CONFIG, light="camera", lamp=numbers)
-    model = config.setup(scene_box=BOX, metadata=make_model().metadata)
-    assert isinstance(model, UnmixModel)
+    model = lit_by(numbers)
     assert (model.field.moving_lamp is None, model.grid.opaque is None) == (numbers == (),) * 2
-
-
-def test_a_lamp_is_ten_numbers():
-    assert Lamp.of_numbers(NUMBERS) == TURNTABLE
-    with pytest.raises(ConfigError, match="ten numbers"):
-        UnmixModelConfig(lamp=(0.0, 1.0))
 
 
 @pytest.mark.parametrize("light", ["auto", "fixed", "per-view"])
 def test_a_lamp_is_refused_in_a_light_that_does_not_move_with_the_camera(light):
-    with pytest.raises(
-        ConfigError, match=f"light camera where numbers of a lamp are given .got light {light}, lamp"
-    ):
+    said = f"light camera where numbers of a lamp are given .got light {light}, lamp"
+    with pytest.raises(ConfigError, match=said):
         UnmixModelConfig(light=light, lamp=NUMBERS)
+    with pytest.raises(ConfigError, match="ten numbers"):
+        UnmixModelConfig(lamp=(0.0, 1.0))
     assert UnmixModelConfig(light=light, lamp=()).lamp == ()
-    assert UnmixModelConfig(light="camera", lamp=NUMBERS).lamp == NUMBERS
+    assert Lamp.of_numbers(UnmixModelConfig(light="camera", lamp=NUMBERS).lamp) == TURNTABLE

@@ -148,6 +148,17 @@ def make_scene(
     return SceneFolder(root)
 
 
+def widen(
+    folder: SceneFolder, num_bands: int, change: Callable[[int, np.ndarray], np.ndarray]
+) -> SceneFolder:
+    """Give a scene other bands, from 450 nm on, whose cubes follow from the number of a view and its cube."""
+    folder.edit(lambda content: content.update(wavelengths=[450.0 + 2 * band for band in range(num_bands)]))
+    folder.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
+    for index in range(len(folder.content["frames"])):
+        folder.edit_cube(index, lambda cube, i=index: change(i, cube))
+    return folder
+
+
 def fault_of(folder: SceneFolder, **options: Any) -> str:
     """The message with which a scene is refused."""
     with pytest.raises(SceneError) as caught:

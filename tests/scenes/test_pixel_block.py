@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.scene_factory import make_scene
+from tests.captures.file_factory import present
+from tests.scenes.scene_factory import make_scene, widen
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.pixel_block import PixelBlock
@@ -13,6 +14,11 @@ from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
 
 CPU = torch.device("cpu")
+STORED = [("<f2", None), ("<f4", None), ("u1", 255.0), ("<i2", 10000.0), ("<u2", 60000.0)]
+
+
+def as_stored(cube: np.ndarray, stored: str, scale: float | None) -> np.ndarray:
+    return (cube * (scale or 1.0)).round(5).astype(stored)
 
 
 def read_block(scene, views: tuple[int, ...]) -> PixelBlock:
@@ -37,7 +43,7 @@ def read_block(scene, views: tuple[int, ...]) -> PixelBlock:
 )
 def test_pixels_are_those_of_the_scene_at_the_size_they_were_stored_in(tmp_path, stored, scale, num_bytes):
     folder = make_scene(tmp_path / "scene")
-    folder.edit_cubes(lambda cube: (cube.astype(np.float64) * (scale or 1.0)).round(5).astype(stored))
+    folder.edit_cubes(lambda cube: as_stored(cube.astype(float), stored, scale))
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     block = read_block(scene, (1, 3))
     everything = torch.arange(len(block))
@@ -45,9 +51,8 @@ def test_pixels_are_those_of_the_scene_at_the_size_they_were_stored_in(tmp_path,
     assert torch.equal(block.spectra(everything), torch.from_numpy(expected))
     assert block.held_bytes == len(block) * 4 * num_bytes
     for row, view in enumerate((1, 3)):
-        alpha = scene.alpha(view)
-        assert alpha is not None
-        assert torch.equal(block.alpha[320 * row :][:320], torch.from_numpy(alpha.reshape(-1)))
+        alpha = torch.from_numpy(present(scene.alpha(view)).reshape(-1))
+        assert torch.equal(block.alpha[320 * row :][:320], alpha)
 
 
 def test_clipped_pixels_come_out_clipped_and_views_of_different_types_as_single_precision(tmp_path):
@@ -61,15 +66,13 @@ def test_clipped_pixels_come_out_clipped_and_views_of_different_types_as_single_
     assert torch.equal(block.spectra(torch.tensor([500])), expected)
 
 
+@pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize(
     ("stored", "scale"), [("<f2", None), (">f4", None), ("<f8", None), ("u1", 255.0), (">u2", 65535.0)]
 )
-@pytest.mark.parametrize("order", ["C", "F"])
 def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, stored, scale, order):
     folder = make_scene(tmp_path / "scene")
-    folder.edit_cubes(
-        lambda cube: np.asarray((cube.astype(np.float64) * (scale or 1.0)).round(5), stored, order=order)
-    )
+    folder.edit_cubes(lambda cube: np.asarray(as_stored(cube.astype(float), stored, scale), order=order))
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     held, mapped = read_block(scene, (1, 3, 4)), PixelBlock(scene, (1, 3, 4), (0, 1, 2), CPU)
     mapped.hold_part(1)
@@ -88,10 +91,8 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(tmp_path, monkeypatch, s
 
     for view, one, other in zip((1, 3, 4), mapped.pictures(sums), held.pictures(sums), strict=True):
         assert torch.equal(one, other)
-        opacity = scene.alpha(view)
-        assert opacity is not None
-        expected = scene.cube(view).sum(axis=-1) + 10 * opacity + 100 * scene.valid_mask(view)
-        torch.testing.assert_close(one, torch.from_numpy(expected).float())
+        own = scene.cube(view).sum(axis=-1) + 10 * present(scene.alpha(view)) + 100 * scene.valid_mask(view)
+        torch.testing.assert_close(one, torch.from_numpy(own).float())
 
 
 def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):
@@ -106,50 +107,35 @@ def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeyp
     assert PixelTable(scene, CPU, scene.train_indices).notes != []
 
 
-@pytest.mark.parametrize(
-    ("stored", "scale"), [("<f2", None), ("<f4", None), ("u1", 255.0), ("<i2", 10000.0), ("<u2", 65535.0)]
-)
+@pytest.mark.parametrize(("stored", "scale"), STORED)
 def test_mended_pixels_are_kept_as_small_as_others(tmp_path, stored, scale):
-    folder = make_scene(tmp_path / "scene")
-    wavelengths = [450.0 + 20 * band for band in range(10)]
-    folder.edit(lambda content: content.update(wavelengths=wavelengths))
-    folder.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
-
-    def write(cube: np.ndarray, bad: bool) -> np.ndarray:
+    def write(index: int, cube: np.ndarray) -> np.ndarray:
         wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
-        if bad:
-            wide[8, 10, 4] = 0.0
-        return (wide * (scale or 1.0)).round(5).astype(stored)
+        wide[8, 10, 4] *= index != 3
+        return as_stored(wide, stored, scale)
 
-    for index in range(6):
-        folder.edit_cube(index, lambda cube, index=index: write(cube, bad=index == 3))
+    folder = widen(make_scene(tmp_path / "scene"), 10, write)
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     size = PixelTable(scene, CPU, (1, 3)).blocks[0].held_bytes
     table = PixelTable(scene, CPU, (1, 3), mends=True)
     assert table.bad_share == pytest.approx(1 / (2 * 320 * 10))
     mended = table.blocks[0].spectra(torch.tensor([320 + 8 * 20 + 10]))[0]
-    expected = torch.from_numpy(scene.cube(1)[8, 10])
-    assert torch.allclose(mended, expected, atol=0.01)
+    assert torch.allclose(mended, torch.from_numpy(scene.cube(1)[8, 10]), atol=0.01)
     assert table.blocks[0].held_bytes == size
 
 
 @pytest.mark.parametrize("components", ["none", 3])
-@pytest.mark.parametrize("stored", ["<f2", "<u2", "<f4"])
+@pytest.mark.parametrize(("stored", "scale"), [STORED[0], STORED[1], STORED[4]])
 def test_views_are_never_read_whole_and_bad_values_at_the_edges_of_parts_are_found(
-    tmp_path, monkeypatch, stored, components
+    tmp_path, monkeypatch, stored, scale, components
 ):
-    scale = 60000.0 if stored == "<u2" else None
-    folder = make_scene(tmp_path / "scene")
-    folder.edit(lambda content: content.update(wavelengths=[450.0 + 20 * band for band in range(10)]))
-    folder.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
-
-    def write(cube: np.ndarray) -> np.ndarray:
+    def write(_: int, cube: np.ndarray) -> np.ndarray:
         bright = 0.5 + 0.1 * np.sin(np.arange(cube.shape[1]) + np.arange(cube.shape[0])[:, None])
         wide = bright[..., None] * np.linspace(0.9, 1.0, 10)
         wide[[7, 7, 8, 9], [10, 11, 11, 9], [4, 2, 7, 0]] = 0.0
-        return (wide * (scale or 1.0)).round(5).astype(stored)
+        return as_stored(wide, stored, scale)
 
-    folder.edit_cubes(write)
+    folder = widen(make_scene(tmp_path / "scene"), 10, write)
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     whole = PixelTable(scene, CPU, scene.train_indices, mends=True, components=components)
     assert whole.bad_share == pytest.approx(4 / (320 * 10))

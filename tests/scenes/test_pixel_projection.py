@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes.scene_factory import make_scene
+from tests.scenes.scene_factory import make_scene, widen
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_projection import ProjectedPixels, Projection
@@ -39,12 +39,8 @@ def spectra_of(cube: np.ndarray, change=None) -> np.ndarray:
 
 
 def make(folder, change=None) -> Scene:
-    scene = make_scene(folder)
-    scene.edit(lambda content: content.update(wavelengths=[450.0 + 2 * band for band in range(BANDS)]))
-    scene.edit(lambda content: [content.pop(key, None) for key in ("endmembers_path", "illuminant_path")])
-    for index in range(6):
-        scene.edit_cube(index, lambda cube, i=index: spectra_of(cube, change if i == 3 else None))
-    return load_scene(scene.root)
+    wide = widen(make_scene(folder), BANDS, lambda i, cube: spectra_of(cube, change if i == 3 else None))
+    return load_scene(wide.root)
 
 
 def test_odd_and_saturated_pixels_are_kept_whole():
@@ -96,22 +92,17 @@ def test_auto_projects_neither_what_fits_nor_what_has_no_subspace(tmp_path, monk
     assert "stay on disk" in note
 
 
-def test_a_given_number_is_taken_and_its_residual_said(tmp_path):
+def test_a_given_number_is_taken_and_its_residual_said_or_that_it_does_not_make_the_pixels_fit(tmp_path):
     scene = make(tmp_path / "scene")
     [note] = PixelTable(scene, CPU, VIEWS, components=2).notes
     assert f"kept as 2 numbers instead of {BANDS}" in note
+    assert PixelTable(scene, CPU, VIEWS, memory_gb=1e-4, components=2).notes == [note]
     assert PixelTable(scene, CPU, VIEWS, components=BANDS).notes == []
     with pytest.raises(SpectrumError, match="more pixels than bands"):
         PixelTable(scene, CPU, (1,), components=2)
-
-
-def test_a_given_number_that_does_not_make_the_pixels_fit_is_said_to_have_no_effect(tmp_path):
-    scene = make(tmp_path / "scene")
     pool, ignored = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components=2).notes
     assert "stay on disk" in pool
     assert ignored.startswith("target-components 2 has no effect: ")
-    [held] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-4, components=2).notes
-    assert "kept as 2 numbers" in held
     [automatic] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components="auto").notes
     assert "no effect" not in automatic
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.captures.file_factory import present
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.scenes import pixel_table
 from unmix_plugin.scenes.pixel_table import PixelTable
@@ -34,9 +35,7 @@ def test_drawn_pixels_are_those_of_their_views(rig):
             assert rig.frames[view].sensor == group.sensor
             assert rig.valid_mask(view)[row, column]
             np.testing.assert_array_equal(spectrum, rig.cube(view)[row, column])
-            opacity = rig.alpha(view)
-            assert opacity is not None
-            assert alpha == opacity[row, column]
+            assert alpha == present(rig.alpha(view))[row, column]
     numbers = torch.cat([group.numbers for group in groups])
     places = torch.cat([torch.cat([g.cameras[:, None], g.corners], dim=1) for g in groups])
     assert len(numbers.unique()) == len(places.unique(dim=0))

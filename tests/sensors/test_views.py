@@ -134,21 +134,33 @@ def test_training_finds_the_exposure_of_each_view():
     assert float(model.comparison.psnr(model.training_batch(rays, pixels).compared)) > 30
 
 
+def predicted_view(spectra: torch.Tensor, opacity: float = 1.0) -> PredictedView:
+    opacities = torch.full(spectra.shape[:2], opacity)
+    return PredictedView(
+        spectra, opacities, opacities[..., None], opacities.to(torch.uint8), opacities[..., None]
+    )
+
+
+def random_spectra() -> torch.Tensor:
+    return torch.rand(8, 9, NUM_BANDS, generator=torch.Generator().manual_seed(0)) * 0.5
+
+
+def everywhere(spectra: torch.Tensor) -> torch.Tensor:
+    return torch.ones(spectra.shape[:2], dtype=torch.bool)
+
+
 def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
-    generator = torch.Generator().manual_seed(0)
-    shown = torch.rand(8, 9, NUM_BANDS, generator=generator) * 0.5
-    gain = (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp()
-    truth = ViewTruth("view", shown * gain, torch.ones(8, 9, dtype=torch.bool))
-    ones = torch.ones(8, 9)
-    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
-    found = truth.shown(align_gain(predicted, truth, WAVELENGTHS))
+    shown = random_spectra()
+    truth = ViewTruth(
+        "view", shown * (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp(), everywhere(shown)
+    )
+    found = truth.shown(align_gain(predicted_view(shown), truth, WAVELENGTHS))
     assert_close(found, truth.spectra, atol=1e-4, rtol=0)
 
 
 @pytest.mark.parametrize("num_channels", [4, 2, 1])
 def test_a_view_of_a_rig_is_aligned_in_the_channels_of_its_sensor_as_in_training(num_channels):
-    generator = torch.Generator().manual_seed(0)
-    shown = torch.rand(8, 9, NUM_BANDS, generator=generator) * 0.5
+    shown, generator = random_spectra(), torch.Generator().manual_seed(1)
     responses = torch.rand(num_channels, NUM_BANDS, generator=generator).double()
     sensor = SceneSensor("colour", (responses / responses.sum(dim=1, keepdim=True)).numpy())
     gains, seen_by = ViewGains(2, WAVELENGTHS), SensorViews([sensor.to_json()], torch.zeros(NUM_BANDS, 3))
@@ -156,36 +168,25 @@ def test_a_view_of_a_rig_is_aligned_in_the_channels_of_its_sensor_as_in_training
         gains.log_gains.copy_(torch.tensor([[0.4, -0.2, 0.1], [-0.4, 0.2, -0.1]]))
         terms = seen_by.project(gains.terms, 0)
         measured = seen_by.project(shown, 0) * gains(torch.tensor([0]), terms / terms[:1])
-    truth = ViewTruth("view", measured, torch.ones(8, 9, dtype=torch.bool), sensor=sensor)
-    ones = torch.ones(8, 9)
-    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
-    assert float((truth.shown(predicted) - measured).abs().max()) > 0.05
-    found = truth.shown(align_gain(predicted, truth, WAVELENGTHS))
+    truth = ViewTruth("view", measured, everywhere(shown), sensor=sensor)
+    assert float((truth.shown(predicted_view(shown)) - measured).abs().max()) > 0.05
+    found = truth.shown(align_gain(predicted_view(shown), truth, WAVELENGTHS))
     assert_close(found, measured, atol=1e-4, rtol=0)
 
 
 def test_a_view_in_another_light_is_aligned_without_the_pixels_that_were_measured_blown_out():
-    shown = torch.rand(8, 9, NUM_BANDS, generator=torch.Generator().manual_seed(0)) * 0.5
+    shown = random_spectra()
     measured = shown.clone()
     measured[:2] = 1.0
-    ones = torch.ones(8, 9)
-    truth = ViewTruth("view", measured, ones.bool()).in_light(np.full(NUM_BANDS, 0.5))
-    predicted = PredictedView(shown, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
-    seen = truth.shown(align_gain(predicted, truth, WAVELENGTHS))
+    truth = ViewTruth("view", measured, everywhere(shown)).in_light(np.full(NUM_BANDS, 0.5))
+    seen = truth.shown(align_gain(predicted_view(shown), truth, WAVELENGTHS))
     assert_close(seen, 0.5 * shown, atol=1e-4, rtol=0)
 
 
-def test_a_view_without_matter_stays_as_it_is():
-    spectra = torch.zeros(4, 4, NUM_BANDS)
-    truth = ViewTruth("void", spectra, torch.ones(4, 4, dtype=torch.bool), torch.zeros(4, 4))
-    ones = torch.ones(4, 4)
-    predicted = PredictedView(spectra, ones, ones[..., None], ones.to(torch.uint8), ones[..., None])
-    assert align_gain(predicted, truth, WAVELENGTHS) is predicted
-
-
-def test_a_prediction_that_is_black_stays_as_it_is():
-    truth = ViewTruth("view", torch.full((4, 4, NUM_BANDS), 0.4), torch.ones(4, 4, dtype=torch.bool))
-    zeros = torch.zeros(4, 4)
+def test_a_view_without_matter_and_a_prediction_that_is_black_stay_as_they_are():
     black = torch.zeros(4, 4, NUM_BANDS)
-    predicted = PredictedView(black, zeros, zeros[..., None], zeros.to(torch.uint8), zeros[..., None])
-    assert torch.equal(truth.shown(align_gain(predicted, truth, WAVELENGTHS)), black)
+    void = ViewTruth("void", black, everywhere(black), torch.zeros(4, 4))
+    predicted = predicted_view(black)
+    assert align_gain(predicted, void, WAVELENGTHS) is predicted
+    truth = ViewTruth("view", torch.full_like(black, 0.4), everywhere(black))
+    assert torch.equal(truth.shown(align_gain(predicted_view(black, 0.0), truth, WAVELENGTHS)), black)

@@ -24,14 +24,14 @@ def entry_of(names: list[str], **lists: list[str]) -> SceneEntry:
     return SceneEntry(None, None, None, None, {key: tuple(value) for key, value in lists.items()}, frames)
 
 
-def split_of(
-    names: list[str],
-    method: Literal["auto", "lists", "filename", "interval"] = "auto",
-    interval: int = 8,
-    **lists: list[str],
-) -> Split:
+Method = Literal["auto", "lists", "filename", "interval"]
+
+
+def split_of(entry: SceneEntry | list[str], method: Method = "auto", interval: int = 8) -> Split:
     faults = Faults(Path("scene"))
-    split = split_frames(entry_of(names, **lists), method, interval, faults)
+    split = split_frames(
+        entry if isinstance(entry, SceneEntry) else entry_of(entry), method, interval, faults
+    )
     faults.raise_if_any()
     return split
 
@@ -55,7 +55,7 @@ def split_of(
     ],
 )
 def test_lists_go_before_names_of_folders_and_files_and_tests_before_validation(names, lists, expected):
-    assert split_of(list(names), **lists) == expected
+    assert split_of(entry_of(list(names), **lists)) == expected
 
 
 def test_a_picture_that_several_frames_share_lists_all_of_them():
@@ -67,9 +67,7 @@ def test_a_picture_that_several_frames_share_lists_all_of_them():
         ({"test": ("images/1",)}, Split((0, 1, 4, 5), (2, 3))),
         ({"train": ("images/0", "cubes/4"), "test": ("images/1",)}, Split((0, 1, 4), (2, 3))),
     ):
-        faults = Faults(Path("scene"))
-        assert split_frames(replace(entry, split_lists=lists), "auto", 8, faults) == expected
-        faults.raise_if_any()
+        assert split_of(replace(entry, split_lists=lists)) == expected
 
 
 @given(st.lists(st.sampled_from([None, "a", "b", "c", "d", "e"]), min_size=2), st.integers(2, 4))
