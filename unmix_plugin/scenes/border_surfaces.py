@@ -10,6 +10,7 @@ Notation: `H x W` pixels, `k` features of a spectrum, `t` terms of a surface, `P
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
@@ -128,7 +129,8 @@ def _means_around(
     from scipy import ndimage
 
     weight = ndimage.uniform_filter(chosen.astype(np.float32), window)
-    total = ndimage.uniform_filter(np.where(chosen[..., None], values, 0.0), (window, window, 1))
+    sizes: Any = (window, window, 1)
+    total = ndimage.uniform_filter(np.where(chosen[..., None], values, 0.0), sizes)
     return total / np.maximum(weight, 1e-6)[..., None], weight
 
 

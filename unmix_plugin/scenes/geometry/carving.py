@@ -130,12 +130,10 @@ def carve_box(
         fewest_views: Views that must see a cell for it to stay.
         witnesses: Views that must look through a cell for it to go.
     """
-    views = [
-        (_LineView if cameras.is_line_camera(index) else _View)(
-            cameras, index, foreground and foreground[index]
-        )
-        for index in range(len(cameras))
-    ]
+    views: list[_View | _LineView] = []
+    for index in range(len(cameras)):
+        kind = _LineView if cameras.is_line_camera(index) else _View
+        views.append(kind(cameras, index, None if foreground is None else foreground[index]))
     near = _NEAR_DEPTH * 0.5 * float(box.size.max())
     sizes = [resolution]
     while sizes[-1] % 2 == 0 and sizes[-1] > COARSEST_CELLS:
