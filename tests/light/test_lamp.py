@@ -223,4 +223,5 @@ def test_a_lamp_is_refused_in_a_light_that_does_not_move_with_the_camera(light):
     with pytest.raises(ConfigError, match="ten numbers"):
         UnmixModelConfig(lamp=(0.0, 1.0))
     assert UnmixModelConfig(light=light, lamp=()).lamp == ()
-    assert Lamp.of_numbers(UnmixModelConfig(light="camera", lamp=NUMBERS).lamp) == TURNTABLE
+    assert UnmixModelConfig(light="camera", lamp=NUMBERS).lamp == NUMBERS
+    assert Lamp.of_numbers(NUMBERS) == TURNTABLE
