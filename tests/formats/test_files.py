@@ -27,23 +27,10 @@ from unmix_plugin.formats.files import (
     write_file,
 )
 
-DEVICES = {
-    "con",
-    "prn",
-    "aux",
-    "nul",
-    *(f"{port}{digit}" for port in ("com", "lpt") for digit in "123456789"),
-}
-NASTY = st.sampled_from(
-    ["con", "NUL", "aux.txt", "com1", ".", " ", ":", "\\", "/", "\0", "a", "\u00e9", "e\u0301", "-"]
-)
-NAMES = st.one_of(st.text(max_size=400), st.lists(NASTY, max_size=6).map("".join))
-
-
-def test_a_file_is_written_into_a_folder_made_for_it(tmp_path):
-    path = write_file(tmp_path / "a" / "b.npy", array_bytes(np.arange(3)))
-    np.testing.assert_array_equal(np.load(path), [0, 1, 2])
-    assert [file.name for file in path.parent.iterdir()] == ["b.npy"]
+PORTS = {f"{port}{digit}" for port in ("com", "lpt") for digit in "123456789"}
+DEVICES = {"con", "prn", "aux", "nul"} | PORTS
+NASTY = ["con", "NUL", "aux.txt", "com1", ".", " ", ":", "\\", "/", "\0", "a", "\u00e9", "e\u0301", "-"]
+NAMES = st.one_of(st.text(max_size=400), st.lists(st.sampled_from(NASTY), max_size=6).map("".join))
 
 
 @pytest.mark.parametrize(
@@ -54,21 +41,19 @@ def test_a_full_disk_keeps_the_old_file_and_says_what_to_do(tmp_path, monkeypatc
     def full(*_args):
         raise OSError(number, os.strerror(number))
 
-    path = write_file(tmp_path / "file", b"old")
+    old = array_bytes(np.arange(3))
+    path = write_file(tmp_path / "made" / "file.npy", old)
+    np.testing.assert_array_equal(np.load(path), [0, 1, 2])
     monkeypatch.setattr(os, "write", full)
-    with pytest.raises(RunError, match=f"can't write .*file: {advice}"):
+    with pytest.raises(RunError, match=f"can't write .*file.npy: {advice}"):
         write_file(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert len(list(tmp_path.iterdir())) == 1
+    assert [file.read_bytes() for file in path.parent.iterdir()] == [old]
 
 
 def test_a_file_that_somebody_reads_is_replaced_once_it_is_free(tmp_path, monkeypatch):
     """Windows replaces no file that is open."""
-    path, replace, refusals = (
-        write_file(tmp_path / "file", b"old"),
-        Path.replace,
-        [PermissionError(errno.EACCES, "someone reads")] * 2,
-    )
+    path, replace = write_file(tmp_path / "file", b"old"), Path.replace
+    refusals = [PermissionError(errno.EACCES, "someone reads")] * 2
 
     def busy(self, target):
         if refusals:
@@ -96,12 +81,11 @@ def test_existing_files_are_counted_and_refused_unless_overwriting_was_asked_for
 
 @pytest.mark.parametrize("values", [random_cube(), np.arange(12, dtype=np.uint8).reshape(3, 4)])
 def test_rows_in_blocks_are_the_array_that_numpy_loads(tmp_path, values):
-    with npy_rows(tmp_path / "a" / "x.npy", values.shape, values.dtype.type) as add:
+    with npy_rows(tmp_path / "x.npy", values.shape, values.dtype.type) as add:
         add(values[:2])
         add(values[2:].astype(np.float64))
-    read = np.load(tmp_path / "a" / "x.npy", allow_pickle=False)
-    assert read.dtype == values.dtype
-    np.testing.assert_array_equal(read, values)
+    assert np.load(tmp_path / "x.npy").dtype == values.dtype
+    np.testing.assert_array_equal(np.load(tmp_path / "x.npy"), values)
 
 
 def test_what_goes_wrong_between_rows_leaves_nothing(tmp_path, monkeypatch):
@@ -154,21 +138,10 @@ def test_a_safe_name_is_one_on_every_system_and_safe_names_stay(name, unfit):
     assert safe_name(safe, unfit) == safe
 
 
-@pytest.mark.parametrize(
-    ("name", "safe"),
-    [
-        ("CON", "_CON"),
-        ("aux.txt", "_aux.txt"),
-        ("com\u00b9", "_com\u00b9"),
-        ("console", "console"),
-        ("C:leaf", "C_leaf"),
-        ("leaf. . ", "leaf"),
-        ("Bl\u00e4tter", "Bl\u00e4tter"),
-        (" . ", "unnamed"),
-    ],
-)
-def test_devices_streams_and_trailing_dots_of_windows_are_no_names(name, safe):
-    assert safe_name(name) == safe
+def test_devices_streams_and_trailing_dots_of_windows_are_no_names():
+    names = ("CON", "aux.txt", "com\u00b9", "console", "C:leaf", "leaf. . ", "Bl\u00e4tter", " . ")
+    safe = ["_CON", "_aux.txt", "_com\u00b9", "console", "C_leaf", "leaf", "Bl\u00e4tter", "unnamed"]
+    assert list(map(safe_name, names)) == safe
     assert safe_name("\u6e2f" * 90 + "a") != safe_name("\u6e2f" * 90 + "b")  # long ones stay different
 
 
@@ -183,7 +156,5 @@ def test_a_path_too_long_for_windows_is_said_to_be_that(tmp_path, monkeypatch, w
     with pytest.raises(RunError, match="File name too long; choose a shorter name"):
         write_file(tmp_path / ("a" * 256), b"")
     monkeypatch.setattr(atomic_files, "_LONGEST_PATH", 12)
-    with pytest.raises(
-        RunError, match="more than 12 letters: choose a shorter folder, or turn on long paths"
-    ):
+    with pytest.raises(RunError, match="more than 12 letters: choose a shorter folder, or turn on"):
         writes(tmp_path / "file" / "name")

@@ -49,18 +49,19 @@ def test_odd_sizes_are_made_even_by_showing_the_last_line_twice_and_other_sizes_
     assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
 
 
+def write(path, count, end=None):
+    with video_frames(path, 48, 32, 24.0) as add:
+        for frame in smooth_frames(count):
+            add(frame)
+        if end is not None:
+            raise end
+
+
 def test_an_error_between_frames_ends_the_encoder_and_leaves_the_old_video(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"old")
-
-    def interrupted():
-        with video_frames(tmp_path / "v.mp4", 48, 32, 24.0) as add:
-            add(smooth_frames(1)[0])
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert [path.name for path in tmp_path.iterdir()] == ["v.mp4"]
-    assert (tmp_path / "v.mp4").read_bytes() == b"old"
+        write(tmp_path / "v.mp4", 1, KeyboardInterrupt())
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]
 
 
 def test_an_encoder_that_fails_is_quoted_and_leaves_nothing(tmp_path, monkeypatch):
@@ -71,14 +72,8 @@ def test_an_encoder_that_fails_is_quoted_and_leaves_nothing(tmp_path, monkeypatc
         return [sys.executable, "-c", code]
 
     monkeypatch.setattr(video, "_command", failing)
-
-    def write():
-        with video_frames(tmp_path / "v.mp4", 48, 32, 24.0) as add:
-            for frame in smooth_frames(50):
-                add(frame)
-
     with pytest.raises(RunError, match=r"can't write \S*v\.mp4: No space left on device; make room"):
-        write()
+        write(tmp_path / "v.mp4", 50)
     assert list(tmp_path.iterdir()) == []
 
 

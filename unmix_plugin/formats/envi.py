@@ -30,7 +30,6 @@ HeaderValue: TypeAlias = str | int | Sequence[str] | Sequence[float] | np.ndarra
 
 _TYPES = {1: "u1", 2: "i2", 3: "i4", 4: "f4", 5: "f8", 12: "u2", 13: "u4", 14: "i8", 15: "u8"}
 _FLOAT32, UINT16 = 4, 12
-_COMPLEX_TYPES = (6, 9)
 _AXES = {"bsq": "byx", "bil": "ybx", "bip": "yxb"}
 _LARGEST = 2**40
 _SAID_ONCE = re.compile(
@@ -47,22 +46,12 @@ _OTHER_HEADERS = {
 }
 """What else ends in .hdr, by how it begins."""
 _DATA_SUFFIXES = (
-    "",
-    ".img",
-    ".dat",
-    ".raw",
-    ".bil",
-    ".bip",
-    ".bsq",
-    ".bin",
-    ".cube",
-    ".hyspex",
-    ".sli",
-    ".lib",
+    *("", ".img", ".dat", ".raw", ".bil", ".bip", ".bsq"),
+    *(".bin", ".cube", ".hyspex", ".sli", ".lib"),
 )
 _SHOWN_NM = (640.0, 550.0, 460.0)
 """Red, green and blue that a viewer shows first, as far as there are bands for them."""
-_NOT_SPACE, _BRACE = re.compile(r"\S"), re.compile(r"[{}]")
+_BRACE = re.compile(r"[{}]")
 
 
 @dataclass(frozen=True)
@@ -96,8 +85,7 @@ def read_header(path: Path) -> dict[str, str]:
         ValueError: it is no ENVI header, or a list in it is never closed.
         OSError: it can't be read.
     """
-    size = path.stat().st_size
-    if size > MOST_TEXT_BYTES:
+    if (size := path.stat().st_size) > MOST_TEXT_BYTES:
         raise ValueError(f"no ENVI header: {size} bytes; expected a text of a few kB")
     text = _decoded(read_bounded(path))
     try:
@@ -108,10 +96,7 @@ def read_header(path: Path) -> dict[str, str]:
             raise
         other = next((kind for word, kind in _OTHER_HEADERS.items() if begin.startswith(word)), None)
         found = f"it is the header of {other}" if other else str(error)
-        raise ValueError(
-            f"no ENVI header: {found}; expected 'ENVI' and then 'key = value' lines. Convert the file to ENVI or "
-            "write such a header for it"
-        ) from error
+        raise ValueError(f"no ENVI header: {found}; expected 'ENVI' and then 'key = value' lines") from error
 
 
 def _decoded(data: bytes) -> str:
@@ -148,13 +133,11 @@ def _parse_header(text: str) -> dict[str, str]:
         if not equals or _BRACE.search(name):
             continue
         key = " ".join(name.lower().replace("_", " ").split())
-        opening = _NOT_SPACE.search(body, end - len(value))
+        opening = re.compile(r"\s*([{[])").match(body, end - len(value))
         close = -1
-        if opening is not None and opening[0] == "{":
-            close = _closing_brace(body, opening.start(), key, key in header)
-        elif (
-            opening is not None and opening[0] == "["
-        ):  # NumPy's way, which a value of one line may begin with too
+        if opening is not None and opening[1] == "{":
+            close = _closing_brace(body, opening.start(1), key, key in header)
+        elif opening is not None:  # NumPy's way, which a value of one line may begin with too
             close = body.find("]", opening.end())
             close = -1 if "=" in body[opening.end() : close] else close
         if opening is not None and close >= 0:
@@ -169,13 +152,12 @@ def _closing_brace(body: str, start: int, key: str, is_repeated: bool) -> int:
     """Where the list ends that the brace at `start` opens."""
     first, depth = body.find("}", start), 0
     # A description is free text, in which a brace need have no partner.
-    if key == "description" and is_repeated and first >= 0:
-        return first
-    for brace in _BRACE.finditer(body, start):
+    is_free = key == "description" and first >= 0
+    for brace in () if is_free and is_repeated else _BRACE.finditer(body, start):
         depth += 1 if brace[0] == "{" else -1
         if depth == 0:
             return brace.start()
-    if key == "description" and first >= 0:
+    if is_free:
         return first
     raise ValueError(f"the list of '{key}' is never closed")
 
@@ -204,7 +186,7 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
     height, width, num_bands = image_size(header)
     code, notes = _count(header, "data type"), ()
     if code not in _TYPES:
-        found = f"{code}, complex numbers" if code in _COMPLEX_TYPES else str(code)
+        found = f"{code}, complex numbers" if code in (6, 9) else str(code)
         known = ", ".join(f"{code} ({np.dtype(name).name})" for code, name in _TYPES.items())
         raise ValueError(f"'data type' is {found}; expected one of {known}")
     kind = np.dtype(_TYPES[code])
@@ -214,13 +196,13 @@ def read_layout(header: Mapping[str, str]) -> EnviLayout:
     if order > 1:
         raise ValueError(f"'byte order' is {order}; expected 0 (little-endian) or 1 (big-endian)")
     # With one band all three are the same.
-    interleave = header.get("interleave", "bsq" if num_bands == 1 else "missing").lower()
-    if interleave not in _AXES:
-        found = interleave if "interleave" not in header else f"'{header['interleave']}'"
+    interleave = header.get("interleave", "bsq" if num_bands == 1 else "missing")
+    if interleave.lower() not in _AXES:
+        found = interleave if "interleave" not in header else f"'{interleave}'"
         raise ValueError(f"'interleave' is {found}; expected bsq, bil or bip: correct the header")
     offset = _count(header, "header offset", default="0")
     dtype = kind.newbyteorder(">" if order else "<")
-    return EnviLayout((height, width, num_bands), dtype, interleave, offset, notes)
+    return EnviLayout((height, width, num_bands), dtype, interleave.lower(), offset, notes)
 
 
 def image_size(header: Mapping[str, str]) -> tuple[int, int, int]:
@@ -248,10 +230,8 @@ def _count(header: Mapping[str, str], key: str, default: str = "", least: int = 
 def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     """The file of numbers that a header describes; of several the one of that size, else the first that is larger.
 
-    Args:
-        header_path: Of the header.
-        needed_bytes: Size of what it describes.
-        first: Suffix that is preferred: of several files of that size it tells which one is meant.
+    `first` is the suffix that is preferred: of several files of that size it tells which one is meant.
+
     Raises:
         ValueError: there is none, or several could be it.
     """
@@ -261,25 +241,20 @@ def data_beside(header_path: Path, needed_bytes: int, first: str = "") -> Path:
     if base.suffix:  # x.raw.hdr beside x.RAW
         candidates |= {base.with_suffix(base.suffix.upper()): None}
     found = _distinct_files(path for path in candidates if path != header_path)
-    # Any other file of this name will do if it has just the size.
-    others = (
-        [] if found or needed_bytes == 0 else sorted(header_path.parent.glob(f"{glob.escape(base.name)}.*"))
-    )
-    found += [path for path in others if path.is_file() and path.stat().st_size == needed_bytes]
+    if not found and needed_bytes:  # any other file of this name will do if it has just the size
+        others = sorted(header_path.parent.glob(f"{glob.escape(base.name)}.*"))
+        found = [path for path in others if path.is_file() and path.stat().st_size == needed_bytes]
     if not found:
         usual = f"{base.name}{first}" if first == ".sli" else f"{base.name} or {base.name}.img"
         raise ValueError(
-            f"no file of numbers beside this header; expected {usual} (.dat, .raw, .bil, .bip, .bsq, ...) in the same "
-            "folder"
+            f"no file of numbers beside this header; expected {usual} (.dat, .raw, .bil, .bip, .bsq, ...)"
         )
     alike = [path for path in found if path.stat().st_size == needed_bytes > 0]
     large = [path for path in found if path.stat().st_size >= needed_bytes]
     chosen = [*alike, *large, *found][0]
     if len(alike) > 1 and chosen.suffix.lower() != first:
         names = " and ".join(path.name for path in alike)
-        raise ValueError(
-            f"{names} could each be what it describes; name the one that is meant, or move the others away"
-        )
+        raise ValueError(f"{names} could each be what it describes; name one, or move the others away")
     return chosen
 
 
@@ -310,8 +285,7 @@ def write_envi_cube(
     Args:
         path_without_suffix: Folder, which is made, and NAME.
         cube: Any numbers.
-        wavelengths: Centres of the bands, if they are bands of a spectrum.
-        names: Of the bands; commas in them become `-`, as the format has no other way.
+        wavelengths, names: Of the bands; commas in names become `-`, as the format has no other way.
         description: What the numbers are, with their unit.
         more: Further entries of the header.
     Raises:
@@ -338,12 +312,12 @@ def envi_cube_rows(
             raise ValueError(f"{len(given)} {what} for {shape[2]} bands")
     height, width, num_bands = shape
     entries = cube_entries("ENVI Standard", description, width, height, num_bands, "bip")
-    if wavelengths is not None:
-        entries |= wavelength_entries(wavelengths)
     if names is not None:
         entries["band names"] = list(names)
-    if wavelengths is not None and all(map(wavelengths.contains, _SHOWN_NM)):
-        entries["default bands"] = [str(wavelengths.nearest(wavelength) + 1) for wavelength in _SHOWN_NM]
+    if wavelengths is not None:
+        entries |= wavelength_entries(wavelengths)
+        if all(map(wavelengths.contains, _SHOWN_NM)):
+            entries["default bands"] = [str(wavelengths.nearest(nm) + 1) for nm in _SHOWN_NM]
     with _rows(envi_cube_paths(path_without_suffix), shape, {**entries, **(more or {})}) as add:
         yield add
 
@@ -360,12 +334,8 @@ def write_envi_library(
     names: Sequence[str],
     description: str = "spectra",
 ) -> list[Path]:
-    """Write spectra as NAME.hdr and NAME.sli, float32; commas in names become `-`, as the format has no other way.
+    """Write spectra as NAME.hdr and NAME.sli, float32, as `write_envi_cube` writes a cube.
 
-    Args:
-        path_without_suffix: Folder, which is made, and NAME.
-        spectra, bands, names: Any numbers, their wavelengths, and what each spectrum is called.
-        description: What the numbers are, with their unit.
     Raises:
         ValueError: another number of names than of spectra, or of wavelengths than of bands.
     """

@@ -72,12 +72,10 @@ def write_spectral_exr(
 
     Args:
         path: File; its folder is made.
-        spectra: On black, bands last.
-        bands: Their wavelengths.
+        spectra, bands: On black, and their wavelengths.
         rgb: Preview for viewers that know no spectra, linear light in sRGB primaries.
         alpha: Opacity, [0, 1]; spectra and preview are multiplied by it already, as OpenEXR wants it.
-        comments: What the numbers are.
-        quantity: What the spectra are, as `Materials.quantity` has it.
+        comments, quantity: What the numbers are, and what the spectra are, as `Materials.quantity` has it.
     Raises:
         ValueError: another number of wavelengths than of bands.
     """
@@ -85,14 +83,9 @@ def write_spectral_exr(
         raise ValueError(f"{len(bands)} wavelengths for spectra of shape {spectra.shape}")
     layer = "T" if quantity == "reflectance" else "S0"
     channels = {_channel_name(layer, nm): spectra[..., i] for i, nm in enumerate(bands.centers_nm.tolist())}
-    if rgb is not None:
-        channels.update({name: rgb[..., i] for i, name in enumerate("RGB")})
-    if alpha is not None:
-        channels["A"] = alpha
-    attributes = {"spectralLayoutVersion": "1.0"}
-    if quantity == "radiance":
-        # The layout's unit; what 1 means depends on the sensor.
+    channels |= {} if rgb is None else {name: rgb[..., i] for i, name in enumerate("RGB")}
+    channels |= {} if alpha is None else {"A": alpha}
+    attributes = {"spectralLayoutVersion": "1.0"} | ({"comments": comments} if comments else {})
+    if quantity == "radiance":  # the layout's unit; what 1 means depends on the sensor
         attributes["emissiveUnits"] = "W.m^-2.sr^-1"
-    if comments:
-        attributes["comments"] = comments
     return write_exr(path, channels, attributes)

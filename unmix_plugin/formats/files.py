@@ -38,7 +38,6 @@ __all__ = [
     "RowSink",
     "array_bytes",
     "csv_bytes",
-    "grey_png_bytes",
     "indexed_png_bytes",
     "make_folder",
     "npy_rows",
@@ -106,11 +105,8 @@ def array_bytes(array: np.ndarray) -> bytes:
 def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype) -> Iterator[RowSink]:
     """Context that gives a sink for the rows of an image; at its end the file is complete and has its name.
 
-    Args:
-        path: File to write.
-        header: Bytes before the pixels.
-        shape: Of the whole image, (H, W, ...).
-        dtype: Of the numbers on disk.
+    The file has `header` before an image of this shape, (H, W, ...), and type.
+
     Raises:
         ValueError: the rows given don't add up to `shape`.
     """
@@ -142,11 +138,7 @@ def raw_rows(path: Path, header: bytes, shape: tuple[int, ...], dtype: np.dtype)
 
 @contextmanager
 def npy_rows(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> Iterator[RowSink]:
-    """Context that gives a sink for the rows of an array of this shape; the file appears at its end.
-
-    Raises:
-        ValueError: the rows given don't add up to `shape`.
-    """
+    """Context that gives a sink for the rows of an array of this shape, as `raw_rows` does."""
     kind = np.dtype(dtype).newbyteorder("<")
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(
@@ -156,21 +148,15 @@ def npy_rows(path: Path, shape: tuple[int, ...], dtype: type[np.generic]) -> Ite
         yield add
 
 
-def rgba_png_bytes(rgba: UInt8[np.ndarray, "H W C"], description: str = "") -> bytes:
-    """sRGB colours, three or four channels; the fourth is opacity, by which colours are not multiplied.
+def rgba_png_bytes(pixels: UInt8[np.ndarray, "H W *C"], description: str = "") -> bytes:
+    """sRGB colours of three or four channels, of which the fourth is opacity, by which they are not multiplied; or
+    numbers as shades of grey.
 
     `description` says what is shown; it is written into the file as its `Description`.
     """
     from PIL import Image
 
-    return _encoded(Image.fromarray(rgba), description)
-
-
-def grey_png_bytes(values: UInt8[np.ndarray, "H W"], description: str = "") -> bytes:
-    """Numbers as shades of grey; `description` as `rgba_png_bytes` takes it."""
-    from PIL import Image
-
-    return _encoded(Image.fromarray(values), description)
+    return _encoded(Image.fromarray(pixels), description)
 
 
 def indexed_png_bytes(
@@ -179,13 +165,9 @@ def indexed_png_bytes(
     transparent: int | None = None,
     description: str = "",
 ) -> bytes:
-    """Ids whose colours are in the palette: readers get either, as they ask.
+    """Ids whose colours are in the palette, sRGB in [0, 1]: readers get either, as they ask.
 
-    Args:
-        ids: Indices.
-        palette: sRGB in [0, 1], at most 256.
-        transparent: An id that is not painted.
-        description: As `rgba_png_bytes` takes it.
+    The id `transparent` is not painted; `description` is as `rgba_png_bytes` takes it.
     """
     from PIL import Image
 

@@ -36,10 +36,9 @@ BUILT_IN = "+builtin"
 """Stands among a user's files for the spectra that come with the program."""
 
 LIBRARY_SUFFIXES = ("csv", "sli", "hdr", "txt", "asc")
-_MARKERS = (-999.0, -9999.0)
-_HIGHEST_MARKER, _LEAST_REFLECTANCE = -99.0, -0.99
-"""Stored numbers that stand for what was not measured: `_MARKERS`, and what is at most both of these, as it is stored
-and as a reflectance. Noise stored as ten-thousandths reaches the first alone."""
+_MARKERS, _HIGHEST_MARKER, _LEAST_REFLECTANCE = (-999.0, -9999.0), -99.0, -0.99
+"""Stored numbers that stand for what was not measured: the first, and what is at most both of the others, as it is
+stored and as a reflectance. Noise stored as ten-thousandths reaches one alone."""
 _NOISE = 0.02
 """Part of its greatest value by which noise may take a spectrum below 0."""
 _LARGEST_UM = 100.0
@@ -50,31 +49,24 @@ _SMALLEST_SCALE = 1e-30
 def library_of(
     paths: Iterable[Path], bands: Bands | None = None, light: Float[np.ndarray, " B"] | None = None
 ) -> MaterialLibrary:
-    """The spectra of a user's files alone, or the built-in ones where there are none or `+builtin` stands among them.
+    """The spectra of a user's files and folders alone, or the built-in ones where there are none or `+builtin` stands
+    among them.
 
-    Own spectra come first. One whose name another has is called `NAME (FILE)`.
+    Own spectra come first. One whose name another has is called `NAME (FILE)`. At `bands`, in `light` (relative power;
+    None for flat light), they will be compared.
 
-    Args:
-        paths: Files, folders of files, or `+builtin`.
-        bands: What spectra will be compared at.
-        light: Its relative power there; None for flat light.
     Raises:
         SpectrumError: a file that can't be read; none of the user's spectra can be compared at the bands.
     """
     asked = list(dict.fromkeys(paths))
-    own = [
-        one
-        for path in asked
-        if str(path) != BUILT_IN
-        for file in (_libraries_in(path) if path.is_dir() else [path])
-        for one in read_library(file)
-    ]
+    named = [path for path in asked if str(path) != BUILT_IN]
+    files = [file for path in named for file in (_libraries_in(path) if path.is_dir() else [path])]
+    own = [one for file in files for one in read_library(file)]
     if bands is not None and own and not MaterialLibrary(tuple(_named(own))).comparable(bands, light).any():
-        low = min(one.bands.centers_nm[0] for one in own)
-        high = max(one.bands.centers_nm[-1] for one in own)
+        nm = np.concatenate([one.bands.centers_nm for one in own])
         raise SpectrumError(
-            f"the library's spectra, from {low:g} to {high:g} nm, can't be compared: each covers less than half of "
-            f"{bands}, or less than three, not counting those without light"
+            f"the library's spectra, from {nm.min():g} to {nm.max():g} nm, can't be compared: each covers less than "
+            f"half of {bands}, or less than three, not counting those without light"
         )
     built_in = measured_library().materials if not own or Path(BUILT_IN) in asked else ()
     return MaterialLibrary(tuple(_named([*own, *built_in])))
@@ -107,11 +99,11 @@ def read_library(path: Path) -> list[LibraryMaterial]:
 def _libraries_in(folder: Path) -> list[Path]:
     """Files of spectra in a folder, without what ECOSTRESS and USGS put beside them."""
     kinds = [f".{suffix}" for suffix in LIBRARY_SUFFIXES if suffix != "hdr"]  # each .sli has its own
-    found = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in kinds]
-    found = [path for path in found if not _BESIDE_SPECTRA.search(path.name)]
+    there = [path for path in sorted(folder.iterdir()) if not _BESIDE_SPECTRA.search(path.name)]
+    found = [path for path in there if path.suffix.lower() in kinds]
     with_numbers = {path.stem for path in found if path.suffix.lower() == ".sli"}
-    headers = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".hdr"]
-    found += [path for path in headers if path.stem not in with_numbers and _is_library(path)]
+    headers = [path for path in there if path.suffix.lower() == ".hdr" and path.stem not in with_numbers]
+    found += filter(_is_library, headers)
     if not found:
         raise SpectrumError(f"{folder}: no library in this folder ({', '.join(kinds)})")
     return found
@@ -164,10 +156,8 @@ def _materials(
         values = np.divide(sums, counts, out=np.full(len(centers), np.nan), where=counts > 0)
         least = np.nanmin(values)
         if least < -_NOISE * np.nanmax(values):
-            wavelength = centers[np.nanargmin(values)]
-            raise SpectrumError(
-                f"spectra must not be negative; found {least:g} in '{name}' at {wavelength:g} nm"
-            )
+            found_at = f"'{name}' at {centers[np.nanargmin(values)]:g} nm"
+            raise SpectrumError(f"spectra must not be negative; found {least:g} in {found_at}")
         inside = slice(*(np.flatnonzero(counts)[[0, -1]] + (0, 1)))
         own = bands if counts.all() else Bands(centers[inside])
         found.append(LibraryMaterial(name, own, np.maximum(values[inside], 0), path.name, (path, name)))
@@ -206,10 +196,10 @@ def _read_envi(path: Path) -> _Table:
     layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
     num_spectra, num_bands, _ = layout.shape
     data_path = data_beside(header_path, layout.num_bytes, ".sli")
-    found, needed = data_path.stat().st_size - layout.offset, layout.num_bytes - layout.offset
-    if found < needed:
+    found = data_path.stat().st_size
+    if found < layout.num_bytes:
         raise ValueError(
-            f"{data_path.name} has {max(0, found)} bytes; {num_spectra} spectra of {num_bands} values need {needed}"
+            f"{data_path.name} has {found} bytes; {num_spectra} spectra of {num_bands} values need {layout.num_bytes}"
         )
     stored = np.fromfile(data_path, layout.dtype, num_spectra * num_bands, offset=layout.offset)
     with np.errstate(all="ignore"):  # signalling NaN, and an ignored value that the type can't hold
@@ -219,9 +209,7 @@ def _read_envi(path: Path) -> _Table:
             values[stored.reshape(values.shape) == ignored] = np.nan
     for key, usual in (("gain", 1.0), ("offset", 0.0)):
         if any(float(number) != usual for number in header_items(header, f"data {key} values")):
-            raise ValueError(
-                f"'data {key} values' can't be applied to spectra; write the library with its values"
-            )
+            raise ValueError(f"'data {key} values' can't be applied to spectra; write it with its values")
     good = [float(number) for number in header_items(header, "bbl")] or [1.0] * num_bands
     if len(good) != num_bands:
         raise ValueError(f"'bbl' has {len(good)} marks for {num_bands} bands")
@@ -281,8 +269,7 @@ def _read_text(path: Path) -> _Table:
         third = "column 3" if heads is None else f"column 3, '{heads[2].strip()}',"
         if count > 3 or heads is None or not _DEVIATION.search(heads[2]):
             raise SpectrumError(
-                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value, or "
-                "write several spectra as a .csv headed 'wavelength,NAME,...'"
+                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value"
             )
     kept = rows[:, 0] > 0
     wavelengths, values = rows[kept].T

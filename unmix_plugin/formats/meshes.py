@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from unmix_plugin import __version__
+from unmix_plugin.formats.envi import beside
 from unmix_plugin.formats.files import write_file
 from unmix_plugin.limits import MOST_TABLE_BYTES, read_bounded
 from unmix_plugin.spectral.colour.srgb import decode_srgb
@@ -54,15 +55,13 @@ def write_ply(
         path: File; its folder is made.
         vertices: Properties by name (x, y, z, nx, ny, nz, red, green, blue have a known meaning), each (P,) of float32,
             float64, uint8 or int32.
-        faces: Indices of vertices.
-        comments: Lines of the header.
+        faces, comments: Indices of vertices, and lines of the header.
     Raises:
         KeyError: a property of another type.
     """
+    kinds = [(name, values.dtype.newbyteorder("<")) for name, values in vertices.items()]
     count = len(next(iter(vertices.values())))
-    table = np.empty(
-        count, dtype=[(name, values.dtype.newbyteorder("<")) for name, values in vertices.items()]
-    )
+    table = np.empty(count, dtype=kinds)
     for name, values in vertices.items():
         table[name] = values
     header = ["ply", "format binary_little_endian 1.0"]
@@ -105,17 +104,19 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
     names = [line[2] for line in named]
     if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise ValueError("vertices have no x, y, z")
-    is_text = kinds[0] == "ascii"
+    is_text, begin = kinds[0] == "ascii", order[kinds[0]]
     dtype = np.dtype(
-        [(line[2], "f8" if is_text else order[kinds[0]] + _READ_TYPES[line[1]]) for line in named]
+        [
+            (name, "f8" if is_text else begin + _READ_TYPES[line[1]])
+            for name, line in zip(names, named, strict=True)
+        ]
     )
-    body, held = io.BytesIO(data), min(count, (len(data) - start) // dtype.itemsize)
-    body.seek(start)
-    table = (
-        np.loadtxt(filter(bytes.strip, body), dtype, comments=None, max_rows=max(count, 1), ndmin=1)
-        if is_text
-        else np.frombuffer(data, dtype, max(held, 0), start)
-    )
+    if is_text:
+        body = filter(bytes.strip, io.BytesIO(data[start:]))
+        table = np.loadtxt(body, dtype, comments=None, max_rows=max(count, 1), ndmin=1)
+    else:
+        held = min(count, (len(data) - start) // dtype.itemsize)
+        table = np.frombuffer(data, dtype, max(held, 0), start)
     if len(table) != count:
         raise ValueError(f"{len(table)} vertices; its header promises {count}")
     positions = np.stack([table[axis] for axis in "xyz"], axis=1, dtype=np.float64)
@@ -129,7 +130,7 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
 
 def obj_paths(path_without_suffix: Path) -> list[Path]:
     """Files that `write_obj` makes."""
-    return [path_without_suffix.with_name(path_without_suffix.name + suffix) for suffix in (".obj", ".mtl")]
+    return [beside(path_without_suffix, suffix) for suffix in (".obj", ".mtl")]
 
 
 def write_obj(
@@ -144,9 +145,7 @@ def write_obj(
     comments: Sequence[str] = (),
     textured: tuple[Float[np.ndarray, "U 2"], Int[np.ndarray, "F 3"], str] | None = None,
 ) -> list[Path]:
-    """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32.
-
-    Positions that are float64 have 17.
+    """Write a mesh as NAME.obj and NAME.mtl, with nine significant digits, exact for float32; 17 of float64 positions.
 
     Args:
         path_without_suffix: Folder, which is made, and NAME.
@@ -177,8 +176,8 @@ def write_obj(
         text.write(f"usemtl {plain[index]}\n")
         np.savetxt(text, corners[materials == index], fmt="f " + " ".join(3 * [corner]))
     library = "".join(
-        f"newmtl {name}\nKd {colour[0]:.6g} {colour[1]:.6g} {colour[2]:.6g}\n{shown}illum 1\n\n"
-        for name, colour in zip(plain, palette.tolist(), strict=True)
+        f"newmtl {name}\nKd {red:.6g} {green:.6g} {blue:.6g}\n{shown}illum 1\n\n"
+        for name, (red, green, blue) in zip(plain, palette.tolist(), strict=True)
     )
     write_file(library_path, library.encode())
     return [write_file(obj_path, text.getvalue().encode("utf-8")), library_path]
@@ -200,8 +199,7 @@ def write_glb(
 
     Args:
         path: File; its folder is made.
-        positions: Of the vertices.
-        normals: Unit vectors.
+        positions, normals: Of the vertices; unit normals.
         linear_rgb: Colours, linear light in sRGB primaries, [0, 1], as glTF wants them.
         faces: Indices of vertices.
         numbers: More of each vertex, (P,) float32, by a name that starts with `_`.
@@ -213,18 +211,16 @@ def write_glb(
     Source:
         Khronos Group, KHR_materials_variants and KHR_materials_unlit.
     """
-    material: dict[str, Any] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
-    attributes = {"POSITION": positions, "NORMAL": normals, "COLOR_0": linear_rgb, **numbers}
+    plain: dict[str, Any] = {"doubleSided": True, "pbrMetallicRoughness": {"metallicFactor": 0.0}}
+    attributes = {"POSITION": positions, "NORMAL": normals, **numbers}
     if uv is None or not pictures:
-        return _write_glb(path, attributes, faces, [material], {}, extras, up)
-    attributes = {**attributes, "TEXCOORD_0": uv}
-    del attributes["COLOR_0"]  # it would be multiplied with the picture
+        return _write_glb(path, {**attributes, "COLOR_0": linear_rgb}, faces, [plain], {}, extras, up)
+    attributes["TEXCOORD_0"] = uv  # and no colours, which would be multiplied with the picture
     materials = []
     for index, name in enumerate(pictures):
         look = {"metallicFactor": 0.0, "baseColorTexture": {"index": index}}
-        materials.append({"name": name, "doubleSided": True, "pbrMetallicRoughness": look})
-        if index > 0:
-            materials[-1]["extensions"] = {"KHR_materials_unlit": {}}
+        unlit = {"extensions": {"KHR_materials_unlit": {}}} if index > 0 else {}
+        materials.append({**plain, "name": name, "pbrMetallicRoughness": look, **unlit})
     mappings = [{"material": index, "variants": [index]} for index in range(len(pictures))]
     of_primitive = {"KHR_materials_variants": {"mappings": mappings}}
     variants = {"KHR_materials_variants": {"variants": [{"name": name} for name in pictures]}}
@@ -263,14 +259,9 @@ def write_splats_glb(
     extras: Mapping[str, Any],
     up: Float64[np.ndarray, "3"],
 ) -> Path:
-    """Write Gaussians as points of a GLB, with their colours for programs that know points only.
+    """Write Gaussians as points of a GLB, with their colours for programs that know points only; numbers, extras and up
+    are as those of `write_glb`.
 
-    Args:
-        path: File; its folder is made.
-        splats: What to write.
-        numbers: More of each Gaussian, (P,) float32, by a name that starts with `_`.
-        extras: As those of `write_glb`.
-        up: The unit vector that is up; the node turns it to +y.
     Source:
         Khronos Group, KHR_gaussian_splatting.
     """
@@ -320,16 +311,9 @@ def write_textured_glb(
 
     The other arguments are as those of `write_glb`.
     """
-    material = {
-        "name": "material",
-        "doubleSided": True,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": {"index": 0},
-            "metallicRoughnessTexture": {"index": 1},
-            "metallicFactor": 1.0,
-            "roughnessFactor": 1.0,
-        },
-    }
+    textures = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}}
+    look = {**textures, "metallicFactor": 1.0, "roughnessFactor": 1.0}
+    material = {"name": "material", "doubleSided": True, "pbrMetallicRoughness": look}
     attributes = {"POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uv}
     pictures = {"base_colour": base_colour_png, "metallic_roughness": metallic_roughness_png}
     return _write_glb(path, attributes, faces, [material], pictures, extras)
@@ -357,15 +341,11 @@ def _write_glb(
         return len(views) - 1
 
     for name, values in attributes.items():
-        accessor = {
-            "bufferView": add(np.ascontiguousarray(values, "<f4").tobytes(), target=_VERTEX_BUFFER),
-            "componentType": _FLOAT,
-            "count": len(values),
-            "type": "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}",
-        }
+        view = add(np.ascontiguousarray(values, "<f4").tobytes(), target=_VERTEX_BUFFER)
+        kind = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessors.append({"bufferView": view, "componentType": _FLOAT, "count": len(values), "type": kind})
         if name == "POSITION" and len(values):
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        accessors.append(accessor)
+            accessors[-1] |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
     primitive: dict[str, Any] = {"attributes": {name: index for index, name in enumerate(attributes)}}
     if faces is None:
         primitive["mode"] = _POINTS
@@ -384,29 +364,25 @@ def _write_glb(
         for name, content in pictures.items()
     ]
     sampler = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMP, "wrapT": _CLAMP}
-    textures = {
-        "textures": [{"sampler": 0, "source": index} for index in range(len(images))],
-        "samplers": [sampler],
-        "images": images,
-    }
-    said = {name: value for name, value in (used or {}).items() if value}
     metres = extras.get("metres_per_unit")
-    node = {"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist()}
+    scaled = {} if metres is None else {"scale": 3 * [metres]}
     content = {
         "asset": {"version": "2.0", "generator": f"unmix-nerf {__version__}"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node if metres is None else {**node, "scale": 3 * [metres]}],
+        "nodes": [{"mesh": 0, "name": "surface", "rotation": least_turns(up, _Y).tolist(), **scaled}],
         "meshes": [{"primitives": [primitive], "extras": {**extras, "up": np.asarray(up).tolist()}}],
-        **({"materials": list(materials)} if materials else {}),
-        **({"extensionsUsed": list(used)} if used else {}),
-        **({"extensions": said} if said else {}),
-        **(textures if images else {}),
+        "materials": list(materials),
+        "extensionsUsed": list(used or {}),
+        "extensions": {name: value for name, value in (used or {}).items() if value},
+        "textures": [{"sampler": 0, "source": index} for index in range(len(images))],
+        "samplers": [sampler] if images else [],
+        "images": images,
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": len(data)}],
     }
-    text = json.dumps(content).encode()
+    text = json.dumps({name: value for name, value in content.items() if value not in ([], {})}).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), _JSON_CHUNK) + text
     chunks += struct.pack("<II", len(data), _BINARY_CHUNK) + data

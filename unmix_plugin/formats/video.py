@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TypeAlias
+from typing import IO, TypeAlias, cast
 
 import numpy as np
 
@@ -42,13 +42,21 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
         ValueError: a frame of another size.
     """
 
+    @contextmanager
+    def failures() -> Iterator[None]:
+        """Context in which an encoder that no longer reads is an error of the video."""
+        try:
+            yield
+        except OSError as error:
+            encoder.wait()
+            raise _failure(path, log) from error
+
     def add(frame: np.ndarray) -> None:
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             raise ValueError(f"frames are ({height}, {width}, 3) uint8; got {frame.shape} {frame.dtype}")
         even = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-        assert encoder.stdin is not None
-        with _failures(encoder, path, log):
-            encoder.stdin.write(even.tobytes())
+        with failures():
+            stdin.write(even.tobytes())
 
     with whole_file(path) as temporary, tempfile.TemporaryFile() as log:
         command = _command(temporary, (width + width % 2, height + height % 2), frames_per_second)
@@ -60,11 +68,10 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
             start_new_session=True,
             creationflags=OWN_GROUP,
         )
-        stdin = encoder.stdin
-        assert stdin is not None
+        stdin = cast("IO[bytes]", encoder.stdin)
         try:
             yield add
-            with _failures(encoder, path, log):
+            with failures():
                 stdin.close()
             if encoder.wait() != 0:
                 raise _failure(path, log)
@@ -74,16 +81,6 @@ def video_frames(path: Path, width: int, height: int, frames_per_second: float) 
                 encoder.wait()
             with contextlib.suppress(OSError):  # what was not yet written has no reader any more
                 stdin.close()
-
-
-@contextmanager
-def _failures(encoder: subprocess.Popen[bytes], path: Path, log: IO[bytes]) -> Iterator[None]:
-    """Context in which an encoder that no longer reads is an error of the video."""
-    try:
-        yield
-    except OSError as error:
-        encoder.wait()
-        raise _failure(path, log) from error
 
 
 def _command(path: Path, size: tuple[int, int], frames_per_second: float) -> list[str]:
