@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -65,30 +64,25 @@ def _write_scene(options: _DemoSceneOptions) -> None:
     from unmix_plugin.scenes.demo.shading import LAMP
     from unmix_plugin.spectral.colour.conversion import parse_light
 
-    folder = options.directory
+    folder, place, started = options.directory, PLACES[options.place], time.perf_counter()
     size, bands, views = _numbers(options, (DEFAULT_SIZE, DEFAULT_BANDS, DEFAULT_VIEWS))
     light = parse_light(options.illuminant or LAMP)
-    started = time.perf_counter()
-    place = PLACES[options.place]
     make_demo_scene(folder, size, bands, views, options.overwrite, light, place)
-    seconds = time.perf_counter() - started
     evaluation = len(list((folder / "abundances").glob("eval_*")))
     print(
         f"{folder}: {views} views ({views - evaluation} to train on, {evaluation} for evaluation) of {size} x {size} "
-        f"pixels and {bands} bands, in {seconds:.1f} s"
+        f"pixels and {bands} bands, in {time.perf_counter() - started:.1f} s"
     )
-    _print_files(
-        folder,
-        (
-            ("transforms.json", "cameras, wavelengths, splits"),
-            ("cubes", "radiance in [0, 1], float16 (H, W, B)"),
-            ("images", "sRGB with alpha" if place.sky is None else "sRGB"),
-            ("labels", "true material of each pixel, 255 where there is none"),
-            ("abundances", "true abundances of evaluation views, float16 (H, W, K)"),
-            ("endmembers.csv", "true reflectances"),
-            ("illuminant.csv", "the lamp's spectrum"),
-        ),
-    )
+    for name, content in (
+        ("transforms.json", "cameras, wavelengths, splits"),
+        ("cubes", "radiance in [0, 1], float16 (H, W, B)"),
+        ("images", "sRGB with alpha" if place.sky is None else "sRGB"),
+        ("labels", "true material of each pixel, 255 where there is none"),
+        ("abundances", "true abundances of evaluation views, float16 (H, W, K)"),
+        ("endmembers.csv", "true reflectances"),
+        ("illuminant.csv", "the lamp's spectrum"),
+    ):
+        print(f"  {folder / name}  {content}")
     print(f"train on it: unmix-train unmix-nerf --data {folder}")
 
 
@@ -107,33 +101,28 @@ def _write_capture(options: _DemoSceneOptions) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, follow
     from unmix_plugin.spectral.colour.conversion import parse_light
 
-    folder = options.directory
+    folder, started = options.directory, time.perf_counter()
     size, bands, views = _numbers(options, (RAW_SIZE, RAW_BANDS, RAW_VIEWS))
     light = parse_light(options.illuminant or RAW_LAMP)
-    started = time.perf_counter()
     place = marked_place() if options.markers else None
     shown = partial(follow, CommandConsole())
     make_demo_capture(folder, size, bands, views, options.overwrite, light, place, follow=shown)
-    seconds = time.perf_counter() - started
     print(
-        f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in {seconds:.1f} s"
+        f"{folder}: {views} raw views of {size} x {size} pixels and {bands} bands, 3 of them bad, in "
+        f"{time.perf_counter() - started:.1f} s"
     )
-    _print_files(
-        folder,
-        (
-            ("view_000.hdr", "and .raw, the first view: counts, uint16, ENVI bil"),
-            ("white.hdr", "white reference"),
-            ("dark.hdr", "dark frame"),
-            (POSES, "where the cameras were, to compare with poses that were estimated"),
-            ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
-        ),
-    )
-    poses = "estimate"
-    if options.markers:
-        poses = f"markers --marker-size {MARKER_SIZE} --marker-family {MARKER_FAMILY}"
+    for name, content in (
+        ("view_000.hdr", "and .raw, the first view: counts, uint16, ENVI bil"),
+        ("white.hdr", "white reference"),
+        ("dark.hdr", "dark frame"),
+        (POSES, "where the cameras were, to compare with poses that were estimated"),
+        ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
+    ):
+        print(f"  {folder / name}  {content}")
+    marked = f"markers --marker-size {MARKER_SIZE} --marker-family {MARKER_FAMILY}"
     print(
         f"make a scene of it: unmix-process cubes --data {folder} --output-dir SCENE --white {folder / 'white.hdr'} "
-        f"--dark {folder / 'dark.hdr'} --poses {poses}"
+        f"--dark {folder / 'dark.hdr'} --poses {marked if options.markers else 'estimate'}"
     )
 
 
@@ -141,8 +130,3 @@ def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tupl
     """Size, bands and views, as asked, or the defaults."""
     asked = (options.size, options.bands, options.views)
     return tuple(default if value is None else value for value, default in zip(asked, defaults, strict=True))
-
-
-def _print_files(folder: Path, files: Iterable[tuple[str, str]]) -> None:
-    for name, content in files:
-        print(f"  {folder / name}  {content}")

@@ -38,11 +38,8 @@ _MACHINE_ERRORS = frozenset(
 """System errors that a user can mend: a disk that is full or fails, a place that is forbidden, a name that is too long
 or leads in a circle, and what is no file or no folder."""
 
-_OUT_OF_MEMORY = (
-    "OutOfMemoryError",
-    "DefaultCPUAllocator",
-    "Failed to allocate",
-    "CUDA error: out of memory",
+_OUT_OF_MEMORY = re.compile(
+    r"OutOfMemoryError|DefaultCPUAllocator|Failed to allocate|CUDA error: out of memory"
 )
 """What torch and Warp say, whose errors are RuntimeErrors."""
 
@@ -111,10 +108,8 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 @contextmanager
 def _libraries_in_short() -> Iterator[None]:
-    """Context in which libraries say in one line what they need many for.
-
-    Matplotlib tells of a home folder that can't be written, where it helps itself, and of every letter that its font
-    lacks.
+    """Context in which Matplotlib says nothing of a home folder that can't be written, where it helps itself, and of
+    all letters that its font lacks one line.
     """
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     usual, is_said = warnings.showwarning, False
@@ -125,12 +120,10 @@ def _libraries_in_short() -> Iterator[None]:
         if lacking is None:
             usual(message, *where, **more)
         elif not is_said:
-            is_said = True
-            letter = chr(int(lacking[1]))
+            is_said, letter = True, chr(int(lacking[1]))
             _say(
                 f"warning: figures have boxes in place of letters such as {letter}, which their font lacks; other "
                 "files have them. Rename materials or views if that matters",
-                is_debug=False,
             )
 
     warnings.showwarning = show
@@ -142,11 +135,8 @@ def _libraries_in_short() -> Iterator[None]:
 
 @contextmanager
 def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
-    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up.
-
-    Args:
-        interrupts: Gets the number of each SIGINT, which raises KeyboardInterrupt as it always does.
-    """
+    """Context in which SIGTERM and SIGHUP raise SystemExit, so that whatever was begun is cleaned up; `interrupts` gets
+    the number of each SIGINT, which raises KeyboardInterrupt as it always does."""
 
     def leave(number: int, _frame: FrameType | None) -> NoReturn:
         sys.exit(128 + number)
@@ -155,13 +145,14 @@ def _signals_as_exits(interrupts: list[int]) -> Iterator[None]:
         interrupts.append(number)
         raise KeyboardInterrupt
 
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    # One that is ignored stays so, as under nohup; outside the main thread there are no handlers.
-    is_main = threading.current_thread() is threading.main_thread()
-    changed = [number for number in numbers if is_main and signal.getsignal(number) is signal.SIG_DFL]
-    before = {number: signal.signal(number, leave) for number in changed}
-    if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
+    usual = {"SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL, "SIGINT": signal.default_int_handler}
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():  # elsewhere there are no handlers
+        for name, handler in usual.items():
+            number = getattr(signal, name, None)
+            # One that is ignored stays so, as under nohup.
+            if number is not None and signal.getsignal(number) is handler:
+                before[number] = signal.signal(number, interrupt if name == "SIGINT" else leave)
     try:
         yield
     finally:
@@ -189,14 +180,12 @@ def _is_output_closed(error: OSError) -> bool:
 
 def _verdict(error: Exception) -> tuple[str, int]:
     """What to say about an error, and the exit code."""
-    if isinstance(error, UnmixError):
-        return f"error: {error}", USER_ERROR
-    if isinstance(error, OSError) and error.errno in _MACHINE_ERRORS:
-        return f"error: {error}", USER_ERROR
     text = f"{type(error).__name__}: {error}"
-    if isinstance(error, RuntimeError) and "Symlink loop" in text:  # so Python says it before 3.13
+    is_of_machine = isinstance(error, OSError) and error.errno in _MACHINE_ERRORS
+    is_loop = isinstance(error, RuntimeError) and "Symlink loop" in text  # so Python says it before 3.13
+    if isinstance(error, UnmixError) or is_of_machine or is_loop:
         return f"error: {error}", USER_ERROR
-    if isinstance(error, MemoryError) or any(sign in text for sign in _OUT_OF_MEMORY):
+    if isinstance(error, MemoryError) or _OUT_OF_MEMORY.search(text):
         reason = str(error).strip().splitlines() or ["no more to be had"]
         return f"error: out of memory: {reason[0]}. {_MEMORY_ADVICE}", USER_ERROR
     return f"this is a bug in unmix-nerf, please report it with what --debug shows: {text}", INTERNAL_ERROR
@@ -206,7 +195,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 """What moves a terminal's cursor or changes its state; messages quote files of others."""
 
 
-def _say(message: str, is_debug: bool) -> None:
+def _say(message: str, is_debug: bool = False) -> None:
     with suppress(OSError):  # the terminal may be gone
         if is_debug:
             traceback.print_exc()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.engine.configs import DeviceName
 from unmix_plugin.errors import ConfigError, counted
+from unmix_plugin.products.product import RunOptions, SharedViews
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _EvalOptions:
+class _EvalOptions(SharedViews, RunOptions):
     """Measure a trained run on its evaluation views: metrics.json, a table, and prediction beside truth as pictures.
 
     They are written to `eval/` in the run folder, in place of an earlier evaluation; those of an edited run to a folder
@@ -33,20 +33,12 @@ class _EvalOptions:
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Run folders, as training printed them; none takes the newest under --output-dir."""
-    run: Path | None = None
-    """The same for one run."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     edits: Path | None = None
     """Recipe (YAML) of edits to make first; the result is compared with the scene as it was measured."""
     illuminant: str | None = None
     """Light to see both in: D65, A, E, FL2, ... or a .csv file (wavelength,power); None: the scene's own."""
-    output_dir: Path = Path("outputs")
-    """Folder in which to look for the newest run."""
-    device: DeviceName = "auto"
-    """Where to compute; auto takes CUDA where there is one."""
-    num_devices: int = 1
-    """Processes that share the views, on CUDA each on a device of its own."""
 
 
 def evaluate(argv: list[str]) -> None:
@@ -106,9 +98,8 @@ def _compare(console: Console, runs: list[ComparedRun]) -> None:
     console.print(table)
     for remark in found.remarks:
         say(console, remark)
-    print(
-        f"{folder}  differences as CSV, of views and bands too, and {counted(found.num_pictures, 'picture')}"
-    )
+    drawn = counted(found.num_pictures, "picture")
+    print(f"{folder}  differences as CSV, of views and bands too, and {drawn}")
 
 
 def _evaluate_run(
@@ -174,15 +165,14 @@ def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: boo
     for what, how in _ALIGNED.items():
         if what in found.more.get("aligned", ()):
             print(f"each evaluation view was aligned first: {how}")
-    of = "" if not is_edited else ", edited, against the scene as measured"
-    of += "" if not is_relit else " (in the same light)"
+    of = ", edited, against the scene as measured" if is_edited else ""
+    of += " (in the same light)" if is_relit else ""
     _show(console, run.figures, f"{run.path.name}: {counted(run.figures['views'], 'evaluation view')}", of)
     print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
     if found.num_pictures:
-        kinds = (
-            ": rgb/, segmentation/ and abundances/, truth beside prediction" if found.has_materials else ""
-        )
-        print(f"{run.pictures}  {counted(found.num_pictures, 'picture')}{kinds}")
+        kinds = ": rgb/, segmentation/ and abundances/, truth beside prediction"
+        drawn = counted(found.num_pictures, "picture")
+        print(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
 
 
 _ALIGNED = {
@@ -218,17 +208,13 @@ def _show(console: Console, figures: dict[str, Any], title: str, of: str) -> Non
     table.add_column("what it is")
     for name, value in figures.items():
         is_common = "bands" in figures or name in ("views", "train_seconds")
-        what = DEFINITIONS.get(name, "") if is_common else ""
+        unit = next((unit for word, unit in _UNITS.items() if word in name.split("_")), "")
         if value is not None:
-            table.add_row(name, f"{value:.4g}{_unit(name)}", what)
+            table.add_row(name, f"{value:.4g}{unit}", DEFINITIONS.get(name, "") if is_common else "")
     console.print(table)
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
         print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
-
-
-def _unit(name: str) -> str:
-    return next((unit for word, unit in _UNITS.items() if word in name.split("_")), "")
 
 
 _UNITS = {"psnr": " dB", "sam": " rad", "angle": " rad", "seconds": " s"}

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import inspect
 import sys
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Collection
+from typing import TYPE_CHECKING, NamedTuple
 
 import tyro
 
@@ -23,34 +23,8 @@ if TYPE_CHECKING:
     from unmix_plugin.engine.processes import Processes
 
 
-@dataclass(frozen=True)
-class _OwnProduct:
-    """A product that only some methods have."""
-
-    product: RunProduct
-    """With the defaults of its options."""
-    methods: tuple[str, ...]
-    """Names of the methods that bring it."""
-
-    def require(self, method_name: str) -> None:
-        """Refuse a run of another method.
-
-        Raises:
-            ConfigError: the product is none of this method's.
-        """
-        if method_name not in self.methods:
-            raise ConfigError(
-                f"the method {method_name} has no product {self.product.name}: it needs a run of "
-                f"{' or '.join(self.methods)}"
-            )
-
-
-def _own_products(taken: frozenset[str]) -> tuple[dict[str, _OwnProduct], list[BrokenPlugin]]:
-    """What methods bring, by the product's name, and what had to be skipped.
-
-    Args:
-        taken: Names of products that are there already.
-    """
+def _own_products(taken: Collection[str]) -> tuple[dict[str, _OwnProduct], list[BrokenPlugin]]:
+    """What methods bring, by the product's name, and what had to be skipped: names in `taken` are others' already."""
     methods, _ = discover_methods()
     found: dict[str, _OwnProduct] = {}
     broken: list[BrokenPlugin] = []
@@ -63,13 +37,20 @@ def _own_products(taken: frozenset[str]) -> tuple[dict[str, _OwnProduct], list[B
             broken.append(BrokenPlugin(method_name, f"its products: {type(error).__name__}: {lines[0]}"))
             continue
         for product in products:
-            known = found.get(product.name)
-            if product.name in taken or (known is not None and known.product != product):
+            known = found.get(product.name, _OwnProduct(product, ()))
+            if product.name in taken or known.product != product:
                 reason = f"another product has the name {product.name} already"
                 broken.append(BrokenPlugin(method_name, reason))
-                continue
-            found[product.name] = _OwnProduct(product, (*(known.methods if known else ()), method_name))
+            else:
+                found[product.name] = _OwnProduct(product, (*known.methods, method_name))
     return found, broken
+
+
+class _OwnProduct(NamedTuple):
+    """A product that only some methods have, with the defaults of its options, and the names of these methods."""
+
+    product: RunProduct
+    methods: tuple[str, ...]
 
 
 _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
@@ -86,7 +67,7 @@ def export(argv: list[str]) -> None:
         SpectrumError: a spectrum or a light that is unknown or does not cover the bands, or a sensor that sees nothing
             in them.
     """
-    own, broken = _own_products(frozenset(product.name for product in PRODUCTS))
+    own, broken = _own_products({product.name for product in PRODUCTS})
     for plugin in broken:
         print(plugin, file=sys.stderr)
     offered = sorted((*PRODUCTS, *(one.product for one in own.values())), key=lambda one: one.name)
@@ -94,9 +75,9 @@ def export(argv: list[str]) -> None:
         {product.name: product for product in offered},
         {product.name: inspect.getdoc(product) or "" for product in offered},
     )
-    product: RunWork = tyro.cli(
-        choices, prog="unmix-export", description="Write products of a run as files.", args=argv
-    )
+    about = "Write products of a run as files."
+    product: RunWork = tyro.cli(choices, prog="unmix-export", description=about, args=argv)
+
     from unmix_plugin.engine.processes import joined, start_together
 
     count = product.num_devices if isinstance(product, ViewProduct) else 1
@@ -129,12 +110,12 @@ def _open(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -
     from unmix_plugin.trained.open_run import load_run
 
     if isinstance(product, Product) and product.sensor is not None and product.name in _IN_THE_RUNS_BANDS:
-        able = ", ".join(
+        able = [
             one.name for one in PRODUCTS if isinstance(one, Product) and one.name not in _IN_THE_RUNS_BANDS
-        )
+        ]
         raise ConfigError(
             f"{product.name} compares with what is known in the run's own bands and can't be seen through another "
-            f"sensor; leave out --sensor. It goes with {able}"
+            f"sensor; leave out --sensor. It goes with {', '.join(able)}"
         )
     console = CommandConsole(quiet=not processes.is_first)
     path = chosen_run(product.run, product.output_dir)
@@ -143,8 +124,11 @@ def _open(product: RunWork, own: dict[str, _OwnProduct], processes: Processes) -
             loaded = load_edited_run(path, product.device, product.edits, product.illuminant, product.sensor)
         else:
             loaded = load_run(path, product.device)
-    if product.name in own:
-        own[product.name].require(loaded.config.method_name)
+    method, methods = loaded.config.method_name, own[product.name].methods if product.name in own else None
+    if methods is not None and method not in methods:
+        raise ConfigError(
+            f"the method {method} has no product {product.name}: it needs a run of {' or '.join(methods)}"
+        )
     folder = loaded.folder.path
     if isinstance(product, RunProduct):
         folder = (product.output or folder.joinpath("exports", product.name)).resolve()

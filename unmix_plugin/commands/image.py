@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from unmix_plugin.captures.spectral_file import Axes, ReadOptions
+from unmix_plugin.commands.process_inspect import ReadingOptions
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
 if TYPE_CHECKING:
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 _CONFIDENT = 0.9
 
 
-@dataclass(frozen=True)
-class _ImageOptions:
+@dataclass(frozen=True, kw_only=True)
+class _ImageOptions(ReadingOptions):
     """Find the materials of one spectral image: spectra, abundances and how far to trust them, as files and figures."""
 
     file: Annotated[Path, tyro.conf.Positional]
@@ -45,12 +45,6 @@ class _ImageOptions:
     """Replace earlier results."""
     seed: int = 0
     """Everything random follows from it."""
-    dataset: str | None = None
-    """Variable, data set, layer or channel to take from a file that holds several."""
-    axes: Axes | None = None
-    """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
-    size: tuple[int, int] | None = None
-    """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
 
 
 def image(argv: list[str]) -> None:
@@ -82,8 +76,7 @@ def image(argv: list[str]) -> None:
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
     refuse_to_overwrite(paths, options.overwrite)
-    reading = ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
-    opened = open_spectral_file(options.file, reading)
+    opened = open_spectral_file(options.file, options.for_readers())
     bands, wavelengths = _good_bands(opened)
     stored = opened.read(bands=bands)
     mask = ~find_missing(stored, opened, bands=bands)

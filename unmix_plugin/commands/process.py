@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 
 def process(arguments: list[str]) -> None:
     """Parse the arguments, make the scene, say where it is.
@@ -31,9 +33,6 @@ def process(arguments: list[str]) -> None:
     from unmix_plugin.commands.reporting import CommandConsole, follow, say
 
     console = CommandConsole()
-    findings = process_capture(
-        options, lambda text: say(console, text), lambda doing, views: follow(console, doing, views)
-    )
-    for finding in findings:
+    for finding in process_capture(options, partial(say, console), partial(follow, console)):
         print(f"looks wrong: {finding}")
     print(f"scene: {options.output_dir}")

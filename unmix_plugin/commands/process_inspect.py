@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -14,15 +14,28 @@ from unmix_plugin.captures.spectral_file import Axes, ReadOptions
 from unmix_plugin.commands.entry import DONE, USER_ERROR
 from unmix_plugin.errors import CaptureError, ConfigError, counted
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 _SHOWN = ("axes", "source", "exposure_s", "exposure_evidence", "gain", "gain_evidence", "f_number", "map")
 """Metadata that have lines of their own."""
 
 
 @dataclass(frozen=True)
-class _InspectOptions:
+class ReadingOptions:
+    """What a user adds to files that don't say enough of themselves."""
+
+    dataset: str | None = None
+    """Variable, data set, layer or channel to take from a file that holds several."""
+    axes: Axes | None = None
+    """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
+    size: tuple[int, int] | None = None
+    """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
+
+    def for_readers(self) -> ReadOptions:
+        """The same as readers take it."""
+        return ReadOptions(dataset=self.dataset, axes=self.axes, size=self.size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _InspectOptions(ReadingOptions):
     """Say what files of instruments hold: size, type, bands, wavelengths with their evidence, poses.
 
     Nothing but headers and one row of each image is read. Exit status 2 if a file is refused.
@@ -32,12 +45,6 @@ class _InspectOptions:
     """Images, folders with one file a band, or poses."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """One JSON object a file, a line each."""
-    dataset: str | None = None
-    """Variable, data set, layer or channel to take from files that hold several."""
-    axes: Axes | None = None
-    """Order of the axes of arrays, the slowest first: y rows, x columns, b bands."""
-    size: tuple[int, int] | None = None
-    """Rows and columns of an image that is stored as a matrix of bands and pixels, column after column."""
 
 
 def inspect_command(arguments: list[str]) -> int:
@@ -51,8 +58,7 @@ def inspect_command(arguments: list[str]) -> int:
     options = tyro.cli(_InspectOptions, prog="unmix-process inspect", args=arguments)
     if not options.files:
         raise ConfigError("no file is named; expected unmix-process inspect FILE...")
-    reading = ReadOptions(dataset=options.dataset, axes=options.axes, size=options.size)
-    reports = [_report(path, reading) for path in options.files]
+    reports = [_report(path, options.for_readers()) for path in options.files]
     if options.json:
         for report in reports:
             print(json.dumps(report))
@@ -71,34 +77,28 @@ def _report(path: Path, options: ReadOptions) -> dict[str, Any]:
 
 
 def _print_tables(reports: Sequence[dict[str, Any]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
     from unmix_plugin.commands.reporting import CommandConsole
 
     console = CommandConsole()
     for report in reports:
-        console.print(_table(report), markup=False, highlight=False)
-
-
-def _table(report: dict[str, Any]) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(report["file"], style="bold"), title_justify="left", show_header=False, box=None)
-    for name, text in _rows(report):
-        table.add_row(name, Text(text))
-    return table
+        title = Text(report["file"], style="bold")
+        table = Table(title=title, title_justify="left", show_header=False, box=None)
+        for name, text in _rows(report):
+            table.add_row(name, Text(text))
+        console.print(table, markup=False, highlight=False)
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     """Facts worth a line."""
     if "error" in report:
         return [("refused", report["error"])]
-    rows: list[tuple[str, str]] = []
-    if report["shape"] is not None:
-        rows = _image_rows(report)
+    rows = [] if report["shape"] is None else _image_rows(report)
     if report.get("poses") is not None:
-        rows.append(
-            ("poses", f"{counted(report['poses'], 'camera')} ({report['metadata'].get('source', '')})")
-        )
+        source = report["metadata"].get("source", "")
+        rows.append(("poses", f"{counted(report['poses'], 'camera')} ({source})"))
     rows += [("note", note) for note in report["notes"]]
     others = [name for name in report["metadata"] if name not in _SHOWN]
     return rows + ([("also holds", ", ".join(others))] if others else [])

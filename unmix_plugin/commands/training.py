@@ -65,9 +65,8 @@ def train(
     try:
         finish(trainer, console)
     except Interrupted as stop:
-        raise KeyboardInterrupt(
-            f"{stop}; go on with train(None, {method!r}, load_run={str(stop.run)!r})"
-        ) from stop
+        again = f"train(None, {method!r}, load_run={str(stop.run)!r})"
+        raise KeyboardInterrupt(f"{stop}; go on with {again}") from stop
     print(f"run: {trainer.run.path}", flush=True)
     return open_loaded(trainer.run.path, config.device).scene
 
@@ -110,16 +109,15 @@ def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> Traine
     from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 
     known, tree, given = dict(_names(config)), {}, {}
+    method = config.method_name
     for name, value in settings.items():
         plain = name.replace("-", "_")
         path = known.get(plain)
         if path is None:
             same = [found for found, at in known.items() if at[-1] == plain]
-            near = (
-                f"; did you mean {min(same, key=len)}?" if same else did_you_mean(plain, known, form="; {}")
-            )
-            listed = f"; unmix-train {config.method_name} --help-all lists all"
-            raise ConfigError(f"{config.method_name} has no setting {name}{near or listed}")
+            near = f"did you mean {min(same, key=len)}?" if same else did_you_mean(plain, known)
+            listed = f"unmix-train {method} --help-all lists all"
+            raise ConfigError(f"{method} has no setting {name}; {near or listed}")
         if path in given:
             raise ConfigError(f"{name} and {given[path]} are the same setting: give one of them")
         given[path] = name
@@ -170,11 +168,8 @@ def prepare(config: TrainerConfig, console: Console, processes: Processes | None
         f"computing on {trainer.pipeline.model.device}",
     )
     if trainer.progress >= 1.0:
-        say(
-            console,
-            f"nothing to train: the run is at its limit, with {trainer.step} steps in {trainer.seconds:.1f} s; "
-            "give a larger --max-num-iterations or --max-seconds",
-        )
+        limit = f"the run is at its limit, with {trainer.step} steps in {trainer.seconds:.1f} s"
+        say(console, f"nothing to train: {limit}; give a larger --max-num-iterations or --max-seconds")
     return trainer
 
 
@@ -196,7 +191,7 @@ def finish(trainer: Trainer, console: Console) -> None:
     if spectral_scene(data) is not None:  # remarks name settings of spectral methods
         num_pixels = int(data.metadata().get("num_train_pixels", 0))
         few = _remark_on_passes(record.total_rays, num_pixels)
-        for remark in [*_read_remarks(trainer.run.metrics_path), *few]:
+        for remark in [*_remarks(trainer.run.metrics_path), *few]:
             say(console, remark)
 
 
@@ -216,34 +211,29 @@ _FEW_PASSES = 3
 """Rays for each training pixel below which fine detail is still being learnt."""
 
 
-def _read_remarks(metrics_path: Path) -> list[str]:
-    """Remarks on a training's `metrics.jsonl`."""
+def _remarks(metrics_path: Path) -> list[str]:
+    """Sentences on a training's `metrics.jsonl`, whose `loss` is None where it was not finite."""
     from unmix_plugin.engine.training.progress import read_metrics
 
-    return _remarks([line for line in read_metrics(metrics_path) if line.get("split") == "train"])
-
-
-def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences on lines of training batches in order, each with `step` and `loss` (None: not finite)."""
+    lines = [line for line in read_metrics(metrics_path) if line.get("split") == "train"]
     known = [line for line in lines if line.get("loss") is not None]
     if len(known) < _FEWEST_LINES:
         return []
     first, third, last = (_typical_loss(known, quarter) for quarter in (1, 3, 4))
-    if None in (first, third, last) or not first or not third or last is None:
+    if not first or not third or last is None:
         return []
     found = []
     undone = int(known[-1].get("poses_undone") or 0)
     if undone:
         found.append(
             f"corrections of the poses of {counted(undone, 'view')} went beyond a quarter of the distance to the scene "
-            "or too far a turn and were undone: look whether these views belong to the scene, or train with "
-            "--poses fixed"
+            "or too far a turn and were undone: do these views belong to the scene? Else train with --poses fixed"
         )
     outliers = float(known[-1].get("pose_outliers") or 0)
     if outliers > _OUTLIERS:
         found.append(
             f"{outliers:.0%} of the views, or of the rows of line cameras, still fit far worse than the others and "
-            "hardly shape the scene: their poses are off by more than was found, or they show something else"
+            "hardly shape the scene: their poses are off, or they show something else"
         )
     matter = known[-1].get("matter_share")
     if matter is not None and matter < _LITTLE_MATTER:
@@ -267,12 +257,7 @@ def _remarks(lines: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _remark_on_passes(num_rays: int, num_pixels: int) -> list[str]:
-    """A remark if the training pixels were seen so rarely that more training will show more.
-
-    Args:
-        num_rays: Cast in all.
-        num_pixels: Of the training views; 0 if it is not known.
-    """
+    """A remark if the pixels of the training views (0: not known) were seen so rarely that more rays show more."""
     if num_pixels == 0 or num_rays >= _FEW_PASSES * num_pixels:
         return []
     rays = f"{num_rays / num_pixels:.2g} rays for each training pixel"

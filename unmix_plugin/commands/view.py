@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from unmix_plugin.engine.configs import DeviceName
+from unmix_plugin.products.product import RunOptions
 from unmix_plugin.viewer.access import ViewerOptions
 
 if TYPE_CHECKING:
@@ -19,11 +19,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ViewOptions:
+class ViewOptions(RunOptions):
     """Show a trained run in the browser: fly around, choose what to see, probe spectra, change materials and light."""
 
-    run: Path | None = None
-    """Run folder, as training printed it; None takes the newest under --output-dir."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it; without the scene only what was measured is
     missing."""
@@ -34,10 +32,6 @@ class ViewOptions:
     library: tuple[Path, ...] = ()
     """Known materials to compare with and to choose from, in place of the built-in ones: .csv, ENVI spectral libraries,
     texts of ECOSTRESS or USGS, or folders of them; +builtin adds the built-in ones."""
-    output_dir: Path = Path("outputs")
-    """Folder in which to look for the newest run."""
-    device: DeviceName = "auto"
-    """Where to compute; auto takes CUDA where there is one."""
     viewer: ViewerOptions = ViewerOptions()
     """How the viewer is served."""
 
@@ -69,7 +63,6 @@ def prepared(options: ViewOptions) -> Viewer:
         ConfigError: the method does not unmix spectra, the device is not there, or the recipe does not fit the run.
         SpectrumError: there is no such light, or a library that can't be read or compared.
     """
-
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, working
     from unmix_plugin.editing.apply import assumption_of_light
     from unmix_plugin.editing.edited_run import requested_recipe
@@ -88,10 +81,8 @@ def prepared(options: ViewOptions) -> Viewer:
     note = None if recipe is None else assumption_of_light(loaded.materials_scene, recipe)
     if note is not None:
         print(note, flush=True)
-    known = None
-    if options.library:
-        shown = loaded.materials_scene
-        known = library_of(options.library, shown.bands, shown.light_power)
+    shown = loaded.materials_scene if options.library else None
+    known = None if shown is None else library_of(options.library, shown.bands, shown.light_power)
     with working(console, "looking at the scene"):
         scene = partial(_scene_of, source, options.data)
         services = Services(source, scene, recipe, options.viewer.environments, known)
@@ -106,7 +97,6 @@ def _scene_of(source: SceneSource, data: Path | None) -> Scene:
     summary = source.record.summary
     scene = find_scene(summary, source.run.path, data)
     if scene is None:
-        raise SceneError(
-            f"it is no longer, or no longer the same, at {summary.get('root')}; name it with --data"
-        )
+        place = summary.get("root")
+        raise SceneError(f"it is no longer, or no longer the same, at {place}; name it with --data")
     return scene
