@@ -94,8 +94,7 @@ def plain_axes(axes: Any) -> None:
 def mark_lone_points(axes: Any) -> None:
     """Give a dot to each value that no line can lead to: those beside it are missing."""
     for line in axes.get_lines():
-        values = np.asarray(line.get_ydata(), dtype=np.float64)
-        is_known = np.pad(np.isfinite(values) & ((values > 0) | (axes.get_yscale() != "log")), 1)
+        is_known = np.pad(np.isfinite(np.asarray(line.get_ydata(), dtype=np.float64)), 1)
         is_alone = is_known[1:-1] & ~is_known[:-2] & ~is_known[2:]
         if is_alone.any():
             size = 2 * line.get_linewidth()
@@ -122,21 +121,17 @@ class ChartLine:
 
 
 @dataclass(frozen=True)
-class LineChart:
-    """Lines over a common axis."""
+class SpectraChart:
+    """Lines over wavelength, above a zero that is shown."""
 
     lines: Sequence[ChartLine]
-    x_label: str
-    y_label: str
-    is_log: bool = False
-    """Whether y is logarithmic; values that are not positive are then left out."""
-    from_zero: bool = False
-    """Whether y has to show 0."""
-    size: tuple[float, float] = (640.0, 300.0)
+    label: str
+    """Of what stands over wavelength."""
+    size: tuple[float, float] = (480.0, 240.0)
     """Width and height in px."""
 
 
-def draw_chart(chart: LineChart) -> bytes:
+def draw_chart(chart: SpectraChart) -> bytes:
     """The chart as an SVG file, without a legend; text is drawn as shapes, so that no font is needed."""
     import matplotlib
     from matplotlib.figure import Figure
@@ -147,17 +142,14 @@ def draw_chart(chart: LineChart) -> bytes:
         axes = figure.add_subplot()
         for line in chart.lines:
             axes.plot(line.x, line.y, color=line.colour, linewidth=line.width, linestyle=line.dash)
-        if chart.is_log and any((np.asarray(line.y) > 0).any() for line in chart.lines):
-            axes.set_yscale("log", nonpositive="mask")
-        elif chart.from_zero:
-            low, high = axes.get_ylim()
-            values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
-            least = values[np.isfinite(values)].min(initial=0.0)
-            axes.set_ylim(min(low, 0.0) if least < 0 else 0.0, max(high, 0.0))
+        low, high = axes.get_ylim()
+        values = np.concatenate([np.asarray(line.y, dtype=np.float64) for line in chart.lines])
+        least = values[np.isfinite(values)].min(initial=0.0)
+        axes.set_ylim(min(low, 0.0) if least < 0 else 0.0, max(high, 0.0))
         mark_lone_points(axes)
         axes.margins(x=0)
-        axes.set_xlabel(chart.x_label, color=_INK)
-        axes.set_ylabel(chart.y_label, color=_INK)
+        axes.set_xlabel("wavelength (nm)", color=_INK)
+        axes.set_ylabel(chart.label, color=_INK)
         axes.tick_params(which="both", colors=_SOFT)
         plain_axes(axes)
         buffer = io.BytesIO()

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float64, UInt8
 
 from unmix_plugin.figures.pictures import ColourScale, id_palette, over_neutral, paint
-from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, LineChart, css_colour
+from unmix_plugin.figures.plotting import RIGHT, WRONG, ChartLine, Colour, SpectraChart, css_colour
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.products.evaluation import material_look
 from unmix_plugin.products.views import SHARE_SCALE
@@ -37,7 +37,6 @@ ERROR_SCALE = ColourScale("magma", 0.0, 0.1, "root mean squared error over bands
 """Colours of errors of spectra."""
 _MAP_COLUMNS = (7, 6, 5)
 _STYLES = (("dashed", "#4b545c"), ("dotted", "#7a838b"), ("solid", "#a2aab1"))
-_SMALL = (480.0, 240.0)
 _EightBits = UInt8[np.ndarray, "H W 3"]
 _ItemT = TypeVar("_ItemT")
 
@@ -197,7 +196,7 @@ def scale_strip(scale: ColourScale) -> np.ndarray:
     return np.repeat(paint(np.linspace(scale.low, scale.high, 220)[None], scale), 12, axis=0)
 
 
-def error_chart(views: ReportViews) -> LineChart | None:
+def error_chart(views: ReportViews) -> SpectraChart | None:
     """Error against wavelength; None without measured views."""
     if views.error_of_bands is None:
         return None
@@ -206,11 +205,7 @@ def error_chart(views: ReportViews) -> LineChart | None:
         ChartLine(nm, rmse, "root mean squared error", "#0b5cad"),
         ChartLine(nm, bias, "mean of predicted less measured", "#c8501e", dash="dashed"),
     ]
-    return _spectra_chart(lines, f"{views.materials.quantity} (1 = full scale)", (900.0, 300.0))
-
-
-def _spectra_chart(lines: Sequence[ChartLine], label: str, size: tuple[float, float] = _SMALL) -> LineChart:
-    return LineChart(lines, "wavelength (nm)", label, from_zero=True, size=size)
+    return SpectraChart(lines, f"{views.materials.quantity} (1 = full scale)", (900.0, 300.0))
 
 
 def segmentation_section(views: ReportViews) -> dict[str, Any]:
@@ -288,7 +283,7 @@ def material_cards(
     cards = []
     for index, name in enumerate(materials.names):
         own = ChartLine(nm, spectra[index], name, css_colour(colours[index]), 3.0)
-        chart = _spectra_chart([*(line for line, *_ in matches[index]), own], materials.quantity)
+        chart = SpectraChart([*(line for line, *_ in matches[index]), own], materials.quantity)
         seen = {"name": name, "colour": colours[index], "proportion": float(proportions[index])}
         cards.append({**seen, "chart": chart, "matches": matches[index]})
     return cards
@@ -306,5 +301,5 @@ def region_card(
     ]
     entries = zip(materials.names, endmember_colours(materials), found.abundances.tolist(), strict=True)
     shares = sorted(entries, key=lambda entry: -entry[2])
-    chart, area = _spectra_chart(lines, materials.quantity), describe_area(found.area, scale)
+    chart, area = SpectraChart(lines, materials.quantity), describe_area(found.area, scale)
     return {"name": name, "area": area, "chart": chart, "shares": shares}

@@ -25,7 +25,7 @@ from unmix_plugin.engine.runs.atomic_files import read_plain_json, read_run_json
 from unmix_plugin.engine.runs.config_json import config_to_json
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, counted
-from unmix_plugin.figures.plotting import LineChart, css_colour, draw_chart
+from unmix_plugin.figures.plotting import SpectraChart, css_colour, draw_chart
 from unmix_plugin.formats.files import eight_bits, write_file
 from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
@@ -231,7 +231,7 @@ def _png_url(image: Float[np.ndarray, "H W 3"] | UInt8[np.ndarray, "H W 3"]) -> 
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _svg_url(chart: LineChart) -> str:
+def _svg_url(chart: SpectraChart) -> str:
     """A chart as a URL with the drawing in it."""
     return f"data:image/svg+xml;base64,{base64.b64encode(draw_chart(chart)).decode()}"
 
@@ -248,6 +248,7 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
     size = (scene.scene_box.size.cpu().double().numpy() / world_frame(scene).scale).tolist()
     cameras = scene.train_cameras
     sizes = sorted({cameras.size(index) for index in range(len(cameras))}, reverse=True)
+    light = "taken out: values are reflectance" if materials.quantity == "reflectance" else "recorded"
     named = [(word.capitalize(), about[word]) for word in ("object", "number", "author") if about.get(word)]
     return [
         *named,
@@ -255,17 +256,11 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
         ("Views", f"{len(cameras)} to learn from, {len(scene.eval_cameras)} to check with"),
         ("Pixels of a view", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("Bands", str(materials.bands)),
-        ("Light", _light_in_words(materials)),
+        ("Light", light if materials.is_light_known else "unknown, taken as flat"),
         ("Size of the scene", " x ".join(describe_length(edge, world.scale) for edge in size)),
         *([("Scale", world.scale.said)] if world.scale is not None else []),
         ("Training", f"{loaded.training.train_seconds:,.0f} s"),
     ]
-
-
-def _light_in_words(materials: Materials) -> str:
-    if not materials.is_light_known:
-        return "unknown, taken as flat"
-    return "taken out: values are reflectance" if materials.quantity == "reflectance" else "recorded"
 
 
 def _summary(
