@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import time
 from pathlib import Path
@@ -11,22 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commands.browser import CHROMIUM, FLAGS
+from tests.commands.browser import CHROMIUM, FLAGS, NEEDS_BROWSER
 from tests.viewer.pages import serving
 from tests.viewer.view_factory import make_source
 from unmix_plugin.commands.view import ViewOptions, prepared
 from unmix_plugin.viewer.access import ViewerOptions
 from unmix_plugin.viewer.rendering.painting import LAYERS
 
-MISSING = [
-    name
-    for name, is_there in (
-        ("the package playwright", importlib.util.find_spec("playwright") is not None),
-        ("the program chromium", CHROMIUM is not None),
-    )
-    if not is_there
-]
-pytestmark = pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")
+pytestmark = NEEDS_BROWSER
 
 WIDTH, HEIGHT, PANEL = 1000, 700, 400
 WAIT_MS = 60_000
@@ -43,9 +34,8 @@ class Browser:
     def picture(self):
         """The canvas without the panel, as 8-bit values."""
         clip = {"x": 0, "y": 0, "width": WIDTH - PANEL, "height": HEIGHT}
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")).astype(
-            float
-        )
+        shot = Image.open(io.BytesIO(self.page.screenshot(clip=clip))).convert("RGB")
+        return np.asarray(shot).astype(float)
 
     def keep(self, name):
         """Keep a screenshot of all of the page for whoever looks at it."""
@@ -53,13 +43,7 @@ class Browser:
 
     def wait_for_picture(self, holds):
         """The first picture for which something holds."""
-        until = time.monotonic() + WAIT_MS / 1000
-        while time.monotonic() < until:
-            picture = self.picture()
-            if holds(picture):
-                return picture
-            time.sleep(0.1)
-        raise AssertionError(f"no such picture came; see {self.folder}")
+        return first_of(self.picture, holds, f"picture; see {self.folder}")
 
     def wait_for_other(self, before):
         """The first picture that differs from one before and is not blank."""
@@ -111,14 +95,19 @@ def browser(viewer, tmp_path):
         chromium.close()
 
 
-def wait_for_file(folder: Path, pattern: str) -> Path:
+def first_of(make, holds, what):
+    """The first thing made for which something holds."""
     until = time.monotonic() + WAIT_MS / 1000
     while time.monotonic() < until:
-        found = list(folder.glob(pattern)) if folder.is_dir() else []
-        if found:
-            return found[0]
-        time.sleep(0.05)
-    raise AssertionError(f"no {pattern} in {folder}")
+        if holds(found := make()):
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"there came no such {what}")
+
+
+def wait_for_file(folder: Path, pattern: str) -> Path:
+    [*found] = first_of(lambda: list(folder.glob(pattern)), bool, f"{pattern} in {folder}")
+    return found[0]
 
 
 def test_a_run_is_looked_at_probed_edited_and_saved(viewer, browser):

@@ -24,11 +24,11 @@ EDGE = 0.004
 
 
 class BallField(CoefficientField):
-    """Matter between two spheres around the origin; and, if asked for, a wall behind it."""
+    """Matter between two spheres around the origin; and, if asked for, a wall behind it and gloss."""
 
-    def __init__(self, has_wall: bool = False) -> None:
+    def __init__(self, has_wall: bool = False, gloss: float | None = None) -> None:
         super().__init__()
-        self.has_wall = has_wall
+        self.has_wall, self.gloss = has_wall, gloss
 
     def encode(self, positions: Tensor, known: Tensor | None = None) -> Tensor:
         """Positions themselves."""
@@ -54,20 +54,25 @@ class BallField(CoefficientField):
     def get_outputs(
         self, positions: Tensor, directions: Tensor, features: Tensor, light: Lamplight | None = None
     ) -> dict[str, Tensor]:
-        """The same shade everywhere, and no gloss."""
+        """The same shade everywhere; gloss where one looks from straight above."""
         abundances = self.abundances_of(features)
+        specular = features.new_zeros(len(features), 0)
+        if self.gloss is not None:
+            cosines = (torch.nn.functional.normalize(features, dim=1) * directions).sum(dim=1, keepdim=True)
+            specular = self.gloss * cosines**2
         return {
             "abundances": abundances,
             "scaled_abundances": SHADE * abundances,
-            "specular_coefficients": features.new_zeros(len(features), 0),
+            "specular_coefficients": specular,
         }
 
 
-def ball_scene(has_wall: bool = False, **settings: Any) -> TrainedScene:
+def ball_scene(has_wall: bool = False, gloss: float | None = None, **settings: Any) -> TrainedScene:
     """A scene that renders the ball in steps of a hundredth."""
     renderer = RendererConfig(samples_per_pixel=8.7, smallest_weight=0.0)
-    model = make_model(specular="none", renderer=renderer, **settings)
-    model.field = BallField(has_wall)  # type: ignore[assignment]
+    kind = "none" if gloss is None else "dictionary"
+    model = make_model(specular=kind, num_specular_spectra=1, renderer=renderer, **settings)
+    model.field = BallField(has_wall, gloss)  # type: ignore[assignment]
     return scene_of(model)
 
 

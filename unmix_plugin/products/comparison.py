@@ -76,15 +76,14 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
         runs = [_without_blank(run) for run in runs]
     first, names = runs[0], _shared_views(runs, remarks)
     bands = {name: _shared_bands([run.bands[name] for run in runs]) for name in names if first.bands}
-    num_bands = [len(nm) for nm, _ in bands.values()]
     squared = {
         name: np.stack([run.bands[name].mse[rows] for run, rows in zip(runs, at, strict=True)], axis=1)
         for name, (_, at) in bands.items()
     }
-    if any(len(run.views) > len(names) for run in runs) or any(
-        len(run.bands[name].nm) > len(nm) for run in runs for name, (nm, _) in bands.items()
-    ):
-        shared = f"{counted(len(names), 'view')} and {counted(max(num_bands), 'band')}"
+    has_more_views = any(len(run.views) > len(names) for run in runs)
+    if has_more_views or any(len(run.bands[name].nm) > len(bands[name][0]) for run in runs for name in bands):
+        num_bands = max(len(nm) for nm, _ in bands.values())
+        shared = f"{counted(len(names), 'view')} and {counted(num_bands, 'band')}"
         remarks.append(f"runs differ in views or bands: psnr and rmse of what they share alone, {shared}")
         of_views = np.stack([errors.mean(axis=0) for errors in squared.values()])
         figures: list[_Row] = [
@@ -95,37 +94,40 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
         figures = _rows([run.figures for run in runs])
     settings = _rows([run.settings for run in runs])
     rows = [row for row in settings if any(value != row[1][0] for value in row[1])] + figures
-    views = [(name, *row) for name in names for row in _rows([run.views[name] for run in runs])]
     errors = [
         (name, f"{nm:g}", np.sqrt(row).tolist())
-        for name in names
-        if bands
-        for nm, row in zip(bands[name][0], squared[name], strict=True)
+        for name, (centers, _) in bands.items()
+        for nm, row in zip(centers, squared[name], strict=True)
     ]
+    views = [(name, *row) for name in names for row in _rows([run.views[name] for run in runs])]
     for file, keys, table in (
         ("figures", ["figure"], rows),
         ("views", ["view", "figure"], views),
         ("band_rmse", ["view", "wavelength_nm"], errors),
     ):
-        header = [*keys, *labels, *(f"{label} minus {labels[0]}" for label in labels[1:])]
-        lines = [
-            [*keyed, *map(shown, values), *(difference(one, values[0]) for one in values[1:])]
-            for *keyed, values in table
-        ]
-        write_file(folder / f"{file}.csv", csv_bytes([header, *lines]))
+        lines = [[*keys, *labels, *(f"{label} minus {labels[0]}" for label in labels[1:])]]
+        for *keyed, values in table:
+            differences = (difference(one, values[0]) for one in values[1:])
+            lines.append([*keyed, *map(shown, values), *differences])
+        write_file(folder / f"{file}.csv", csv_bytes(lines))
+    return Comparison(labels, rows, remarks, _write_pictures(runs, names, labels, folder))
+
+
+def _write_pictures(
+    runs: Sequence[ComparedRun], names: Sequence[str], labels: Sequence[str], folder: Path
+) -> int:
+    """Pictures that all runs have, one above the other, in place of earlier ones; and how many there are."""
     for earlier in folder.glob("*/*.png"):
         earlier.unlink()
-    kinds = sorted({path.parent.name for path in first.pictures.glob("*/*.png")})
     drawn = 0
-    for kind, name in ((kind, name) for kind in kinds for name in names):
-        pictures = [run.pictures / kind / f"{name}.png" for run in runs]
-        if all(path.is_file() for path in pictures):
-            write_file(
-                folder / kind / f"{name}.png",
-                one_above_the_other(pictures, [f"run {label}" for label in labels]),
-            )
-            drawn += 1
-    return Comparison(labels, rows, remarks, drawn)
+    for kind in sorted({path.parent.name for path in runs[0].pictures.glob("*/*.png")}):
+        for name in names:
+            pictures = [run.pictures / kind / f"{name}.png" for run in runs]
+            if all(path.is_file() for path in pictures):
+                page = one_above_the_other(pictures, [f"run {label}" for label in labels])
+                write_file(folder / kind / f"{name}.png", page)
+                drawn += 1
+    return drawn
 
 
 def shown(value: Any) -> str:
@@ -184,8 +186,7 @@ def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
     for other in runs[1:]:
         if bool(other.bands) != bool(first.bands):
             raise ConfigError(
-                f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure their views by "
-                "different definitions; compare runs of methods that measure alike"
+                f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure views differently"
             )
     names = [name for name in first.views if all(name in run.views for run in runs)]
     others = len({name for run in runs for name in run.views}) - len(names)
@@ -200,19 +201,17 @@ def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
         names = banded
         same = [name for name in names if _is_same([run.bands[name] for run in runs])]
     else:
-        alike = [
-            run.cameras.shape == first.cameras.shape and np.allclose(run.cameras, first.cameras, atol=1e-4)
-            for run in runs
-        ]
-        same = names if all(alike) and not others else []
+        poses = [run.cameras for run in runs]
+        alike = all(one.shape == poses[0].shape and np.allclose(one, poses[0], atol=1e-4) for one in poses)
+        same = names if alike and not others else []
     if len(same) < len(names):
         remarks.append(
             f"left out: {counted(len(names) - len(same), 'view')} of one name with other measurements"
         )
     if not same:
+        paths = " and ".join(str(run.path) for run in runs)
         raise ConfigError(
-            f"{' and '.join(str(run.path) for run in runs)} are runs of different scenes: no evaluation view shows the "
-            "same in all of them"
+            f"{paths} are runs of different scenes: no evaluation view shows the same in all of them"
         )
     return same
 

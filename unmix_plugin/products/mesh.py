@@ -10,18 +10,16 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float, Float32, Float64
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import (
     eight_bits,
-    grey_png_bytes,
     indexed_png_bytes,
     rgba_png_bytes,
     write_file,
@@ -42,33 +40,27 @@ _MOST_SMOOTHING = 8.0
 
 def export(job: Job, asked: Mesh) -> list[Path]:
     """Sample the density, march through it, trim and colour the surface."""
-    density, smoothing, formats, texture_size = (
-        asked.density,
-        asked.smoothing,
-        asked.formats,
-        asked.texture_size,
-    )
+    density, smoothing, formats = asked.density, asked.smoothing, asked.formats
     if density is not None and not 0 < density < math.inf:
         raise ConfigError(f"--density is {density:g}; it must be greater than 0")
     if not 0 <= smoothing <= _MOST_SMOOTHING:
         raise ConfigError(f"--smoothing is {smoothing:g}; choose 0 to {_MOST_SMOOTHING:g} cells")
-    if texture_size is None and importlib.util.find_spec("xatlas") is None:
-        texture_size = 0
+    has_textures = asked.texture_size != 0 and bool({"glb", "obj"} & set(formats))
+    if asked.texture_size is None and importlib.util.find_spec("xatlas") is None:
+        has_textures = False
         job.say("no textures, since xatlas is not installed: GLB and OBJ have colours of vertices")
-    names = job.materials.names if texture_size != 0 and {"glb", "obj"} & set(formats) else None
-    job.claim(_mesh_paths(job.folder, formats, names))
+    job.claim(_mesh_paths(job.folder, formats, job.materials.names if has_textures else None))
     mesh, threshold = find_surface(job, asked.resolution, density, smoothing, asked.unseen == "keep")
     textures = None
-    if names is not None:
+    if has_textures:
         with job.working("making textures"):
-            textures = _textures(job.scene, mesh, texture_size)
+            textures = _textures(job.scene, mesh, asked.texture_size)
         job.say(f"textures of {textures.size} x {textures.size} texels")
     with job.working("making the mesh"):
         written = _write_mesh(job.folder, formats, mesh, job.scene, job.frame, asked.up, textures)
-    job.say(
-        f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles, "
-        f"at a density of {threshold * job.frame.scale:.4g} per world unit"
-    )
+    density = threshold * job.frame.scale
+    found = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles"
+    job.say(f"{found}, at a density of {density:.4g} per world unit")
     if "glb" in formats:
         say_units(job, "mesh.glb")
     return written
@@ -109,7 +101,6 @@ def _texture_path(folder: Path, name: str) -> Path:
 
 _TEXTURE_SIZES = (1024, 2048, 4096)
 """Tried one after the other until the charts fit."""
-_TEXTURE_BOUNDS = (16, 8192)
 _TEXELS = 1 << 16
 """Looked at together."""
 
@@ -130,7 +121,7 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
     Raises:
         ConfigError: xatlas is not installed, or the charts don't fit into a texture of the size asked for.
     """
-    low, high = _TEXTURE_BOUNDS
+    low, high = 16, 8192
     if size is not None and not low <= size <= high:
         raise ConfigError(f"--texture-size is {size}; choose {low} to {high} texels, or 0 for no textures")
     atlas, size = _unwrapped(mesh, _TEXTURE_SIZES if size is None else (size,))
@@ -153,8 +144,7 @@ def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Tex
     }
     for index, name in enumerate(property_names(names)):
         about = f"share of {names[index]}: 0 to 255 are 0 to 1"
-        shown = np.ascontiguousarray(share_pictures[..., index])
-        pictures[name] = grey_png_bytes(shown, about)
+        pictures[name] = rgba_png_bytes(np.ascontiguousarray(share_pictures[..., index]), about)
     return _Textures(atlas, size, pictures)
 
 
@@ -188,27 +178,26 @@ def _write_mesh(
     looks = SurfaceAppearance(scene.materials, *seen, scale=scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     turned = directions_to_world(frame, normals).astype(np.float32)
-    glb = partial(
-        _write_glb,
-        up=world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0]),
-        textures=textures,
-    )
-    writers = {"ply": _write_ply, "obj": partial(_write_obj, textures=textures), "glb": glb}
-    return [path for kind in formats for path in writers[kind](_paths(folder, kind)[0], world, turned, looks)]
+    axis = world_up(scene.views, frame) if up == "y" else np.array([0.0, 1.0, 0.0])
+    written: list[Path] = []
+    for kind in formats:
+        path = _paths(folder, kind)[0]
+        if kind == "ply":
+            vertices = xyz_columns(world.vertices) | xyz_columns(turned, "n") | looks.properties()
+            written.append(write_ply(path, vertices, world.faces, looks.comments(_WHAT)))
+        elif kind == "obj":
+            written += _write_obj(path, world, turned, looks, textures)
+        else:
+            written.append(_write_glb(path, world, turned, looks, axis, textures))
+    return written
+
+
+def xyz_columns(vectors: Float[np.ndarray, "P 3"], prefix: str = "") -> dict[str, np.ndarray]:
+    """Vectors as three properties of a PLY."""
+    return {f"{prefix}{name}": vectors[:, axis] for axis, name in enumerate("xyz")}
 
 
 _WHAT = "surface of an unmix-nerf run"
-
-
-def _write_ply(
-    path: Path, mesh: TriangleMesh, normals: Float32[np.ndarray, "V 3"], looks: SurfaceAppearance
-) -> list[Path]:
-    vertices = {
-        **{name: mesh.vertices[:, axis] for axis, name in enumerate("xyz")},
-        **{f"n{name}": normals[:, axis] for axis, name in enumerate("xyz")},
-        **looks.properties(),
-    }
-    return [write_ply(path, vertices, mesh.faces, looks.comments(_WHAT))]
 
 
 def _write_obj(
@@ -226,18 +215,9 @@ def _write_obj(
         for name, content in textures.pictures.items():
             pictures.append(write_file(_texture_path(path.parent, name), content))
         shown = (textures.atlas.uv, textures.atlas.faces, pictures[0].name)
-    written = write_obj(
-        path.with_suffix(""),
-        mesh.vertices,
-        normals,
-        looks.srgb,
-        mesh.faces,
-        materials,
-        looks.materials.names,
-        looks.palette,
-        looks.comments(_WHAT),
-        shown,
-    )
+    vertices = (mesh.vertices, normals, looks.srgb)
+    named = (looks.materials.names, looks.palette, looks.comments(_WHAT))
+    written = write_obj(path.with_suffix(""), *vertices, mesh.faces, materials, *named, shown)
     return [*written, *pictures]
 
 
@@ -248,7 +228,7 @@ def _write_glb(
     looks: SurfaceAppearance,
     up: Float64[np.ndarray, "3"],
     textures: _Textures | None,
-) -> list[Path]:
+) -> Path:
     positions, numbers, extras = gltf_content(mesh, looks, _WHAT)
     faces, uv, pictures, colours = mesh.faces, None, None, looks.linear_rgb
     if textures is not None:
@@ -256,7 +236,7 @@ def _write_glb(
         positions, normals, colours = positions[chosen], normals[chosen], colours[chosen]
         numbers = {name: values[chosen] for name, values in numbers.items()}
         pictures = textures.pictures
-    return [write_glb(path, positions, normals, colours, faces, numbers, extras, up, uv, pictures)]
+    return write_glb(path, positions, normals, colours, faces, numbers, extras, up, uv, pictures)
 
 
 def gltf_content(

@@ -25,10 +25,8 @@ from unmix_plugin.trained.evaluation import PredictedView, as_numpy
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _PcaOf = Literal["spectra", "abundances"]
-
 _PIXELS = 48 * 48
 """Of each view that the components are found from."""
-
 _LEAST_EXPLAINED = 1e-6
 """Part of the variance that a component has to explain to be shown."""
 
@@ -69,9 +67,9 @@ def _find_components(values: Sequence[Float[Tensor, "_ C"]], of: _PcaOf) -> _Com
     together = torch.cat(list(values)).double()
     colours = PcaColours.fit(together)
     centred = together - colours.mean
-    total = float(centred.square().sum())
-    along = (centred @ colours.axes).square().sum(dim=0).tolist()
-    first, second, third = (part / total if total > 0 else 0.0 for part in along)
+    total = max(float(centred.square().sum()), 1e-300)
+    along = (centred @ colours.axes).square().sum(dim=0)
+    first, second, third = (along / total).tolist()
     # What is left of abundances that sum to 1, or of mixtures of few spectra, is rounding: it would be drawn as noise.
     tells = (torch.tensor([first, second, third]) > _LEAST_EXPLAINED).double()
     high = colours.high * tells + (1 - tells)
@@ -92,18 +90,14 @@ def _painted(name: str, view: PredictedView, components: _Components) -> bytes:
 
 def _table(components: _Components, materials: Materials) -> bytes:
     """What red, green and blue stand for: a row for each band or endmember, with its mean and its weight in each
-    component; then the values that become 0 and 1, and the part of the variance that each component explains.
-    """
+    component; then the values that become 0 and 1, and the part of the variance that each component explains."""
     colours = components.colours
     of_spectra = components.of == "spectra"
     names = [f"{nm:g}" for nm in materials.bands.centers_nm] if of_spectra else list(materials.names)
     rows = [["wavelength" if of_spectra else "endmember", "mean", "red", "green", "blue"]]
     for name, mean, axes in zip(names, colours.mean.tolist(), colours.axes.tolist(), strict=True):
         rows.append([name, f"{mean:.9g}", *(f"{value:.9g}" for value in axes)])
-    for name, row in (
-        ("value of 0", colours.low.tolist()),
-        ("value of 1", colours.high.tolist()),
-        ("explained variance", components.explained),
-    ):
+    ends = {"value of 0": colours.low.tolist(), "value of 1": colours.high.tolist()}
+    for name, row in {**ends, "explained variance": components.explained}.items():
         rows.append([name, "", *(f"{value:.9g}" for value in row)])
     return csv_bytes(rows)

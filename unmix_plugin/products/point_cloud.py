@@ -19,6 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, RunError, counted
 from unmix_plugin.formats.meshes import write_ply
+from unmix_plugin.products.mesh import xyz_columns
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.scene_products import PointCloud
 from unmix_plugin.scenes.scene import Normalisation
@@ -217,8 +218,8 @@ def _write_point_cloud(
     world = positions_for_files(frame.to_world(positions[chosen]))
     turned = directions_to_world(frame, normals).astype(np.float32)
     vertices = {
-        **{name: world[:, axis] for axis, name in enumerate("xyz")},
-        **{f"n{name}": turned[:, axis] for axis, name in enumerate("xyz")},
+        **xyz_columns(world),
+        **xyz_columns(turned, "n"),
         **looks.properties(),
         **{score.property: score.values(diffuse, materials.light) for score in scores},
     }

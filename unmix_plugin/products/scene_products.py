@@ -189,7 +189,7 @@ class Scale(RunWork):
 
     def write(self, job: Job) -> list[Path]:
         """Find the points, set the scale."""
-        from unmix_plugin.products.measuring import set_scale
+        from unmix_plugin.products.regions import set_scale
 
         return set_scale(job, self)
 

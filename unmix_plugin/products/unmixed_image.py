@@ -41,7 +41,7 @@ class BandAxis:
     """Where the image lies, as entries of an ENVI header."""
 
 
-def unmixed_image_paths(folder: Path, has_library: bool = False, has_fractions: bool = False) -> list[Path]:
+def unmixed_image_paths(folder: Path, has_library: bool, has_fractions: bool) -> list[Path]:
     """Files that `write_unmixed_image` makes."""
     cubes = [path for name in ("abundances", "confidence") for path in envi_cube_paths(folder / name)]
     cubes += [folder / "angles.csv"] if has_library else []
@@ -53,8 +53,8 @@ def write_unmixed_image(
     folder: Path,
     found: UnmixedImage,
     axis: BandAxis,
-    library: MaterialLibrary | None = None,
-    fractions: NoiseFractions | None = None,
+    library: MaterialLibrary | None,
+    fractions: NoiseFractions | None,
 ) -> list[str]:
     """Write everything, and return the materials' names.
 
@@ -65,19 +65,23 @@ def write_unmixed_image(
     Raises:
         RunError: the disk is full or refuses.
     """
-    table, plot, maps, *_ = unmixed_image_paths(make_folder(folder))
+    make_folder(folder)
     names = [f"material {number}" for number in range(1, len(found.endmembers) + 1)]
-    bands = None if axis.wavelengths_nm is None else Bands.of(axis.wavelengths_nm)
     spectra = found.endmembers.astype(np.float64)
+    bands = None if axis.wavelengths_nm is None else Bands.of(axis.wavelengths_nm)
     if bands is None:
-        write_file(table, _numbered_table(names, spectra, axis.numbers))
+        x, x_label, own = axis.numbers, "band", np.resize(_FIRST_COLOURS, (len(names), 3))
+        rows = [
+            [number, *(f"{value:.9g}" for value in row)] for number, row in zip(x, spectra.T, strict=True)
+        ]
+        write_file(folder / "endmembers.csv", csv_bytes([["band", *names], *rows]))
     else:
-        write_spectra_csv(table, SpectraTable(bands, tuple(names), spectra))
-    colours = _colours(found, bands)
-    x = axis.numbers if bands is None else bands.centers_nm
-    x_label = "band" if bands is None else "wavelength (nm)"
-    write_file(plot, draw_spectra(spectra, x, names, colours, (x_label, "value in the image's unit")))
-    write_file(maps, _maps(found, names, colours))
+        x, x_label = bands.centers_nm, "wavelength (nm)"
+        own = own_colours(torch.from_numpy(spectra / max(float(spectra.max()), 1e-12)), bands)
+        write_spectra_csv(folder / "endmembers.csv", SpectraTable(bands, tuple(names), spectra))
+    colours, labels = distinct_colours(own), (x_label, "value in the image's unit")
+    write_file(folder / "endmembers.png", draw_spectra(spectra, x, names, colours, labels))
+    write_file(folder / "maps.png", _maps(found, names, colours))
     about = f"abundances: shares of {found.shares}, 0 to 1"
     write_envi_cube(folder / "abundances", found.abundances, None, names, about, axis.on_map)
     trust = np.stack([found.confidence, found.misfit], axis=-1)
@@ -88,33 +92,14 @@ def write_unmixed_image(
     if library is not None and bands is not None:
         write_file(folder / "angles.csv", angles_csv(library, names, spectra, bands, None))
     if fractions is not None:
-        _write_fractions(folder, fractions, axis.on_map)
+        cube = fractions.components.numpy().astype(np.float32)
+        fraction_names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
+        about = "minimum noise fractions: noise 1; 0 where nothing was measured"
+        write_envi_cube(folder / "mnf", cube, None, fraction_names, about, axis.on_map)
+        ratios = enumerate(fractions.signal_to_noise.tolist(), 1)
+        table = [("component", "signal to noise"), *((number, f"{ratio:.9g}") for number, ratio in ratios)]
+        write_file(folder / "mnf.csv", csv_bytes(table))
     return names
-
-
-def _write_fractions(folder: Path, found: NoiseFractions, on_map: Mapping[str, str] | None) -> None:
-    """Minimum noise fractions as a cube, and the ratio of signal to noise of all of them as a table."""
-    cube = found.components.numpy().astype(np.float32)
-    names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
-    about = "minimum noise fractions: noise 1; 0 where nothing was measured"
-    write_envi_cube(folder / "mnf", cube, None, names, about, on_map)
-    rows = [(number, f"{ratio:.9g}") for number, ratio in enumerate(found.signal_to_noise.tolist(), 1)]
-    write_file(folder / "mnf.csv", csv_bytes([("component", "signal to noise"), *rows]))
-
-
-def _numbered_table(names: list[str], spectra: np.ndarray, numbers: np.ndarray) -> bytes:
-    bands = zip(numbers, spectra.T, strict=True)
-    rows = [[number, *(f"{value:.9g}" for value in row)] for number, row in bands]
-    return csv_bytes([["band", *names], *rows])
-
-
-def _colours(found: UnmixedImage, bands: Bands | None) -> np.ndarray:
-    """As the materials look, where wavelengths are known."""
-    count = len(found.endmembers)
-    if bands is None:
-        return distinct_colours(np.resize(_FIRST_COLOURS, (count, 3)))
-    spectra = torch.from_numpy(found.endmembers / max(float(found.endmembers.max()), 1e-12))
-    return distinct_colours(own_colours(spectra, bands))
 
 
 def _maps(found: UnmixedImage, names: list[str], colours: np.ndarray) -> bytes:
