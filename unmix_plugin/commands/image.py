@@ -59,18 +59,10 @@ def image(argv: list[str]) -> None:
     """
     options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
-    from unmix_plugin.captures.calibration.references import (
-        find_missing,
-        own_dark_mean,
-        stated_values,
-    )
+    from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean, stated_values
     from unmix_plugin.captures.readers.opening import open_spectral_file
     from unmix_plugin.formats.files import NOT_PORTABLE, refuse_to_overwrite, safe_name
-    from unmix_plugin.products.unmixed_image import (
-        BandAxis,
-        unmixed_image_paths,
-        write_unmixed_image,
-    )
+    from unmix_plugin.products.unmixed_image import unmixed_image_paths, write_unmixed_image
     from unmix_plugin.spectral.unmixing.image import unmix_image
 
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
@@ -89,8 +81,8 @@ def image(argv: list[str]) -> None:
     _say_what_was_read(opened, mask, len(bands), library is not None)
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
-    axis = BandAxis(wavelengths, bands + 1, opened.metadata.get("map"))
-    names = write_unmixed_image(folder, found, axis, library, fractions)
+    place = opened.metadata.get("map")
+    names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)
     for path in paths:
         print(f"  {path}")
@@ -101,9 +93,8 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
     from unmix_plugin.captures.calibration.references import is_srgb, stated_reflectance
     from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
-    print(
-        f"{opened.path}: {mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}", flush=True
-    )
+    size = f"{mask.shape[0]} x {mask.shape[1]} pixels, {counted(num_bands, 'band')}"
+    print(f"{opened.path}: {size}", flush=True)
     for warning in opened.warnings:
         print(f"looks wrong: {warning}")
     if "geo_reference" in opened.metadata:
@@ -115,9 +106,8 @@ def _say_what_was_read(opened: SpectralFile, mask: np.ndarray, num_bands: int, i
     if is_compared and stated_reflectance(opened) is None:
         print(f"note: the file does not say that it holds reflectance. If it does not, {LIGHT_UNKNOWN}")
     if left_out := opened.shape[2] - num_bands:
-        print(
-            f"{counted(left_out, 'band')} left out: marked as bad in the file, or of a wavelength that is there twice"
-        )
+        why = "marked as bad in the file, or of a wavelength that is there twice"
+        print(f"{counted(left_out, 'band')} left out: {why}")
     if not mask.all():
         print(f"{counted(int((~mask).sum()), 'pixel')} without a measurement in every band left out")
 
@@ -154,9 +144,8 @@ def _library(options: _ImageOptions, wavelengths: np.ndarray | None) -> Material
     if not options.library:
         return None
     if wavelengths is None:
-        raise CaptureError(
-            f"{options.file}: its wavelengths are not known, so no spectrum of a library can be compared"
-        )
+        unknown = "its wavelengths are not known, so no spectrum of a library can be compared"
+        raise CaptureError(f"{options.file}: {unknown}")
     return library_of(options.library, Bands.of(wavelengths))
 
 

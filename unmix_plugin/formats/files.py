@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from unmix_plugin.engine.runs.atomic_files import (
+from unmix_plugin.engine.runs.atomic_files import (  # noqa: F401 - some of them for others, who take them from here
     NOT_PLAIN,
     NOT_PORTABLE,
     make_folder,
@@ -31,22 +31,6 @@ from unmix_plugin.errors import ConfigError
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-
-__all__ = [
-    "NOT_PLAIN",
-    "NOT_PORTABLE",
-    "RowSink",
-    "array_bytes",
-    "csv_bytes",
-    "indexed_png_bytes",
-    "make_folder",
-    "npy_rows",
-    "raw_rows",
-    "refuse_to_overwrite",
-    "rgba_png_bytes",
-    "safe_name",
-    "write_file",
-]
 
 RowSink: TypeAlias = Callable[[np.ndarray], None]
 """Takes the next rows of an image, (rows, W, ...), from the top down."""

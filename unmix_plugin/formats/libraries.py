@@ -317,14 +317,11 @@ def _usgs_wavelengths(path: Path, count: int) -> Float64[np.ndarray, " B"]:
     """Of splib07, whose spectra are lists of values alone: the one list of wavelengths of that length nearby."""
     folders = (path.parent, path.resolve().parent.parent)
     near = [one for folder in folders for one in sorted(folder.glob("*[Ww]avelengths*.txt"))]
-    lists = {np.ravel(rows).tobytes(): np.ravel(rows) for rows in map(_column, near) if len(rows) == count}
+    columns = ([row[0] for row in _words_and_numbers(one)[1] if len(row) == 1] for one in near)
+    lists = {tuple(column) for column in columns if len(column) == count}
     if len(lists) != 1:
         raise SpectrumError(
             f"it has {count} values without wavelengths, and {len(lists)} lists of {count} wavelengths lie beside it "
             "or above; put the *Wavelengths*.txt of its spectrometer there"
         )
-    return next(iter(lists.values())) * 1000.0
-
-
-def _column(path: Path) -> list[float]:
-    return [row[0] for row in _words_and_numbers(path)[1] if len(row) == 1]
+    return np.array(lists.pop()) * 1000.0

@@ -31,8 +31,7 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
     Raises:
         ConfigError: a library to compare with what another sensor sees.
     """
-    materials, folder = job.materials, job.folder
-    paths = _endmember_paths(folder)
+    materials, paths = job.materials, _endmember_paths(job.folder)
     if materials.sensor is not None:
         if asked.library:
             raise ConfigError(
@@ -40,18 +39,17 @@ def export(job: Job, asked: Endmembers) -> list[Path]:
             )
         job.claim(paths)
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
-        _write_endmembers(folder, materials)
+        _write_endmembers(job.folder, materials)
         return paths
-    light = job.scene.light_power
+    light, angles_path = job.scene.light_power, job.folder / "angles.csv"
     known = library_of(asked.library, materials.bands, light)
-    paths.append(folder / "angles.csv")
-    job.claim(paths)
+    job.claim([*paths, angles_path])
     if not materials.is_light_known:
         job.say(LIGHT_UNKNOWN)
-    _write_endmembers(folder, materials)
+    _write_endmembers(job.folder, materials)
     table = materials.table()
-    write_file(paths[-1], angles_csv(known, table.names, table.spectra, table.bands, light, asked.compare))
-    return paths
+    angles = angles_csv(known, table.names, table.spectra, table.bands, light, asked.compare)
+    return [*paths, write_file(angles_path, angles)]
 
 
 def angles_csv(
@@ -75,8 +73,8 @@ def angles_csv(
 
 
 def _endmember_paths(folder: Path) -> list[Path]:
-    names = [folder / "endmembers.csv", folder / "endmembers.png"]
-    return [names[0], *envi_library_paths(folder / "endmembers"), names[1]]
+    base = folder / "endmembers"
+    return [folder / "endmembers.csv", *envi_library_paths(base), folder / "endmembers.png"]
 
 
 def _write_endmembers(folder: Path, materials: Materials) -> None:

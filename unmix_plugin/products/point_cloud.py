@@ -8,6 +8,7 @@ Notation: `P` points, `B` bands.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,34 +137,26 @@ class _PointScore:
 def _require_point_scores(
     outputs: Sequence[str], bands: Bands, lit: Bool[Tensor, "B"] | None = None
 ) -> list[_PointScore]:
-    """Numbers to add to points; an output asked for twice is given once."""
-    scores: list[_PointScore] = []
-    for output in dict.fromkeys(_plain(output) for output in outputs):
-        if not is_reflectance_map(output) or not output.partition(":")[2]:
+    """Numbers to add to points, each once; called `index_ndvi` of a named index, else by kind and number: formats know
+    few characters."""
+    scores: dict[str, _PointScore] = {}
+    counts: Counter[str] = Counter()
+    for asked in outputs:
+        kind, colon, argument = asked.partition(":")
+        plain = argument.strip().lower()
+        is_named = kind == "index" and plain in NAMED_INDICES
+        output = f"{kind}{colon}{plain}" if is_named else asked
+        if not is_reflectance_map(output) or not argument:
             raise ConfigError(
                 f"--outputs {output}: points take spectral indices, index:NAME or index:FORMULA such as "
                 "index:ndvi, targets, target:FILE.csv or target:ace:FILE.csv, library:FILE and absorption:LOW-HIGH; "
                 "colour, material and abundances are in every cloud"
             )
-        name = _property_name(output, [score.property for score in scores])
-        scores.append(_PointScore(output, name, parse_reflectance_map(output, bands, lit)))
-    return scores
-
-
-def _plain(output: str) -> str:
-    """Named indices in the one way that their table has them."""
-    kind, colon, argument = output.partition(":")
-    name = argument.strip().lower()
-    return f"{kind}{colon}{name if kind == 'index' and name in NAMED_INDICES else argument}"
-
-
-def _property_name(output: str, taken: Sequence[str]) -> str:
-    """`index_ndvi` of a named index; else the kind and the least number that is free: formats know few characters."""
-    kind, _, argument = output.partition(":")
-    if kind == "index" and argument in NAMED_INDICES:
-        return f"index_{argument.replace('-', '_')}"
-    number = next(count for count in range(1, len(taken) + 2) if f"{kind}_{count}" not in taken)
-    return f"{kind}_{number}"
+        if output not in scores:
+            counts[kind] += not is_named
+            name = f"index_{plain.replace('-', '_')}" if is_named else f"{kind}_{counts[kind]}"
+            scores[output] = _PointScore(output, name, parse_reflectance_map(output, bands, lit))
+    return list(scores.values())
 
 
 _RAYS_PER_POINT = 5

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from trimesh import triangles
 
 from unmix_plugin.formats.meshes import Gaussians, least_turns, write_splats_glb, write_splats_ply
@@ -46,7 +46,8 @@ def export(job: Job, asked: Splats) -> list[Path]:
         looks = SurfaceAppearance(materials, seen.abundances, materials.spectra(seen), scene.scale)
     world = TriangleMesh(positions_for_files(frame.to_world(mesh.vertices)), mesh.faces)
     positions, numbers, extras = gltf_content(world, looks, _WHAT)
-    widths = _WIDTH * np.sqrt(_vertex_areas(world))
+    areas = vertex_areas(triangles.area(world.vertices[mesh.faces]), mesh.faces, len(world.vertices))
+    widths = _WIDTH * np.sqrt(np.maximum(areas, 0.01 * np.mean(areas)))
     splats = Gaussians(
         positions,
         least_turns(np.eye(3)[2:], directions_to_world(frame, normals)).astype(np.float32),
@@ -55,9 +56,8 @@ def export(job: Job, asked: Splats) -> list[Path]:
         _OPACITY,
     )
     axis = world_up(scene.views, frame) if asked.up == "y" else np.array([0.0, 1.0, 0.0])
-    written = []
     if "glb" in paths:
-        written.append(write_splats_glb(paths["glb"], splats, numbers, extras, axis))
+        write_splats_glb(paths["glb"], splats, numbers, extras, axis)
     if "ply" in paths:
         own = {name.lower().lstrip("_"): values for name, values in numbers.items()}
         comments = looks.comments(_WHAT)
@@ -66,17 +66,11 @@ def export(job: Job, asked: Splats) -> list[Path]:
         if asked.up == "y":
             splats = _turned(splats, axis)
             comments.append("turned so that -y is up; --up z keeps the axes of the world")
-        written.append(write_splats_ply(paths["ply"], splats, own, comments))
+        write_splats_ply(paths["ply"], splats, own, comments)
     job.say(f"{len(positions)} Gaussians")
     if "glb" in paths:
         say_units(job, "splats.glb")
-    return written
-
-
-def _vertex_areas(mesh: TriangleMesh) -> Float64[np.ndarray, " V"]:
-    """Of each vertex a third of the area of its triangles, at least a hundredth of the mean."""
-    areas = vertex_areas(triangles.area(mesh.vertices[mesh.faces]), mesh.faces, len(mesh.vertices))
-    return np.maximum(areas, 0.01 * np.mean(areas))
+    return list(paths.values())
 
 
 def _turned(splats: Gaussians, up: Float[np.ndarray, "3"]) -> Gaussians:

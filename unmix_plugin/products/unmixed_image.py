@@ -6,7 +6,6 @@ Notation: `H x W` pixels, `B` bands, `K` materials.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,18 +28,6 @@ _FIRST_COLOURS = np.array(
 )
 
 
-@dataclass(frozen=True)
-class BandAxis:
-    """What a file says of its bands and its place."""
-
-    wavelengths_nm: Float64[np.ndarray, " B"] | None
-    """Strictly increasing; None where they are not known."""
-    numbers: Int[np.ndarray, " B"]
-    """Of the bands in the file, from 1."""
-    on_map: Mapping[str, str] | None = None
-    """Where the image lies, as entries of an ENVI header."""
-
-
 def unmixed_image_paths(folder: Path, has_library: bool, has_fractions: bool) -> list[Path]:
     """Files that `write_unmixed_image` makes."""
     cubes = [path for name in ("abundances", "confidence") for path in envi_cube_paths(folder / name)]
@@ -52,14 +39,18 @@ def unmixed_image_paths(folder: Path, has_library: bool, has_fractions: bool) ->
 def write_unmixed_image(
     folder: Path,
     found: UnmixedImage,
-    axis: BandAxis,
+    wavelengths_nm: Float64[np.ndarray, " B"] | None,
+    numbers: Int[np.ndarray, " B"],
+    on_map: Mapping[str, str] | None,
     library: MaterialLibrary | None,
     fractions: NoiseFractions | None,
 ) -> list[str]:
     """Write everything, and return the materials' names.
 
     Args:
-        folder, found, axis: Where and what.
+        folder, found: Where and what.
+        wavelengths_nm, numbers: Of the bands, strictly increasing if known, and from 1 in the file.
+        on_map: Where the image lies, as entries of an ENVI header.
         library: Known spectra to which angles are written, where wavelengths are known.
         fractions: Minimum noise fractions, if asked for.
     Raises:
@@ -68,9 +59,9 @@ def write_unmixed_image(
     make_folder(folder)
     names = [f"material {number}" for number in range(1, len(found.endmembers) + 1)]
     spectra = found.endmembers.astype(np.float64)
-    bands = None if axis.wavelengths_nm is None else Bands.of(axis.wavelengths_nm)
+    bands = None if wavelengths_nm is None else Bands.of(wavelengths_nm)
     if bands is None:
-        x, x_label, own = axis.numbers, "band", np.resize(_FIRST_COLOURS, (len(names), 3))
+        x, x_label, own = numbers, "band", np.resize(_FIRST_COLOURS, (len(names), 3))
         rows = [
             [number, *(f"{value:.9g}" for value in row)] for number, row in zip(x, spectra.T, strict=True)
         ]
@@ -83,19 +74,19 @@ def write_unmixed_image(
     write_file(folder / "endmembers.png", draw_spectra(spectra, x, names, colours, labels))
     write_file(folder / "maps.png", _maps(found, names, colours))
     about = f"abundances: shares of {found.shares}, 0 to 1"
-    write_envi_cube(folder / "abundances", found.abundances, None, names, about, axis.on_map)
+    write_envi_cube(folder / "abundances", found.abundances, None, names, about, on_map)
     trust = np.stack([found.confidence, found.misfit], axis=-1)
     about = (
         "probability that the largest abundance is the largest in truth; angle between pixel and mixture, rad"
     )
-    write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about, axis.on_map)
+    write_envi_cube(folder / "confidence", trust, None, ["confidence", "misfit"], about, on_map)
     if library is not None and bands is not None:
         write_file(folder / "angles.csv", angles_csv(library, names, spectra, bands, None))
     if fractions is not None:
         cube = fractions.components.numpy().astype(np.float32)
         fraction_names = [f"MNF {number}" for number in range(1, cube.shape[2] + 1)]
         about = "minimum noise fractions: noise 1; 0 where nothing was measured"
-        write_envi_cube(folder / "mnf", cube, None, fraction_names, about, axis.on_map)
+        write_envi_cube(folder / "mnf", cube, None, fraction_names, about, on_map)
         ratios = enumerate(fractions.signal_to_noise.tolist(), 1)
         table = [("component", "signal to noise"), *((number, f"{ratio:.9g}") for number, ratio in ratios)]
         write_file(folder / "mnf.csv", csv_bytes(table))

@@ -15,12 +15,12 @@ import gzip
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from itertools import compress
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -87,15 +87,6 @@ class PageContent:
     """Endmembers and the light that they are seen in, where there are bands."""
 
 
-@runtime_checkable
-class _ShownAsPage(Protocol):
-    """A trained scene without mixed materials that says itself what a page shows of it."""
-
-    def page_content(self, resolution: int) -> PageContent:
-        """Its surface with about so many cells along the longest edge."""
-        ...
-
-
 def export(job: Job, asked: Page) -> list[Path]:
     """Find the surface, look at every vertex, and write `page.html`, with as many triangles as fit.
 
@@ -103,23 +94,24 @@ def export(job: Job, asked: Page) -> list[Path]:
         ConfigError: a library for an object without bands, or too large a one.
         SpectrumError: a library that can't be read or compared.
     """
-    path, scene = job.folder / "page.html", job.loaded.scene
+    path = job.folder / "page.html"
     job.claim([path])
-    known = None if isinstance(scene, _ShownAsPage) else _known_spectra(job.materials, asked.library)
+    # A scene without mixed materials may say itself what a page shows of it, with about so many cells along an edge.
+    own: Callable[[int], PageContent] | None = getattr(job.loaded.scene, "page_content", None)
+    known = None if own is not None else _known_spectra(job.materials, asked.library)
     resolution, before = asked.resolution, math.inf
     while True:
-        if isinstance(scene, _ShownAsPage):
+        if own is not None:
             with job.working("looking at the surface"):
-                content = scene.page_content(resolution)
+                content = own(resolution)
         else:
             content, resolution = _mixture_content(job, resolution)
         known = known or _known_spectra(content.materials, asked.library)
+        notes = content.facts["notes"]
         if asked.edits is not None:
-            content.facts["notes"].append(
-                f"Edited: shown with the edits of {asked.edits.name}, not as found."
-            )
+            notes.append(f"Edited: shown with the edits of {asked.edits.name}, not as found.")
         if resolution < asked.resolution:
-            content.facts["notes"].append(
+            notes.append(
                 f"The surface is as fine as {resolution} cells along the longest edge, not {asked.resolution}: "
                 f"browsers turn {MOST_TRIANGLES:,} triangles smoothly, and a mail takes {MOST_BYTES / 1e6:g} MB."
             )
@@ -139,7 +131,7 @@ def export(job: Job, asked: Page) -> list[Path]:
             f"{MOST_BYTES / 1e6:g} MB that a mail takes: made again with {coarser} cells along the longest edge"
         )
         resolution, before = coarser, len(page)
-    for note in content.facts["notes"]:
+    for note in notes:
         job.say(note)
     job.say(f"{len(content.arrays['faces'])} triangles, {len(page) / 1e6:.1f} MB")
     return [write_file(path, page)]

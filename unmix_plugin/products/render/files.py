@@ -85,8 +85,7 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True)
-class FormattedOutput:
+class FormattedOutput(NamedTuple):
     """An output in a format."""
 
     output: Output
@@ -179,7 +178,7 @@ def with_units(outputs: Sequence[FormattedOutput], info: MapInfo | None) -> tupl
     if info is None or not info.is_metric:
         return tuple(outputs)
     told = [replace(one.output, what=one.output.what.replace("in world units", IN_METRES)) for one in outputs]
-    return tuple(replace(one, output=output) for one, output in zip(outputs, told, strict=True))
+    return tuple(one._replace(output=output) for one, output in zip(outputs, told, strict=True))
 
 
 def _require_tifffile() -> Any:
@@ -269,24 +268,16 @@ def still(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> Abs
 def video(
     formatted: FormattedOutput, setting: RenderSetting, frames_per_second: float
 ) -> AbstractContextManager[FrameSink]:
-    """Context that gives a sink for the frames of an output of all views; at its end the video is there.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Context that gives a sink for the frames of an output of all views; raises as `still` does."""
     size = _layout(formatted.output, setting).size
     return video_frames(video_path(setting.folder, formatted), *size, frames_per_second)
 
 
 @contextmanager
 def frame(output: Output, progress: float, setting: RenderSetting, add: FrameSink) -> Iterator[RowsSink]:
-    """Context that gives a sink for the rows of one view; at its end they are a frame.
+    """Context that gives a sink for the rows of one view; at its end they are a frame, which the video `add` gets.
 
-    Args:
-        output: What is shown; of spectra one band.
-        progress: How far the video is, in [0, 1]: of spectra, it goes through the bands.
-        setting: Of the render.
-        add: The video.
+    Of spectra one band is shown: a video goes through the bands by its `progress`, in [0, 1].
     """
     if output.kind == "channels":
         names = setting.channels[output.name]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -143,12 +144,10 @@ _BLOCK_PIXELS, _BLOCK_NUMBERS = 1 << 16, 1 << 22
 """Most pixels of a block, and most numbers of one of its outputs."""
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Some rows of a view, as a camera of their own."""
+class _Block(NamedTuple):
+    """Some rows of a view, by its index, as a camera of their own."""
 
     view: int
-    """Index of the view."""
     first_row: int
     camera: Cameras
 
