@@ -3,12 +3,14 @@
 import hashlib
 import json
 import os
+import re
 
 import pytest
 import safetensors.torch
 import torch
 
 from tests.commands.running import done, refused
+from tests.formats.cubes import full_disk
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
@@ -71,12 +73,6 @@ def circle(path):
     (path / "notes").symlink_to("notes")
 
 
-def camera_of_another_size(path):
-    values = json.loads((path / "scene.json").read_text())
-    values["eval_cameras"]["width"] *= 2
-    (path / "scene.json").write_text(json.dumps(values))
-
-
 def as_before_format_6(path):
     values = json.loads((path / "config.json").read_text())
     values["format_version"] = 5
@@ -129,11 +125,32 @@ def test_a_run_folder_or_a_device_that_is_not_there_is_named(run_copy, tmp_path,
     assert "--device cuda, but" in refused(command, *words, run_copy, "--device", "cuda")
 
 
+@pytest.mark.parametrize(
+    ("command", "words", "file", "after"),
+    [
+        (evaluate, ["--run"], r"rgb/eval_002\.png", 0),
+        (export, ["abundances", "--output", "out", "--run"], r"out/eval_002\.npy", 0),
+        (render, ["--output", "out", "--formats", "npy", "--run"], r"out/spectral/eval_002\.npy", 6000),
+    ],
+)
+def test_a_full_disk_exits_2_says_where_and_leaves_whole_files_only(
+    run_copy, tmp_path, monkeypatch, command, words, file, after
+):
+    monkeypatch.chdir(tmp_path)
+    before = set(contents(run_copy))
+    full_disk(monkeypatch, after)
+    said = refused(command, *words, run_copy)
+    assert re.search(rf"can't write \S*{file}: No space left on device; make room", said)
+    assert "--load-run" not in said
+    left = [*contents(tmp_path / "out"), *(set(contents(run_copy)) - before)]
+    assert {path.name for path in left} <= {"cameras-dataset-eval.json", "run.log"}
+
+
 NO_FIGURES = [
-    "[" * 60 + "]" * 60,
-    '{"psnr": "high"}',
     '{"psnr": 1' + "0" * 400 + "}",
     "\udcff",
+    "[" * 60 + "]" * 60,
+    '{"psnr": "high"}',
     '{"psnr": NaN}',
     "[]",
 ]
@@ -149,7 +166,12 @@ def test_figures_that_no_evaluation_wrote_are_refused_by_the_report(run_copy, fo
 BESIDE = {
     "piped metrics": (piped("metrics.jsonl"), train, ["unmix-nerf", "--load-run"], "is no regular file"),
     "piped log": (piped("run.log"), train, ["unmix-nerf", "--load-run"], "run.log"),
-    "camera of another size": (camera_of_another_size, evaluate, ["--run"], "is not the one that"),
+    "camera of another size": (
+        in_scene("eval_cameras", width=32),
+        evaluate,
+        ["--run"],
+        "is not the one that",
+    ),
 }
 
 

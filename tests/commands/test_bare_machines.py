@@ -80,11 +80,9 @@ def test_make_refuses_a_python_that_is_too_old_and_says_how_to_name_another(tmp_
         f"#!/bin/sh\nexec '{sys.executable}' -c 'import sys; sys.version_info = (3, 9, 18); exec(sys.argv[1])' \"$2\"\n"
     )
     old.chmod(0o755)
-    end = subprocess.run(
-        ["make", f"PYTHON={old}", "demo"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    words = ["make", f"PYTHON={old}", "demo"]
+    end = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert end.returncode != 0
-    assert (
-        end.stderr.splitlines()[0] == "Python 3.10 or newer is needed; name one as in: make PYTHON=python3.12"
-    )
+    said = "Python 3.10 or newer is needed; name one as in: make PYTHON=python3.12"
+    assert end.stderr.splitlines()[0] == said
     assert not (tmp_path / ".venv").exists()

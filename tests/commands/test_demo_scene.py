@@ -42,9 +42,9 @@ def test_the_light_is_chosen_by_name(tmp_path):
     powers = (tmp_path / "scene" / "illuminant.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in powers] == ["wavelength", "400", "550", "700"]
     assert powers[-1] == "700,1"
-    assert "there is no light 'candle'" in refused(
-        write_demo_scene, tmp_path / "other", *SMALL, "--illuminant", "candle"
-    )
+    words = [tmp_path / "other", *SMALL]
+    assert "there is no light 'candle'" in refused(write_demo_scene, *words, "--illuminant", "candle")
+    assert "give --raw too" in refused(write_demo_scene, *words, "--markers")
     assert not (tmp_path / "other").exists()
 
 
@@ -58,8 +58,3 @@ def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp
     assert all(f"  {tmp_path / 'capture' / name}  " in printed for name in shown)
     assert f"unmix-process cubes --data {tmp_path / 'capture'} --output-dir SCENE" in printed
     assert not (tmp_path / "capture" / "transforms.json").exists()
-
-
-def test_markers_are_for_raw_captures(tmp_path):
-    assert "give --raw too" in refused(write_demo_scene, tmp_path / "scene", *SMALL, "--markers")
-    assert not (tmp_path / "scene").exists()

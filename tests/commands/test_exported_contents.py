@@ -48,14 +48,13 @@ def test_points_and_mesh_lie_where_the_scene_is(solid, exported):
     low, high = corners.min(axis=0) - 0.2, corners.max(axis=0) + 0.2
     points = PlyData.read(exported[0] / "point-cloud" / "points.ply")["vertex"]
     vertices = [np.stack([points[axis] for axis in "xyz"], axis=1)]
-    vertices += [
-        loaded_mesh(exported[0] / "mesh" / f"mesh.{kind}").vertices for kind in ("ply", "obj", "glb")
-    ]
+    meshes = [exported[0] / "mesh" / f"mesh.{kind}" for kind in ("ply", "obj", "glb")]
+    vertices += [loaded_mesh(path).vertices for path in meshes]
     assert 100 < len(vertices[0]) <= 500
     assert all(((low <= one) & (one <= high)).all() for one in vertices)
-    for name, file in (("mesh", "mesh.glb"), ("splats", "splats.glb")):
+    for name in ("mesh", "splats"):
         said = " ".join(exported[1][name].split())
-        assert f"lengths in {file} are in units of the scene, of unknown size" in said
+        assert f"lengths in {name}.glb are in units of the scene, of unknown size" in said
 
 
 def test_splats_are_flat_upright_and_as_dense_as_the_surface(exported):
@@ -86,23 +85,20 @@ def test_a_page_holds_the_surface_and_escapes_its_title(exported):
     assert page.count("<b>") == 0
     facts = json.loads(page.split('id="data-facts">')[1].split("</script>")[0])
     assert facts["title"] == "pots </script><b>"
-    arrays = gzip.decompress(base64.b64decode(page.split('id="data-arrays">')[1].split("<")[0]))
-    how = facts["arrays"]["positions"]
-    stored = np.frombuffer(arrays, "<u2", how["count"], how["start"]).reshape(-1, 3)
-    mesh = loaded_mesh(exported[0] / "mesh" / "mesh.ply")
-    found = stored * how["scale"] + how["offset"]
-    np.testing.assert_allclose(found, mesh.vertices, atol=0.6 * how["scale"])
-    how = facts["arrays"]["faces"]
-    corners = np.cumsum(np.frombuffer(arrays, "<i4", how["count"], how["start"]))
-    np.testing.assert_array_equal(corners.reshape(-1, 3), mesh.faces)
-    how = facts["arrays"]["areas"]
-    areas = np.frombuffer(arrays, "<f4", how["count"], how["start"])
+    data = gzip.decompress(base64.b64decode(page.split('id="data-arrays">')[1].split("<")[0]))
+    layout = facts["arrays"]
+    stored = {
+        name: np.frombuffer(data, how["type"], how["count"], how["start"]) for name, how in layout.items()
+    }
+    mesh, place = loaded_mesh(exported[0] / "mesh" / "mesh.ply"), layout["positions"]
+    found = stored["positions"].reshape(-1, 3) * place["scale"] + place["offset"]
+    np.testing.assert_allclose(found, mesh.vertices, atol=0.6 * place["scale"])
+    np.testing.assert_array_equal(np.cumsum(stored["faces"]).reshape(-1, 3), mesh.faces)
     sheet = TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
     expected = vertex_areas(sheet.areas(), sheet.faces, len(sheet.vertices))
-    np.testing.assert_allclose(areas, expected, rtol=1e-5)
-    how = facts["arrays"]["abundances"]
-    roots = np.frombuffer(arrays, "u1", how["count"], how["start"]).reshape(-1, 6) / 1.0
-    np.testing.assert_allclose((how["scale"] * roots**2).sum(axis=1), 1, atol=0.03)
+    np.testing.assert_allclose(stored["areas"], expected, rtol=1e-5)
+    shares = layout["abundances"]["scale"] * (stored["abundances"].reshape(-1, 6) / 1.0) ** 2
+    np.testing.assert_allclose(shares.sum(axis=1), 1, atol=0.03)
     assert "https://" not in page.split("<body>")[0]
 
 
@@ -185,16 +181,17 @@ def test_own_reflectances_are_compared_with_too(solid, tmp_path):
 def test_a_report_with_the_find_scene_compares_and_is_self_contained(exported):
     page = (exported[0] / "report" / "report.html").read_text()
     outline = assert_self_contained(page)
-    assert outline.ids == [
-        "scene", "views", "materials", "abundances", "segmentation", "figures", "error", "worst", "settings",
-        "versions",
-    ]  # fmt: skip
-    assert "Rendered: 1 of 2 evaluation views." in outline.text
-    assert "Of the 1 views rendered for this report." in outline.text
-    assert "intersection over union" in outline.text
-    assert re.search(r"6 materials told apart in 6 views: endmember_\d \(\d+% of what is seen", outline.text)
-    assert re.search(r"estimated probability of \d+% on average", outline.text)
-    assert "num_endmembers" in outline.text
+    ids = "scene views materials abundances segmentation figures error worst settings versions"
+    assert outline.ids == ids.split()
+    for text in (
+        r"Rendered: 1 of 2 evaluation views\.",
+        r"Of the 1 views rendered for this report\.",
+        "intersection over union",
+        r"6 materials told apart in 6 views: endmember_\d \(\d+% of what is seen",
+        r"estimated probability of \d+% on average",
+        "num_endmembers",
+    ):
+        assert re.search(text, outline.text), text
 
 
 def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):
@@ -254,8 +251,6 @@ def test_a_report_quotes_the_figures_that_eval_found_and_links_to_the_page(solid
     assert "eval/metrics.json" in page
     assert "12.34" in page
     # On Windows, there is no relative path to another drive.
-    monkeypatch.setattr(
-        "os.path.relpath", Mock(side_effect=ValueError("path is on mount 'C:', start on 'D:'"))
-    )
+    monkeypatch.setattr("os.path.relpath", Mock(side_effect=ValueError("path is on mount 'C:'")))
     done(export, *words("report", "--run", moved, *out))
     assert "in 3-D" not in (tmp_path / "out" / "report.html").read_text()

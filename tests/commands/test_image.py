@@ -57,7 +57,6 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
 @pytest.mark.parametrize(
     ("name", "field", "is_said"),
     [
-        ("field", "reflectance scale factor = 2", True),
         ("field", "reflectance scale factor = 1", True),
         ("field", "data gain values = {2}", False),
         ("field_reflectance", "", True),
@@ -134,16 +133,13 @@ def test_what_cannot_be_unmixed_ends_with_one_message(change, words, message, cu
 
 def test_the_place_on_the_earth_is_kept_and_a_repeated_wavelength_left_out(cube, tmp_path):
     nm = np.linspace(450, 900, cube.shape[2])
-    on_map = {
-        "map info": "UTM, 1, 1, 5e5, 4.5e6, 2, 2, 33, North",
-        "coordinate system string": 'PROJCS["x", 1]',
-    }
+    place = "UTM, 1, 1, 5e5, 4.5e6, 2, 2, 33, North"
+    on_map = {"map info": place, "coordinate system string": 'PROJCS["x", 1]'}
     write_envi_cube(tmp_path / "field", cube, Bands.of(nm), None, "a field", on_map)
     header = (tmp_path / "field.hdr").read_text()
     (tmp_path / "field.hdr").write_text(header.replace(f"{float(nm[3])!r},", f"{float(nm[2])!r},"))
-    ended = done(
-        image, tmp_path / "field.hdr", "--endmembers", 3, "--mnf", 2, "--output-dir", tmp_path / "out"
-    )
+    words = ["--endmembers", 3, "--mnf", 2, "--output-dir", tmp_path / "out"]
+    ended = done(image, tmp_path / "field.hdr", *words)
     assert "1 band left out: marked as bad in the file, or of a wavelength that is there twice" in ended.out
     for name in ("abundances", "confidence", "mnf"):
         assert open_spectral_file(tmp_path / "out" / "field" / f"{name}.hdr").metadata["map"] == on_map

@@ -107,10 +107,6 @@ def test_products_that_compare_in_the_runs_own_bands_refuse(solid, camera, tmp_p
     assert f"{name} compares with what is known in the run's own bands" in said
     others = "abundances, cubes, endmembers, mesh, page, pca, point-cloud, poses, regions, segmentation, splats, volume"
     assert f"It goes with {others}" in said
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_sensor_that_is_not_there_exits_2(solid, tmp_path):
-    words = ["--output", tmp_path / "out", "--sensor", tmp_path / "none.csv"]
-    assert "can't read spectra" in refused(render, "--run", solid.run, *words)
+    words = ["--run", solid.run, "--output", tmp_path / "out", "--sensor", tmp_path / "none.csv"]
+    assert "can't read spectra" in refused(render, *words)
     assert not (tmp_path / "out").exists()

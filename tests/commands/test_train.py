@@ -265,7 +265,7 @@ def test_training_from_python_refuses_a_setting_in_one_message(monkeypatch, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def remarks_on(folder, *quarters: float, kept=slice(None), **last) -> list[str]:
+def remarks_on(folder, *quarters: float | None, kept=slice(None), **last) -> list[str]:
     """On five lines a quarter of a training, around a loss each, one batch far off."""
     lines = [
         {

@@ -1,8 +1,9 @@
 """The viewer beside `unmix-train`: what is printed, what is served, and how both end."""
 
-import io
 import signal
 import threading
+from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -38,9 +39,7 @@ def test_a_training_is_watched_while_it_runs_and_ends_as_without(trained, tmp_pa
         command.process.send_signal(signal.SIGINT)
         assert command.end() == 0
         assert command.lines[-1].startswith("run: ")
-        found = read_spectra_csv(
-            type(trained.run)(command.lines[-1].removeprefix("run: ")) / "endmembers.csv"
-        )
+        found = read_spectra_csv(Path(command.lines[-1].removeprefix("run: ")) / "endmembers.csv")
         np.testing.assert_array_equal(found.spectra, read_spectra_csv(trained.run / "endmembers.csv").spectra)
 
 
@@ -98,18 +97,10 @@ def test_a_training_that_is_stopped_from_the_page_can_go_on(trained, tmp_path):
 
 def test_the_viewer_is_off_where_the_output_is_no_terminal_and_on_where_it_is(tmp_path, monkeypatch):
     words = ["unmix-nerf", "--data", str(tmp_path)]
-    monkeypatch.setattr(train_module.sys, "stdout", io.StringIO())
-    assert not parse(words)[1].enabled
-    monkeypatch.setattr(train_module.sys, "stdout", Terminal())
-    assert parse(words)[1].enabled
-    assert not parse([*words, "--viewer.no-enabled"])[1].enabled
-
-
-class Terminal:
-    """Says that it is one."""
-
-    def isatty(self):
-        return True
+    for is_terminal in (False, True):
+        monkeypatch.setattr(train_module.sys, "stdout", Mock(isatty=lambda is_one=is_terminal: is_one))
+        assert parse(words)[1].enabled == is_terminal
+        assert not parse([*words, "--viewer.no-enabled"])[1].enabled
 
 
 def test_words_of_the_viewer_are_no_settings_of_the_training(trained):

@@ -62,12 +62,6 @@ class Started:
         """Of the viewer's websocket."""
         return "ws://" + self.wait_for_line(r"viewer: http://(\S+)")[1]
 
-    def close(self):
-        """Let go of its output."""
-        self._reader.join(10)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
-
     def end(self):
         status = self.process.wait(START_S)
         self._reader.join(10)
@@ -83,8 +77,9 @@ def started(command, *words):
     finally:
         if one.process.poll() is None:
             one.process.kill()
-        one.process.wait()
-        one.close()
+        one.end()
+        assert one.process.stdout is not None
+        one.process.stdout.close()
 
 
 def visited(visit, command, *words):

@@ -16,22 +16,28 @@ from unmix_plugin.spectral.library.material_library import measured_library
 NAN = np.nan
 
 
+def spectra_of(path):
+    """Names, wavelengths and values of each spectrum."""
+    return [(one.name, one.bands.centers_nm.tolist(), one.reflectance.tolist()) for one in read_library(path)]
+
+
+def written(folder, name, text):
+    (folder / name).write_text(text)
+    return folder / name
+
+
 def written_by_spectral(folder, **changed):
     """A library of two spectra in three bands, written by Spectral Python; then lines of its header replaced."""
     values = np.array([[0.1, 0.25, 0.5], [0.3, 0.2, 0.7]], dtype=np.float32)
-    header = {
-        "wavelength": [400.5, 500, 700],
-        "wavelength units": "Nanometers",
-        "spectra names": ["oak", "fir tree"],
-    }
+    header = {"wavelength": [400.5, 500, 700], "wavelength units": "Nanometers"}
+    header |= {"spectra names": ["oak", "fir tree"]}
     envi.SpectralLibrary(values, header).save(str(folder / "trees"))
     path = folder / "trees.hdr"
     lines = path.read_text().splitlines()
     for key, value in changed.items():
         name = key.replace("_", " ")
-        lines = [line for line in lines if not line.startswith(name)] + (
-            [] if value is None else [f"{name} = {value}"]
-        )
+        lines = [line for line in lines if not line.startswith(name)]
+        lines += [] if value is None else [f"{name} = {value}"]
     path.write_text("\n".join(lines))
     return path, values
 
@@ -85,28 +91,13 @@ def test_missing_parts_of_an_envi_library_are_named(tmp_path):
         read_library(path)
 
 
-def spectra_of(path):
-    """Names, wavelengths and values of each spectrum."""
-    return [(one.name, one.bands.centers_nm.tolist(), one.reflectance.tolist()) for one in read_library(path)]
-
-
-def written(folder, name, text):
-    path = folder / name
-    path.write_text(text)
-    return path
-
-
 def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what_is_missing(tmp_path):
     text = (
         "Wavelength (um),clay (%),ash\n0.7,40,-1.23e34\n0.5,20,0.1\n0.6,30,-999\n0.4,-0.1,0.3\n0.8,nan,0.2\n"
     )
-    (clay, ash) = read_library(written(tmp_path, "mine.csv", text))
-    assert (clay.name, ash.name, clay.source, ash.origin) == (
-        "clay",
-        "ash",
-        "mine.csv",
-        (tmp_path / "mine.csv", "ash"),
-    )
+    path = written(tmp_path, "mine.csv", text)
+    (clay, ash) = read_library(path)
+    assert (clay.name, clay.source, ash.origin) == ("clay", "mine.csv", (path, "ash"))
     np.testing.assert_allclose(clay.bands.centers_nm, [400, 500, 600, 700])
     np.testing.assert_allclose(clay.reflectance, [0, 0.2, 0.3, 0.4])
     np.testing.assert_allclose(ash.reflectance, [0.3, 0.1, NAN, NAN, 0.2])
@@ -186,12 +177,9 @@ def test_a_text_of_ecostress_is_read_as_spectral_python_reads_it(tmp_path):
 def test_texts_of_usgs_are_read_with_their_wavelengths_and_without_deleted_channels(tmp_path):
     (tmp_path / "ChapterM").mkdir()
     path = tmp_path / "ChapterM" / "splib07a_Kaolinite.txt"
-    path.write_text(
-        " splib07a Record=11: Kaolinite CM3 BR93-34A   ASDFRb AREF\n -1.23e34\n 0.4\n-1.23e34\n 0.5\n"
-    )
-    with pytest.raises(
-        SpectrumError, match="4 values without wavelengths, and 0 lists of 4 wavelengths lie beside"
-    ):
+    title = " splib07a Record=11: Kaolinite CM3 BR93-34A   ASDFRb AREF\n"
+    path.write_text(f"{title} -1.23e34\n 0.4\n-1.23e34\n 0.5\n")
+    with pytest.raises(SpectrumError, match="4 values without wavelengths, and 0 lists of 4 wavelengths lie"):
         read_library(path)
     head = " splib07a Record=1: Wavelengths ASD 0.35-2.5 microns 2151 ch\n"
     (tmp_path / "splib07a_Wavelengths_ASD.txt").write_text(head + "0.5\n0.6\n0.7\n0.8\n")
@@ -283,10 +271,8 @@ def test_a_folder_stands_for_the_libraries_in_it_whatever_the_suffix_of_their_nu
 
 
 def test_a_library_is_refused_where_it_covers_too_little_of_what_is_lit(tmp_path):
-    red, bands = (
-        written(tmp_path, "red.csv", "wavelength,clay\n600,1\n700,3\n"),
-        Bands.of(range(400, 710, 10)),
-    )
+    red = written(tmp_path, "red.csv", "wavelength,clay\n600,1\n700,3\n")
+    bands = Bands.of(range(400, 710, 10))
     lights = {start: (bands.centers_nm >= start) * 1.0 for start in (400, 550, 690)}
     assert library_of([red], bands, lights[550]).names == ("clay",)
     for light in (None, lights[400], lights[690]):  # 11 of 31 bands, and 2 of 2

@@ -124,11 +124,8 @@ def ribbon(count, left):
 
 
 def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_stay():
-    (large, large_faces), (middle, middle_faces), (two, two_faces) = (
-        ribbon(120, 0.0),
-        ribbon(20, 200.0),
-        ribbon(2, 61.0),
-    )
+    (large, large_faces), (middle, middle_faces) = ribbon(120, 0.0), ribbon(20, 200.0)
+    two, two_faces = ribbon(2, 61.0)
     vertices = np.concatenate([large, middle, two])
     two_faces = two_faces + len(large) + len(middle)
     two_faces[0, 0] = len(large) - 1  # the last vertex of the large piece
@@ -141,7 +138,7 @@ def test_stray_pieces_go_though_they_touch_the_rest_in_a_point_and_large_ones_st
     assert len(_without_stray_pieces(empty).faces) == 0
 
 
-def test_a_blur_does_not_move_a_flat_wall():
+def test_a_blur_does_not_move_a_flat_wall_and_a_surface_that_reaches_the_box_is_closed_there():
     grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (12, 12, 12))
     wall = np.zeros(grid.shape, dtype=np.float32)
     wall[6:] = 1e4
@@ -149,13 +146,9 @@ def test_a_blur_does_not_move_a_flat_wall():
     middle = mesh.vertices[(np.abs(mesh.vertices[:, 1:] - 0.55) < 0.15).all(axis=1)]
     front = middle[middle[:, 0] < 0.9]
     np.testing.assert_allclose(front[:, 0], 0.55, atol=0.01)
-
-
-def test_a_surface_that_reaches_the_box_is_closed_there():
-    grid = GridPoints(np.zeros(3, dtype=np.float32), 0.1, (5, 5, 5))
     mesh = _extract_mesh(np.full(grid.shape, 1e4, dtype=np.float32), grid, 1.0, 0.0, PIXEL)
     assert trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
-    np.testing.assert_allclose(mesh.vertices.max(axis=0), 0.4, atol=0.1)
+    np.testing.assert_allclose(mesh.vertices.max(axis=0), 1.1, atol=0.1)
 
 
 def test_the_surface_lies_at_the_density_where_rays_end(seen_all_round):
@@ -185,23 +178,16 @@ def test_other_readers_get_the_mesh_in_the_world_of_the_scene(files, outside, ki
     assert mesh.volume > 0
 
 
-def test_gltf_is_in_metres_where_the_scene_has_a_scale(files, outside, tmp_path):
-    scaled = replace(SCENE, scale=Scale(0.025, "as measured"))
-    _write_mesh(tmp_path, ("glb", "ply"), outside, scaled, FRAME, up="z")
-    metres, units = loaded_mesh(tmp_path / "mesh.glb"), loaded_mesh(files[".glb"])
-    np.testing.assert_allclose(metres.vertices, 0.025 * units.vertices, atol=1e-6)
+def test_gltf_alone_is_in_metres_where_the_scene_has_a_scale_and_y_is_up_in_it(files, outside, tmp_path):
+    _write_mesh(tmp_path, ("glb", "ply"), outside, replace(SCENE, scale=Scale(0.025, "test")), FRAME)
+    metres, units = loaded_mesh(tmp_path / "mesh.glb"), loaded_mesh(files[".glb"]).vertices
+    heights = units @ world_up(SCENE.views, FRAME)
+    np.testing.assert_allclose(metres.vertices[:, 1], 0.025 * heights, atol=1e-6)
+    lengths = [np.linalg.norm(one, axis=1) for one in (metres.vertices, 0.025 * units)]
+    np.testing.assert_allclose(*lengths, atol=1e-6)
     assert metres.volume > 0
-    vertices = PlyData.read(tmp_path / "mesh.ply")["vertex"]
-    np.testing.assert_array_equal(vertices["x"], PlyData.read(files[".ply"])["vertex"]["x"])
-
-
-def test_up_is_y_in_glb_unless_asked_otherwise(files, outside, tmp_path):
-    _write_mesh(tmp_path, ("glb",), outside, SCENE, FRAME)
-    units = loaded_mesh(files[".glb"])
-    turned = loaded_mesh(tmp_path / "mesh.glb").vertices
-    np.testing.assert_allclose(turned[:, 1], units.vertices @ world_up(SCENE.views, FRAME), atol=1e-5)
-    lengths = [np.linalg.norm(one, axis=1) for one in (turned, units.vertices)]
-    np.testing.assert_allclose(*lengths, atol=1e-5)
+    plain, scaled = (PlyData.read(path)["vertex"]["x"] for path in (files[".ply"], tmp_path / "mesh.ply"))
+    np.testing.assert_array_equal(plain, scaled)
 
 
 def test_numbers_in_ply_and_glb_are_the_same_floats_and_vertices_have_the_material_of_their_half(
@@ -262,18 +248,9 @@ def test_a_textured_glb_has_its_segmentation_and_abundances_as_variants(textured
     assert content["extensionsUsed"] == ["KHR_materials_variants", "KHR_materials_unlit"]
     primitive = content["meshes"][0]["primitives"][0]
     assert "COLOR_0" not in primitive["attributes"]
-    assert primitive["extensions"]["KHR_materials_variants"]["mappings"][3] == {
-        "material": 3,
-        "variants": [3],
-    }
+    mappings = primitive["extensions"]["KHR_materials_variants"]["mappings"]
+    assert mappings[3] == {"material": 3, "variants": [3]}
     assert "map_Kd mesh_colour.png" in (textured / "mesh.mtl").read_text()
-
-
-def test_textures_that_are_too_small_or_of_no_size_are_refused(outside):
-    with pytest.raises(ConfigError, match="--texture-size is 9; choose 16 to 8192"):
-        _textures(SCENE, outside, 9)
-    with pytest.raises(ConfigError, match="choose a larger --texture-size"):
-        _textures(SCENE, outside, 16)
 
 
 @pytest.mark.parametrize(
@@ -290,7 +267,10 @@ def test_impossible_settings_are_refused(density, smoothing, said):
         export(MagicMock(spec=Job), Mesh(density=density, smoothing=smoothing))
 
 
-def test_a_surface_that_is_none_is_refused(densities):
+def test_surfaces_that_are_none_and_textures_that_are_too_small_or_of_no_size_are_refused(densities, outside):
+    for size, said in ((9, "--texture-size is 9; choose 16 to 8192"), (16, "choose a larger --texture-size")):
+        with pytest.raises(ConfigError, match=said):
+            _textures(SCENE, outside, size)
     with pytest.raises(ConfigError, match=r"the density asked for; choose a lower --density"):
         _extract_mesh(densities, GRID, 1e9, 0.0, PIXEL)
     with pytest.raises(RunError, match="no camera of the run sees it; keep it with --unseen keep"):

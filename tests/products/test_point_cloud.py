@@ -74,8 +74,7 @@ def test_normals_of_a_sphere_are_its_radii_and_face_the_viewer():
     assert (outwards * positions[:200]).sum(axis=1).min() > 0.99
     np.testing.assert_allclose(inwards, -outwards)
     towards = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])  # where there is no plane, the viewer's direction
-    normals = _plane_normals(np.zeros((2, 3)), towards, np.array([0, 1]))
-    np.testing.assert_allclose(normals, [[0, 0, 1], [1, 0, 0]])
+    np.testing.assert_allclose(_plane_normals(0 * towards, towards, np.arange(2)), [[0, 0, 1], [1, 0, 0]])
 
 
 BANDS = Bands.of(WAVELENGTHS_NM)
@@ -90,22 +89,17 @@ def paint(tmp_path):
     return path
 
 
-def properties(*outputs):
-    return [score.property for score in _require_point_scores(outputs, BANDS)]
-
-
 def test_named_indices_keep_their_names_and_the_rest_is_numbered(paint):
     outputs = ("index:r650/r450", "index:PRI", "index:iron-oxide", "index:1+r450", f"target:ace:{paint}")
     outputs += ("index: PRI", "index:r650/r450")  # asked for twice
-    assert properties(*outputs) == ["index_1", "index_pri", "index_iron_oxide", "index_2", "target_1"]
+    names = [score.property for score in _require_point_scores(outputs, BANDS)]
+    assert names == ["index_1", "index_pri", "index_iron_oxide", "index_2", "target_1"]
 
 
 def test_a_target_is_judged_against_the_points_themselves(paint):
     (score,) = _require_point_scores([f"target:mf:{paint}"], BANDS)
-    g = torch.Generator().manual_seed(0)
-    others = 0.3 + 0.05 * torch.randn(400, 5, generator=g)
-    both = torch.cat([others, PAINT[None]])
-    values = score.values(both, None)
+    others = 0.3 + 0.05 * torch.randn(400, 5, generator=torch.Generator().manual_seed(0))
+    values = score.values(torch.cat([others, PAINT[None]]), None)
     assert values[-1] == pytest.approx(1.0, abs=1e-4)
     assert abs(values.mean()) < 1e-4  # scores are taken from the mean of the points
 
@@ -113,11 +107,9 @@ def test_a_target_is_judged_against_the_points_themselves(paint):
 def test_a_comment_says_what_a_property_is_and_whether_the_light_was_known():
     formula, named = _require_point_scores(["index:r650/r450", "index:pri"], BANDS)
     unknown, known = make_model().materials, make_model(light=LIGHT).materials
-    assert formula.comments(known) == [
-        "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
-    ]
-    [said] = formula.comments(unknown)
-    assert said.endswith("; of radiance, since the scene's light is unknown")
+    [said] = formula.comments(known)
+    assert said == "index_1: index:r650/r450, formula r650/r450; from the bands at 450, 650 nm"
+    assert formula.comments(unknown) == [f"{said}; of radiance, since the scene's light is unknown"]
     assert named.comments(known)[0].startswith("index_pri: index:pri, photochemical reflectance index")
 
 
@@ -163,7 +155,7 @@ def columns(cloud, names):
     return np.stack([np.asarray(cloud["vertex"][name]) for name in names], axis=1)
 
 
-def test_points_are_in_the_world_of_the_scene(cloud):
+def test_points_are_in_the_world_of_the_scene_with_unit_normals_out_of_the_surface(cloud):
     ply, count = cloud
     assert 600 < count == ply["vertex"].count <= 800
     what, world, size, *materials = ply.comments
@@ -171,18 +163,12 @@ def test_points_are_in_the_world_of_the_scene(cloud):
     assert "coordinates: world of the given poses, or of transforms.json if they were estimated" in world
     assert size == "lengths are in units of the scene, of unknown size"
     assert materials == [f"material {index}: endmember_{index}" for index in range(3)]
-    center = FRAME.to_world(np.zeros(3))
-    radii = np.linalg.norm(columns(ply, "xyz") - center, axis=1)
-    np.testing.assert_allclose(radii, RADIUS / FRAME.scale, atol=0.02 / FRAME.scale)
-
-
-def test_normals_are_unit_vectors_out_of_the_surface_in_the_world(cloud):
-    ply, _ = cloud
     outwards = columns(ply, "xyz") - FRAME.to_world(np.zeros(3))
-    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    radii = np.linalg.norm(outwards, axis=1, keepdims=True)
+    np.testing.assert_allclose(radii, RADIUS / FRAME.scale, atol=0.02 / FRAME.scale)
     normals = columns(ply, ("nx", "ny", "nz"))
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
-    assert (normals * outwards).sum(axis=1).min() > 0.9
+    assert (normals * outwards / radii).sum(axis=1).min() > 0.9
 
 
 def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectrum(cloud):

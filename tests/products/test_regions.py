@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from tests.products.ball_model import RADIUS, SHADE, ball_scene, cameras_around
+from tests.products.ball_page import box
 from tests.trained.camera_scenes import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
@@ -20,14 +21,7 @@ from unmix_plugin.trained.surface_mesh import TriangleMesh, vertex_areas
 
 SCENE = replace(ball_scene(), frame=FRAME)
 WORLD_RADIUS = RADIUS / FRAME.scale
-MIDDLE = FRAME.to_world(np.zeros(3))
 [CAMERA] = cameras_around([(0.3, 0.1, 1.0)])
-
-
-def box(low, high):
-    """In the world; FRAME keeps the vertical, in which the ball's two materials lie above each other."""
-    (a, b, c), (x, y, z) = (MIDDLE + low).tolist(), (MIDDLE + high).tolist()
-    return Box((a, b, c), (x, y, z))
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +72,9 @@ def test_a_view_marks_what_it_sees_and_not_what_is_behind(surface):
     patch = surface.measure(InView.of_mask(CAMERA, polygon_mask(middle, (40, 40))), "patch")
     pixel = (3 - RADIUS) / float(CAMERA.focal_px[0, 0]) / FRAME.scale
     assert patch.area == pytest.approx((8 * pixel) ** 2, rel=0.05)
+    corner = InView.of_mask(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40)))
     with pytest.raises(ConfigError, match="has nothing of the surface"):
-        surface.measure(
-            InView.of_mask(CAMERA, polygon_mask([(0.0, 0.0), (3.0, 0.0), (0.0, 3.0)], (40, 40))), "corner"
-        )
+        surface.measure(corner, "corner")
 
 
 def test_regions_come_back_as_they_were_kept(tmp_path):
@@ -116,21 +109,8 @@ def test_many_regions_of_large_views_take_little_memory_until_they_are_measured(
 
 
 def test_names_that_no_file_can_have_or_that_tables_take_for_formulas_are_refused():
-    for name in (
-        "",
-        " ",
-        "../x",
-        "a/b",
-        ".x",
-        "leaf.",
-        "a\nb",
-        "con",
-        "x" * 65,
-        "=1+1",
-        "+x",
-        "-x",
-        "@SUM(A1)",
-    ):
+    paths, formulas = ("", " ", "../x", "a/b", ".x", "leaf.", "a\nb", "con", "x" * 65), "=1+1 +x -x @SUM(A1)"
+    for name in (*paths, *formulas.split()):
         with pytest.raises(ConfigError, match="can't be the name of a region"):
             check_name(name)
     with pytest.raises(ConfigError, match="'material leaf' can't be the name of a region: exports"):

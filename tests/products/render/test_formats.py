@@ -21,11 +21,8 @@ def formats(*outputs, asked=(), is_path=False):
     return found
 
 
-def test_all_is_every_output_that_the_model_has():
+def test_all_is_every_output_that_the_model_has_and_each_has_formats_that_suit_it():
     assert set(formats("all")) == set(OUTPUTS) - {"reflectance"}  # the light is unknown
-
-
-def test_each_output_has_formats_that_suit_it():
     assert formats("spectral", "rgb", "abundances", "segmentation", "depth", "linear_rgb", "band:550nm") == {
         "spectral": ["envi"],
         "rgb": ["png"],

@@ -101,13 +101,8 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
     assert national is not None
     directory = np.array(utm.geotiff[2][3]).reshape(-1, 4)
     assert {tuple(key) for key in directory[1:]} >= {(1024, 0, 1, 1), (3072, 0, 1, 32632)}
-    assert [utm.envi["map info"][0], *utm.envi["map info"][7:]] == [
-        "UTM",
-        32,
-        "North",
-        "WGS-84",
-        "units=Meters",
-    ]
+    kind, *_, zone, half, datum, units = utm.envi["map info"]
+    assert (kind, zone, half, datum, units) == ("UTM", 32, "North", "WGS-84", "units=Meters")
     assert (3072, 0, 1, 25832) in {tuple(key) for key in np.array(national.geotiff[2][3]).reshape(-1, 4)}
     assert national.envi["map info"][0] == "Arbitrary"
     with pytest.raises(ConfigError, match="--epsg needs a world in metres"):

@@ -223,7 +223,9 @@ class SpectralFamily(MaterialFamily):
         fresnel, facets, masking, above = _gloss(roughness, f0, wi, wo)
         a, b = mean_ggx_albedo(roughness)
         passed = _passing(roughness, f0, wi[2]) * _passing(roughness, f0, wo[2]) / (1.0 - (f0 * a + b))
-        return (passed * above / math.pi).T * self.base_colour(parameters) + (fresnel * facets * masking * above).T
+        return (passed * above / math.pi).T * self.base_colour(parameters) + (
+            fresnel * facets * masking * above
+        ).T
 
     def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
         """Diffuse reflectance of each band, [0, 1]."""
