@@ -193,8 +193,9 @@ def test_what_the_system_says_of_names_and_disks_is_for_the_user_to_mend(number,
 @pytest.mark.parametrize(
     ("command", "words", "heavy"),
     [
-        ("train", ["unmix-nerf", "--help-all"], "colour tensorboard"),
+        ("train", ["unmix-nerf", "--help-all"], "torch colour tensorboard"),
         ("export", ["mesh", "--help"], "torch warp"),
+        ("view", ["--help"], "torch"),
     ],
 )
 def test_help_imports_nothing_that_it_does_not_need(command, words, heavy):

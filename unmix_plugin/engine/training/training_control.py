@@ -11,7 +11,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Literal
 
-from unmix_plugin.engine.machine import handled_signals
 from unmix_plugin.engine.training.progress import TrainingStatus
 
 SHARE_BOUNDS = (0.05, 0.9)
@@ -232,6 +231,8 @@ def stop_signals() -> Iterator[list[int]]:
         if noted and signal.Signals(number).name != "SIGHUP":
             raise KeyboardInterrupt
         noted.append(number)
+
+    from unmix_plugin.engine.machine import handled_signals  # which imports torch: help of commands must not
 
     names = ["SIGINT", "SIGTERM", "SIGHUP"] if threading.current_thread() is threading.main_thread() else []
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and names:
