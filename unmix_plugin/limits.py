@@ -53,30 +53,18 @@ _LARGEST_ARRAY = 1 << 46
 
 
 def refuse(path: Path, found: str, expected: str, kind: type[UnmixError]) -> NoReturn:
-    """The one message of a file that asks for too much.
-
-    Raises:
-        UnmixError: of this kind, always.
-    """
+    """The one message of a file that asks for too much. Raises UnmixError: of this kind, always."""
     raise kind(f"{path}: {found}; expected {expected}: the file is damaged, or not made by an instrument")
 
 
 def allow_parts(path: Path, number: int, noun: str, kind: type[UnmixError]) -> None:
-    """Ask before parts are read one after the other.
-
-    Raises:
-        UnmixError: of this kind: there are too many.
-    """
+    """Ask before parts are read one after the other. Raises UnmixError: of this kind: there are too many."""
     if number > MOST_PARTS:
         refuse(path, f"{number} {noun}", f"at most {MOST_PARTS}", kind)
 
 
 def allow_depth(path: Path, levels: int, kind: type[UnmixError]) -> None:
-    """Ask before parts within parts are read.
-
-    Raises:
-        UnmixError: of this kind: they lie too deep.
-    """
+    """Ask before parts within parts are read. Raises UnmixError: of this kind: they lie too deep."""
     if levels > DEEPEST:
         refuse(path, f"parts in parts, {levels} levels deep", f"at most {DEEPEST}", kind)
 
@@ -128,11 +116,8 @@ def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int 
 
 
 def regular_file(path: str, flags: int) -> int:
-    """An `opener` for `open` of files that are ones: opening a pipe or a device may wait for ever.
-
-    Raises:
-        OSError: it can't be opened, or is no regular file.
-    """
+    """An `opener` for `open` of files that are ones: opening a pipe or a device may wait for ever. Raises OSError: it
+    can't be opened, or is no regular file."""
     descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -146,11 +131,8 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
-    """All bytes of a regular file that is read whole.
-
-    Raises:
-        OSError: it can't be read, is no regular file, or has more than `most` bytes.
-    """
+    """All bytes of a regular file that is read whole. Raises OSError: it can't be read, is no regular file, or has more
+    than `most` bytes."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         data = b"" if size > most else file.read(most + 1)
@@ -176,11 +158,7 @@ def parse_json(text: str) -> Any:
 
 
 def parse_xml(data: bytes | str) -> ElementTree.Element:
-    """The root of an XML text.
-
-    Raises:
-        ValueError: it is damaged, or declares entities, which can grow without end.
-    """
+    """The root of an XML text. Raises ValueError: it is damaged, or declares entities, which can grow without end."""
     # UTF-16 has zeros between letters.
     found = data.encode() if isinstance(data, str) else data.replace(b"\0", b"")
     if b"<!DOCTYPE" in found or b"<!ENTITY" in found:

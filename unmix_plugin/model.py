@@ -83,11 +83,8 @@ class UnmixModel(Model):
     endmember_bound: Tensor
 
     def populate_modules(self) -> None:
-        """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata.
-
-        Raises:
-            ConfigError: more endmembers than bands.
-        """
+        """Field, grid, endmembers (K, B) and specular spectra (J, B), shaped by config and metadata. Raises
+        ConfigError: more endmembers than bands."""
         config, metadata = self.config, self.metadata
         centers, widths = (metadata.get(key) for key in ("wavelengths_nm", "fwhm_nm"))
         self.bands = Bands(np.array(centers, float), None if widths is None else np.array(widths, float))

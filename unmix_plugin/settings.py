@@ -37,6 +37,13 @@ _WHY_LIGHT = {
     "camera": "the light moves with the camera: brightness depends on the direction of view",
     "per-view": "views differ in exposure: training finds a gain for each (--light fixed leaves them out)",
 }
+_IS_DARK = "the scene is dark: training compares spectra multiplied by {:.3g} (exposure)"
+_IS_UNEVEN = (
+    "part of the scene is much brighter than the rest: squared errors are divided by the brightness to the power of "
+    "{:.2g} (relative)"
+)
+_WHY_LOSSES = (("exposure", 1.0, _IS_DARK), ("relative", 0.0, _IS_UNEVEN))
+"""Settings of losses that follow from the scene, what they usually are, and why they would be more."""
 _LAMP_NUMBERS = 10
 """Which of the two frames, and three places of three numbers."""
 _WHERE_LAMP = {
@@ -384,11 +391,7 @@ class UnmixModelConfig(ModelConfig):
         return found, "\n".join(reasons)
 
     def checked_num_endmembers(self, num_bands: int) -> int:
-        """K.
-
-        Raises:
-            ConfigError: more endmembers than bands.
-        """
+        """K. Raises ConfigError: more endmembers than bands."""
         count = self.num_endmembers
         if count is None:
             return _usual_num_endmembers(num_bands)
@@ -413,28 +416,16 @@ def _resolved_losses(
     losses: LossConfig, initial_data: Callable[[], Mapping[str, np.ndarray]]
 ) -> tuple[LossConfig, list[str]]:
     """With what follows from the brightness and the noise of the scene, and the evidence for it."""
-    import numpy as np
-
     reasons = []
-    if losses.exposure == "auto":
-        exposure = round(float(initial_data().get("exposure", 1.0)), 3)
-        losses = replace(losses, exposure=exposure)
-        if exposure > 1:
-            reasons.append(
-                f"the scene is dark: training compares spectra multiplied by {exposure:.3g} (exposure)"
-            )
-    if losses.relative == "auto":
-        relative = round(float(initial_data().get("relative", 0.0)), 3)
-        losses = replace(losses, relative=relative)
-        if relative > 0:
-            reasons.append(
-                "part of the scene is much brighter than the rest: squared errors are divided by the "
-                f"brightness to the power of {relative:.2g} (relative)"
-            )
+    for name, usual, why in _WHY_LOSSES:
+        if getattr(losses, name) == "auto":
+            found = round(float(initial_data().get(name, usual)), 3)
+            losses = replace(losses, **{name: found})
+            if found > usual:
+                reasons.append(why.format(found))
     if losses.band_weights == "auto":
-        given = initial_data().get("band_weights", np.ones(1))
-        weights = () if bool((given == 1).all()) else tuple(round(float(w), 6) for w in given)
-        losses = replace(losses, band_weights=weights)
+        weights = tuple(round(float(weight), 6) for weight in initial_data().get("band_weights", ()))
+        losses = replace(losses, band_weights=weights if any(weight != 1 for weight in weights) else ())
     return losses, reasons
 
 

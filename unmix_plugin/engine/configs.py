@@ -63,11 +63,7 @@ class InstantiateConfig:
 
 
 def require_in_range(name: str, value: int | float, low: int | float, high: int | float) -> None:
-    """Refuse a setting outside [low, high].
-
-    Raises:
-        ConfigError: it is outside, or not a number.
-    """
+    """Refuse a setting outside [low, high]. Raises ConfigError: it is outside, or not a number."""
     if not low <= value <= high:
         raise ConfigError(f"{name} must be from {low} to {high}; got {value}")
 
@@ -221,11 +217,8 @@ class TrainerConfig:
 
 
 def refuse_changes_at_start(before: Any, now: Any, flag: str = "--") -> None:
-    """Compare the settings of a run with those to go on with.
-
-    Raises:
-        ConfigError: one differs that is annotated with `AtStart`, and would be written down without having acted.
-    """
+    """Compare the settings of a run with those to go on with. Raises ConfigError: one differs that is annotated with
+    `AtStart`, and would be written down without having acted."""
     hints = get_type_hints(type(now), include_extras=True)
     for name in (entry.name for entry in fields(now)):
         old, new, own = getattr(before, name, None), getattr(now, name), flag + name.replace("_", "-")

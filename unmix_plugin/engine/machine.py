@@ -20,11 +20,8 @@ from unmix_plugin.errors import ConfigError
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device that `auto`, `cpu` or `cuda` means on this machine.
-
-    Raises:
-        ConfigError: CUDA was asked for and there is none, or the word is none of the three.
-    """
+    """The device that `auto`, `cpu` or `cuda` means on this machine. Raises ConfigError: CUDA was asked for and there
+    is none, or the word is none of the three."""
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"--device must be auto, cpu or cuda; got {name!r}")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):

@@ -54,15 +54,9 @@ class Processes:
     def average_gradients(
         self, parameters: Sequence[nn.Parameter], numbers: Sequence[Tensor]
     ) -> list[Tensor]:
-        """Replace each gradient by its mean over the processes, in one exchange.
+        """Replace each gradient by its mean over the processes, in one exchange; also the means of some scalars.
 
         A parameter without gradient in every process keeps none.
-
-        Args:
-            parameters: The same in each process.
-            numbers: Scalars to average with them.
-        Returns:
-            The means of `numbers`, scalars.
         """
         if self.count == 1:
             return list(numbers)
@@ -129,14 +123,13 @@ class Processes:
         if self.count == 1:
             yield
             return
-        failure: Exception | None = None
-        described: str | None = None
+        failure, described = None, None
         try:
             yield
         except Exception as error:  # noqa: BLE001 - raised again below, by the first process
-            failure = error
-            is_ours = isinstance(error, UnmixError)
-            described = str(error) if is_ours else traceback.format_exception_only(error)[-1].strip()
+            failure, described = error, str(error)
+            if not isinstance(error, UnmixError):
+                described = traceback.format_exception_only(error)[-1].strip()
         said = self.gather(described)
         failed = [rank for rank, text in enumerate(said) if text is not None]
         if not failed:
@@ -204,13 +197,10 @@ def _are_started() -> bool:
 def _join(device: str) -> Processes:
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     is_cuda = device == "cuda" or (device == "auto" and torch.cuda.is_available())
-    backend = "nccl" if is_cuda else "gloo"
-    has_it = {"nccl": distributed.is_nccl_available, "gloo": distributed.is_gloo_available}[backend]
-    found = torch.cuda.device_count()
-    fault = None
+    backend, found, fault = "nccl" if is_cuda else "gloo", torch.cuda.device_count(), None
     if is_cuda and processes_here() > found:
         fault = f"{processes_here()} processes on this machine, which has {found} CUDA devices"
-    elif not distributed.is_available() or not has_it():
+    elif not distributed.is_available() or not getattr(distributed, f"is_{backend}_available")():
         fault = (
             f"this PyTorch is built without {backend}, through which processes talk: install another build, or train "
             "with one process"
@@ -227,26 +217,16 @@ def _join(device: str) -> Processes:
 
 
 def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) -> None:
-    """Refuse processes that were started with different settings.
-
-    Args:
-        settings: Whatever has to be the same everywhere, as JSON has it.
-    Raises:
-        ConfigError: in the first process, with the settings that differ.
-        Follower: in the others.
-    """
-    told = processes.gather({**flat_settings(settings), "torch": torch.__version__})
-    for rank, other in enumerate(told):
-        names = told[0].keys() | other.keys()
-        different = sorted(name for name in names if told[0].get(name) != other.get(name))
-        if different and processes.is_first:
-            name = different[0]
-            raise ConfigError(
-                f"process {rank + 1} of {processes.count} has {name} {other.get(name)}, the first has "
-                f"{told[0].get(name)}; start all with the same arguments and packages"
-            )
-        if different:
-            raise Follower(2)
+    """Refuse processes that were started with different settings, as `together` does."""
+    first, *others = processes.gather({**flat_settings(settings), "torch": torch.__version__})
+    with processes.together():
+        for number, other in enumerate(others, start=2):
+            for name in sorted(first.keys() | other.keys()):
+                if first.get(name) != other.get(name):
+                    raise ConfigError(
+                        f"process {number} of {processes.count} has {name} {other.get(name)}, the first has "
+                        f"{first.get(name)}; start all with the same arguments and packages"
+                    )
 
 
 def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

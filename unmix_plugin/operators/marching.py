@@ -79,11 +79,8 @@ class GridRays:
         skips: UInt8[Tensor, "X Y Z"],
         step: float,
     ) -> "GridRays":
-        """Rays of origins and directions, with what else the kernel takes of each ray, in float32.
-
-        Raises:
-            ValueError: step isn't positive.
-        """
+        """Rays of origins and directions, with what else the kernel takes of each ray, in float32. Raises ValueError:
+        step isn't positive."""
         check_step(step)
         point = vector_type(3, torch.float32)
         arrays = [as_warp(values.contiguous(), point) for values in lines]

@@ -231,11 +231,8 @@ class Cameras:
 
     @staticmethod
     def from_json(values: dict[str, Any]) -> Cameras:
-        """The cameras that `to_json` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError, RuntimeError: a part is missing, of another shape or out of its range.
-        """
+        """The cameras that `to_json` wrote. Raises KeyError, TypeError, ValueError, RuntimeError: a part is missing, of
+        another shape or out of its range."""
         count, width, height = len(values["camera_to_world"]), values["width"], values["height"]
         sizes = [tuple(size) for size in values.get("sizes", [])]
         for size in ((width, height), *sizes):

@@ -59,22 +59,18 @@ class KeyPoses:
 
     def at(self, cameras: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Float[Tensor, "R 3 4"]:
         """The pose of each camera at each height."""
-        first = self._segment(cameras, y)
-        last = torch.minimum(first + 1, self._ends[cameras] - 1)
+        # The key pose from which each is interpolated: the last at or before y that has a next one.
+        ends = self._ends[cameras]
+        found = torch.searchsorted(self._places, cameras * self._stride + y.double(), right=True) - 1
+        starts = ends - self._counts[cameras]
+        first = found.maximum(starts).minimum((ends - 2).clamp(min=0)).maximum(starts)
+        last = torch.minimum(first + 1, ends - 1)
         low, high = self.heights[first], self.heights[last]
         fraction = torch.where(last > first, (y - low) / torch.where(last > first, high - low, 1.0), 0.0)
         start, end = self.poses[first], self.poses[last]
         turned = start[:, :, :3] @ rotation_matrix(fraction[:, None] * self._turns[first])
         moved = start[:, :, 3] + fraction[:, None] * (end[:, :, 3] - start[:, :, 3])
         return torch.cat([turned, moved[:, :, None]], dim=-1)
-
-    def _segment(self, cameras: Int[Tensor, " R"], y: Float[Tensor, " R"]) -> Int[Tensor, " R"]:
-        """The key pose from which each is interpolated: the last at or before y that has a next one."""
-        found = torch.searchsorted(self._places, cameras * self._stride + y.double(), right=True) - 1
-        starts = self._ends[cameras] - self._counts[cameras]
-        return torch.minimum(torch.maximum(found, starts), (self._ends[cameras] - 2).clamp(min=0)).maximum(
-            starts
-        )
 
     @cached_property
     def _counts(self) -> Int[Tensor, " N"]:
@@ -111,11 +107,8 @@ class KeyPoses:
 
     @staticmethod
     def from_json(values: dict[str, Any], num_cameras: int) -> KeyPoses:
-        """The key poses that `to_json` wrote.
-
-        Raises:
-            KeyError, TypeError, ValueError, RuntimeError: a part is missing, of another shape or out of its range.
-        """
+        """The key poses that `to_json` wrote. Raises KeyError, TypeError, ValueError, RuntimeError: a part is missing,
+        of another shape or out of its range."""
         counts = tuple(values["counts"])
         if len(counts) != num_cameras or not all(type(count) is int and count >= 1 for count in counts):
             raise ValueError(f"key poses need a count of at least 1 for each of {num_cameras} cameras")

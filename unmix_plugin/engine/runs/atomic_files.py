@@ -96,11 +96,8 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> Path:
-    """Write `data` as a `whole_file`; its path.
-
-    Raises:
-        RunError: the disk is full or refuses; what was there before is untouched.
-    """
+    """Write `data` as a `whole_file`; its path. Raises RunError: the disk is full or refuses; what was there before is
+    untouched."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
     with whole_file(path) as temporary, write_errors_as(path):
         descriptor = os.open(temporary, flags, 0o666)

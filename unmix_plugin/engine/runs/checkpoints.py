@@ -51,14 +51,9 @@ class Checkpoint:
 def save_checkpoint(
     folder: Path, step: int, tensors: Mapping[str, Tensor], record: Mapping[str, Any], keep: int = 2
 ) -> Path:
-    """Save a checkpoint, then remove all but it and the `keep - 1` complete ones before it.
+    """Save tensors and what JSON can hold after so many training steps, then remove all but this checkpoint and the
+    `keep - 1` complete ones before it.
 
-    Args:
-        folder: Made if missing.
-        step: Training steps done, >= 0.
-        tensors: What to save, on any device.
-        record: What to save as JSON.
-        keep: How many checkpoints stay, >= 1.
     Returns:
         The path of the record.
     Raises:
@@ -66,16 +61,13 @@ def save_checkpoint(
     """
     data = safetensors.torch.save(_separate(tensors))
     tensors_path, record_path = folder / f"{_stem(step)}.safetensors", folder / f"{_stem(step)}.json"
-    sha256 = hashlib.sha256(data).hexdigest()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale_temporaries(folder)
         _remove_orphans(folder)
-        is_there = record_path.exists() and tensors_path.exists()
-        if not is_there or hashlib.sha256(tensors_path.read_bytes()).hexdigest() != sha256:
-            record_path.unlink(missing_ok=True)
-            write_file(tensors_path, data)
-        write_run_json(record_path, {**record, "step": step, "sha256": sha256})
+        record_path.unlink(missing_ok=True)  # of a damaged one: never a record beside other tensors
+        write_file(tensors_path, data)
+        write_run_json(record_path, {**record, "step": step, "sha256": hashlib.sha256(data).hexdigest()})
         _remove_others(folder, step, keep)
     except OSError as error:
         raise RunError(f"can't write to {folder}: {error.strerror or error}") from error
@@ -197,11 +189,8 @@ class TrainingRecord:
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> "TrainingRecord":
-        """What `to_json` wrote, further entries ignored.
-
-        Raises:
-            RunError: an entry is missing, of another type, or negative.
-        """
+        """What `to_json` wrote, further entries ignored. Raises RunError: an entry is missing, of another type, or
+        negative."""
         known = {name: values.get(name) for name in TrainingRecord.__dataclass_fields__}
         try:
             return config_from_json(known, TrainingRecord(0, 0.0, 0, 0, 1, 0, 0.0, {}), "the record")
@@ -226,11 +215,7 @@ def collect_tensors(
 def restore_training(
     tensors: Mapping[str, Tensor], model: nn.Module, optimizer: torch.optim.Optimizer
 ) -> None:
-    """Restore what `collect_tensors` gave, but for the average.
-
-    Raises:
-        RunError: the tensors do not fit the model.
-    """
+    """Restore what `collect_tensors` gave, but for the average. Raises RunError: the tensors do not fit the model."""
     restore_model(tensors, model, averaged=False)
     params = dict(model.named_parameters())
     optimizer.state.clear()
@@ -243,11 +228,8 @@ def restore_training(
 
 
 def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: bool) -> None:
-    """Give the model its values, with `averaged` those of the moving average where there is one.
-
-    Raises:
-        RunError: the tensors do not fit the model.
-    """
+    """Give the model its values, with `averaged` those of the moving average where there is one. Raises RunError: the
+    tensors do not fit the model."""
     values = {**part(tensors, _MODEL), **(part(tensors, AVERAGE) if averaged else {})}
     try:
         model.load_state_dict(values)

@@ -63,11 +63,8 @@ class RunFolder:
 def create_run_folder(
     output_dir: Path, scene_name: str, method_name: str, started: datetime | None = None
 ) -> RunFolder:
-    """Make a new run folder, named for the local time; a second one in the same second gets `-2` appended.
-
-    Raises:
-        RunError: it can't be made.
-    """
+    """Make a new run folder, named for the local time; a second one in the same second gets `-2` appended. Raises
+    RunError: it can't be made."""
     stamp = (started or datetime.now(timezone.utc).astimezone()).strftime("%Y-%m-%d_%H%M%S")
     parent = output_dir.resolve() / safe_name(scene_name, fallback="scene") / safe_name(method_name)
     try:
@@ -87,11 +84,8 @@ def create_run_folder(
 
 
 def open_run_folder(path: Path) -> RunFolder:
-    """An existing run folder.
-
-    Raises:
-        RunError: it is missing, is not a run folder, is half-written, or has a link that leads out of it.
-    """
+    """An existing run folder. Raises RunError: it is missing, is not a run folder, is half-written, or has a link that
+    leads out of it."""
     try:
         if not path.is_dir():
             raise RunError(f"no run folder at {path}; give the path that training printed as its last line")
@@ -106,11 +100,8 @@ def open_run_folder(path: Path) -> RunFolder:
 
 
 def newest_run(output_dir: Path) -> RunFolder:
-    """The run under `output_dir` that was started or resumed last, of those that have a checkpoint.
-
-    Raises:
-        RunError: there is none.
-    """
+    """The run under `output_dir` that was started or resumed last, of those that have a checkpoint. Raises RunError:
+    there is none."""
     # By time, not by name, which only says what a clock once said.
     found = [
         ((path / "config.json").stat().st_mtime_ns, path)
@@ -146,11 +137,8 @@ class RunLock:
     """Held from its making to `release`, or to the end of the process, however it ends."""
 
     def __init__(self, path: Path, holder: str = "training") -> None:
-        """Take the lock; the same process may take it again. `holder` is what takes such locks.
-
-        Raises:
-            RunError: another process has it, or the file can't be made.
-        """
+        """Take the lock; the same process may take it again. `holder` is what takes such locks. Raises RunError:
+        another process has it, or the file can't be made."""
         self._lock = FileLock(path, timeout=0, is_singleton=True, thread_local=False)
         self._is_held = False
         try:

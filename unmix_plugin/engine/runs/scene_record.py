@@ -73,11 +73,8 @@ def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> 
 
 
 def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolder) -> None:
-    """Refuse another scene than the run's; numbers may differ by what machines round differently.
-
-    Raises:
-        RunError: metadata, scene box or identity differ from what the run was trained with.
-    """
+    """Refuse another scene than the run's; numbers may differ by what machines round differently. Raises RunError:
+    metadata, scene box or identity differ from what the run was trained with."""
     box, other_box = scene.scene_box.aabb.tolist(), datamanager.scene_box.aabb.tolist()
     sizes, other_sizes = (_sizes(x.train_cameras, x.eval_cameras) for x in (scene, datamanager))
     kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary), "image sizes": sizes}

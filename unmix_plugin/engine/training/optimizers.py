@@ -29,11 +29,8 @@ def _learning_rate(config: OptimizerConfig, progress: float) -> float:
 def build_optimizer(
     param_groups: Mapping[str, list[nn.Parameter]], configs: Mapping[str, OptimizerConfig]
 ) -> torch.optim.Adam:
-    """One Adam over all groups, each with its config's settings; `param_groups[i]["name"]` is the group's name.
-
-    Raises:
-        ConfigError: a group of the model has no optimizer config.
-    """
+    """One Adam over all groups, each with its config's settings; `param_groups[i]["name"]` is the group's name. Raises
+    ConfigError: a group of the model has no optimizer config."""
     missing = sorted(name for name, params in param_groups.items() if params and name not in configs)
     if missing:
         raise ConfigError(
@@ -53,11 +50,9 @@ def set_learning_rates(
     optimizer: torch.optim.Optimizer, configs: Mapping[str, OptimizerConfig], progress: float
 ) -> dict[str, float]:
     """Set every group's step size for `progress`; returns them by group name."""
-    names = [group["name"] for group in optimizer.param_groups]
-    rates = {name: _learning_rate(configs[name], progress) for name in names}
     for group in optimizer.param_groups:
-        group["lr"] = rates[group["name"]]
-    return rates
+        group["lr"] = _learning_rate(configs[group["name"]], progress)
+    return {group["name"]: group["lr"] for group in optimizer.param_groups}
 
 
 def forget_gradients(optimizer: torch.optim.Optimizer, names: Collection[str]) -> None:
@@ -84,11 +79,8 @@ class GradientGuard:
 
     @torch.no_grad()
     def check(self, loss: Tensor) -> tuple[bool, float]:
-        """Whether the optimiser may step, and the loss as a number.
-
-        Raises:
-            RunError: too many steps in a row were refused.
-        """
+        """Whether the optimiser may step, and the loss as a number. Raises RunError: too many steps in a row were
+        refused."""
         gradients = {
             group["name"]: [param.grad for param in group["params"] if param.grad is not None]
             for group in self.optimizer.param_groups
@@ -126,16 +118,9 @@ class ParameterAverage:
     """
 
     def __init__(self, module: nn.Module, decay: float, interval: int = 1) -> None:
-        """Start from the current values.
-
-        Args:
-            module: Whose parameters to follow.
-            decay: Of a step, in [0, 1).
-            interval: Steps between updates after the first interval; each then counts for so many steps.
-        """
-        self.interval = interval
-        self.decay = decay**interval
-        self.updates = 0
+        """Start from the current values. `decay` is of a step, in [0, 1); updates after the first interval count for as
+        many steps as it has."""
+        self.interval, self.decay, self.updates = interval, decay**interval, 0
         self.params = {name: param for name, param in module.named_parameters() if param.requires_grad}
         self.values = {name: param.detach().clone() for name, param in self.params.items()}
         """The averages by parameter name."""

@@ -209,10 +209,7 @@ def _append(path: Path, line: str) -> None:
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
     """Lines of a run's `metrics.jsonl`, each with its `step`; those that a killed run left incomplete are passed over.
-
-    Raises:
-        RunError: it is no regular file, or longer than a training writes.
-    """
+    Raises RunError: it is no regular file, or longer than a training writes."""
     return [record for line in _lines(path) if (record := _record(line)) is not None]
 
 

@@ -107,11 +107,8 @@ class TrainingSteps:
         return record
 
     def begin(self, step: int) -> None:
-        """Start all processes from the first one's model, before step number `step`.
-
-        Raises:
-            RunError: a process is at another step: their checkpoints differ.
-        """
+        """Start all processes from the first one's model, before step number `step`. Raises RunError: a process is at
+        another step: their checkpoints differ."""
         self.processes.equalise(self.pipeline.model.state_dict().values())
         found = set(self.processes.gather(step))
         if len(found) > 1:
@@ -122,11 +119,8 @@ class TrainingSteps:
         self.pipeline.draw_as(self.processes.rank)
 
     def take(self, step: int, progress: float) -> StepResult:
-        """Take step number `step` at `progress` in [0, 1].
-
-        Raises:
-            RunError: loss and gradients stay non-finite, or another process has ended.
-        """
+        """Take step number `step` at `progress` in [0, 1]. Raises RunError: loss and gradients stay non-finite, or
+        another process has ended."""
         pipeline, datamanager = self.pipeline, self.pipeline.datamanager
         pipeline.train()  # a guest may have left it in evaluation mode
         pipeline.seed_step(step)
@@ -164,11 +158,8 @@ class TrainingSteps:
 
 
 def prepare_steps(config: TrainerConfig, processes: Processes = ALONE) -> tuple[TrainerConfig, TrainingSteps]:
-    """Read the scene and make the model; settings without `auto`, and what takes the steps.
-
-    Raises:
-        SceneError, ConfigError: scene or settings are wrong.
-    """
+    """Read the scene and make the model; settings without `auto`, and what takes the steps. Raises SceneError,
+    ConfigError: scene or settings are wrong."""
     device = resolve_device(config.device)
     seed_everything(config.seed)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=device, seed=config.seed)
