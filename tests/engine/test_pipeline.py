@@ -1,6 +1,5 @@
 """What a pipeline computes from a model and a data manager, whatever they are."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -101,17 +100,6 @@ def test_a_pipeline_loads_with_its_scene_at_another_place(short_config: TrainerC
     assert loaded.config.data == loaded.pipeline.datamanager.data == moved
     assert loaded.training == trainer.record
     assert not loaded.pipeline.model.training
-
-
-def test_two_runs_of_one_seed_are_equal_and_of_another_seed_are_not(short_config: TrainerConfig):
-    def trained(seed: int) -> torch.Tensor:
-        trainer = quiet_trainer(replace(short_config, seed=seed))
-        trainer.train()
-        return next(trainer.pipeline.model.parameters()).detach()
-
-    first = trained(1)
-    assert torch.equal(trained(1), first)
-    assert not torch.equal(trained(2), first)
 
 
 def test_warnings_of_the_data_are_told_when_a_run_starts_and_not_when_one_is_loaded(

@@ -204,18 +204,15 @@ CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
     "no box": lambda scene: scene.pop("scene_box"),
     "box of text": lambda scene: scene.update(scene_box="big"),
     "box inside out": lambda scene: scene.update(scene_box=[[1, 1, 1], [0, 0, 0]]),
-    "box of another shape": lambda scene: scene.update(scene_box=[1, 2]),
     "metadata a list": lambda scene: scene.update(metadata=[]),
     "no metadata": lambda scene: scene.update(metadata={}),
     "metadata of text": lambda scene: scene["metadata"].update(grid_size="x"),
+    "another grid": lambda scene: scene["metadata"].update(grid_size=10),
     "summary null": lambda scene: scene.update(summary=None),
-    "cameras null": lambda scene: scene.update(eval_cameras=None),
     "cameras ragged": lambda scene: scene["eval_cameras"]["camera_to_world"].append([1]),
     "too few lenses": lambda scene: scene["eval_cameras"]["focal_px"].pop(),
     "no width": lambda scene: scene["eval_cameras"].update(width=0),
-    "width of text": lambda scene: scene["eval_cameras"].update(width="20"),
     "huge": lambda scene: scene["eval_cameras"].update(height=10**12),
-    "beyond 64 bits": lambda scene: scene["eval_cameras"].update(height=10**40),
     "infinite lens": lambda scene: scene["eval_cameras"]["focal_px"].__setitem__(0, [1e60, 1e60]),
     "indices beyond": lambda scene: scene["summary"].update(frames=["a"], eval_indices=[0, 7]),
     "indices of text": lambda scene: scene["summary"].update(frames=["a", "b"], eval_indices=["0", "1"]),
@@ -227,7 +224,9 @@ CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_scene_of_another_shape_is_refused(trained: RunFolder, name: str):
     rewrite(trained.scene_path, CHANGES[name])
-    with pytest.raises(RunError, match=r"scene\.json"):
+    with pytest.raises(
+        RunError, match="does not fit the model" if name == "another grid" else r"scene\.json"
+    ):
         load_model(trained.path, "cpu")
 
 

@@ -76,28 +76,6 @@ def test_a_group_whose_gradients_are_forgotten_steps_as_at_first():
     assert moved["b"] == pytest.approx(0.1)
 
 
-def test_a_step_is_adams():
-    param = nn.Parameter(torch.tensor([1.0, -2.0, 3.0]))
-    config = OptimizerConfig(lr=0.1)
-    optimizer = build_optimizer({"a": [param]}, {"a": config})
-    param.grad = torch.tensor([0.5, -4.0, 1e-3])
-    optimizer.step()
-    # The first step of Adam is lr times the sign of the gradient, whatever its size.
-    torch.testing.assert_close(param.detach(), torch.tensor([0.9, -1.9, 2.9]))
-
-
-def test_weight_decay_draws_what_has_no_gradient_to_zero_and_hardly_moves_the_rest():
-    param = nn.Parameter(torch.tensor([1.0, -1.0]))
-    optimizer = build_optimizer({"a": [param]}, {"a": OptimizerConfig(lr=0.01, weight_decay=1e-3)})
-    for _ in range(50):
-        param.grad = torch.tensor([0.0, -1.0])  # the second is asked to grow
-        optimizer.step()
-    assert 0.4 < float(param.detach()[0]) < 0.6
-    torch.testing.assert_close(param.detach()[1], torch.tensor(-0.5), atol=1e-3, rtol=0)
-    with pytest.raises(ConfigError, match="weight-decay of at least 0"):
-        OptimizerConfig(weight_decay=-1.0)
-
-
 def make_guard():
     params = [nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(1))]
     configs = {"a": OptimizerConfig(), "b": OptimizerConfig()}
@@ -183,15 +161,6 @@ def averaged(weights: Iterable[float], decay: float, interval: int = 1) -> Param
     return average
 
 
-def test_after_many_steps_the_average_is_exponential():
-    weights = [float(step % 7) for step in range(1, 60)]
-    expected = 0.0
-    for weight in weights:
-        expected = 0.5 * expected + 0.5 * weight
-    found = averaged(weights, decay=0.5).values["weight"].item()
-    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
-
-
 def test_an_interval_updates_at_its_steps_with_the_decay_to_its_power_after_the_first():
     average = averaged([1.0, 1.0], decay=0.9, interval=2)
     assert average.decay == 0.9**2
@@ -202,6 +171,8 @@ def test_an_interval_updates_at_its_steps_with_the_decay_to_its_power_after_the_
     short = averaged([1.0] * 3, decay=0.99, interval=8)  # each step, so that a short training shows
     assert short.updates == 3
     assert short.values["weight"].item() > 0.95
+    long = averaged([*[0.0] * 30, 1.0, 1.0], decay=0.5)  # exponential in the end
+    assert long.values["weight"].item() == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize("num_steps", [400, 4000])

@@ -108,17 +108,6 @@ def test_a_status_says_step_loss_psnr_speed_and_time_left():
     assert str(replace(STATUS, seconds=7200.0)).endswith("6:00:00 left")
 
 
-def test_where_the_output_is_no_terminal_each_status_is_one_plain_line():
-    out = io.StringIO()
-    display = ProgressDisplay(Console(file=out, width=40), plain_interval_s=0.0)
-    with display:
-        assert display.is_due
-        display.show(STATUS)
-        display.message("saved [bold]x[/bold]")
-    assert out.getvalue() == f"{STATUS}\nsaved [bold]x[/bold]\n"
-    assert not ProgressDisplay(Console(file=out), plain_interval_s=100.0).is_due
-
-
 @pytest.mark.parametrize("width", [40, 60, 200])
 def test_on_a_terminal_the_bar_is_redrawn_in_place_and_the_time_left_is_never_cut_off(width: int):
     out = io.StringIO()
