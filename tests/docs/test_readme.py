@@ -85,10 +85,6 @@ def test_every_command_runs(place, monkeypatch):
     assert ran == set(COMMANDS)
 
 
-def test_the_readme_is_short():
-    assert len(README.splitlines()) <= 200
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_to_a_page_and_to_a_heading(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", text_of(page)):

@@ -48,19 +48,6 @@ def test_ci_scripts_run_what_is_here(script):
     assert not any(faults), faults
 
 
-def test_a_step_that_names_what_is_not_here_is_found():
-    for line in (
-        "make no-such-target",
-        "make",
-        "bash .ci/no-such-script",
-        "python scripts/none.py",
-        "tox -e py310",
-    ):
-        assert fault_of(line)
-    for line in ("make lint", "bash .ci/run", "make wheel WHEEL_OPTIONS=--release || status=1", "# a word"):
-        assert fault_of(line) is None
-
-
 def test_every_run_of_the_tests_is_also_one_of_ci():
     """So that what is green there is green here."""
     lines = {

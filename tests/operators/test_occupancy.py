@@ -28,18 +28,12 @@ def full(side: int = 8) -> OccupancyGrid:
 
 def test_cells_are_occupied_where_there_is_density_and_empty_elsewhere():
     grid = updated(full(), ball, times=10)
+    few = updated(full(), ball, times=60, num_cells=128)
+    assert (few.occupied != grid.occupied).float().mean() < 0.05
     centres = (torch.stack(torch.meshgrid(*[torch.arange(8)] * 3, indexing="ij"), -1) + 0.5) / 8
     distance = (centres - 0.5).norm(dim=-1)
     assert grid.occupied[distance < 0.2].all()
     assert not grid.occupied[distance > 0.4].any()
-
-
-def test_unreachable_cells_stay_empty_whatever_the_density():
-    reachable = torch.ones(4, 4, 4, dtype=torch.bool)
-    reachable[0] = False
-    grid = updated(OccupancyGrid(reachable), lambda points: torch.full((len(points),), 50.0), times=3)
-    assert not grid.occupied[0].any()
-    assert grid.occupied[1:].all()
 
 
 def test_what_is_emptied_later_stays_empty_and_all_else_is_as_it_was():
@@ -64,12 +58,6 @@ def test_a_cell_is_forgotten_once_its_density_has_decayed_and_occupied_again_whe
     assert not grid.occupied.any()
     updated(grid, ball, times=4)
     assert grid.occupied[1:3, 1:3, 1:3].all()
-
-
-def test_probing_some_cells_at_a_time_finds_the_same_ball():
-    grid = updated(full(), ball, times=60, num_cells=128)
-    reference = updated(full(), ball, times=60)
-    assert (grid.occupied != reference.occupied).float().mean() < 0.05
 
 
 def test_a_thin_density_everywhere_stays_visible():
@@ -133,72 +121,55 @@ SIDE = 8
 ENOUGH_RAYS = 16 * SIDE * SIDE
 
 
-def looked_at(
-    *sights: tuple[tuple[int, int, int], int], seen: bool = True, num_rays=ENOUGH_RAYS
-) -> _VisibleCells:
-    """Cells after samples in the middle of these ones, each with the number of its view, and a judgement."""
-    cells = _VisibleCells((SIDE, SIDE, SIDE))
-    record(cells, *sights, seen=seen, num_rays=num_rays)
-    cells.update()
-    return cells
-
-
 def record(cells: _VisibleCells, *sights, seen: bool = True, num_rays: int = ENOUGH_RAYS) -> None:
+    """Samples in the middle of cells, each with the number of its view."""
     points = (torch.tensor([cell for cell, _ in sights]) + 0.5) / SIDE
     views = torch.tensor([view for _, view in sights])
     cells.record(points, views, torch.full((len(sights),), seen), num_rays)
 
 
-def test_what_two_views_see_stays_with_its_neighbours_and_the_rest_is_closed():
-    cells = looked_at(((2, 3, 4), 0), ((2, 3, 4), 1))
-    expected = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
-    expected[1:4, 2:5, 3:6] = True
-    assert torch.equal(cells.visible, expected)
+NEAR, FAR = (1, 1, 1), (6, 6, 6)
 
 
-def test_what_one_view_sees_however_often_is_closed():
-    cells = looked_at(((1, 1, 1), 3), ((1, 1, 1), 5), ((6, 6, 6), 3), ((6, 6, 6), 3))
-    assert cells.visible[1, 1, 1]
-    assert not cells.visible[6, 6, 6]
-
-
-def test_of_a_single_view_all_that_it_sees_stays():
-    cells = looked_at(((1, 1, 1), 0), ((6, 6, 6), 0))
-    assert cells.visible[1, 1, 1]
-    assert cells.visible[6, 6, 6]
-    assert not cells.visible[3, 3, 3]
-
-
-def test_samples_that_send_too_little_light_see_nothing_and_where_all_do_everything_stays():
+@pytest.mark.parametrize(
+    ("sights", "unseen", "opened", "closed"),
+    [
+        ([(NEAR, 3), (NEAR, 5), (FAR, 3), (FAR, 3)], [], [NEAR, (0, 2, 1)], [FAR, (3, 1, 1)]),
+        ([(NEAR, 0), (FAR, 0)], [], [NEAR, FAR], [(3, 3, 3)]),  # a single view
+        ([(NEAR, 0), (NEAR, 1)], [(FAR, 0), (FAR, 1)], [NEAR], [FAR]),  # samples that send too little light
+        ([], [(FAR, 0), (FAR, 1)], [NEAR, FAR], []),  # where none sends enough, all stays
+    ],
+)
+def test_what_two_views_see_stays_with_its_neighbours_and_the_rest_is_closed(sights, unseen, opened, closed):
     cells = _VisibleCells((SIDE, SIDE, SIDE))
-    record(cells, ((6, 6, 6), 0), ((6, 6, 6), 1), seen=False)
-    record(cells, ((1, 1, 1), 0), ((1, 1, 1), 1))
+    for some, seen in ((sights, True), (unseen, False)):
+        if some:
+            record(cells, *some, seen=seen)
     cells.update()
-    assert cells.visible[1, 1, 1]
-    assert not cells.visible[6, 6, 6]
-    assert looked_at(((6, 6, 6), 0), ((6, 6, 6), 1), seen=False).visible.all()
+    assert all(cells.visible[cell] for cell in opened)
+    assert not any(cells.visible[cell] for cell in closed)
 
 
 @pytest.mark.parametrize("more", [0, 1])
 def test_nothing_is_left_out_before_enough_rays_were_cast(more):
     """Of which large pictures need more, and views may have large numbers."""
     cells = _VisibleCells((SIDE, SIDE, SIDE))
-    record(cells, ((1, 1, 1), 1000), ((1, 1, 1), 1001), num_rays=ENOUGH_RAYS - 1 + more)
+    record(cells, (NEAR, 1000), (NEAR, 1001), num_rays=ENOUGH_RAYS - 1 + more)
     cells.update(fewest_rays=ENOUGH_RAYS + more)
     assert cells.visible.all()
-    record(cells, ((6, 6, 6), 1000), ((6, 6, 6), 1001), num_rays=1)
+    record(cells, (FAR, 1000), (FAR, 1001), num_rays=1)
     cells.update(fewest_rays=ENOUGH_RAYS + more)
-    assert cells.visible[1, 1, 1]
-    assert cells.visible[6, 6, 6]
-    assert not cells.visible[4, 1, 1]
+    assert [bool(cells.visible[cell]) for cell in (NEAR, FAR, (4, 1, 1))] == [True, True, False]
 
 
 def test_only_what_was_seen_since_the_last_update_counts_and_the_open_cells_follow_a_surface():
-    cells = looked_at(((3, 3, 3), 0), ((3, 3, 3), 1))
-    record(cells, ((4, 3, 3), 0), ((4, 3, 3), 1))
-    cells.update()
-    assert cells.visible[5, 3, 3]
-    assert not cells.visible[2, 3, 3]
+    cells = _VisibleCells((SIDE, SIDE, SIDE))
+    for x in (3, 4):
+        record(cells, ((x, 3, 3), 0), ((x, 3, 3), 1))
+        cells.update()
+    expected = torch.zeros(SIDE, SIDE, SIDE, dtype=torch.bool)
+    expected[3:6, 2:5, 2:5] = True
+    assert torch.equal(cells.visible, expected)
 
 
 def test_points_on_the_faces_of_the_box_belong_to_the_outermost_cells():

@@ -1,9 +1,7 @@
 """Run folders: made once each, found again, refused when unusable; one from a stranger writes nowhere but in itself."""
 
-import hashlib
 import json
 import os
-import struct
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timezone
@@ -115,13 +113,20 @@ def test_a_run_without_a_checkpoint_is_refused(trained: RunFolder):
         load_model(trained.path)
 
 
-def test_a_config_that_does_not_fit_its_method_or_whose_method_is_gone_is_refused(
-    trained: RunFolder, registered: list
-):
-    change = {"num_samples_per_ray": "many"}
-    rewrite(trained.config_path, lambda values: values["config"]["pipeline"]["model"].update(change))
-    with pytest.raises(RunError, match=r"config\.pipeline\.model\.num_samples_per_ray: expected an integer"):
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("num_samples_per_ray", "many", r"config\.pipeline\.model\.num_samples_per_ray: expected an integer"),
+        ("eval_num_rays_per_chunk", -1, "eval_num_rays_per_chunk must be from 256"),
+    ],
+)
+def test_a_config_that_does_not_fit_its_method_is_refused(trained: RunFolder, name, value, words):
+    rewrite(trained.config_path, lambda run: run["config"]["pipeline"]["model"].update({name: value}))
+    with pytest.raises(RunError, match=words):
         load_model(trained.path)
+
+
+def test_a_run_whose_method_is_gone_is_refused(trained: RunFolder, registered: list):
     registered.clear()
     with pytest.raises(RunError, match="unknown method 'rgb-nerf'"):
         load_config(trained.path)
@@ -242,32 +247,6 @@ def test_json_that_no_run_writes_is_refused(trained: RunFolder, name: str, value
         load_model(trained.path, "cpu")
 
 
-@pytest.mark.parametrize("rays", [0, -1, 10**15])
-def test_a_setting_out_of_its_range_is_refused_by_name(trained: RunFolder, rays: int):
-    change = {"eval_num_rays_per_chunk": rays}
-    rewrite(trained.config_path, lambda values: values["config"]["pipeline"]["model"].update(change))
-    with pytest.raises(RunError, match="eval_num_rays_per_chunk must be from 256"):
-        load_model(trained.path, "cpu")
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"\xff" * 8,
-        struct.pack("<Q", 2) + b"{}trailing",
-        struct.pack("<Q", 60) + b'{"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 9]}}',
-        struct.pack("<Q", 4) + b"[[[[",
-    ],
-)
-def test_tensors_with_the_right_hash_and_a_bad_header_are_passed_over(trained: RunFolder, data: bytes):
-    for record in trained.checkpoints.glob("*.json"):
-        record.with_suffix(".safetensors").write_bytes(data)
-        rewrite(record, lambda values: values.update(sha256=hashlib.sha256(data).hexdigest()))
-    with pytest.raises(RunError, match=r"no complete checkpoint|does not fit the model"):
-        load_model(trained.path, "cpu")
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [("steps", "many"), ("steps", -1), ("num_rays", 0), ("learning_rates", 3), ("train_seconds", None)],
@@ -307,10 +286,8 @@ def test_what_json_or_the_rounding_of_another_machine_change_is_no_difference():
     [
         ({"cameras": {"width": 65, "pose": SCENE["cameras"]["pose"]}}, "cameras.width"),
         ({"cameras": {"width": 64, "pose": [[[1.0, 0.0, 0.25], [0.0, 1.0, 4.01]]]}}, "cameras.pose"),
-        ({"wavelengths_nm": [450.0, 550.0]}, "wavelengths_nm"),
         ({"wavelengths_nm": [[450.0], [550.0, 650.0]]}, "wavelengths_nm"),
         ({"frames": ["left", "middle"]}, "frames"),
-        ({"light": [1.0, 0.5, 0.5]}, "light"),
         ({"has_alpha": 1}, "has_alpha"),
         ({"files": {}}, "files"),
     ],

@@ -21,11 +21,11 @@ from unmix_plugin.engine.training.training_control import SHARE_BOUNDS, DeviceSh
 STEP_S = 0.004
 
 
-def busy(seconds):
-    """Take time as computing does, without being interrupted."""
-    until = time.perf_counter() + seconds
-    while time.perf_counter() < until:
-        pass
+def in_background(work):
+    """A thread that does something, started."""
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
 
 
 @pytest.fixture
@@ -47,8 +47,7 @@ def contest(monkeypatch):
             while not is_over.is_set():
                 step(device.guest_turn(cost), "guest")
 
-        guest = threading.Thread(target=be_guest)
-        guest.start()
+        guest = in_background(be_guest)
         for _ in range(steps):
             while device._waiting["guest"] == 0:  # the guest is on its way to its next turn
                 time.sleep(0)
@@ -75,13 +74,8 @@ def test_turns_never_overlap():
                 time.sleep(0)  # lets the other thread run, which must not enter
                 inside -= 1
 
-    guest = threading.Thread(target=take, args=(device.guest_turn,))
-    guest.start()
-    while guest.is_alive():
-        with device.training_turn():
-            inside += 1
-            most = max(most, inside)
-            inside -= 1
+    guest = in_background(lambda: take(device.guest_turn))
+    take(device.training_turn)
     guest.join()
     assert most == 1
 
@@ -100,9 +94,8 @@ def test_work_that_may_wait_gets_less(contest):
 def test_without_training_a_guest_never_waits():
     device = DeviceShare(0.05)
     started = time.monotonic()
-    for _ in range(50):
-        with device.guest_turn(100.0):
-            busy(0.001)
+    with device.guest_turn(1e6):
+        time.sleep(0.001)
     device.charge(1000.0)
     with device.guest_turn():
         pass
@@ -121,8 +114,7 @@ def test_a_guest_that_waits_for_credit_goes_on_when_training_ends():
         with device.guest_turn():
             went.set()
 
-    guest = threading.Thread(target=be_guest)
-    guest.start()
+    guest = in_background(be_guest)
     assert not went.wait(0.1)
     device.is_training = False
     assert went.wait(120)
@@ -154,9 +146,8 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under
         with device.training_turn():
             order.append("training")
 
-    training = threading.Thread(target=warm_up)
     with device.guest_turn():
-        training.start()
+        training = in_background(warm_up)
         while device._waiting["training"] == 0:
             time.sleep(0)
     for _ in range(3):
@@ -164,13 +155,6 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under
             order.append("guest")
     training.join(120)
     assert order == ["training", "guest", "guest", "guest"]
-
-
-def in_background(work):
-    """A thread that does something, started."""
-    thread = threading.Thread(target=work)
-    thread.start()
-    return thread
 
 
 def wait_for(holds, timeout_s=120.0):
