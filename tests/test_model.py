@@ -54,16 +54,6 @@ def test_highlights_have_the_lights_colour_and_where_no_alpha_is_known_those_of_
     bare.warm_up()  # compiles kernels without spectra to learn
 
 
-def test_samples_without_weight_change_little_when_left_out():
-    rays = make_rays(40)
-    everything, most = (
-        make_model(renderer=replace(CONFIG.renderer, smallest_weight=weight)) for weight in (0.0, 1e-3)
-    )
-    assert_close(
-        most.get_outputs(rays)["spectral"], everything.get_outputs(rays)["spectral"], rtol=0, atol=0.04
-    )
-
-
 def test_a_ray_that_misses_the_box_sees_black_and_nothing():
     outputs = make_model().get_outputs(make_rays(5))
     assert outputs["spectral"][-1].abs().sum() == 0

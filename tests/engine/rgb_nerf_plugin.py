@@ -25,6 +25,7 @@ from unmix_plugin.engine import (
     Target,
     TrainerConfig,
     step_generator,
+    upright_cameras,
 )
 
 VIEWS, SIZE = 12, 20
@@ -42,7 +43,10 @@ class BallDataManager(DataManager):
 
     def __init__(self, config: BallConfig, *, data: Path, device: torch.device, seed: int = 0) -> None:
         super().__init__(config, data=data, device=device, seed=seed)
-        cameras = _cameras_around(VIEWS)
+        turns, heights = np.arange(VIEWS) * 2.399963, np.linspace(-0.7, 0.7, VIEWS)
+        across = np.sqrt(1 - heights**2)[:, None] * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        backs = np.concatenate([across, heights[:, None]], axis=1)
+        cameras = upright_cameras(3.0 * backs, backs, SIZE, 2 * np.arctan(1 / 3.6))
         self.eval_cameras = cameras[list(config.eval_views)]
         self.train_cameras = cameras[[view for view in range(VIEWS) if view not in config.eval_views]]
         self.scene_box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
@@ -171,15 +175,3 @@ def _trace(rays: RayBundle) -> Tensor:
     discriminant = along.square() - rays.origins.square().sum(dim=-1) + 0.36
     normals = (rays.origins + (-along - discriminant.clamp_min(0).sqrt())[:, None] * rays.directions) / 0.6
     return torch.where(discriminant[:, None] > 0, 0.5 + 0.4 * normals, torch.zeros(3))
-
-
-def _cameras_around(count: int) -> Cameras:
-    angles = torch.arange(count) * 2.399963
-    heights = torch.linspace(-0.7, 0.7, count)
-    radii = (1 - heights.square()).sqrt()
-    backs = torch.stack([radii * angles.cos(), radii * angles.sin(), heights], dim=-1)
-    rights = nn.functional.normalize(torch.linalg.cross(torch.tensor([[0.0, 0.0, 1.0]]), backs), dim=-1)
-    ups = torch.linalg.cross(backs, rights)
-    poses = torch.stack([rights, ups, backs, 3.0 * backs], dim=-1)
-    lens = torch.tensor([[1.8 * SIZE, 1.8 * SIZE]]).expand(count, 2)
-    return Cameras(poses, lens, torch.full((count, 2), SIZE / 2), torch.zeros(count, 4), SIZE, SIZE)

@@ -19,10 +19,8 @@ from unmix_plugin.rendering import front_to_back
 
 def textured(smallest_weight: float, opacity: float):
     """A renderer and a field of as many different densities and materials as a table holds."""
-    renderer, field = make(smallest_weight=smallest_weight, pixel=0.03)
-    with torch.no_grad():
-        field.table.normal_(std=1.0, generator=torch.Generator().manual_seed(2))
-        field.log_initial_density = math.log(-math.log1p(-opacity) / renderer.step)
+    renderer, field = make(smallest_weight, pixel=0.03, depth=-math.log1p(-opacity))
+    torch.nn.init.normal_(field.table, std=1.0, generator=torch.Generator().manual_seed(2))
     return renderer, field
 
 

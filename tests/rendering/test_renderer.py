@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 from torch.testing import assert_close
 
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
@@ -32,15 +33,16 @@ PIXEL = 0.1
 
 
 def make(
-    box: SceneBox = BOX, smallest_weight: float = WITH_ALPHA.smallest_weight, pixel: float = PIXEL
+    smallest_weight: float = WITH_ALPHA.smallest_weight, pixel: float = PIXEL, depth: float | None = None
 ) -> tuple[VolumeRenderer, UnmixField]:
+    """With `depth` every sample has that optical depth."""
     torch.manual_seed(0)
-    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), box, 3, 1, 1.0, PIXEL)
-    cells = torch.ones(8, 8, 8)
-    step = pixel / 1.5
-    return VolumeRenderer(
-        box, skip_distances(cells > 0), cells > 0, step, smallest_weight, rays_per_chunk=7
-    ), field
+    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, 1.0, PIXEL)
+    cells, step = torch.ones(8, 8, 8) > 0, pixel / 1.5
+    if depth is not None:
+        nn.init.zeros_(field.table)
+        field.log_initial_density = math.log(depth / step)
+    return VolumeRenderer(BOX, skip_distances(cells), cells, step, smallest_weight, rays_per_chunk=7), field
 
 
 def rays(num_rays: int) -> RayBundle:
@@ -56,10 +58,9 @@ def samples_of(renderer: VolumeRenderer, bundle: RayBundle) -> PackedSamples:
 
 
 def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
-    renderer, field = make()
+    renderer, field = make(depth=PIXEL / 1.5)
     bundle = rays(20)
     with torch.no_grad():
-        field.table.zero_()  # then the network's output is zero, and the density its initial value
         rendered = renderer.render(field, bundle)
     t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
     assert rendered.num_samples == pytest.approx(((t_far - t_near) / renderer.step).sum().item(), rel=0.02)
@@ -71,11 +72,9 @@ def test_a_homogeneous_box_absorbs_what_beer_lambert_says():
 @pytest.mark.parametrize("density", [0.1, 10.0])
 def test_sparsity_counts_the_samples_that_density_is_spread_over(density):
     """Closed form in a homogeneous box; a sample of depth 10 counts a few times one of depth 0.1, not 100 times."""
-    renderer, field = make()
+    renderer, field = make(depth=density)
     bundle = rays(20)
     with torch.no_grad():
-        field.table.zero_()
-        field.log_initial_density = math.log(density / renderer.step)
         spread = renderer.render(field, bundle).sparsity
     t_near, t_far = BOX.intersect(bundle.origins, bundle.directions)
     carrying = [
@@ -91,10 +90,9 @@ def test_sparsity_counts_the_samples_that_density_is_spread_over(density):
 
 def test_a_softmax_that_is_sure_still_learns_that_it_should_not_be():
     """The certainty of even abundances is the opacity times log K; where one share is 1, its gradient stays."""
-    renderer, field = make()
+    renderer, field = make(depth=PIXEL / 1.5)
     bundle = rays(20)
     with torch.no_grad():
-        field.table.zero_()
         rendered = renderer.render(field, bundle)
         opacity = rendered.coefficients.accumulation.mean()
         assert_close(rendered.certainty, opacity * math.log(field.num_endmembers))
@@ -107,10 +105,8 @@ def test_without_alpha_an_untrained_scene_can_grow_dense_along_the_whole_of_a_ra
     """Every sample takes part although it starts behind semi-transparent density; with alpha, far ones are left out."""
     bundle, found = rays(20), {}
     for preset in (WITHOUT_ALPHA, WITH_ALPHA):
-        renderer, field = make(smallest_weight=preset.first_smallest_weight, pixel=0.02)
+        renderer, field = make(preset.first_smallest_weight, pixel=0.02, depth=-math.log1p(-0.01))
         with torch.no_grad():
-            field.table.zero_()
-            field.log_initial_density = math.log(-math.log1p(-0.01) / renderer.step)
             rendered = renderer.render(field, bundle)
         spread_a_sample = math.log1p(-math.log1p(-0.01) / 0.03)
         found[preset] = float(rendered.sparsity) * 20 / spread_a_sample / rendered.num_samples
@@ -166,11 +162,10 @@ def test_impossible_settings_are_refused(settings, message):
 @pytest.mark.parametrize("at_first", [_FIRST_SAMPLES, _FIRST_ON_GPU])
 def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_weight, opacity, at_first):
     monkeypatch.setattr("unmix_plugin.rendering.renderer._FIRST_SAMPLES", at_first)
-    renderer, field = make(smallest_weight=smallest_weight)
+    renderer, field = make(smallest_weight, depth=-math.log1p(-opacity))
     bundle, step = rays(30), renderer.step
     with torch.no_grad():
         field.table.normal_(std=3.0, generator=torch.Generator().manual_seed(2))
-        field.log_initial_density = math.log(-math.log1p(-opacity) / step)
         samples = samples_of(renderer, bundle)
         found = _visible_samples(field, samples, bundle, step, smallest_weight)
         encoded = field.encode(_points_of(samples, bundle)[0])
@@ -185,11 +180,9 @@ def test_samples_found_from_the_front_are_those_of_all(monkeypatch, smallest_wei
 
 
 def test_what_lies_behind_an_opaque_front_is_not_evaluated_and_rays_that_miss_have_no_samples():
-    renderer, field = make(pixel=0.02)
+    renderer, field = make(pixel=0.02, depth=10.0)
     bundle = rays(30)
     with torch.no_grad():
-        field.table.zero_()
-        field.log_initial_density = math.log(10 / renderer.step)
         samples = samples_of(renderer, bundle)
         found = _visible_samples(field, samples, bundle, renderer.step, renderer.smallest_weight)
     assert found.num_evaluated == 30 * 8
