@@ -17,16 +17,12 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.operators.launching import as_warp, launch
+from unmix_plugin.operators.launching import launch
 
 
 def volume_weights(optical_depths: Float[Tensor, "S"], packed_info: Int[Tensor, "R 2"]) -> Float[Tensor, "S"]:
-    """Share of its ray's light that each sample sends to the camera, in [0, 1]; differentiable once.
-
-    Args:
-        optical_depths: Density times length of each sample, >= 0.
-        packed_info: First sample and count of each ray; together the rays cover all samples.
-    """
+    """Share of its ray's light that each sample sends to the camera, in [0, 1]; differentiable once. `packed_info` has
+    the first sample and the count of each ray; together the rays cover all samples."""
     return _VolumeWeights.apply(optical_depths.contiguous(), packed_info)  # type: ignore[no-any-return]
 
 
@@ -58,15 +54,12 @@ def accumulate_twin(
     return totals.index_add(0, ray_indices, weights[:, None] * values)
 
 
-def _launch(kernel: Any, packed_info: Int[Tensor, "R 2"], *arrays: Tensor) -> None:
-    launch(kernel, len(packed_info), [as_warp(array) for array in arrays], packed_info.device)
-
-
 class _VolumeWeights(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, optical_depths: Tensor, packed_info: Tensor) -> Tensor:
         weights, transmittances = torch.empty_like(optical_depths), torch.empty_like(optical_depths)
-        _launch(_weights_kernel, packed_info, optical_depths, packed_info, weights, transmittances)
+        arrays = [optical_depths, packed_info, weights, transmittances]
+        launch(_weights_kernel, len(packed_info), arrays, packed_info.device)
         ctx.save_for_backward(weights, transmittances, packed_info)
         return weights
 
@@ -75,8 +68,8 @@ class _VolumeWeights(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
         weights, transmittances, packed_info = ctx.saved_tensors
         incoming, depth_gradients = gradients[0].contiguous(), torch.empty_like(weights)
-        arrays = (weights, transmittances, packed_info, incoming, depth_gradients)
-        _launch(_weights_gradient_kernel, packed_info, *arrays)
+        arrays = [weights, transmittances, packed_info, incoming, depth_gradients]
+        launch(_weights_gradient_kernel, len(packed_info), arrays, packed_info.device)
         return depth_gradients, None
 
 
@@ -84,7 +77,7 @@ class _Accumulate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, weights: Tensor, values: Tensor, packed_info: Tensor) -> Tensor:
         totals = values.new_empty(len(packed_info), values.shape[1])
-        _launch(_accumulate_kernel, packed_info, weights, values, packed_info, totals)
+        launch(_accumulate_kernel, len(packed_info), [weights, values, packed_info, totals], totals.device)
         ctx.save_for_backward(weights, values, packed_info)
         return totals
 
@@ -94,8 +87,8 @@ class _Accumulate(torch.autograd.Function):
         weights, values, packed_info = ctx.saved_tensors
         incoming = gradients[0].contiguous()
         weight_gradients, value_gradients = torch.empty_like(weights), torch.empty_like(values)
-        arrays = (weights, values, packed_info, incoming, weight_gradients, value_gradients)
-        _launch(_accumulate_gradient_kernel, packed_info, *arrays)
+        arrays = [weights, values, packed_info, incoming, weight_gradients, value_gradients]
+        launch(_accumulate_gradient_kernel, len(packed_info), arrays, packed_info.device)
         return weight_gradients, value_gradients, None
 
 

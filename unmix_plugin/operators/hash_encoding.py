@@ -133,7 +133,7 @@ class _HashEncode(torch.autograd.Function):
         arrays = [
             as_warp(positions, point),
             as_warp(table, features),
-            as_warp(levels),
+            levels,
             as_warp(rows, features),
         ]
         launch(_encode_kernel, num_samples * num_levels, arrays, positions.device)
@@ -149,12 +149,12 @@ class _HashEncode(torch.autograd.Function):
         table_gradient = position_gradient = None
         if ctx.needs_input_grad[1]:
             table_gradient = torch.zeros_like(table)
-            arrays = [as_warp(positions, point), incoming, as_warp(levels), as_warp(table_gradient, features)]
+            arrays = [as_warp(positions, point), incoming, levels, as_warp(table_gradient, features)]
             size = num_samples * num_levels
             launch(_table_gradient_kernel, size, arrays, positions.device, cpu_part=num_samples)
         if ctx.needs_input_grad[0]:
             position_gradient = torch.empty_like(positions)
-            arrays = [as_warp(positions, point), as_warp(table, features), incoming, as_warp(levels)]
+            arrays = [as_warp(positions, point), as_warp(table, features), incoming, levels]
             arrays.append(as_warp(position_gradient, point))
             launch(_position_gradient_kernel, num_samples, arrays, positions.device)
         return position_gradient, table_gradient, None, None

@@ -51,16 +51,15 @@ def warp() -> Any:
     # Without a GPU the native library warns on standard error that there is no driver.
     with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
         is_kept = _is_initialised(wp)
+        if not is_kept:
+            settings.kernel_cache_dir = tempfile.mkdtemp(prefix="unmix-kernels-")
+            atexit.register(shutil.rmtree, settings.kernel_cache_dir, ignore_errors=True)
+            wp.init()
     if not is_kept:
-        folder = tempfile.mkdtemp(prefix="unmix-kernels-")
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        settings.kernel_cache_dir = folder
         sys.stderr.write(
             "Warp's folder of compiled kernels can't be written, so they are compiled anew for this command; name one "
             "that can in the environment variable WARP_CACHE_PATH\n"
         )
-        with nullcontext() if torch.cuda.is_available() else _standard_error_closed():
-            wp.init()
     return wp
 
 
@@ -104,12 +103,8 @@ class KernelArray:
 
 
 def as_warp(tensor: torch.Tensor, dtype: Any = None) -> KernelArray:
-    """A tensor's memory without its gradient, since Warp must never own torch's.
-
-    Args:
-        tensor: Any tensor; for a vector `dtype` its last axis is contiguous and has the vector's length.
-        dtype: Warp type of an element; None for the tensor's own.
-    """
+    """A tensor's memory without its gradient, since Warp must never own torch's; with a vector `dtype` its last axis is
+    contiguous and has the vector's length."""
     wp = warp()
     plain = tensor.detach()
     is_vector = dtype is not None and hasattr(dtype, "_shape_")
@@ -121,25 +116,23 @@ def as_warp(tensor: torch.Tensor, dtype: Any = None) -> KernelArray:
 def launch(
     kernel: Any,
     size: int,
-    arguments: Sequence[KernelArray | float | int],
+    arguments: Sequence[KernelArray | torch.Tensor | float | int],
     device: torch.device,
     cpu_part: int | None = None,
 ) -> None:
     """Run `kernel(first, end, stride, *arguments)` so that each of `size` work items is done once.
 
     Args:
-        kernel: Warp kernel with the three parameters that the head of this module describes.
-        size: Number of work items; zero launches nothing.
-        arguments: Remaining parameters.
-        device: Torch device of the arrays.
+        arguments: Numbers and arrays on `device`, as tensors or as `as_warp` gives them.
         cpu_part: Work items of a part on a CPU, where those that write to the same address must be in one part; None
             if the range may be cut anywhere.
     """
     if size == 0:
         return
     wp = warp()
-    types = tuple(x.annotation if isinstance(x, KernelArray) else type(x) for x in arguments)
-    values = [x.descriptor if isinstance(x, KernelArray) else x for x in arguments]
+    taken = [as_warp(x) if isinstance(x, torch.Tensor) else x for x in arguments]
+    types = tuple(x.annotation if isinstance(x, KernelArray) else type(x) for x in taken)
+    values = [x.descriptor if isinstance(x, KernelArray) else x for x in taken]
     if device.type == "cuda":
         with _PACKING:
             stream = wp.stream_from_torch(torch.cuda.current_stream(device))

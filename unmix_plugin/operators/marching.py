@@ -68,7 +68,7 @@ class GridRays:
 
     origins: Float[Tensor, "R 3"]
     kernel: Any
-    arguments: list[KernelArray | float]
+    arguments: list[KernelArray | Tensor | float]
     """Its first ones."""
 
     @staticmethod
@@ -84,8 +84,8 @@ class GridRays:
         check_step(step)
         point = vector_type(3, torch.float32)
         arrays = [as_warp(values.contiguous(), point) for values in lines]
-        arrays += [as_warp(values.contiguous()) for values in numbers]
-        return GridRays(lines[0], kernel, [*arrays, step, as_warp(skips.contiguous())])
+        numbers = [values.contiguous() for values in numbers]
+        return GridRays(lines[0], kernel, [*arrays, *numbers, step, skips.contiguous()])
 
     def first_samples(self, most: int) -> FirstSamples:
         """At most so many samples of each ray by one launch, which writes them where there is room for as many."""
@@ -93,7 +93,7 @@ class GridRays:
         t = self.origins.new_empty(num_rays, most, dtype=torch.float32)
         ends = self.origins.new_empty(num_rays, dtype=torch.float32)
         counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
-        launch(self.kernel, num_rays, [*self.arguments, *map(as_warp, (t, counts, ends))], t.device)
+        launch(self.kernel, num_rays, [*self.arguments, t, counts, ends], t.device)
         return FirstSamples(t, counts, ends)
 
     def samples(self) -> PackedSamples:

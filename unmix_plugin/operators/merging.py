@@ -16,7 +16,7 @@ import warp as wp
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.operators.launching import as_warp, launch
+from unmix_plugin.operators.launching import launch
 from unmix_plugin.operators.marching import packed_rows
 
 _GAP = 1.5
@@ -60,24 +60,15 @@ def merge_samples(
     left: Float[Tensor, "R"],
     limits: MergeLimits,
 ) -> MergedSamples:
-    """Merge the samples of each ray from the front; without gradients.
-
-    Args:
-        optical_depths: Density times length of each sample, >= 0.
-        t: Distances along the ray, growing.
-        features: Of each sample.
-        packed_info: First sample and count of each ray.
-        left: Share of its light that each ray has before its samples.
-        limits: Which samples are left out and which are merged.
-    """
+    """Merge the samples of each ray from the front, where `left` is the share of its light that it has before them;
+    without gradients."""
     num_rays, behind = len(packed_info), left.clone()
     weights, places = torch.empty_like(t), torch.empty_like(t)
     means = torch.empty_like(features, memory_format=torch.contiguous_format)
     counts = torch.empty(num_rays, dtype=torch.int64, device=t.device)
     inputs = [optical_depths.contiguous(), t, features.contiguous(), packed_info]
     numbers = [limits.smallest_weight, limits.most_weight, _GAP * limits.step]
-    outputs = [as_warp(values) for values in (behind, counts, weights, places, means)]
-    launch(_merge_kernel, num_rays, [*map(as_warp, inputs), *numbers, *outputs], t.device)
+    launch(_merge_kernel, num_rays, [*inputs, *numbers, behind, counts, weights, places, means], t.device)
     rays, rows, group_info = packed_rows(packed_info[:, 0], counts)
     weights, places, means = (values.index_select(0, rows) for values in (weights, places, means))
     return MergedSamples(weights, places, means, rays, group_info, behind)
