@@ -3,7 +3,6 @@
 What takes long to import is imported where a method is used.
 """
 
-from pathlib import Path
 from typing import Any
 
 from unmix_plugin.engine.configs import OptimizerConfig, PipelineConfig, TrainerConfig
@@ -21,15 +20,11 @@ def _unmix_nerf() -> TrainerConfig:
 
     return TrainerConfig(
         method_name="unmix-nerf",
-        output_dir=Path("outputs"),
         max_num_iterations=10_000,
         # With an average, steps may stay large: what they overshoot averages out. Its ramp decides, not the decay: it
         # spans about a ninth of the steps so far, short trainings and long ones alike.
         average_decay=0.999,
-        pipeline=PipelineConfig(
-            datamanager=HyperspectralDataManagerConfig(),
-            model=UnmixModelConfig(),
-        ),
+        pipeline=PipelineConfig(datamanager=HyperspectralDataManagerConfig(), model=UnmixModelConfig()),
         optimizers={
             # Without decay, floaters grow before single cameras: what few pixels ask for is as good as free.
             "grid": OptimizerConfig(lr=2e-2, final_factor=0.05, weight_decay=1e-7),
@@ -61,7 +56,6 @@ def _unmix_nerf_published() -> TrainerConfig:
 
     return TrainerConfig(
         method_name="unmix-nerf-published",
-        output_dir=Path("outputs"),
         max_num_iterations=30_000,
         pipeline=PipelineConfig(
             datamanager=HyperspectralDataManagerConfig(subpixels=1),
