@@ -83,14 +83,8 @@ def name_some(names: Sequence[str], most: int = 3) -> str:
 
 
 def require(what: str, settings: Any, rules: dict[str, bool]) -> None:
-    """Refuse settings that break a rule.
-
-    Args:
-        what: Whose settings, for the message.
-        settings: A dataclass of them.
-        rules: What must hold, in words that name the settings with hyphens, and whether it does.
-    Raises:
-        ConfigError: a rule is broken; the message names all of them, and what was found.
+    """Refuse `settings`, a dataclass of `what` for the message, that break one of the rules: what must hold, in words
+    that name settings with hyphens, and whether it does. Raises ConfigError: with all broken rules, and what was found.
     """
     broken = [rule + _found(settings, rule) for rule, holds in rules.items() if not holds]
     if broken:

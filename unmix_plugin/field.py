@@ -71,12 +71,9 @@ class CoefficientField(Field):
         features: Float[Tensor, "S G"],
         light: Lamplight | None = None,
     ) -> dict[str, Tensor]:
-        """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`.
-
-        Args:
-            light: What reaches each sample of `moving_lamp`; None where there is no such lamp, or to see all places
-                as if it shone on them squarely, without gloss.
-        """
+        """`abundances` (S, K), `scaled_abundances` (S, K) and `specular_coefficients` (S, J) along `directions`, in the
+        `light` that reaches each sample of `moving_lamp`; None where there is no such lamp, or to see all places as if
+        it shone on them squarely, without gloss."""
 
     @abstractmethod
     def encode(

@@ -70,12 +70,8 @@ def allow_depth(path: Path, levels: int, kind: type[UnmixError]) -> None:
 
 
 def open_zip(path: Path, kind: type[UnmixError]) -> zipfile.ZipFile:
-    """Open an archive whose list of members, which is read whole, is no longer than that of as many as are allowed.
-
-    Raises:
-        UnmixError: of this kind: it has too many members.
-        zipfile.BadZipFile: it is no archive.
-    """
+    """Open an archive, of which the list of members is read whole. Raises UnmixError: of this kind: it has too many
+    members. zipfile.BadZipFile: it is no archive."""
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         file.seek(max(0, size - _ZIP_END_BYTES))
@@ -97,14 +93,8 @@ def open_zip(path: Path, kind: type[UnmixError]) -> zipfile.ZipFile:
 
 
 def allow_decoded(path: Path, decoded: int, kind: type[UnmixError], stored: int | None = None) -> None:
-    """Ask before something compressed is decoded.
-
-    Args:
-        decoded: Bytes that it will take.
-        stored: Bytes that it has in the file; by default those of the whole file.
-    Raises:
-        UnmixError: of this kind: small in the file and huge in memory.
-    """
+    """Ask before something compressed is decoded to so many bytes; stored in so many, by default those of the whole
+    file. Raises UnmixError: of this kind: it is small in the file and huge in memory."""
     size = path.stat().st_size if stored is None else stored
     if decoded > _LARGEST_ARRAY or decoded > max(_FREE_BYTES, _MOST_RATIO * size):
         refuse(

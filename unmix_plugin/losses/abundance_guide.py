@@ -80,11 +80,8 @@ class AbundanceGuide(nn.Module):
     def error(
         self, abundances: Float[Tensor, "R K"], measured: MeasuredPixels, endmembers: Float[Tensor, "K b"]
     ) -> Float[Tensor, ""]:
-        """Mean squared distance of composited abundances, which sum to the opacity, to what pixels are made of.
-
-        Args:
-            endmembers: The guide's, as the sensor of these pixels sees them.
-        """
+        """Mean squared distance of composited abundances, which sum to the opacity, to what pixels are made
+        of, in endmembers of the guide as their sensor sees them."""
         mixtures = measured.alpha[:, None] * self._mixtures_of(measured, endmembers)
         distances = (abundances - mixtures).square().sum(dim=1)
         return torch.where(_is_informative(measured), distances, 0.0).mean()

@@ -120,14 +120,8 @@ class BatchComparison:
         materials: Materials,
         ray_weights: Float[Tensor, "N"] | None = None,
     ) -> list[ComparedPixels]:
-        """The pixels of a batch with what is seen of them.
-
-        Args:
-            measured, rendered: The pixels and the rays through them.
-            views: Training view of each ray.
-            materials: That rendered coefficients are of.
-            ray_weights: By which rays shape the scene; None: alike.
-        """
+        """The pixels of a batch with what is seen of them by the rays through them, each of a training view;
+        `ray_weights` are those by which rays shape the scene, None: alike."""
         found, first, num_rays = [], 0, len(views)
         for own in measured:
             rows, whole = slice(first, first + own.num_rays), own.num_rays == num_rays
@@ -155,13 +149,8 @@ class BatchComparison:
     def losses(
         self, compared: Sequence[ComparedPixels], wanted: set[str], generator: torch.Generator | None
     ) -> dict[str, Tensor]:
-        """Losses that compare rendered with measured pixels, not yet weighted.
-
-        Args:
-            compared: The pixels of a batch.
-            wanted: Names of the losses that count.
-            generator: Source of random backgrounds.
-        """
+        """Losses of these names that compare rendered with measured pixels, not yet weighted; the generator draws
+        backgrounds."""
         return _mean(compared, lambda part: self._losses_of(part, wanted, generator))
 
     @staticmethod

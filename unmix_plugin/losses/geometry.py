@@ -33,14 +33,8 @@ def stray_light(
     surfaces: Float[Tensor, "R 3"],
     space: UnitSpace,
 ) -> Float[Tensor, ""]:
-    """Mean over all rays of the share of light from elsewhere; 0 for rays whose surface isn't known.
-
-    Args:
-        weights: Share of its ray's light that each sample sends.
-        positions: Of the samples, in the unit cube.
-        ray_indices: Ray of each sample.
-        surfaces: Known places, model space; NaN where unknown.
-        space: That the positions are in.
+    """Mean over all rays of the share of light from elsewhere than their surfaces (model space, NaN where unknown); 0
+    for rays whose surface isn't known. Each sample, at a position of the unit cube, sends a weight of its ray's light.
     """
     is_known = ~surfaces.isnan().any(dim=-1)
     places = space.to_unit(surfaces.nan_to_num(0.0)).index_select(0, ray_indices)
@@ -61,14 +55,8 @@ def normals_error(
     weights: Float[Tensor, "S"],
     generator: torch.Generator | None,
 ) -> Float[Tensor, ""]:
-    """Mean of 1 - n . m over some samples, by weight: n the learnt normals, m against the slope of the log density.
-
-    Args:
-        get_density: From positions to densities and geometry features.
-        shading: Whose normals are guided.
-        positions: Model space, without gradients.
-        weights: Share of its ray's light that each sample contributes.
-        generator: Chooses the samples.
+    """Mean of 1 - n . m over some samples in model space, by weight: n the learnt normals, m against the slope of the
+    log density.
 
     Source: Verbin et al. 2022, Ref-NeRF, on predicted normals; there as a squared distance, which is twice as much.
     """

@@ -41,11 +41,7 @@ def rays_in_world(
     Args:
         origins, directions: Rays in units of the inner cube's half edge.
         t_start: 0, or the `ends` of the samples before.
-        jitter: Where in its interval a ray's samples lie, [0, 1).
-        skips: 0 in occupied cells of the cube from -2 to 2, as `skip_distances` says.
-        step: Distance of samples in the inner cube, in the ray parameter, > 0.
-    Raises:
-        ValueError: step isn't positive.
+        jitter, skips, step: As `rays_in_box` takes them, in the inner cube; the grid fills the cube from -2 to 2.
     """
     return GridRays.of(_write_kernel, (origins, directions), (t_start, jitter), skips, step)
 

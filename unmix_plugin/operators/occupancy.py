@@ -90,14 +90,8 @@ class _VisibleCells(nn.Module):
     def record(
         self, points: Float[Tensor, "S 3"], views: Int[Tensor, "S"], seen: Bool[Tensor, "S"], num_rays: int
     ) -> None:
-        """Note which views see which cells.
-
-        Args:
-            points: Samples in the unit cube.
-            views: Number of the view of each.
-            seen: Samples that send enough of their ray's light to the camera.
-            num_rays: Rays that the samples are of; of all processes, where several train together.
-        """
+        """Note which views see the cells of points in the unit cube, of which `seen` marks those that send enough of
+        their ray's light to the camera; of so many rays in all processes."""
         cells = flat_cells_at(points, self.visible.shape)
         ids = (views % _NO_VIEW).to(torch.uint8)
         # Unseen samples take part with a number that changes nothing: to choose would be to wait for the device.
@@ -159,12 +153,9 @@ class OccupancyGrid(nn.Module):
     def __init__(
         self, reachable: Bool[Tensor, "X Y Z"], casts_shadows: bool = False, records_observed: bool = False
     ) -> None:
-        """Start with every cell occupied that `reachable` allows; the others always stay empty.
-
-        Args:
-            casts_shadows: Whether to keep the cells that are opaque, none at the start.
-            records_observed: Whether densities that rays meet are noted, so that updates need not probe those cells.
-        """
+        """Start with every cell occupied that `reachable` allows; the others always stay empty. Keep which cells are
+        opaque, none at the start, where some cast shadows; and what densities rays meet, so that updates need not probe
+        those cells, where that is recorded."""
         super().__init__()
         self.visibility = _VisibleCells(reachable.shape)
         self.register_buffer("reachable", reachable.clone())
@@ -198,7 +189,6 @@ class OccupancyGrid(nn.Module):
             threshold: Density from which a cell counts as occupied; never above the mean over reachable cells.
             decay: Factor on a probed cell's old maximum.
             num_cells: Cells to probe: half drawn from the occupied ones, half from all reachable ones; None for all.
-            generator: Source of the points and cells.
             block: Cells along the edge of blocks of which each counts as one cell, as dense as the densest in it.
             fewest_rays: Rays to cast at least before visibility is decided anew.
         """

@@ -50,17 +50,8 @@ def update_grid(
     progress: float,
     num_pixels: int = 0,
 ) -> None:
-    """Probe the field in some cells, the same in each process, and decide anew what is occupied.
-
-    Args:
-        grid: What is updated in place.
-        field: Whose densities are probed.
-        renderer: With the distance of samples of the present training step.
-        processes: That train together; they share which cells their rays saw.
-        generator: Source of the cells.
-        progress: Part of the training that is over.
-        num_pixels: Of the training views; 0 if it is not known.
-    """
+    """Probe the field in some cells, the same in each process, and decide anew what is occupied. The renderer has the
+    distance of samples of the present training step; the training views have so many pixels, 0 if that is not known."""
     device = "cpu" if generator is None else generator.device
     drawn = processes.of_first(torch.randint(2**62, (1,), generator=generator, device=device))
     # Which cells the rays of all processes saw, and what they met; sharing it twice is as good as once.

@@ -64,14 +64,11 @@ def _visible_samples(
     step: float,
     smallest_weight: float,
 ) -> _VisibleSamples:
-    """Samples of which each contributes more than `smallest_weight` of its ray's light.
+    """Of samples of the rays that lie `step` apart those that contribute more than `smallest_weight` of their ray's
+    light.
 
     The first samples of all rays are evaluated first, then twice as many of the rays that still let light through, and
     so on: what lies behind can't contribute enough, whatever it is.
-
-    Args:
-        samples: Of the rays of the bundle.
-        step: Distance of samples.
     """
     starts, counts = samples.packed_info.unbind(-1)
     depths, rows = torch.zeros_like(samples.t), torch.zeros_like(samples.ray_indices)
@@ -173,13 +170,7 @@ class VolumeRenderer:
     def render(
         self, field: CoefficientField, ray_bundle: RayBundle, generator: torch.Generator | None = None
     ) -> RenderedRays:
-        """Composited coefficients of each ray.
-
-        Args:
-            field: What is rendered.
-            ray_bundle: R rays.
-            generator: Shifts the samples of each ray at random, as training wants it; None takes them as they are.
-        """
+        """Composited coefficients of each ray; a generator shifts the samples of each at random, as in training."""
         origins, directions = ray_bundle.origins.detach(), ray_bundle.directions.detach()
         samples = self.march(origins, directions, torch.zeros_like(origins[:, 0]), generator).samples()
         seen = _visible_samples(field, samples, ray_bundle, self.step, self.smallest_weight)
@@ -230,13 +221,8 @@ class VolumeRenderer:
 
     @torch.no_grad()
     def composite_view(self, field: CoefficientField, camera: Cameras, subpixels: int = 1) -> Coefficients:
-        """Coefficients (H, W, ...) of a whole view: every picture of it follows from them.
-
-        Args:
-            field: What is rendered.
-            camera: One camera.
-            subpixels: Rays through a pixel along each of its edges, averaged: all outputs but ratios are linear.
-        """
+        """Coefficients (H, W, ...) of a whole view of one camera: every picture of it follows from them. So many rays
+        pass a pixel along each of its edges and are averaged: all outputs but ratios are linear."""
         camera = camera.to(self.skips.device)
         centres = [(i + 0.5) / subpixels for i in range(subpixels)]
         total: Coefficients | None = None
@@ -306,11 +292,8 @@ class VolumeRenderer:
         behind: Float[Tensor, "R"],
         generator: torch.Generator | None = None,
     ) -> GridRays:
-        """Rays through the grid, which give their samples behind these distances, at first 0.
-
-        Args:
-            generator: Shifts the samples of each ray at random; None: they lie in the middles of intervals.
-        """
+        """Rays through the grid, which give their samples behind these distances, at first 0; a generator shifts the
+        samples of each at random, else they lie in the middles of intervals."""
         jitter = torch.full_like(behind, 0.5)
         if generator is not None:
             jitter = torch.rand(jitter.shape, generator=generator, device=generator.device).to(jitter)

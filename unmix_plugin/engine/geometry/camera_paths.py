@@ -29,16 +29,10 @@ _STEEPEST_DEG = 80.0
 
 
 def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
-    """A circle around what the cameras look at, at their middle distance and elevation; it ends where it starts.
+    """A circle of `num_frames` cameras with the middle lens of the given ones, around what these look at, at their
+    middle distance and elevation; its centre lies in the box, and it ends where it starts.
 
     Where the cameras are on one side only, it is an arc over that side, back and forth.
-
-    Args:
-        cameras: Those of the scene.
-        box: What is modelled; the circle's centre lies in it.
-        num_frames: F.
-    Returns:
-        F pinhole cameras with the middle lens of the given ones.
     """
     poses = cameras.camera_to_world.double().cpu().numpy()
     centre, up = _looked_at(poses, box.aabb.double().cpu().numpy()), _upwards(poses)
@@ -55,18 +49,11 @@ def orbit(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
 
 
 def interpolated(cameras: Cameras, box: SceneBox, num_frames: int) -> Cameras:
-    """A smooth path through the cameras, each the nearest of those left; from the first to the last at even speed.
+    """A smooth path of `num_frames` cameras with the middle lens of the given ones, through these, each the nearest of
+    those left; from the first to the last at even speed.
 
-    Between two cameras the path bends around what all look at, and does not cut through it.
-
-    Args:
-        cameras: N of them, at least two in different places or directions.
-        box: What is modelled.
-        num_frames: F.
-    Returns:
-        F pinhole cameras with the middle lens of the given ones.
-    Raises:
-        ConfigError: there are no two different cameras.
+    Between two cameras the path bends around what all look at, and does not cut through it. Raises ConfigError: there
+    are no two different cameras.
     """
     poses, lengths = _tour(cameras.camera_to_world.double().cpu().numpy())
     if len(poses) < 2:

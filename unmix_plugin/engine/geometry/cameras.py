@@ -153,12 +153,8 @@ class Cameras:
     def generate_rays(
         self, camera_indices: Int[Tensor, " R"], pixel_coords: Float[Tensor, "R 2"]
     ) -> RayBundle:
-        """Rays through points of the images, lens distortion undone.
-
-        Args:
-            camera_indices: Which camera, in [0, N), int64.
-            pixel_coords: x, y in pixels; the centre of column c, row r is (c + 0.5, r + 0.5).
-        """
+        """Rays of cameras (int64) through points of their images, lens distortion undone; x, y in pixels, the centre of
+        column c, row r is (c + 0.5, r + 0.5)."""
         coords = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
         if self.key_poses is not None:
             on_axis = torch.stack([coords[:, 0], torch.zeros_like(coords[:, 1])], dim=-1)
@@ -174,12 +170,8 @@ class Cameras:
         )
 
     def image_rays(self, index: int, subpixel_offset: tuple[float, float] = (0.5, 0.5)) -> RayBundle:
-        """One ray a pixel of a whole image, H * W of them, row after row.
-
-        Args:
-            index: Which camera.
-            subpixel_offset: Where in a pixel the ray passes, x, y in [0, 1].
-        """
+        """One ray a pixel of a whole image, H * W of them, row after row, each through that part x, y of its pixel, in
+        [0, 1]."""
         device = self.camera_to_world.device
         x, y = (
             torch.arange(count, device=device, dtype=torch.float32) + offset
@@ -267,12 +259,7 @@ _NEWTON_STEPS = 12
 def distort(
     coords: Float[Tensor, "*points 2"], coefficients: Float[Tensor, "*#points D"]
 ) -> Float[Tensor, "*points 2"]:
-    """Bend ideal coordinates as the lens does.
-
-    Args:
-        coords: Ideal x, y, without unit.
-        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
-    """
+    """Bend ideal coordinates x, y as a lens of these coefficients does, one row a point or one that broadcasts."""
     x, y = coords.unbind(-1)
     p1, p2 = coefficients[..., 2], coefficients[..., 3]
     r2 = x * x + y * y
@@ -289,10 +276,6 @@ def undistort(
 
     Exact to rounding where the lens model is invertible along the way, as it is for every lens whose image does not
     fold over; where its Jacobian vanishes the step is left out.
-
-    Args:
-        bent: Distorted x', y', without unit.
-        coefficients: k1, k2, p1, p2 and perhaps k3, k4, one row a point or one that broadcasts.
     """
     p1, p2 = coefficients[..., 2], coefficients[..., 3]
     coords = bent

@@ -133,14 +133,8 @@ _CHUNK = 1 << 14
 def project_by_row(
     points: Float[Tensor, "P 3"], keys: KeyPoses, num_rows: int
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, "P 3"]]:
-    """The height at which each point is first seen, and where it lies in the camera's axes then.
-
-    Args:
-        keys: Of one line camera.
-        num_rows: Rows of its image.
-    Returns:
-        y in [0, num_rows], and positions in the camera's axes; a point that no row sees has z = 1, behind the camera.
-    """
+    """The height y in [0, num_rows] at which a line camera with these key poses first sees each point, and where it
+    lies in the camera's axes then; a point that no row sees has z = 1, behind the camera."""
     num_stripes = min(num_rows, _MOST_STRIPES)
     heights = torch.linspace(0, num_rows, num_stripes + 1, device=points.device)
     poses = keys.at(torch.zeros_like(heights, dtype=torch.int64), heights)
