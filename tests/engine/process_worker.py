@@ -96,26 +96,22 @@ def main(argv: list[str]) -> None:
     load_run.find_method = lambda _: rgb_nerf
     folder, action = Path(argv[0]), argv[1]
     atexit.register(name_threads, folder / f"threads-{os.environ['RANK']}.txt")
-    config = config_for(folder)
-    is_second = os.environ.get("RANK") == "1"
+    config, is_second = config_for(folder), os.environ.get("RANK") == "1"
     if action == "gradients":
         gradients(folder, config)
-    elif action == "train":
-        train(folder, config)
-    elif action == "resume":
+        return
+    if action == "resume":
         (run,) = (folder / "outputs").glob("*/*/*")
-        train(folder, replace(load_run.load_config(run), max_num_iterations=STEPS + 10))
+        config = replace(load_run.load_config(run), max_num_iterations=STEPS + 10)
     elif action == "other-seed":
-        train(folder, replace(config, seed=5 if is_second else 4))
-    elif action == "no-scene":
-        train(folder, replace(config, data=None) if is_second else config)
+        config = replace(config, seed=5 if is_second else 4)
+    elif action == "no-scene" and is_second:
+        config = replace(config, data=None)
     elif action == "interrupted":
         interrupt_in(STEPS // 2)
-        train(folder, config)
-    elif action == "die":
-        if is_second:
-            setattr(TrainingSteps, "take", lambda *_: os._exit(9))  # noqa: B010
-        train(folder, config)
+    elif action == "die" and is_second:
+        setattr(TrainingSteps, "take", lambda *_: os._exit(9))  # noqa: B010
+    train(folder, config)
 
 
 if __name__ == "__main__":

@@ -24,28 +24,24 @@ def second_of_two(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     return monkeypatch
 
 
-def test_too_few_devices_are_told_by_the_first_process_alone(second_of_two):
-    second_of_two.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(Follower) as ended, joined("cuda"):
+@pytest.mark.parametrize(
+    ("device", "lacking", "found", "message"),
+    [
+        ("cuda", "device_count", 1, "2 processes on this machine, which has 1 CUDA devices"),
+        ("cuda", "is_nccl_available", False, "built without nccl"),
+        ("cpu", "is_gloo_available", False, "built without gloo"),
+    ],
+)
+def test_what_keeps_processes_from_working_together_is_told_by_the_first_alone(
+    second_of_two, device, lacking, found, message
+):
+    where = torch.cuda if lacking == "device_count" else distributed
+    second_of_two.setattr(where, lacking, lambda: found)
+    with pytest.raises(Follower) as ended, joined(device):
         pass
     assert ended.value.code == 2
     second_of_two.setenv("LOCAL_RANK", "0")
-    with (
-        pytest.raises(ConfigError, match="2 processes on this machine, which has 1 CUDA devices"),
-        joined("cuda"),
-    ):
-        pass
-
-
-@pytest.mark.parametrize(("device", "backend"), [("cuda", "nccl"), ("cpu", "gloo")])
-def test_a_pytorch_that_lacks_what_processes_talk_through_is_told_by_the_first(
-    second_of_two, device, backend
-):
-    second_of_two.setattr(distributed, f"is_{backend}_available", lambda: False)
-    with pytest.raises(Follower), joined(device):
-        pass
-    second_of_two.setenv("LOCAL_RANK", "0")
-    with pytest.raises(ConfigError, match=f"built without {backend}"), joined(device):
+    with pytest.raises(ConfigError, match=message), joined(device):
         pass
 
 

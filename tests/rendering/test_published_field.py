@@ -106,17 +106,3 @@ def test_a_model_as_published_has_one_specular_value_a_band_and_the_probe_choose
     assert torch.equal(probabilities.argmax(-1), scores.argmax(-1))
     seen = view.opacity > 0.5
     assert torch.equal(view["segmentation"][seen].long(), probabilities.argmax(-1)[seen])
-
-
-def test_a_scene_is_not_changed_by_what_becomes_of_its_model():
-    model = make_model()
-    scene = scene_of(model)
-    camera = scene.views[0].camera
-    before = scene.render(camera, ["spectral"])["spectral"]
-    with torch.no_grad():
-        model.field.get_parameter("table").mul_(-2)
-        model.endmembers.mul_(0.5)
-        model.grid.skips.fill_(1)
-    dark = replace(scene, materials=replace(scene.materials, endmembers=0 * scene.materials.endmembers))
-    assert dark.render(camera, ["diffuse"])["diffuse"].max() == 0
-    assert torch.equal(scene.render(camera, ["spectral"])["spectral"], before)

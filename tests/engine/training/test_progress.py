@@ -1,6 +1,5 @@
 """When training ends, what is shown of it, and what is written down."""
 
-import errno
 import importlib.util
 import io
 import json
@@ -28,7 +27,6 @@ from unmix_plugin.engine.training.progress import (
 )
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import Interrupted
-from unmix_plugin.errors import RunError
 
 limits = st.tuples(st.none() | st.integers(0, 10_000), st.none() | st.floats(1e-3, 1e4)).filter(any)
 steps, seconds = st.integers(0, 20_000), st.floats(0, 2e4)
@@ -192,27 +190,3 @@ def test_resuming_cuts_off_later_lines_and_a_half_written_one(tmp_path: Path):
     path.write_text('\ufeff{"step": 1}\n{"step": 2}\n{"step": 3}\n[]\n{"step": 4, "lo', encoding="utf-8")
     MetricsWriter(RunFolder(tmp_path), resumed_step=2).write(3, 0.0, "train", {})
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
-
-
-def test_a_full_disk_while_saving_ends_training_with_a_clear_error_and_the_last_checkpoint(
-    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
-):
-    trainer = Trainer(short_config)
-    saved: list[int] = []
-    original = trainer.save
-
-    def save_then_fill_the_disk() -> None:
-        original()
-        saved.append(trainer.step)
-        monkeypatch.setattr("os.write", refuse)
-
-    def refuse(*_: object) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(trainer, "save", save_then_fill_the_disk)
-    with pytest.raises(RunError, match=r"No space left on device.*go on with --load-run"):
-        trainer.train()
-    assert saved == [4]
-    names = sorted(path.name for path in trainer.run.checkpoints.iterdir())
-    assert names == ["step-000004.json", "step-000004.safetensors"]
-    assert "failed at step 8: RunError" in trainer.run.log_path.read_text()

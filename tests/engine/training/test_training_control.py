@@ -80,15 +80,13 @@ def test_turns_never_overlap():
     assert most == 1
 
 
-@pytest.mark.parametrize("share", [0.2, 0.5])
-def test_a_guest_that_always_wants_more_gets_its_share(contest, share):
-    # What an idle guest has saved comes on top, hence a run long enough for it not to count much.
-    assert contest(share) == pytest.approx(share, abs=0.02)
-
-
-def test_work_that_may_wait_gets_less(contest):
-    # A guest's second costs four: 0.4 / 0.6 of training's are earned, a quarter of them taken.
-    assert contest(0.4, cost=4.0) == pytest.approx(1 / 7, abs=0.02)
+# What an idle guest has saved comes on top, hence a run long enough for it not to count much. Where a guest's second
+# costs four, 0.4 / 0.6 of training's are earned, and a quarter of them taken.
+@pytest.mark.parametrize(("share", "cost", "part"), [(0.2, 1.0, 0.2), (0.5, 1.0, 0.5), (0.4, 4.0, 1 / 7)])
+def test_a_guest_that_always_wants_more_gets_its_share_and_less_for_work_that_may_wait(
+    contest, share, cost, part
+):
+    assert contest(share, cost) == pytest.approx(part, abs=0.02)
 
 
 def test_without_training_a_guest_never_waits():
@@ -268,10 +266,7 @@ def test_a_guest_that_leaves_the_model_in_evaluation_mode_does_not_change_the_ne
     trainer = quiet_trainer(short_config)
     modes = []
 
-    def leave_in_evaluation_mode() -> None:
-        trainer.pipeline.eval()
-
-    call_after_step(trainer, 3, leave_in_evaluation_mode)
+    call_after_step(trainer, 3, trainer.pipeline.eval)
     for step in range(1, 13):
         call_after_step(trainer, step, lambda: modes.append(trainer.pipeline.model.training))
     trainer.pipeline.eval()  # a page that rendered before the first step
