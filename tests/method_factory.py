@@ -69,21 +69,10 @@ def scene_of(model: UnmixModel, cameras: Cameras = CAMERA) -> TrainedScene:
     return unmix_scene(model, SceneRecord(BOX, dict(model.metadata), cameras, cameras, {}))
 
 
-class _BlackSky(torch.nn.Module):
-    """Sends no light along any direction."""
-
-    def __init__(self, num_endmembers: int) -> None:
-        super().__init__()
-        self.outputs = torch.tensor([*[0.0] * num_endmembers, -100.0])
-
-    def forward(self, directions: torch.Tensor) -> torch.Tensor:
-        return self.outputs.expand(len(directions), -1)
-
-
 def with_a_sky(field: Any) -> CoefficientField:
     """The field with a black sky behind all that is rendered."""
-    world = copy.deepcopy(field)
-    world.sky_network = _BlackSky(field.num_endmembers)
+    world, black = copy.deepcopy(field), torch.tensor([*[0.0] * field.num_endmembers, -100.0])
+    world.sky_network = lambda features: black.expand(len(features), -1)
     return world
 
 

@@ -90,6 +90,8 @@ class UnmixModel(Model):
         self.bands = Bands(np.array(centers, float), None if widths is None else np.array(widths, float))
         self.is_unbounded = bool(metadata.get("is_unbounded", False))
         self.has_backdrop = bool(metadata.get("has_backdrop", False))
+        self.is_carved = metadata["has_alpha"] or self.has_backdrop
+        """Whether pictures tell where nothing is."""
         self.preset = preset_for(metadata["has_alpha"], self.is_unbounded, self.has_backdrop)
         self.num_endmembers = config.checked_num_endmembers(len(self.bands))
         shape = (self.num_endmembers, len(self.bands))
@@ -100,19 +102,16 @@ class UnmixModel(Model):
         self._lamp = None if unknown else Lamp.of_numbers([float(x) for x in config.lamp])
         self.grid = self._new_grid(torch.ones((metadata["grid_resolution"],) * 3, dtype=torch.bool))
         self._renderer: VolumeRenderer | None = None
-        self.step = config.renderer.sample_distance(
-            metadata["pixel_size"],
-            float(self.scene_box.size.max()),
-            metadata["has_alpha"] or self.has_backdrop,
-        )
+        self.longest_edge = float(self.scene_box.size.max())
+        self.step = config.renderer.sample_distance(metadata["pixel_size"], self.longest_edge, self.is_carved)
         self.field = self._new_field()
         self.register_buffer("rgb_weights", rgb_matrix(self.bands), persistent=False)
         self.register_buffer("every_band", torch.eye(len(self.bands)), persistent=False)
         self.register_buffer("endmember_bound", torch.ones(()))
         self.guide = AbundanceGuide(*shape)
-        per_view = config.light == "per-view"
-        wavelengths_nm = torch.tensor(metadata["wavelengths_nm"])
-        self.view_gains = ViewGains(metadata["num_train_views"], wavelengths_nm) if per_view else None
+        self.view_gains: ViewGains | None = None
+        if config.light == "per-view":
+            self.view_gains = ViewGains(metadata["num_train_views"], torch.tensor(metadata["wavelengths_nm"]))
         self.poses: PoseRefinement | None = None
         if config.poses == "refine":
             rows = metadata.get("line_rows") or [0] * metadata["num_train_views"]
@@ -222,31 +221,24 @@ class UnmixModel(Model):
 
     def get_train_loss_dict(self, ray_bundle: RayBundle, batch: dict[str, Tensor]) -> TrainOutputs:
         """`num_samples`; weighted losses by name, those of no weight left out; and `psnr` of the batch in dB, on black,
-        where samples go, and how far poses were corrected."""
+        samples a ray evaluated and visible, the share of the grid's cells that are occupied, how far poses were
+        corrected, and in an unbounded world the share of light that comes from matter rather than from the sky."""
+        num_rays = max(len(ray_bundle), 1)
         measured = from_batch(batch, len(ray_bundle), self.seen_by.num_channels)
         step = self.training_batch(ray_bundle, measured)
-        losses = self.losses(step)
+        losses, rendered = self.losses(step), step.rendered
         metrics = {
             "psnr": self.comparison.psnr(step.compared),
-            **self._sample_figures(step.rendered, len(ray_bundle)),
+            "samples_per_ray": torch.tensor(rendered.num_samples / num_rays),
+            "visible_samples_per_ray": torch.tensor(len(rendered.weights) / num_rays),
+            "occupied_share": self._occupied_share,
             **self._pose_training.figures(step.corrected),
         }
+        if self.is_unbounded:
+            metrics["matter_share"] = rendered.coefficients.accumulation.detach().mean()
         with torch.no_grad():
             self.learn_from(step)
-        return {"num_samples": torch.tensor(step.rendered.num_samples)}, losses, metrics
-
-    def _sample_figures(self, rendered: RenderedRays, num_rays: int) -> dict[str, Tensor]:
-        """Samples a ray evaluated and visible, and the share of the grid's cells that are occupied; in an unbounded
-        world the share of light that comes from matter rather than from the sky."""
-        matter = {}
-        if self.is_unbounded:
-            matter = {"matter_share": rendered.coefficients.accumulation.detach().mean()}
-        return {
-            **matter,
-            "samples_per_ray": torch.tensor(rendered.num_samples / max(num_rays, 1)),
-            "visible_samples_per_ray": torch.tensor(len(rendered.weights) / max(num_rays, 1)),
-            "occupied_share": self._occupied_share,
-        }
+        return {"num_samples": torch.tensor(rendered.num_samples)}, losses, metrics
 
     def training_batch(self, ray_bundle: RayBundle, measured: list[MeasuredPixels]) -> TrainingBatch:
         """Rays of training views, rendered and laid beside what was measured along them; changes nothing."""
@@ -371,8 +363,7 @@ class UnmixModel(Model):
 
     def _coarseness(self, progress: float) -> float:
         """How many times farther apart samples are in training than in the end: large images begin coarsely."""
-        samples = float(self.scene_box.size.max()) / self.step
-        return self.config.renderer.coarseness(samples, self.preset, progress)
+        return self.config.renderer.coarseness(self.longest_edge / self.step, self.preset, progress)
 
     def _new_field(self) -> CoefficientField:
         config, opacity = self.config, choose(self.config.initial_opacity, self.preset.initial_opacity)
@@ -398,10 +389,8 @@ class UnmixModel(Model):
     def _new_grid(self, reachable: Bool[Tensor, "X Y Z"]) -> OccupancyGrid:
         """Before training. Where little was carved, cells are too many to wait until each was probed: what rays meet
         in them counts as well."""
-        is_carved = self.metadata["has_alpha"] or self.has_backdrop
-        return OccupancyGrid(
-            reachable, self._lamp is not None, not is_carved or self.config.poses == "refine"
-        )
+        records_observed = not self.is_carved or self.config.poses == "refine"
+        return OccupancyGrid(reachable, self._lamp is not None, records_observed)
 
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress

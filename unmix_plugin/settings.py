@@ -392,9 +392,7 @@ class UnmixModelConfig(ModelConfig):
 
     def checked_num_endmembers(self, num_bands: int) -> int:
         """K. Raises ConfigError: more endmembers than bands."""
-        count = self.num_endmembers
-        if count is None:
-            return _usual_num_endmembers(num_bands)
+        count = _usual_num_endmembers(num_bands) if self.num_endmembers is None else self.num_endmembers
         if count == "auto":
             raise ConfigError("num-endmembers is auto: call resolve_auto first")
         if count > num_bands:
