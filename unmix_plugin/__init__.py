@@ -8,33 +8,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from unmix_plugin.commands.training import train
-    from unmix_plugin.editing.apply import edit_scene
-    from unmix_plugin.editing.recipe import Light, Recipe
-    from unmix_plugin.editing.recipe_files import read_recipe
-    from unmix_plugin.engine.geometry.cameras import Cameras
-    from unmix_plugin.products.save import save
-    from unmix_plugin.spectral.unmixing.image import unmix_image
-    from unmix_plugin.trained.open_run import open_run
-    from unmix_plugin.trained.outputs import MaterialView
-    from unmix_plugin.trained.protocol import Probe
-    from unmix_plugin.trained.trained_scene import TrainedScene
+    from unmix_plugin.commands.training import train as train
+    from unmix_plugin.editing.apply import edit_scene as edit_scene
+    from unmix_plugin.editing.recipe import Light as Light
+    from unmix_plugin.editing.recipe import Recipe as Recipe
+    from unmix_plugin.editing.recipe_files import read_recipe as read_recipe
+    from unmix_plugin.engine.geometry.cameras import Cameras as Cameras
+    from unmix_plugin.products.save import save as save
+    from unmix_plugin.spectral.unmixing.image import unmix_image as unmix_image
+    from unmix_plugin.trained.open_run import open_run as open_run
+    from unmix_plugin.trained.outputs import MaterialView as MaterialView
+    from unmix_plugin.trained.protocol import Probe as Probe
+    from unmix_plugin.trained.trained_scene import TrainedScene as TrainedScene
 
 __version__ = "0.1.0"
-__all__ = [
-    "Cameras",
-    "Light",
-    "MaterialView",
-    "Probe",
-    "Recipe",
-    "TrainedScene",
-    "edit_scene",
-    "open_run",
-    "read_recipe",
-    "save",
-    "train",
-    "unmix_image",
-]
 
 _MODULES = {
     "Cameras": "engine.geometry.cameras",
@@ -50,6 +37,7 @@ _MODULES = {
     "train": "commands.training",
     "unmix_image": "spectral.unmixing.image",
 }
+__all__ = list(_MODULES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:

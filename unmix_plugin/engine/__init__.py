@@ -10,41 +10,40 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from unmix_plugin.engine.configs import (
-        AtStart,
-        Common,
-        DataManagerConfig,
-        InstantiateConfig,
-        ModelConfig,
-        OptimizerConfig,
-        PipelineConfig,
-        Target,
-        TrainerConfig,
-        short,
-    )
-    from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes, upright_cameras
-    from unmix_plugin.engine.geometry.cameras import Cameras
-    from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-    from unmix_plugin.engine.machine import step_generator
-    from unmix_plugin.engine.model import (
-        DataManager,
-        Field,
-        Model,
-        TrainingCallback,
-        TrainingCallbackLocation,
-    )
-    from unmix_plugin.engine.pipeline import Pipeline
-    from unmix_plugin.engine.registry import (
-        MethodSpecification,
-        Output,
-        discover_methods,
-        find_method,
-        named_output,
-    )
-    from unmix_plugin.engine.runs.config_json import config_from_json
-    from unmix_plugin.engine.runs.load_run import LoadedModel, load_config, load_model, load_pipeline
-    from unmix_plugin.engine.runs.scene_record import SceneRecord
-    from unmix_plugin.engine.training.trainer import Trainer
+    from unmix_plugin.engine.configs import AtStart as AtStart
+    from unmix_plugin.engine.configs import Common as Common
+    from unmix_plugin.engine.configs import DataManagerConfig as DataManagerConfig
+    from unmix_plugin.engine.configs import InstantiateConfig as InstantiateConfig
+    from unmix_plugin.engine.configs import ModelConfig as ModelConfig
+    from unmix_plugin.engine.configs import OptimizerConfig as OptimizerConfig
+    from unmix_plugin.engine.configs import PipelineConfig as PipelineConfig
+    from unmix_plugin.engine.configs import Target as Target
+    from unmix_plugin.engine.configs import TrainerConfig as TrainerConfig
+    from unmix_plugin.engine.configs import short as short
+    from unmix_plugin.engine.geometry.camera_paths import nearest_to_axes as nearest_to_axes
+    from unmix_plugin.engine.geometry.camera_paths import upright_cameras as upright_cameras
+    from unmix_plugin.engine.geometry.cameras import Cameras as Cameras
+    from unmix_plugin.engine.geometry.space import RayBundle as RayBundle
+    from unmix_plugin.engine.geometry.space import SceneBox as SceneBox
+    from unmix_plugin.engine.machine import step_generator as step_generator
+    from unmix_plugin.engine.model import DataManager as DataManager
+    from unmix_plugin.engine.model import Field as Field
+    from unmix_plugin.engine.model import Model as Model
+    from unmix_plugin.engine.model import TrainingCallback as TrainingCallback
+    from unmix_plugin.engine.model import TrainingCallbackLocation as TrainingCallbackLocation
+    from unmix_plugin.engine.pipeline import Pipeline as Pipeline
+    from unmix_plugin.engine.registry import MethodSpecification as MethodSpecification
+    from unmix_plugin.engine.registry import Output as Output
+    from unmix_plugin.engine.registry import discover_methods as discover_methods
+    from unmix_plugin.engine.registry import find_method as find_method
+    from unmix_plugin.engine.registry import named_output as named_output
+    from unmix_plugin.engine.runs.config_json import config_from_json as config_from_json
+    from unmix_plugin.engine.runs.load_run import LoadedModel as LoadedModel
+    from unmix_plugin.engine.runs.load_run import load_config as load_config
+    from unmix_plugin.engine.runs.load_run import load_model as load_model
+    from unmix_plugin.engine.runs.load_run import load_pipeline as load_pipeline
+    from unmix_plugin.engine.runs.scene_record import SceneRecord as SceneRecord
+    from unmix_plugin.engine.training.trainer import Trainer as Trainer
 
 _MODULES = {
     "configs": (
@@ -71,43 +70,7 @@ _MODULES = {
     "runs.scene_record": ("SceneRecord",),
     "training.trainer": ("Trainer",),
 }
-
-__all__ = [
-    "AtStart",
-    "Cameras",
-    "Common",
-    "DataManager",
-    "DataManagerConfig",
-    "Field",
-    "InstantiateConfig",
-    "LoadedModel",
-    "MethodSpecification",
-    "Model",
-    "ModelConfig",
-    "OptimizerConfig",
-    "Output",
-    "Pipeline",
-    "PipelineConfig",
-    "RayBundle",
-    "SceneBox",
-    "SceneRecord",
-    "Target",
-    "Trainer",
-    "TrainerConfig",
-    "TrainingCallback",
-    "TrainingCallbackLocation",
-    "config_from_json",
-    "discover_methods",
-    "find_method",
-    "load_config",
-    "load_model",
-    "load_pipeline",
-    "named_output",
-    "nearest_to_axes",
-    "short",
-    "step_generator",
-    "upright_cameras",
-]
+__all__ = sorted(name for names in _MODULES.values() for name in names)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:
