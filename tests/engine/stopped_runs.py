@@ -4,6 +4,7 @@ import io
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -25,7 +26,7 @@ def finished(config: TrainerConfig) -> Trainer:
     return trainer
 
 
-def call_after_step(trainer: Trainer, step: int, action: Callable[[], None]) -> None:
+def call_after_step(trainer: Trainer, step: int, action: Callable[[], Any]) -> None:
     """Let `action` run inside the step that brings the count to `step`."""
     where = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
     trainer.callbacks.append(TrainingCallback(where, lambda i, _: action() if i + 1 == step else None))

@@ -112,8 +112,7 @@ def _evaluate_run(
     from unmix_plugin.editing.apply import edit_scene, light_factors
     from unmix_plugin.editing.edited_run import requested_recipe
     from unmix_plugin.editing.recipe_files import recipe_to_yaml
-    from unmix_plugin.engine.processes import flat_settings
-    from unmix_plugin.engine.runs.config_json import config_to_json
+    from unmix_plugin.engine.runs.config_json import config_to_json, flattened
     from unmix_plugin.engine.runs.load_run import load_pipeline
     from unmix_plugin.formats.files import safe_name
     from unmix_plugin.products.comparison import ComparedRun
@@ -154,7 +153,7 @@ def _evaluate_run(
         found.bands,
         loaded.scene.eval_cameras.camera_to_world.numpy(),
         folder,
-        flat_settings(config_to_json(config)),
+        flattened(config_to_json(config)),
     )
     if show:
         _report(console, compared, found, recipe is not None, factors is not None)

@@ -28,6 +28,7 @@ from torch import Tensor, distributed, nn
 
 from unmix_plugin.engine.configs import MOST_PROCESSES, require_in_range
 from unmix_plugin.engine.machine import handled_signals
+from unmix_plugin.engine.runs.config_json import flattened
 from unmix_plugin.errors import ConfigError, RunError, UnmixError
 
 _T = TypeVar("_T")
@@ -218,7 +219,7 @@ def _join(device: str) -> Processes:
 
 def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) -> None:
     """Refuse processes that were started with different settings, as `together` does."""
-    first, *others = processes.gather({**flat_settings(settings), "torch": torch.__version__})
+    first, *others = processes.gather({**flattened(settings), "torch": torch.__version__})
     with processes.together():
         for number, other in enumerate(others, start=2):
             for name in sorted(first.keys() | other.keys()):
@@ -227,16 +228,6 @@ def require_equal_settings(processes: Processes, settings: Mapping[str, Any]) ->
                         f"process {number} of {processes.count} has {name} {other.get(name)}, the first has "
                         f"{first.get(name)}; start all with the same arguments and packages"
                     )
-
-
-def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by their dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in settings.items():
-        found |= (
-            flat_settings(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
-        )
-    return found
 
 
 _GRACE_SECONDS = 10.0

@@ -2,8 +2,10 @@
 
 import contextlib
 import errno
+import itertools
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,51 +19,54 @@ from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, sav
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.errors import RunError
 
-CALLS = ("open", "write", "fsync", "replace", "unlink")
-
 
 def tensors_of(step: int) -> dict[str, Tensor]:
     return {"a": torch.full((40, 3), float(step)), "n": torch.tensor(step)}
-
-
-class Faults:
-    """Counts the system calls of a save and raises in place of the `at`-th, and of all later ones if `dead`."""
-
-    def __init__(
-        self, monkeypatch: pytest.MonkeyPatch, at: int | None, error: type[BaseException], dead: bool
-    ):
-        self.count = 0
-        self.at = at
-        self.error = error
-        self.dead = dead
-        monkeypatch.setattr(atomic_files, "_CHUNK_BYTES", 200)
-        for name in CALLS:
-            monkeypatch.setattr(os, name, self.wrap(name, getattr(os, name)))
-
-    def wrap(self, name: str, real: Any) -> Any:
-        def call(*args: Any, **kwargs: Any) -> Any:
-            # A full disk refuses to grow files; removing them always works.
-            if not self.dead and name == "unlink":
-                return real(*args, **kwargs)
-            self.count += 1
-            if self.at is not None and (self.count == self.at or (self.dead and self.count > self.at)):
-                if name == "write" and self.count == self.at:
-                    real(args[0], args[1][: len(args[1]) // 2])
-                raise self.error(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            return real(*args, **kwargs)
-
-        return call
 
 
 class Killed(BaseException):
     """Stands for SIGKILL: nothing that runs after it has any effect."""
 
 
-def calls_of_a_save(folder: Path, dead: bool = True) -> int:
+@contextlib.contextmanager
+def failing_at(number: int, error: type[BaseException]) -> Iterator[list[str]]:
+    """Notes system calls; that number of them raises, and of a killed process all later ones."""
+    calls: list[str] = []
+
+    def wrapped(name: str, real: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if error is OSError and name == "unlink":  # a full disk refuses to grow files alone
+                return real(*args, **kwargs)
+            calls.append(name)
+            if len(calls) == number or (error is Killed and len(calls) > number):
+                if name == "write" and len(calls) == number:
+                    real(args[0], args[1][: len(args[1]) // 2])
+                raise error(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return real(*args, **kwargs)
+
+        return call
+
     with pytest.MonkeyPatch.context() as monkeypatch:
-        faults = Faults(monkeypatch, None, Killed, dead)
-        save_checkpoint(folder, 2, tensors_of(2), {}, keep=1)
-    return faults.count
+        monkeypatch.setattr(atomic_files, "_CHUNK_BYTES", 200)
+        for name in ("open", "write", "fsync", "replace", "unlink"):
+            monkeypatch.setattr(os, name, wrapped(name, getattr(os, name)))
+        yield calls
+
+
+def failed_saves(folder: Path, error: type[BaseException], keep: int) -> Iterator[tuple[Path, str]]:
+    """Folders with step 1 to which step 2 was saved, failing at each system call in turn, and what was said."""
+    for number in itertools.count(1):
+        place, said = folder / str(number), ""
+        save_checkpoint(place, 1, tensors_of(1), {})
+        with failing_at(number, error) as calls:
+            try:
+                save_checkpoint(place, 2, tensors_of(2), {}, keep=keep)
+            except (Killed, RunError) as stopped:
+                said = str(stopped)
+        if len(calls) < number:
+            assert number > 12
+            return
+        yield place, said
 
 
 def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
@@ -90,47 +95,24 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
 
 
 def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path):
-    reference = tmp_path / "reference"
-    save_checkpoint(reference, 1, tensors_of(1), {})
-    count = calls_of_a_save(reference)
-    assert count >= 15
     seen: set[int] = set()
-    for at in range(1, count + 1):
-        folder = tmp_path / str(at)
-        save_checkpoint(folder, 1, tensors_of(1), {})
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            Faults(monkeypatch, at, Killed, dead=True)
-            with contextlib.suppress(Killed):
-                save_checkpoint(folder, 2, tensors_of(2), {}, keep=1)
+    for folder, _ in failed_saves(tmp_path, Killed, keep=1):
         found = newest_complete_checkpoint(folder)
         assert found.damaged == ()
         assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
         seen.add(found.step)
         save_checkpoint(folder, 3, tensors_of(3), {}, keep=1)
-        assert sorted(path.name for path in folder.iterdir()) == [
-            "step-000003.json",
-            "step-000003.safetensors",
-        ]
+        assert {path.name for path in folder.iterdir()} == {"step-000003.json", "step-000003.safetensors"}
     assert seen == {1, 2}
 
 
 def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Path):
-    reference = tmp_path / "reference"
-    save_checkpoint(reference, 1, tensors_of(1), {})
-    count = calls_of_a_save(reference, dead=False)
-    assert count >= 12
-    for at in range(1, count + 1):
-        folder = tmp_path / str(at)
-        save_checkpoint(folder, 1, tensors_of(1), {})
-        with pytest.MonkeyPatch.context() as monkeypatch:
-            Faults(monkeypatch, at, OSError, dead=False)
-            with pytest.raises(RunError, match="No space left on device"):
-                save_checkpoint(folder, 2, tensors_of(2), {})
+    for folder, said in failed_saves(tmp_path, OSError, keep=2):
+        assert "No space left on device" in said
         names = {path.name for path in folder.iterdir()}
         assert not [name for name in names if name.endswith(".tmp")]
         assert {"step-000001.json", "step-000001.safetensors"} <= names
-        found = newest_complete_checkpoint(folder)
-        assert found.damaged == ()
+        assert newest_complete_checkpoint(folder).damaged == ()
 
 
 def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):

@@ -38,6 +38,19 @@ def config_to_json(value: Any) -> Any:
     raise TypeError(f"a config holds a {type(value).__name__}, which JSON has no form for: {value!r}")
 
 
+def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values by their dotted names.
+
+    >>> flattened({"scene": {"world": "auto"}, "seed": 42})
+    {'scene.world': 'auto', 'seed': 42}
+    """
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        own = prefix + str(name)
+        found |= flattened(value, f"{own}.") if isinstance(value, Mapping) and value else {own: value}
+    return found
+
+
 def config_from_json(values: Any, default: ConfigT, where: str = "config") -> ConfigT:
     """`default` with every value that `values` has, each checked against the field's type.
 

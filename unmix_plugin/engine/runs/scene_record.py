@@ -16,6 +16,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import DataManager
 from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, read_run_json, safe_name
+from unmix_plugin.engine.runs.config_json import flattened
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, name_some
 
@@ -121,23 +122,15 @@ _RELATIVE_TOLERANCE = 1e-4
 """Of numbers, against the greatest of the list that they are in."""
 
 
-def differences(expected: Any, found: Any, name: str = "") -> list[str]:
-    """What differs between two JSON-like values, each as the name of its place; empty if nothing does.
-
-    Args:
-        expected, found: Dictionaries, lists, tuples, strings, numbers, booleans, None, nested as they like.
-        name: Of the values themselves.
+def differences(expected: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
+    """What differs between nested JSON-like values, each as the name of its place; empty if nothing does.
 
     >>> differences({"size": [64, 48], "box": 1.0}, {"size": [64, 32], "box": 1.0 + 1e-9})
     ['size']
     """
-    if isinstance(expected, Mapping) and isinstance(found, Mapping):
-        places: list[str] = []
-        for key in dict.fromkeys([*expected, *found]):
-            place, both = f"{name}.{key}" if name else str(key), key in expected and key in found
-            places += differences(expected[key], found[key], place) if both else [place]
-        return places
-    return [] if _agree(expected, found) else [name]
+    one, other = flattened(expected), flattened(found)
+    names = dict.fromkeys([*one, *other])
+    return [x for x in names if x not in one or x not in other or not _agree(one[x], other[x])]
 
 
 def name_differences(places: list[str]) -> str:
@@ -150,6 +143,8 @@ def name_differences(places: list[str]) -> str:
 
 
 def _agree(expected: Any, found: Any) -> bool:
+    if isinstance(expected, Mapping) and isinstance(found, Mapping):
+        return not differences(expected, found)
     a, b = _as_numbers(expected), _as_numbers(found)
     if a is not None and b is not None:
         if a.shape != b.shape:
@@ -157,7 +152,7 @@ def _agree(expected: Any, found: Any) -> bool:
         scale = max(float(np.abs(a).max(initial=0.0)), float(np.abs(b).max(initial=0.0)))
         return bool((np.abs(a - b) <= _RELATIVE_TOLERANCE * scale).all())
     if isinstance(expected, list | tuple) and isinstance(found, list | tuple):
-        return len(expected) == len(found) and not any(map(differences, expected, found))
+        return len(expected) == len(found) and all(map(_agree, expected, found))
     return type(expected) is type(found) and expected == found
 
 
