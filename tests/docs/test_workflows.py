@@ -2,7 +2,6 @@
 
 import re
 import shlex
-from pathlib import Path
 
 import pytest
 import yaml
@@ -58,11 +57,6 @@ def test_every_run_of_the_tests_is_also_one_of_ci():
     assert called == {"make lint", "make test-all"}
     [repository] = yaml.safe_load(text_of(".pre-commit-config.yaml"))["repos"]
     assert [fault_of(hook["entry"]) for hook in repository["hooks"]] == [None]
-
-
-def test_makefile_recipes_name_files_that_are_here():
-    named = set(re.findall(r"(?<![\w/-])(?:scripts|benchmarks|tests|docs)/[\w/.-]+", text_of("Makefile")))
-    assert [name for name in sorted(named) if not Path(ROOT, name).exists() and "[" not in name] == []
 
 
 def test_the_oldest_python_that_is_tested_is_the_oldest_allowed():

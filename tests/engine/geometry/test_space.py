@@ -16,23 +16,15 @@ def make_bundle(count: int) -> RayBundle:
     return RayBundle(torch.randn(count, 3, generator=generator), directions, torch.arange(count))
 
 
-def test_a_slice_keeps_origin_direction_and_camera_of_each_ray_together():
+def test_a_part_of_a_bundle_keeps_each_ray_together_and_joined_parts_are_one_after_the_other():
     bundle = make_bundle(7)
     for index in (slice(2, 5), torch.tensor([4, 0, 4]), torch.arange(7) % 3 == 0):
-        part = bundle[index]
-        assert torch.equal(part.origins, bundle.origins[index])
-        assert torch.equal(part.directions, bundle.directions[index])
-        assert torch.equal(part.camera_indices, bundle.camera_indices[index])
-
-
-def test_joined_bundles_are_one_after_the_other():
-    bundle = make_bundle(5)
-    joined = RayBundle.join([bundle[:2], bundle[2:]])
-    assert torch.equal(joined.origins, bundle.origins)
-    assert torch.equal(joined.directions, bundle.directions)
-    assert torch.equal(joined.camera_indices, bundle.camera_indices)
-    assert joined.axes is None
-    assert len(joined[:0]) == 0
+        part, again = bundle[index], RayBundle.join([bundle[index], bundle[index]])
+        assert part.axes is again.axes is None
+        for name in ("origins", "directions", "camera_indices"):
+            expected = getattr(bundle, name)[index]
+            assert torch.equal(getattr(part, name), expected)
+            assert torch.equal(getattr(again, name), torch.cat([expected, expected]))
 
 
 BOX = SceneBox(torch.tensor([[-1.0, -2.0, 0.0], [1.0, 3.0, 0.5]]))

@@ -17,7 +17,7 @@ from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT, whole_file, write_
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
 from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
-from unmix_plugin.engine.runs.scene_record import differences, name_differences, read_scene_record
+from unmix_plugin.engine.runs.scene_record import differences
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.errors import ConfigError, RunError, SceneError
 
@@ -150,16 +150,6 @@ def test_nothing_is_written_when_the_scene_or_a_setting_is_refused(short_config:
     assert not short_config.output_dir.exists()
 
 
-def test_the_scene_record_holds_box_cameras_and_metadata_to_the_bit(
-    trained: RunFolder, short_config: TrainerConfig
-):
-    scene = read_scene_record(trained)
-    datamanager = Trainer(short_config).pipeline.datamanager
-    assert torch.equal(scene.scene_box.aabb, datamanager.scene_box.aabb)
-    assert torch.equal(scene.eval_cameras.camera_to_world, datamanager.eval_cameras.camera_to_world)
-    assert scene.metadata == {"grid_size": 20}
-
-
 def test_a_run_finds_its_scene_from_any_working_directory(
     short_config: TrainerConfig, monkeypatch, tmp_path: Path
 ):
@@ -258,13 +248,6 @@ def test_a_record_of_another_shape_is_refused(trained: RunFolder, name: str, val
         load_model(trained.path, "cpu")
 
 
-def test_odd_lines_of_metrics_are_dropped_on_resume(trained: RunFolder):
-    good = trained.metrics_path.read_bytes()
-    trained.metrics_path.write_bytes(good + b"\xff\xfe\n" + b"[" * 100_000 + b"\nnull\n[1]\n{}\n")
-    Trainer(load_config(trained.path))
-    assert trained.metrics_path.read_bytes() == good
-
-
 SCENE = {
     "wavelengths_nm": [450.0, 550.0, 650.0],
     "frames": ["left", "right"],
@@ -295,7 +278,3 @@ def test_what_json_or_the_rounding_of_another_machine_change_is_no_difference():
 def test_anything_else_is_a_difference_and_is_named(change, named):
     assert differences(SCENE, {**SCENE, **change}) == [named]
     assert differences({**SCENE, **change}, SCENE) == [named]
-
-
-def test_long_lists_of_differences_are_cut_with_a_count():
-    assert name_differences([f"file {i}" for i in range(9)]).endswith("file 4 and 4 more differ")

@@ -185,8 +185,9 @@ def test_tensorboard_gets_the_same_numbers_where_it_is_installed(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("without_tensorboard")
-def test_resuming_cuts_off_later_lines_and_a_half_written_one(tmp_path: Path):
+def test_resuming_cuts_off_later_lines_odd_ones_and_a_half_written_one(tmp_path: Path):
     path = tmp_path / "metrics.jsonl"
-    path.write_text('\ufeff{"step": 1}\n{"step": 2}\n{"step": 3}\n[]\n{"step": 4, "lo', encoding="utf-8")
+    odd = b"\xff\xfe\n" + b"[" * 100_000 + b"\nnull\n[1]\n{}\n"
+    path.write_bytes(b'\xef\xbb\xbf{"step": 1}\n' + odd + b'{"step": 2}\n{"step": 3}\n{"step": 4, "lo')
     MetricsWriter(RunFolder(tmp_path), resumed_step=2).write(3, 0.0, "train", {})
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
