@@ -70,10 +70,7 @@ def _no_wavelengths(root: Path) -> None:
 
 
 OPTIONS: list[tuple[dict[str, Any], str]] = [
-    (
-        {"white": "dark.hdr", "dark": "white.hdr"},
-        "not brighter than the dark frame .* white and dark swapped",
-    ),
+    ({"white": "dark.hdr", "dark": "white.hdr"}, "not brighter than the dark .* white and dark swapped"),
     ({"white": "nowhere.hdr"}, r"--white .*nowhere\.hdr: no such file"),
     ({"wavelengths": "500,600"}, "2 wavelengths were given for .* 9 bands"),
     ({"wavelengths": "500,inf"}, "500,inf holds NaN or infinity; expected"),
@@ -118,27 +115,15 @@ SPOILT: list[tuple[Spoil, dict[str, Any], str]] = [
     ),
     (_cut, {}, r"view_01\.raw: cut short: 1000 bytes; view_01\.hdr promises 13824"),
     (_pointer, {}, r"view_09\.tif: a pointer of Git LFS, not the file itself; fetch it with 'git lfs pull'"),
-    (
-        _cube("view_01", lines=10**9, samples=10**6),
-        {},
-        r"13824 bytes; view_01\.hdr promises 18000000000000000",
-    ),
+    (_cube("view_01", lines=10**9, samples=10**6), {}, r"view_01\.hdr promises 18000000000000000"),
     (_cube("white", COUNTS[..., :4]), REFERENCES, "the white reference has 4 bands, the cubes have 9"),
-    (
-        _cube("white", 0 * COUNTS + 4095),
-        REFERENCES | {"saturation": 4095.0},
-        "100% of the white reference is sat",
-    ),
+    (_cube("white", 0 * COUNTS + 4095), REFERENCES | {"saturation": 4095.0}, "100% of the white reference"),
     (_fill(50), {"dark": "dark.hdr"}, "not above 0 .*; check the dark frame"),
     (_fill(7), {"saturation": 4000.0}, "no sampled pixel .* has a measurement in all bands"),
     (_no_wavelengths, {}, "the wavelengths of its 9 bands are unknown .* --wavelengths"),
     (_zero_poses, {}, "4 of 4 camera matrices that are not poses: .* the rotation is all zeros"),
     (_poses_of("cow", "horse"), {}, "no view has a pose"),
-    (
-        _poses_of("view_00", "view_01", size=(100, 40)),
-        {},
-        "has 32 x 24 pixels .*, its lens is given for 100 x 40",
-    ),
+    (_poses_of("view_00", "view_01", size=(100, 40)), {}, "has 32 x 24 .*, its lens is given for 100 x 40"),
 ]
 
 

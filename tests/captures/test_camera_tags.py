@@ -186,9 +186,6 @@ def test_what_is_below_the_black_level_stays_below_0(tmp_path):
     assert (model_of(file).apply(file.read().astype(np.float64), slice(None)) < 0.0).all()
 
 
-SECOND_SENSOR = {"Camera:HorizontalIrradiance": "108.5", "Camera:IrradianceScaleToSIUnits": "0.01"}
-
-
 def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     file = make(tmp_path, pixels, MICASENSE, EXIF | {"ExposureTime": 1.0 / 6329.0})
     plain = model_of(file)

@@ -56,9 +56,8 @@ def parse_xmp(packet: bytes | str) -> XmpTags:
     start, end = text.find("<rdf:RDF"), text.rfind("</rdf:RDF>")
     opening = text.find("<x:xmpmeta")
     start = opening if 0 <= opening < start else start
-    if start < 0 or end < 0 or "<!DOCTYPE" in text[:end] or "<!ENTITY" in text[:end]:
-        return {}
-    if end - start > _LARGEST_PACKET:
+    declares = "<!DOCTYPE" in text[:end] or "<!ENTITY" in text[:end]
+    if start < 0 or end < 0 or declares or end - start > _LARGEST_PACKET:
         return {}
     body = text[start:end] + "</rdf:RDF>" + ("</x:xmpmeta>" if start == opening else "")
     prefixes: dict[str, str] = {}
@@ -121,7 +120,7 @@ def _black_levels(tag: Any) -> list[float] | None:
     """Stored as integers, or as rationals in one flat tuple of numerators and denominators."""
     if tag is None:
         return None
-    numbers = [float(part) for part in np.atleast_1d(np.asarray(tag.value, dtype=np.float64))]
+    numbers = np.atleast_1d(np.asarray(tag.value, dtype=np.float64)).tolist()
     if tag.dtype not in _RATIONAL_TYPES:
         return numbers
     return [above / below for above, below in zip(numbers[::2], numbers[1::2], strict=True) if below]
@@ -153,12 +152,8 @@ def tag_numbers(tags: XmpTags, *names: str) -> list[float] | None:
 
 def tag_text(tags: XmpTags, *names: str) -> str | None:
     """Text of the first of some tags that is there and not empty; the items of a list with commas between."""
-    for name in names:
-        value = tag_value(tags, name)
-        text = ",".join(value) if isinstance(value, list) else value
-        if text:
-            return text
-    return None
+    values = (tag_value(tags, name) for name in names)
+    return next((",".join(value) if isinstance(value, list) else value for value in values if value), None)
 
 
 def band_of(tags: XmpTags) -> BandTable | None:

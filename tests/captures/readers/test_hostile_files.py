@@ -139,10 +139,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
     "variables.mat": (many_variables, "4097 variables"),
     "packed.exr": (lambda path: write_exr(path, {"S0.450,0nm": ZEROS}), "decode to 3,240,000"),
     "word.pt": (lambda path: path.write_bytes(LONG_WORD), "a word of 100005 letters"),
-    "expanded.pt": (
-        lambda path: torch.save(torch.zeros(1).expand(2000, 2000, 500), path),
-        "to 8,000,000,000",
-    ),
+    "expanded.pt": (lambda path: torch.save(torch.zeros(1).expand(2000, 10**6), path), "to 8,000,000,000"),
 }
 
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from itertools import accumulate, count
+from itertools import count
 from math import prod
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -60,24 +60,25 @@ def _list_npy(path: Path) -> list[FoundArray]:
 
 
 def _list_npz(path: Path) -> list[FoundArray]:
+    """Members by their headers."""
+    arrays = []
     with open_zip(path, CaptureError) as archive:
-        return [_npz_member(path, archive, info) for info in archive.infolist()]
-
-
-def _npz_member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> FoundArray:
-    """A member by its header."""
-    with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in READ_HEADER:
-            raise CaptureError(f"{path}: {info.filename} is .npy of version {version}; use numpy.savez")
-        shape, _, dtype = parse_header(file, version)
-    needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
-    if not dtype.hasobject and info.file_size < needed:
-        held = f"holds {info.file_size} bytes"
-        raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
-    allow_decoded(path, info.file_size, CaptureError, info.compress_size)
-    name = info.filename.removesuffix(".npy")
-    return FoundArray(name, shape, dtype, lambda: loaded(_load_npz_member, path, info.filename))
+        for info in archive.infolist():
+            with archive.open(info) as file:
+                version = np.lib.format.read_magic(file)
+                if version not in READ_HEADER:
+                    raise CaptureError(
+                        f"{path}: {info.filename} is .npy of version {version}; use numpy.savez"
+                    )
+                shape, _, dtype = parse_header(file, version)
+            needed = int(np.prod(shape, dtype=object)) * dtype.itemsize
+            if not dtype.hasobject and info.file_size < needed:
+                held = f"holds {info.file_size} bytes"
+                raise CaptureError(f"{path}: {info.filename} {held}; its header promises {needed}")
+            allow_decoded(path, info.file_size, CaptureError, info.compress_size)
+            whole = partial(loaded, _load_npz_member, path, info.filename)
+            arrays.append(FoundArray(info.filename.removesuffix(".npy"), shape, dtype, whole))
+    return arrays
 
 
 def _load_npz_member(path: Path, name: str) -> np.ndarray:
@@ -188,12 +189,13 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     with path.open("rb") as begin:
         is_matlab = begin.read(10) == b"MATLAB 7.3"
     arrays: list[FoundArray] = []
-    groups: dict[str, dict[str, Any]] = {}
     visited = count(1)
     seen: set[Any] = set()
 
-    def visit(group: Any, inside: str = "") -> None:
+    def visit(group: Any, inside: str, inherited: dict[str, Any]) -> None:
         # Not by `visititems`, which never ends where a damaged tree of names leads back to itself.
+        seen.add(group)
+        inherited = inherited | _attributes(path, group)
         for link in group:
             if not isinstance(group.get(link, getlink=True), h5py.HardLink) or (item := group[link]) in seen:
                 continue
@@ -201,23 +203,13 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
             allow_parts(path, next(visited), "groups and data sets", CaptureError)
             allow_depth(path, name.count("/") + 1, CaptureError)
             seen.add(item)
-            arrays.extend(_found_in_hdf5(path, name, item, is_matlab))
-            if not hasattr(item, "shape"):
-                groups[name] = _attributes(path, item)
             if isinstance(item, h5py.Group):
-                visit(item, f"{name}/")
+                visit(item, f"{name}/", inherited)
+            else:
+                arrays.extend(_found_in_hdf5(path, name, item, is_matlab, inherited))
 
     with h5py.File(path, "r") as file:
-        seen.add(file["/"])
-        visit(file)
-        groups[""] = _attributes(path, file)
-    for index, array in enumerate(
-        arrays
-    ):  # attributes of the file and of groups, the nearest, hold for images in them
-        if len(array.shape) == 3:
-            inside = ["", *accumulate(array.name.split("/")[:-1], "{}/{}".format)]
-            inherited = {key: value for name in inside for key, value in groups.get(name, {}).items()}
-            arrays[index] = replace(array, inherited=inherited)
+        visit(file, "", {})
     opened = image_of_arrays(path, "matlab" if is_matlab else "hdf5", arrays, options)
     name = opened.metadata.get("dataset") or arrays[0].name
     with h5py.File(path, "r") as file:
@@ -247,11 +239,14 @@ def _with_fill(opened: SpectralFile, image: Any) -> SpectralFile:
     return replace(opened, no_data=(*opened.no_data, fill), warnings=(*opened.warnings, warning))
 
 
-def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[FoundArray]:
+def _found_in_hdf5(
+    path: Path, name: str, item: Any, is_matlab: bool, inherited: dict[str, Any]
+) -> list[FoundArray]:
     if not hasattr(item, "shape") or item.shape is None or "#refs#" in name:
         return []
     shape = tuple(item.shape[::-1] if is_matlab else item.shape)
     is_cube = len(shape) == 3
+    inherited = inherited if is_cube else {}
     if not is_cube and (item.external or item.is_virtual):
         return []
 
@@ -277,7 +272,11 @@ def _found_in_hdf5(path: Path, name: str, item: Any, is_matlab: bool) -> list[Fo
         # HDF5 ends the process where a damaged value is asked for; asked whether there is one, it raises an error.
         item.id.get_create_plist().fill_value_defined()
         fill = float(item.fillvalue)
-    return [FoundArray(name, shape, item.dtype, whole, faster, _attributes(path, item), {}, dimensions, fill)]
+    return [
+        FoundArray(
+            name, shape, item.dtype, whole, faster, _attributes(path, item), inherited, dimensions, fill
+        )
+    ]
 
 
 def _attributes(path: Path, item: Any) -> dict[str, Any]:

@@ -55,25 +55,22 @@ LAYERS = ("S0", "T", "")
 
 @dataclass(frozen=True)
 class _Channel:
-    """One channel as the header of its part lists it."""
+    """One channel as the header of its part lists it; it is whole if there is a number for each pixel."""
 
     name: str
     part: int
     dtype: np.dtype
     is_whole: bool
-    """Whether there is a number for each pixel."""
 
 
 @dataclass(frozen=True)
 class _SpectralChannel:
-    """A channel whose name is a wavelength."""
+    """A channel whose name is a wavelength, in a layer `S0`, `T` or none; ranges have a width."""
 
     name: str
     layer: str
-    """`S0`, `T`, or empty."""
     nm: float
     width_nm: float | None
-    """Of a range."""
 
 
 def open_exr(path: Path, options: ReadOptions) -> SpectralFile:

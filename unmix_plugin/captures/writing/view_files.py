@@ -345,12 +345,12 @@ def _read_view_masks(view: CaptureView, raster: Raster, use_opacity: bool) -> _V
     valid, opacity, straight = np.ones((raster.height, raster.width), bool), None, None
     alpha = _alpha(view) if use_opacity else None
     if alpha is not None:
-        of_file = _cut(alpha, raster)
+        of_file = alpha[raster.pixels]
         opacity = np.rint(raster.averaged(of_file.astype(np.float32))).astype(np.uint8)
         if view.alpha is None and _is_picture(view):
             straight = of_file
     if view.mask is not None:
-        is_black = raster.any_in_square(~_cut(_read(view.mask, white_of, view), raster))
+        is_black = raster.any_in_square(~_read(view.mask, white_of, view)[raster.pixels])
         if use_opacity and opacity is None:
             opacity = np.where(is_black, 0, OPAQUE).astype(np.uint8)
         else:
@@ -364,16 +364,13 @@ def _read_labels(view: CaptureView, raster: Raster) -> UInt8[np.ndarray, "H W"] 
     if view.labels is None or raster.binning > 1:
         return None
     labels = _read(view.labels, np.asarray, view)
-    if (
-        labels.ndim != 2
-        or labels.dtype.kind not in "bui"
-        or not 0 <= int(labels.min()) <= int(labels.max()) <= 255
-    ):
+    is_flat = labels.ndim == 2 and labels.dtype.kind in "bui"
+    if not is_flat or not 0 <= int(labels.min()) <= int(labels.max()) <= 255:
         channels = counted(1 if labels.ndim == 2 else labels.shape[2], "channel")
         raise CaptureError(
             f"{view.labels}: {channels} of {labels.dtype.name}; expected labels of 0 to 255 in one channel"
         )
-    return _cut(labels, raster).astype(np.uint8)
+    return labels[raster.pixels].astype(np.uint8)
 
 
 def _alpha(view: CaptureView) -> UInt8[np.ndarray, "H W"] | None:
@@ -407,10 +404,6 @@ def alpha_picture(view: CaptureView) -> Path | None:
 def _is_picture(view: CaptureView) -> bool:
     """Whether the cube is one picture; a folder of them, one a band, has no opacity of its own."""
     return view.cube.reader == "picture" and not view.cube.path.is_dir()
-
-
-def _cut(pixels: np.ndarray, raster: Raster) -> np.ndarray:
-    return pixels[raster.file_rows(0, raster.height), raster.columns]
 
 
 def _read(path: Path, pixels_of: Callable[[Image.Image], np.ndarray], view: CaptureView) -> np.ndarray:
