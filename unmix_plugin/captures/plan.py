@@ -202,18 +202,21 @@ def _with_one_exposure(sensors: dict[str, Sensor], first: dict[str, SpectralFile
     ]
     if len(bare) < 2 or not files:
         return sensors
-    found = compare_exposures(files, [], [], any(map(is_srgb, files)), any(map(may_be_reflectance, files)))
-    notes, warnings = found.notes if known or found.common is None else (), found.warnings
+    notes: list[str] = []
+    warnings: list[str] = []
+    bent, finished = any(map(is_srgb, files)), any(map(may_be_reflectance, files))
+    common = compare_exposures(files, [], [], bent, finished, notes, warnings)
     if known and rest:
         unlike = f"exposures of {name_some(rest)} are not known or not compared, those of {name_some([*known])} are"
-        warnings += (f"{unlike}: values of these lenses or cameras may be off by a factor",)
+        warnings.append(f"{unlike}: values of these lenses or cameras may be off by a factor")
     brought, first_name = dict(sensors), next(iter(bare))
-    for name, exposure in known.items() if found.common is not None else ():
-        sensor, factor = sensors[name], (found.common / exposure).astype(np.float32)
-        calibration = replace(sensor.calibration, exposure=found.common)
+    for name, exposure in known.items() if common is not None else ():
+        sensor, factor = sensors[name], (common / exposure).astype(np.float32)
+        calibration = replace(sensor.calibration, exposure=common)
         brought[name] = replace(sensor, calibration=calibration, sample=sensor.sample * factor)
     one = brought[first_name]
-    brought[first_name] = replace(one, notes=(*one.notes, *notes), warnings=(*one.warnings, *warnings))
+    noted = (*one.notes, *(notes if known or common is None else ()))
+    brought[first_name] = replace(one, notes=noted, warnings=(*one.warnings, *warnings))
     return brought
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -92,23 +93,31 @@ def exposed(time, gain=1.0, evidence="header field 'tint', no unit: taken as mil
     )
 
 
+def compared(views, whites=(), darks=(), is_bent=False, may_be_finished=False):
+    """What they are brought to, with notes and warnings."""
+    notes, warnings = [], []
+    common = compare_exposures(views, whites, darks, is_bent, may_be_finished, notes, warnings)
+    return SimpleNamespace(common=common, notes=notes, warnings=warnings)
+
+
 def test_views_are_brought_to_the_white_and_that_is_said():
-    found = compare_exposures([exposed(0.01), exposed(0.02, 2.0)], [exposed(0.005)], [], False)
+    found = compared([exposed(0.01), exposed(0.02, 2.0)], [exposed(0.005)])
     np.testing.assert_array_equal(found.common, [0.005])
-    assert found.notes == (
-        "views were exposed 0.01 to 0.04 s times gain: each is brought to that of the white reference, 0.005",
+    said = (
+        "views were exposed 0.01 to 0.04 s times gain: each is brought to that of the white reference, 0.005"
     )
-    assert found.warnings == ()
-    same = compare_exposures([exposed(0.01)] * 2, [exposed(0.01)], [(exposed(0.01), exposed(0.01))], False)
-    assert (same.notes, same.warnings) == ((), ())
+    assert found.notes == [said]
+    assert found.warnings == []
+    same = compared([exposed(0.01)] * 2, [exposed(0.01)], [(exposed(0.01), exposed(0.01))])
+    assert (same.notes, same.warnings) == ([], [])
     bands = exposed([0.01, 0.02, 0.04])  # which may differ within a view
     np.testing.assert_array_equal(exposure_of(bands), [0.01, 0.02, 0.04])
-    np.testing.assert_array_equal(compare_exposures([bands], [], [], False).common, [0.02])
+    np.testing.assert_array_equal(compared([bands]).common, [0.02])
 
 
 def test_what_may_be_wrong_with_exposures_is_said():
-    def warnings(given, whites=(), darks=(), is_bent=False):
-        return " ".join(compare_exposures(given, whites, darks, is_bent).warnings)
+    def warnings(*files, **options):
+        return " ".join(compared(*files, **options).warnings)
 
     plain = file_of(np.ones((2, 2, 3), np.uint16))
     views = [exposed(0.01), exposed(0.02)]
@@ -124,7 +133,7 @@ def test_what_may_be_wrong_with_exposures_is_said():
 def test_files_of_several_sizes_have_an_exposure_a_band_each_of_its_own():
     lens, camera = exposed(0.01), exposed([0.01, 0.02])
     camera = replace(camera, shape=(2, 2, 2))
-    assert compare_exposures([lens, camera], [], [], False).warnings == ()
+    assert compared([lens, camera]).warnings == []
 
 
 def test_the_aperture_counts_for_light_and_not_for_dark_current():
@@ -132,20 +141,17 @@ def test_the_aperture_counts_for_light_and_not_for_dark_current():
         return replace(exposed(time), metadata={"exposure_s": time, "f_number": f_number})
 
     views = [taken(0.01, 4.0), taken(0.02, 4.0 * 2**0.5), taken(0.04, 8.0)]  # the same light
-    found = compare_exposures(views, [], [], False)
+    found = compared(views)
     np.testing.assert_allclose([present(exposure_of(view)) for view in views], 0.01 / 16)
     np.testing.assert_allclose(present(found.common), 0.01 / 16)
-    brighter = compare_exposures([*views, taken(0.01, 2.0)], [], [(taken(0.01, 16.0), views[0])], False)
+    brighter = compared([*views, taken(0.01, 2.0)], [], [(taken(0.01, 16.0), views[0])])
     assert "s times gain over the square of the f-number: each is brought to" in brighter.notes[0]
-    assert brighter.warnings == ()
-    assert "dark frame was exposed 0.04" in " ".join(
-        compare_exposures(views[:1], [], [(taken(0.04, 8.0), views[0])], False).warnings
-    )
-    (warning,) = compare_exposures([*views, exposed(0.01)], [], [], False).warnings
-    assert (
-        "the f-number of the lens is known of some files and not of memory.npy: exposures are not" in warning
-    )
-    assert compare_exposures(views, [exposed(0.01)], [], False).common is None
+    assert brighter.warnings == []
+    (warning,) = compared(views[:1], [], [(taken(0.04, 8.0), views[0])]).warnings
+    assert "dark frame was exposed 0.04" in warning
+    (warning,) = compared([*views, exposed(0.01)]).warnings
+    assert "the f-number of the lens is known of some files and not of memory.npy: exposures are" in warning
+    assert compared(views, [exposed(0.01)]).common is None
 
 
 def test_scenes_have_the_same_values_whatever_the_exposures(tmp_path):
@@ -171,13 +177,10 @@ def test_exposures_that_are_neither_one_nor_one_a_band_are_not_dropped_in_silenc
     odd = file_of(np.ones((2, 2, 3), np.uint16), metadata=facts)
     other = exposed([0.02, 0.01])
     for views, whites in (([odd, other], []), ([odd], [exposed(0.01)]), ([exposed(0.01)], [odd])):
-        found = compare_exposures(views, whites, [], False)
-        assert any(
-            "2 exposure times or gains for 3 bands: exposures may differ and were not compared" in text
-            for text in found.warnings
-        )
+        found = compared(views, whites)
+        assert "2 exposure times or gains for 3 bands: exposures may differ" in " ".join(found.warnings)
         assert not found.notes
-    assert compare_exposures([odd, odd], [odd], [], False).warnings == ()  # nothing that could differ
+    assert compared([odd, odd], [odd]).warnings == []  # nothing that could differ
 
 
 @pytest.mark.parametrize(
@@ -199,19 +202,17 @@ def test_reflectances_are_not_divided_by_the_exposure_of_their_raw_files(tmp_pat
     np.testing.assert_allclose(means, values.mean() / factor, rtol=1e-3)
     said = next(text for text in (told if header else wrong[:1]) if "values are not divided by that" in text)
     assert "were exposed 0.01 to 0.02 s times gain" in said
-    assert ("taken for reflectances" in said) == (
-        not header
-    )  # which nobody can know: the report begins with it
+    # Which nobody can know: the report begins with it.
+    assert ("taken for reflectances" in said) == (not header)
 
 
 def test_values_that_may_be_reflectances_are_raw_beside_a_reference():
     views = [exposed(0.01), exposed(0.02)]
-    (warning,) = compare_exposures(views, [], [], False, may_be_finished=True).warnings
+    (warning,) = compared(views, may_be_finished=True).warnings
     assert "give a white reference, or divide them by it yourself" in warning
-    assert compare_exposures(views, [exposed(0.01)], [], False, may_be_finished=True).common == 0.01
-    assert (
-        compare_exposures(views, [], [(exposed(0.01), views[0])], False, may_be_finished=True).common == 0.01
-    )
+    assert compared(views, [exposed(0.01)], may_be_finished=True).common == 0.01
+    darks = [(exposed(0.01), views[0])]
+    assert compared(views, [], darks, may_be_finished=True).common == 0.01
 
 
 def test_values_are_finished_by_gains_or_names_that_say_so():
@@ -219,7 +220,7 @@ def test_values_are_finished_by_gains_or_names_that_say_so():
 
     def notes(whites=(), **facts):
         files = [replace(exposed(time), **facts) for time in (0.01, 0.02)]
-        return compare_exposures(files, whites, [], False).notes
+        return compared(files, whites).notes
 
     values = np.dtype(np.float32)
     linear = Linear(np.full(3, 0.5), np.zeros(3), "attribute 'scale_factor'")

@@ -59,6 +59,11 @@ class Raster:
         """Columns of the file."""
         return slice(self.left, self.left + self.width * self.binning)
 
+    @property
+    def pixels(self) -> tuple[slice, slice]:
+        """Rows and columns of the file."""
+        return self.file_rows(0, self.height), self.columns
+
     def file_rows(self, first: int, last: int) -> slice:
         """Rows of the file that rows `first` to `last` (excluded) of the result are made of."""
         return slice(self.top + first * self.binning, self.top + last * self.binning)
@@ -215,26 +220,17 @@ def exposure_of(file: SpectralFile, to_light: bool = True) -> Float64[np.ndarray
     return exposure if is_usable else None
 
 
-@dataclass(frozen=True)
-class Exposures:
-    """What becomes of the exposures of views and references."""
-
-    common: Float64[np.ndarray, " b"] | None = None
-    """What all are brought to (see `exposure_of`), one number or one a band; None where exposures are not compared."""
-    notes: tuple[str, ...] = ()
-    """What was done."""
-    warnings: tuple[str, ...] = ()
-    """What may be wrong."""
-
-
 def compare_exposures(
     views: Sequence[SpectralFile],
     whites: Sequence[SpectralFile],
     darks: Sequence[tuple[SpectralFile, SpectralFile]],
     is_bent: bool,
-    may_be_finished: bool = False,
-) -> Exposures:
-    """The exposure of the white reference, to which views are brought; without one, that of the first view.
+    may_be_finished: bool,
+    notes: list[str],
+    warnings: list[str],
+) -> Float64[np.ndarray, " b"] | None:
+    """What all views are brought to (see `exposure_of`): the exposure of the white reference, otherwise of the first
+    view; None where exposures are not compared.
 
     Args:
         views: At least one.
@@ -242,6 +238,7 @@ def compare_exposures(
         darks: Each dark frame with a view or a white that it is subtracted from.
         is_bent: Whether the files are pictures for people, in which twice the exposure is not twice the number.
         may_be_finished: Whether values look like reflectances, which nothing is divided by but a reference.
+        notes, warnings: What was done, and what may be wrong, is appended.
     """
     files = (*views, *whites)
     known, of_whites = (
@@ -254,9 +251,10 @@ def compare_exposures(
     finished = [finished_by(file, by_name=not whites) for file in views]
     if None not in finished and not is_bent:
         kept = f"values are not divided by that, as {finished[0]} says that they are reflectance or radiance already"
-        return Exposures(notes=(f"views {taken}: {kept}",) if differs else ())
-    misfits = _misfits(views, whites)
-    warnings, why = [*_missing_units(files), *misfits], None
+        notes += [f"views {taken}: {kept}"] if differs else []
+        return None
+    misfits, why = _misfits(views, whites), None
+    warnings += [*_missing_units(files), *misfits]
     if len(known) < len(views):
         missing = counted(len(views) - len(known), "view")
         is_partial = bool(known or of_whites) and not misfits
@@ -274,25 +272,32 @@ def compare_exposures(
             "If they grow with the exposure, as raw numbers do, give a white reference, or divide them by it yourself"
         )
     if why is not None:
-        return Exposures(warnings=(*warnings, *filter(None, [why])))
+        warnings += filter(None, [why])
+        return None
     if len(of_whites) < len(whites) and differs and not misfits:
         warnings.append(
             f"views {taken}, the white reference does not say how long: reflectances may be off by a factor"
         )
-    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
-    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
-    if unlike:
-        of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
-        warnings.append(
-            f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}: dark current "
-            "grows with exposure, so take a dark frame at each"
-        )
+    warnings += _unlike_darks(darks)
     common, of_whom = np.median(known[0], keepdims=True), "the first view"
     if of_whites:
         common, of_whom = of_whites[0], f"{'the' if len(whites) == 1 else 'its'} white reference"
-    is_same = len({tuple(exposure) for exposure in [*known, *of_whites, common]}) == 1
-    brought = f"views {taken}: each is brought to that of {of_whom}, {_in_words(of_whites or [common])}"
-    return Exposures(common, () if is_same else (brought,), tuple(warnings))
+    if len({tuple(exposure) for exposure in [*known, *of_whites, common]}) > 1:
+        notes.append(
+            f"views {taken}: each is brought to that of {of_whom}, {_in_words(of_whites or [common])}"
+        )
+    return common
+
+
+def _unlike_darks(darks: Sequence[tuple[SpectralFile, SpectralFile]]) -> list[str]:
+    """A warning of dark frames that were exposed otherwise than what they are subtracted from."""
+    pairs = [(exposure_of(dark, False), exposure_of(other, False)) for dark, other in darks]
+    unlike = [(a, b) for a, b in pairs if a is not None and b is not None and not np.array_equal(a, b)]
+    if not unlike:
+        return []
+    of_darks, of_others = (_in_words(exposures) for exposures in zip(*unlike, strict=True))
+    said = f"the dark frame was exposed {of_darks} s times gain, what it is subtracted from {of_others}"
+    return [f"{said}: dark current grows with exposure, so take a dark frame at each"]
 
 
 def _in_words(exposures: Iterable[Float64[np.ndarray, " _"]]) -> str:

@@ -115,8 +115,6 @@ class Reference:
     """A measured reference, brought to the columns of the cubes."""
 
     file: SpectralFile
-    what: str
-    """dark frame or white reference, for messages."""
     mean: Float32[np.ndarray, "1 columns B"]
     """Mean over its lines; one column where it stands for all."""
     is_per_pixel: bool
@@ -167,17 +165,17 @@ def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Refere
         )
     if (height, width) == cube.shape[:2] and height > 1 and pattern > _MOST_PATTERN:
         how = f"pixel by pixel, as its rows differ ({pattern:.1f} times what noise explains)"
-        return Reference(file, what, mean, True, how)
+        return Reference(file, mean, True, how)
     lines = f"mean of {height} line{'s' if height > 1 else ''}"
     if width == cube.shape[1]:
-        return Reference(file, what, mean, False, f"{lines}, column by column")
+        return Reference(file, mean, False, f"{lines}, column by column")
     ratio = max(width, cube.shape[1]) / min(width, cube.shape[1])
     wider = f"it is {width} columns wide and the cubes {cube.shape[1]}"
     if ratio == int(ratio) and width > 1:
         how = f"{lines}, interpolated along the line: {wider}, as with another binning"
-        return Reference(file, what, _stretched(mean, cube.shape[1]), False, how)
+        return Reference(file, _stretched(mean, cube.shape[1]), False, how)
     how = f"{lines} and of all columns: {wider}, so its columns can't be those of the cubes"
-    return Reference(file, what, mean.mean(axis=1, keepdims=True), False, how)
+    return Reference(file, mean.mean(axis=1, keepdims=True), False, how)
 
 
 def _open_white(file: SpectralFile, own_dark: SpectralFile | None, cube: SpectralFile) -> Reference:
@@ -206,7 +204,7 @@ def _panel_reference(cube: SpectralFile, rectangle: tuple[int, int, int, int], v
         raise CaptureError(f"{cube.path}: no pixel of --white-rectangle holds a measurement; name another")
     mean = np.nanmean(values, axis=(0, 1), keepdims=True).astype(np.float32)
     how = f"mean of {height} x {width} pixels from row {top} and column {left} of view {view}"
-    return Reference(cube, "white reference", mean, False, how, rectangle=rectangle)
+    return Reference(cube, mean, False, how, rectangle=rectangle)
 
 
 def refuse_outside(what: str, rectangle: tuple[int, int, int, int], size: tuple[int, int]) -> None:

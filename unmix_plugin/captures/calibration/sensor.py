@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
-from unmix_plugin.captures.calibration.calibration import Calibration, Exposures, Raster, compare_exposures
+from unmix_plugin.captures.calibration.calibration import Calibration, Raster, compare_exposures
 from unmix_plugin.captures.calibration.references import (
     Reference,
     References,
@@ -192,26 +192,24 @@ def prepare_sensor(
         lamp = used.signal / used.reflectance if lamp is None else lamp
         choice = _lit_bands(choice, used, saturation, warnings)
     choice.require(binning, str(first.path))
-    # A maker's calibration accounts for exposures already.
-    exposures = Exposures()
-    if model is None:
+    exposure = None
+    if model is None:  # a maker's calibration accounts for exposures already
         darks: list[tuple[SpectralFile, SpectralFile]] = []
         for file in files:
             its_dark, used = own.get(file.path, (dark, white))
             darks += [(its_dark.file, file)] if its_dark else []
             darks += [(used.dark.file, used.file)] if used and used.dark else []
-        exposures = compare_exposures(
-            files, [one.file for one in whites], darks, is_srgb(first), may_be_reflectance(first)
-        )
+        of_whites, finished = [one.file for one in whites], may_be_reflectance(first)
+        exposure = compare_exposures(files, of_whites, darks, is_srgb(first), finished, notes, warnings)
     raster = Raster.of(first.shape[0], first.shape[1], options.crop, options.bin_pixels)
-    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposures.common, own)
+    calibration = Calibration(raster, choice.kept, 1, dark, white, saturation, exposure, own)
     sample = _draw_sample(files, calibration)
     choice = _drop_found(choice, sample, options.max_noise, notes)
     choice = choice.without_incomplete_bins(binning)
     choice.require(binning, str(first.path))
     still_kept = np.isin(calibration.bands, choice.kept)
     if lamp is not None:
-        lamp = _binned(lamp[choice.kept][None].astype(np.float32), binning)[0].astype(np.float64)
+        lamp = lamp[choice.kept].astype(np.float32).reshape(-1, binning).mean(axis=1).astype(np.float64)
         lamp = np.clip(lamp, 0.0, None) / lamp.max()
     # Floating-point numbers may have been brought to what stands for 1 already.
     has_one = is_srgb(first) or first.linear is not None or (first.dtype.kind == "f" and model is None)
@@ -227,11 +225,11 @@ def prepare_sensor(
         choice,
         "reflectance" if whites else _unit(first, finished, has_one),
         bool(whites) or has_one,
-        _binned(sample[0][:, still_kept], binning),
+        sample[0][:, still_kept].reshape(len(sample[0]), -1, binning).mean(axis=2),
         evidence | _evidence(views, choice, (dark, white), own),
         lamp,
-        (*exposures.notes, *notes),
-        (*warnings, *exposures.warnings),
+        tuple(notes),
+        tuple(warnings),
         bool(whites) or states_one,
         bool(whites) or (has_one and finished is not None),
     )
@@ -456,7 +454,3 @@ def _noise_shares(values: Float32[np.ndarray, "N B"]) -> Float64[np.ndarray, " B
     moments = pixels.T @ pixels / count
     inverse = np.linalg.inv(moments + 1e-9 * np.eye(bands))
     return np.sqrt(1.0 / np.diag(inverse))
-
-
-def _binned(values: Float32[np.ndarray, "N b"], binning: int) -> Float32[np.ndarray, "N c"]:
-    return values.reshape(len(values), -1, binning).mean(axis=2)
