@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.captures.file_factory import AXES, header_text
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.process import process_capture
 
@@ -58,22 +59,10 @@ def write_cube(
     if kind == "npy":
         np.save(root / f"{name}.npy", counts)
         return root / f"{name}.npy"
-    height, width, bands = counts.shape
-    counts.transpose(0, 2, 1).tofile(root / f"{name}.raw")
-    entries = {
-        "samples": width,
-        "lines": height,
-        "bands": bands,
-        "header offset": 0,
-        "data type": {"uint8": 1, "int16": 2, "float32": 4, "uint16": 12}[counts.dtype.name],
-        "interleave": "bil",
-        "byte order": 0,
-        "wavelength units": "Nanometers",
-        "wavelength": "{" + ", ".join(f"{value:g}" for value in WAVELENGTHS_NM[:bands]) + "}",
-        **(header or {}),
-    }
-    text = "\n".join(["ENVI", *(f"{key} = {value}" for key, value in entries.items() if value is not None)])
-    (root / f"{name}.hdr").write_text(text + "\n", encoding="utf-8")
+    counts.transpose(AXES["bil"]).tofile(root / f"{name}.raw")
+    centres = ", ".join(f"{value:g}" for value in WAVELENGTHS_NM[: counts.shape[2]])
+    bands = {"wavelength units": "Nanometers", "wavelength": f"{{{centres}}}"}
+    (root / f"{name}.hdr").write_text(header_text(counts, "bil", bands | (header or {})), encoding="utf-8")
     return root / f"{name}.hdr"
 
 

@@ -104,7 +104,7 @@ def write_envi(header: Path, cube: np.ndarray, interleave: str, more: str = "") 
     return header
 
 
-def header_text(cube: np.ndarray, interleave: str, change: dict[str, str | None]) -> str:
+def header_text(cube: np.ndarray, interleave: str, change: Mapping[str, Any]) -> str:
     """Header of a cube; entries in `change` replace others, or take them away."""
     lines, samples, bands = cube.shape
     entries = {

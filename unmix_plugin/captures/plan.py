@@ -118,7 +118,7 @@ def make_plan(
     for name, same in by_sensor.items():
         # Views of several sizes are several sensors, and one may show the panel of all.
         every = [v for v in capture.views if v.sensor == name or not (name and v.release)]
-        sensors[name] = prepare_sensor(name, same, options, references, every)
+        sensors[name] = prepare_sensor(same, options, references, every)
     sensors = _with_one_exposure(sensors, {name: same[0].cube for name, same in by_sensor.items()})
     scale, why = _choose_scale(list(sensors.values()), options.scale)
     mask, said_of_mask = _choose_mask(views, options.mask)

@@ -182,7 +182,7 @@ def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, sc
     }
     options = ProcessOptions("cubes", data=Path(), output_dir=Path())
     each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
-    sensors = {name: prepare_sensor(name, own, options, (None, None), own) for name, own in each.items()}
+    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
     upright, across = with_one_exposure(sensors, files).values()
     assert said in " ".join([*upright.notes, *upright.warnings])
     assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)
@@ -197,7 +197,7 @@ def test_what_is_wrong_with_exposures_of_one_sensor_is_said_once():
     }
     options = ProcessOptions("cubes", data=Path(), output_dir=Path())
     each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
-    sensors = {name: prepare_sensor(name, own, options, (None, None), own) for name, own in each.items()}
+    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
     for sensor in with_one_exposure(sensors, files).values():
         (warning,) = sensor.warnings
         assert "2 exposure times or gains for 3 bands" in warning

@@ -6,7 +6,13 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import check_file, present, rows_and_bands_of, write_band_file
+from tests.captures.file_factory import (
+    check_file,
+    header_text,
+    present,
+    rows_and_bands_of,
+    write_band_file,
+)
 from unmix_plugin.captures.calibration.references import find_missing, finished_by
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
@@ -101,10 +107,9 @@ def test_a_band_in_a_folder_has_what_its_header_says(tmp_path):
     for nm in (500, 600):
         plane = np.array([[5000, 0]], np.uint16)
         tifffile.imwrite(tmp_path / f"{nm}nm.tif", plane, photometric="minisblack", metadata=None)
-        (tmp_path / f"{nm}nm.hdr").write_text(
-            "ENVI\nsamples=2\nlines=1\nbands=1\nfile type=TIFF\ndata type=12\ninterleave=bsq\nbyte order=0\n"
-            f"reflectance scale factor=10000\ndata ignore value=0\nwavelength={{{nm}}}\nwavelength units=nm\n"
-        )
+        stated = {"file type": "TIFF", "reflectance scale factor": 10000, "data ignore value": 0}
+        entries = stated | {"wavelength": f"{{{nm}}}", "wavelength units": "nm"}
+        (tmp_path / f"{nm}nm.hdr").write_text(header_text(plane[..., None], "bsq", entries))
     file = open_spectral_file(tmp_path)
     check_file(file, nm=[500, 600], scale=10000, no_data=(0,))
     assert finished_by(file) == "header field 'reflectance scale factor'"

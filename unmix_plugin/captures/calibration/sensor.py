@@ -128,7 +128,6 @@ class _BandChoice:
 class Sensor:
     """How all views of one lens or camera are calibrated, and why."""
 
-    name: str
     calibration: Calibration
     bands: _BandChoice
     unit: str
@@ -144,7 +143,6 @@ class Sensor:
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     """What may make values wrong, one sentence each."""
-
     is_stated: bool = False
     """Whether a white reference or the files say what 1 is, which dividing values loses."""
     is_reflectance: bool = False
@@ -157,7 +155,6 @@ class Sensor:
 
 
 def prepare_sensor(
-    name: str,
     views: Sequence[CaptureView],
     options: ProcessOptions,
     references: tuple[SpectralFile | None, SpectralFile | None],
@@ -166,7 +163,6 @@ def prepare_sensor(
     """Look at some rows of every view and decide how they are calibrated.
 
     Args:
-        name: Of the sensor; empty where there is one.
         views: At least one; all have the same bands and size.
         references: Dark frame and white reference that the user names.
         all_views: With those that have no pose: one may show a panel.
@@ -220,7 +216,6 @@ def prepare_sensor(
     finished = said[0] if None not in said else None
     evidence = {"saturation": {"stored": saturation, "evidence": how}}
     return Sensor(
-        name,
         replace(calibration, bands=choice.kept, bin_bands=binning),
         choice,
         "reflectance" if whites else _unit(first, finished, has_one),
@@ -303,11 +298,7 @@ def _evidence(
 
 
 def sampled_rows(height: int) -> list[int]:
-    """Rows spread evenly over an image.
-
-    >>> sampled_rows(4), len(sampled_rows(1000))
-    ([0, 1, 2, 3], 12)
-    """
+    """Rows spread evenly over an image."""
     count = min(height, _ROWS_A_VIEW)
     return [int((index + 0.5) * height / count) for index in range(count)]
 
