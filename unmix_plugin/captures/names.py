@@ -138,14 +138,8 @@ def match_poses(
     unposed = [name for name in wanted if name not in found]
     unused = [name for name in owners if name not in set(found.values())]
     cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
-    shared = [  # several views or cameras have one name
-        view
-        for view in unposed
-        if any(
-            cameras_of.get(_stem(name)) and len(cameras_of[_stem(name)]) + len(views_of[_stem(name)]) > 2
-            for name in wanted[view]
-        )
-    ]
+    several = {stem for stem in views_of if len(views_of[stem]) + len(cameras_of.get(stem, ())) > 2}
+    shared = [view for view in unposed if several & cameras_of.keys() & set(map(_stem, wanted[view]))]
     notes = [f"{len(found)} of {len(wanted)} views were matched {how}"]
     if how == _IN_ORDER and (ordered := sorted(wanted)) != sorted(wanted, key=natural_order):
         notes.append(
@@ -169,13 +163,14 @@ def match_poses(
 
 def _by_names(owners: dict[str, list[str]], wanted: dict[str, list[str]]) -> dict[str, str]:
     found: dict[str, str] = {}
+    taken: set[str] = set()
     for key in _KEYS:
         cameras, views = _owners_of(owners, key), _owners_of(wanted, key)
-        for view, names in wanted.items():
-            hits = (cameras.get(key(name), set()) for name in names if len(views[key(name)]) == 1)
-            hit = next((next(iter(those)) for those in hits if len(those) == 1), None)
-            if view not in found and hit is not None and hit not in found.values():
-                found[view] = hit
+        for name, those in views.items():
+            hits = cameras.get(name, set()) - taken
+            if len(those) == len(cameras.get(name, ())) == len(hits) == 1 and not those & found.keys():
+                found |= zip(those, hits, strict=True)
+                taken |= hits
     return found
 
 
@@ -186,12 +181,10 @@ def _cores(names: Iterable[str]) -> dict[str, str]:
     end = common_length([stem[start:][::-1] for stem in stems.values()])
     cores: dict[str, str] = {}
     for name, stem in stems.items():
-        first = start
-        while first > 0 and stem[first - 1].isdigit():
-            first -= 1
-        last = len(stem) - end
-        while last < len(stem) and stem[last].isdigit():
-            last += 1
+        # Numbers are taken whole, with the digits that all of them have.
+        first = len(stem[:start].rstrip("0123456789"))
+        rest = stem[len(stem) - end :]
+        last = len(stem) - len(rest.lstrip("0123456789"))
         core = stem[first:last]
         cores[str(int(core)) if core.isdecimal() else core] = name
     return cores if len(cores) == len(stems) else {}

@@ -29,7 +29,6 @@ from unmix_plugin.captures.readers.pictures import open_picture
 from unmix_plugin.captures.readers.tiff import open_tiff
 from unmix_plugin.captures.spectral_file import (
     GIVEN,
-    BandTable,
     ReadOptions,
     SpectralFile,
     unreadable,
@@ -74,6 +73,10 @@ _LONGEST_TEXT = 500
 _OF_ARRAYS = ("npy", "torch", "matlab", "hdf5", "netcdf")
 _USED_BY = {"dataset": (*_OF_ARRAYS, "exr"), "axes": (*_OF_ARRAYS, "tiff"), "size": _OF_ARRAYS}
 """Options that change nothing in files of other readers."""
+_FACTS = (
+    *("file", "reader", "shape", "dtype", "interleave", "wavelengths_nm", "wavelength_evidence", "fwhm_nm"),
+    *("band_names", "bad_bands", "scale", "gains", "offsets", "no_data", "poses", "notes", "metadata"),
+)
 _LLFF_COLUMNS = 17
 _POSE_SUFFIXES = (".json", ".xml", ".bin", ".txt")
 
@@ -210,27 +213,26 @@ def inspect_file(path: Path, options: ReadOptions | None = None) -> dict[str, An
             opened.read(slice(height - 1, height), slice(first, num_bands))
     except CaptureError as error:
         opened, refused = None, error
-    bands = BandTable(evidence="") if opened is None else opened.bands
-    facts = {
-        "file": str(path),
-        "reader": opened and opened.reader,
-        "shape": opened and list(opened.shape),
-        "dtype": opened and opened.dtype.newbyteorder("=").name,
-        "interleave": opened and opened.interleave,
-        "wavelengths_nm": _listed(bands.wavelengths_nm),
-        "wavelength_evidence": bands.evidence or None,
-        "fwhm_nm": _listed(bands.fwhm_nm),
-        "band_names": None if bands.names is None else list(bands.names),
-        "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),
-        "scale": opened and _plain(opened.linear and opened.linear.scale),
-        "gains": opened and opened.linear and _plain(opened.linear.gains),
-        "offsets": opened and opened.linear and _plain(opened.linear.offsets),
-        "no_data": opened
-        and _plain(opened.no_data[0] if len(opened.no_data) == 1 else opened.no_data or None),
-        "poses": None,
-        "notes": opened and [*opened.warnings, *opened.notes],
-        "metadata": opened and _plain(opened.metadata),
-    }
+    facts = dict.fromkeys(_FACTS) | {"file": str(path)}
+    if opened is not None:
+        bands, linear = opened.bands, opened.linear
+        facts |= {
+            "reader": opened.reader,
+            "shape": list(opened.shape),
+            "dtype": opened.dtype.newbyteorder("=").name,
+            "interleave": opened.interleave,
+            "wavelengths_nm": _listed(bands.wavelengths_nm),
+            "wavelength_evidence": bands.evidence,
+            "fwhm_nm": _listed(bands.fwhm_nm),
+            "band_names": bands.names and list(bands.names),
+            "bad_bands": None if bands.bad is None else np.flatnonzero(bands.bad).tolist(),
+            "scale": linear and linear.scale,
+            "gains": linear and linear.gains.tolist(),
+            "offsets": linear and linear.offsets.tolist(),
+            "no_data": _plain(opened.no_data[0] if len(opened.no_data) == 1 else opened.no_data or None),
+            "notes": [*opened.warnings, *opened.notes],
+            "metadata": _plain(opened.metadata),
+        }
     if opened is None or (path.suffix.lower() == ".npy" and opened.shape[1:] == (_LLFF_COLUMNS, 1)):
         facts |= _poses_of(path, refused)
     return facts
