@@ -49,6 +49,7 @@ _COLOURS = ("R", "G", "B")
 _OF_EXIF = {"isoSpeed": "EXIF ISOSpeed", "aperture": "EXIF FNumber"}
 """Attributes of the format, by the names of the same things in EXIF."""
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
+_DAMAGED = "can't be read as OpenEXR, copy the file again"
 LAYERS = ("S0", "T", "")
 """Which of several layers is taken: radiance, reflectance, any other."""
 
@@ -79,14 +80,9 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     `options.dataset` names a layer (`S0`, `T`), a part, or one channel. Raises CaptureError: the file is damaged, or
     has no such layer, part or channel.
     """
-    with path.open("rb") as file:
-        begin = file.read(_HEADER_BYTES)
-    try:
-        _ = _list_channels(begin, [False])
-        parts = _opened(path, header_only=True).parts
-        channels = _list_channels(begin, ["deep" in str(part.type()).lower() for part in parts])
-    except ValueError as error:
-        raise CaptureError(f"{path}: no OpenEXR image: {error}; copy the file again") from error
+    _ = _channels_of(path)
+    parts = _opened(path, header_only=True).parts
+    channels = _channels_of(path, ["deep" in str(part.type()).lower() for part in parts])
     allow_parts(path, len(channels), "channels", CaptureError)
     wanted, titles = options.dataset, [str(part.header.get("name", "")) for part in parts]
     considered = [one for one in channels if wanted is None or titles[one.part] == wanted]
@@ -104,7 +100,7 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
     windows = {one.part: _window(parts[one.part].header, "dataWindow") for one in chosen}
     is_partial = False
     for index, own in windows.items():
-        low, high = np.maximum(own[0], frame[0]), np.minimum(own[1], frame[1])
+        low, high = _on_both(own, frame)
         if (high <= low).any():
             has, whole = ((window - [[0], [1]]).tolist() for window in (own, frame))
             raise CaptureError(
@@ -146,14 +142,35 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
 
 
 def channel_names(path: Path) -> list[str]:
-    """Names of the channels in the order of the file, read without the library, which damaged headers end. Raises
-    CaptureError: the header is damaged."""
+    """Names of the channels in the order of the file. Raises CaptureError: the header is damaged."""
+    return [channel.name for channel in _channels_of(path)]
+
+
+def _channels_of(path: Path, is_deep: Sequence[bool] = (False,)) -> list[_Channel]:
+    """Channels of all parts, read without the library, which damaged headers end.
+
+    Args:
+        is_deep: Of each part, whether its pixels hold any number of numbers.
+    """
     with path.open("rb") as file:
-        begin = file.read(_HEADER_BYTES)
-    try:
-        return [channel.name for channel in _list_channels(begin, [False])]
-    except ValueError as error:
-        raise CaptureError(f"{path} can't be read as OpenEXR ({error}); copy it again") from error
+        header = file.read(_HEADER_BYTES)
+    channels, position = [], 0
+    for part, deep in enumerate(is_deep):
+        position = header.find(_MARK, position) + len(_MARK)
+        if position < len(_MARK):
+            raise CaptureError(f"{path} {_DAMAGED}: no list of channels is in the header")
+        position += 4
+        while position < len(header) and header[position] != 0:
+            end = header.find(b"\0", position)
+            if end < 0 or end + 17 > len(header):
+                raise CaptureError(f"{path} {_DAMAGED}: the list of channels is cut short")
+            kind, across, down = struct.unpack_from("<i4xii", header, end + 1)
+            if not 0 <= kind < len(_TYPES):
+                raise CaptureError(f"{path} {_DAMAGED}: a channel has the unknown type {kind}")
+            name = header[position:end].decode("utf-8", "replace")
+            channels.append(_Channel(name, part, _TYPES[kind], (across, down) == (1, 1) and not deep))
+            position = end + 17
+    return channels
 
 
 def _window(header: dict[str, Any], key: str) -> Int[np.ndarray, "2 2"]:
@@ -162,34 +179,12 @@ def _window(header: dict[str, Any], key: str) -> Int[np.ndarray, "2 2"]:
     return np.stack([first, last + 1])
 
 
+def _on_both(window: Int[np.ndarray, "2 2"], frame: Int[np.ndarray, "2 2"]) -> Int[np.ndarray, "2 2"]:
+    return np.stack([np.maximum(window[0], frame[0]), np.minimum(window[1], frame[1])])
+
+
 def _area(window: Int[np.ndarray, "2 2"]) -> int:
     return prod(max(0, side) for side in (window[1] - window[0]).tolist())
-
-
-def _list_channels(header: bytes, is_deep: Sequence[bool]) -> list[_Channel]:
-    """Channels of all parts, from the first bytes of a file; ValueError where they are damaged.
-
-    Args:
-        header: The first bytes.
-        is_deep: Of each part, whether its pixels hold any number of numbers.
-    """
-    channels, position = [], 0
-    for part, deep in enumerate(is_deep):
-        position = header.find(_MARK, position) + len(_MARK)
-        if position < len(_MARK):
-            raise ValueError("no list of channels in the header")
-        position += 4
-        while position < len(header) and header[position] != 0:
-            end = header.find(b"\0", position)
-            if end < 0 or end + 17 > len(header):
-                raise ValueError("the list of channels is cut short")
-            kind, across, down = struct.unpack_from("<i4xii", header, end + 1)
-            if not 0 <= kind < len(_TYPES):
-                raise ValueError(f"a channel has the unknown type {kind}")
-            name = header[position:end].decode("utf-8", "replace")
-            channels.append(_Channel(name, part, _TYPES[kind], (across, down) == (1, 1) and not deep))
-            position = end + 17
-    return channels
 
 
 def _choose(
@@ -281,7 +276,7 @@ def _load_exr(path: Path, keys: tuple[tuple[int, str], ...]) -> np.ndarray:
         pixels, window = parts[index].channels[name].pixels, _window(parts[index].header, "dataWindow")
         if (window != frame).any():
             placed = np.full((frame[1] - frame[0])[::-1], np.nan, np.result_type(pixels.dtype, np.float16))
-            low, high = np.maximum(window[0], frame[0]), np.minimum(window[1], frame[1])
+            low, high = _on_both(window, frame)
             (x, y), (right, bottom) = low - frame[0], high - frame[0]
             (left, top), (width, height) = low - window[0], high - low
             placed[y:bottom, x:right] = pixels[top : top + height, left : left + width]
