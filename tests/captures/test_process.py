@@ -6,7 +6,6 @@ import hashlib
 import json
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,8 @@ from tests.captures.capture_factory import (
     write_poses,
 )
 from tests.captures.file_factory import present
-from tests.captures.poses.alignment import elsewhere
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.layouts.cubes import find_cubes
-from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
@@ -90,21 +87,6 @@ BRIGHT_SQUARE = np.zeros((HEIGHT, WIDTH), bool)
 BRIGHT_SQUARE[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 4 : 3 * WIDTH // 4] = True
 
 
-def test_a_scene_with_estimated_poses_has_its_own_upright_world(tmp_path: Path, monkeypatch):
-    capture = make_capture(tmp_path / "capture", views=12)
-    tilted = elsewhere(read_poses(capture.root / "transforms.json"))
-    cameras = {Path(name).stem: camera for name, camera in tilted.cameras.items()}
-    estimated = replace(tilted, cameras=cameras, up=None, has_world=False)
-    monkeypatch.setattr(process_module, "poses_of_written_views", lambda *_: estimated)
-    scene, _ = made(tmp_path, capture, poses="estimate")
-    written = read_poses(tmp_path / "scene" / "transforms.json").cameras
-    world = scene.normalisation.to_world(scene.cameras.camera_to_world[:, :, 3].double().numpy())
-    expected = [written[f"images/{frame.name}.png"].camera_to_world for frame in scene.frames]
-    np.testing.assert_allclose(world, [pose[:, 3] for pose in expected], atol=1e-6)
-    np.testing.assert_allclose([pose[2, 0] for pose in expected], 0.0, atol=1e-9)  # cameras stand upright
-    assert min(pose[2, 1] for pose in expected) > 0.5
-
-
 def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path, capture):
     scene, _ = made(tmp_path, capture, crop=(4, 6, 16, 20), bin_pixels=2, bin_bands=3)
     assert (scene.cameras.height, scene.cameras.width) == (8, 10)
@@ -114,15 +96,6 @@ def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path, capture)
     counts = np.fromfile(capture.root / "view_00.raw", "<u2").reshape(HEIGHT, len(WAVELENGTHS_NM), WIDTH)
     scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
     assert scene.cube(0)[0, 0, 0] == pytest.approx(counts[4:6, :3, 6:8].mean() / scale, abs=1e-4)
-
-
-def test_bands_on_both_sides_of_a_range_that_is_left_out_are_not_averaged(tmp_path: Path, capture):
-    scene, _ = made(tmp_path, capture, drop_bands="500-550", bin_bands=2, **references_of(capture))
-    np.testing.assert_allclose(scene.wavelengths_nm, [625, 725, 825])
-    expected = capture.reflectance["view_00"][..., [[3, 4], [5, 6], [7, 8]]].mean(axis=-1)
-    np.testing.assert_allclose(scene.cube(0), expected, atol=1.0 / 1000)
-    report = (tmp_path / "scene" / "report.txt").read_text()
-    assert "bands left out: 450 nm (too few up to a gap or the end for --bin-bands 2)" in report
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
