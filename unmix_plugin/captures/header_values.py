@@ -99,12 +99,10 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
     ) -> tuple[str, list[Any] | None]:
         for unit in units:
             for name, key in named.items():
-                items = listed(entries[key], separators) if names.fullmatch(name) else []
-                if (
-                    items
-                    and _unit_in(name) == unit
-                    and not (name == "bands" and _counts(items, unit_of(name)))
-                ):
+                if not names.fullmatch(name) or _unit_in(name) != unit:
+                    continue
+                items = listed(entries[key], separators)
+                if items and not (name == "bands" and _counts(items, unit_of(name))):
                     return name, items
         return "", None
 
