@@ -238,16 +238,14 @@ def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[s
 
 
 def _points_seen(view: SeenView, focus: Float64[np.ndarray, "3"]) -> _Points:
-    """Points on a grid of the view's rays, at the depth of the middle; lenses are taken without distortion."""
-    lens = view.camera.lens
-    assert lens is not None
+    """Points on a grid of the view's rays, at the depth of the middle."""
+    assert view.camera.lens is not None
     steps = (np.arange(8) + 0.5) / 8
-    x, y = np.meshgrid(steps * lens.width, steps * lens.height)
-    across = (x.ravel() - lens.center_px[0]) / lens.focal_px[0]
-    down = (y.ravel() - lens.center_px[1]) / lens.focal_px[1]
-    rays = np.column_stack([across, -down, -np.ones_like(across)]) @ view.camera.camera_to_world[:, :3].T
+    x, y = np.meshgrid(steps * view.camera.lens.width, steps * view.camera.lens.height)
+    rays = view.camera.rays_of(np.column_stack([x.ravel(), y.ravel()]))
+    rays = view.axis[None] if rays is None else rays
     depth = max(float((focus - view.position) @ view.axis), 1e-9)
-    return view.position + depth * rays
+    return view.position + depth * rays / (rays @ view.axis)[:, None]
 
 
 def _blur(views: Sequence[SeenView], _: _Points | None, findings: list[str]) -> str:
