@@ -48,23 +48,18 @@ def test_a_refined_lens_is_that_of_evaluation_views_too_whose_poses_stay():
     assert_close(seen, scene.look(evaluated)["spectral"], atol=1e-5, rtol=0)
 
 
-def test_a_scene_says_what_training_fitted_for_each_view():
-    assert scene_of(model_with()).fitted == ()
+def test_a_scene_says_what_training_fitted_for_each_view_and_with_which_gain_it_is_as_it_was_measured():
+    assert (scene_of(model_with()).fitted, scene_of(model_with()).view_gains) == ((), None)
     assert scene_of(model_with(poses="refine"), three_cameras()).fitted == ("pose",)
-    assert scene_of(model_with(light="per-view")).fitted == ("gain",)
-
-
-def test_a_scene_knows_the_gain_with_which_each_training_view_is_as_it_was_measured():
     model = model_with(light="per-view")
     with torch.no_grad():
         model.view_gains.log_gains[:, 0] = torch.tensor([0.3, -0.1, -0.2])
     found = scene_of(model)
-    expected = torch.tensor([0.3, -0.1, -0.2]).exp()[:, None].expand(3, len(found.bands))
-    assert_close(found.view_gains, expected)
+    assert found.fitted == ("gain",)
     with torch.no_grad():
         model.view_gains.log_gains.zero_()  # training that goes on
+    expected = torch.tensor([0.3, -0.1, -0.2]).exp()[:, None].expand(3, len(found.bands))
     assert_close(found.view_gains, expected)
-    assert scene_of(model_with()).view_gains is None
 
 
 @pytest.fixture(scope="module")
@@ -89,16 +84,13 @@ def find(summary, data=None):
 def test_a_scene_is_found_where_it_was_or_is_said_to_be(copy, tmp_path):
     run = run_on(copy)
     scene = find(run)
-    assert scene is not None
     assert scene.root == copy
     assert scene.cube(0).max() > 0
     for root in (None, "relative/place"):
         assert find({**run, "root": root}) is None
     moved = copy.rename(tmp_path / "moved")
     assert find(run) is None
-    scene = find(run, moved)
-    assert scene is not None
-    assert scene.root == moved
+    assert find(run, moved).root == moved
 
 
 def edit(root, change):
