@@ -58,9 +58,6 @@ class Bands:
     def of(cls, centers_nm: Sequence[object] | np.ndarray | Tensor) -> Bands:
         """Bands from a list, an array of any number type, or a tensor on any device.
 
-        Raises:
-            SpectrumError: not one axis, empty, not numbers, not finite, not positive, or not strictly increasing.
-
         >>> Bands.of([450, 550, 650]).edges_nm
         array([400., 500., 600., 700.])
         """
@@ -144,10 +141,7 @@ class Bands:
         return bool(((low <= wavelength_nm) & (last <= high)).any())
 
     def nearest(self, wavelength_nm: float | int) -> int:
-        """Index of the band whose centre is nearest; of two equally near the shorter wavelength.
-
-        Raises:
-            SpectrumError: no band's interval contains the wavelength.
+        """Index of the band whose centre is nearest to a wavelength in some band's interval; of two the shorter one.
 
         >>> Bands.of([450, 550, 650]).nearest(560)
         1
@@ -160,11 +154,7 @@ class Bands:
 
 
 def require_nanometres(centers_nm: Float64[np.ndarray, " B"]) -> None:
-    """Refuse wavelengths that a file gives in another unit.
-
-    Raises:
-        SpectrumError: the wavelengths count bands, look like micrometres, or lie where no optical sensor measures.
-    """
+    """Refuse wavelengths that count bands, look like micrometres, or lie where no optical sensor measures."""
     low, high = _MEASURABLE_RANGE_NM
     first, last = float(centers_nm.min()), float(centers_nm.max())
     if are_band_numbers(centers_nm):
@@ -189,11 +179,8 @@ def nm_per_unit(unit: str) -> float | None:
 
 
 def are_band_numbers(values: np.ndarray, may_have_gaps: bool = False) -> bool:
-    """Whether numbers without a unit count bands instead of measuring: whole ones, one apart from 0 or 1.
-
-    Args:
-        values: One number a band.
-        may_have_gaps: Whether any whole numbers too small for nm count, as in a list called `bands`.
+    """Whether numbers without a unit, one a band, count bands instead of measuring: whole ones, one apart from 0 or 1;
+    or, with gaps, any whole ones too small for nm, as in a list called `bands`.
 
     >>> are_band_numbers(np.array([1, 2, 3])), are_band_numbers(np.array([8, 9, 10]))
     (True, False)

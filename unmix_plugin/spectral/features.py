@@ -31,11 +31,8 @@ def continuum(
 ) -> Float64[Tensor, "*N B"]:
     """Upper convex hull of each spectrum over its wavelengths; NaN where a spectrum has a value that is not finite.
 
-    From each corner the hull goes on to the band that it climbs to most steeply: the gift wrapping of Jarvis 1973, for
-    all spectra at once.
-
-    Source:
-        Clark and Roush 1984, Journal of Geophysical Research 89(B7).
+    Source: Clark and Roush 1984, Journal of Geophysical Research 89(B7); by the gift wrapping of Jarvis 1973, from each
+    corner to the band that the hull climbs to most steeply, for all spectra at once.
 
     >>> continuum(torch.tensor([0.2, 0.2, 0.4]), np.array([400.0, 500.0, 600.0]))
     tensor([0.2000, 0.3000, 0.4000], dtype=torch.float64)
@@ -118,9 +115,6 @@ def derivative_matrix(
     At each band that of the parabola of least squares through it and its neighbours, five bands in all; at the ends
     through the outermost five. For evenly spaced bands these are the filters of Savitzky and Golay 1964, as
     `scipy.signal.savgol_filter` has them; gaps and uneven steps are allowed for.
-
-    Raises:
-        SpectrumError: fewer than five bands.
     """
     count = len(wavelengths_nm)
     if count < FEWEST_BANDS:
@@ -149,10 +143,8 @@ def minimum_noise_fractions(
 ) -> NoiseFractions:
     """The first components of an image after Green et al. 1988, IEEE TGRS 26(1): minimum noise fractions.
 
-    The noise is that of the differences between neighbours to the right, over the root of two: edges count as noise.
-
-    Raises:
-        SpectrumError: fewer pairs of neighbours than bands, or a band whose noise the others have already.
+    The noise is that of the differences between neighbours to the right, over the root of two: edges count as noise. It
+    takes more pairs of neighbours than bands, and bands that have a noise of their own.
     """
     data, bands = cube.double(), cube.shape[-1]
     pairs = mask[:, 1:] & mask[:, :-1]

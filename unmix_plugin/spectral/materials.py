@@ -165,11 +165,6 @@ class Materials:
     """Name of another camera whose channels the bands are; None: they are the run's own."""
 
     def __post_init__(self) -> None:
-        """Give names where there are none.
-
-        Raises:
-            SpectrumError: another number of names than of endmembers, or two the same.
-        """
         count = len(self.endmembers)
         if not self.names:
             object.__setattr__(self, "names", default_names(count))

@@ -68,10 +68,7 @@ def ssim(
     """Structural similarity in [-1, 1], mean over bands: 7 x 7 uniform window, data range 1, sample covariance, windows
     that reach beyond the image left out. Pixels whose windows do not count are made equal in both images first.
 
-    Raises:
-        SpectrumError: an image smaller than the window.
-    Source:
-        Wang et al., IEEE TIP 13(4), 2004, as computed by scikit-image.
+    Source: Wang et al., IEEE TIP 13(4), 2004, as computed by scikit-image.
     """
     from skimage.metrics import structural_similarity
 

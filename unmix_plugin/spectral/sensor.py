@@ -62,11 +62,6 @@ class Sensor:
     """Of the channels as they were given."""
 
     def __post_init__(self) -> None:
-        """Sort the channels.
-
-        Raises:
-            SpectrumError: a single wavelength, a channel that responds to nothing, or two with the same centre.
-        """
         table = self.responses
         if len(table.bands) < 2:
             raise SpectrumError("a spectral response needs at least two wavelengths; found one")
@@ -95,10 +90,7 @@ class Sensor:
 
         A band weighs as much as of the channel's response lies in its interval, so channels narrower than the bands
         count too; they get what the band has. A channel of which more than 1 % lies where there are no bands is left
-        out.
-
-        Raises:
-            SpectrumError: no channel is left.
+        out; one has to be left.
         """
         integrals = self._responses_up_to(bands.intervals_nm.ravel())
         in_bands = np.diff(integrals.reshape(len(integrals), len(bands), 2))[..., 0]
@@ -142,11 +134,7 @@ class Sensor:
 
 
 def read_sensor(path: Path) -> Sensor:
-    """A sensor from a CSV file, `wavelength,NAME,NAME,...`, of relative spectral responses; its name is the file's.
-
-    Raises:
-        SpectrumError: as `spectra_csv.read_spectra_csv` and `Sensor`.
-    """
+    """A sensor from a CSV file, `wavelength,NAME,NAME,...`, of relative spectral responses; its name is the file's."""
     table = read_spectra_csv(path)
     try:
         return Sensor(path.stem, table)
@@ -203,11 +191,7 @@ class SceneSensor:
 
     @staticmethod
     def from_json(values: Mapping[str, Any], num_bands: int) -> SceneSensor:
-        """The sensor that `to_json` wrote.
-
-        Raises:
-            KeyError, IndexError, TypeError, ValueError: no sensor of a scene with so many bands.
-        """
+        """The sensor that `to_json` wrote; a KeyError, IndexError, TypeError or ValueError where it is none."""
         if "bands" in values:
             return SceneSensor(str(values["name"]), np.eye(num_bands)[list(values["bands"])])
         matrix = np.array(values["responses"], dtype=np.float64)

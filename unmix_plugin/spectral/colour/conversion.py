@@ -67,9 +67,6 @@ _CURVE = (15.5, -40.14, 31.96, -6.868, 0.4298, 0.1191, -0.00232)
 def parse_light(text: str) -> str | Path:
     """A light as a user writes it: the name of a known one, or the path of a CSV file.
 
-    Raises:
-        SpectrumError: neither; the message has the nearest names.
-
     >>> parse_light("d65")
     'D65'
     """
@@ -96,11 +93,9 @@ def illuminant_power(
 
     Args:
         light: A name as `parse_light` gives it, or a CSV file, `wavelength,power`.
-        bands: Of the sensor.
         beyond: What to do in bands at whose centres the light is not known: refuse, or hold its outermost value.
     Raises:
-        SpectrumError: an unknown name; a file that is missing, malformed or not one light; a light that is not known at
-            all bands (the message says by how much) or that is zero there.
+        SpectrumError: an unknown name, a file that is not one light, or a light that is zero or unknown at bands.
     """
     source, power = _table(light)
     try:
@@ -120,13 +115,8 @@ def power_in_bands(
 ) -> Float64[np.ndarray, " B"]:
     """A light's mean power in each band, from a table: that of the line through it over the band's interval, exactly.
 
-    A table at the centres of the bands, but for rounding, has such means already and is taken as it is.
-
-    Args:
-        power: At the centres of `source`.
-        beyond: As that of `illuminant_power`.
-    Raises:
-        SpectrumError: the table does not reach all centres; the message says by how much.
+    A table at the centres of the bands, but for rounding, has such means already and is taken as it is. One that does
+    not reach all centres is refused, or its outermost value held.
     """
     if len(source) == len(bands) and (abs(source.centers_nm - bands.centers_nm) <= TOLERANCE_NM).all():
         return power
@@ -187,10 +177,7 @@ def _incandescent(wavelengths_nm: Float64[np.ndarray, " N"]) -> Float64[np.ndarr
     return 100.0 * (560.0 / wavelengths_nm) ** 5 * radiation
 
 
-_ColourMode = Literal["true-colour", "false-colour"]
-
-
-def colour_mode(bands: Bands) -> _ColourMode:
+def colour_mode(bands: Bands) -> Literal["true-colour", "false-colour"]:
     """Whether `rgb_matrix` gives colours as an eye would see them, or a false-colour composite.
 
     True colour takes a band centre in each of 380-500, 500-600 and 600-780 nm, and a noticeable response of each sRGB
@@ -245,19 +232,13 @@ def xyz_matrix(bands: Bands, dtype: torch.dtype = torch.float32) -> Float[Tensor
     """Matrix from spectra to CIE 1931 2 degree XYZ, on the CPU; flat 1 has Y = 1 and the chromaticity of illuminant E.
 
     Relative to the covered range: a sensor that ends at 650 nm is normalised by what it sees of Y. The colour matching
-    functions are those of CIE 15:2018 at 1 nm, as colour-science gives them.
-
-    Raises:
-        SpectrumError: no band reaches into 360-830 nm, where the colour matching functions are.
+    functions are those of CIE 15:2018 at 1 nm, as colour-science gives them; some band has to reach into 360-830 nm.
     """
     return torch.tensor(_xyz_weights(bands), dtype=dtype)
 
 
 def band_composite_matrix(bands: Bands, wavelengths_nm: Sequence[float | int]) -> Float[Tensor, "B 3"]:
     """Matrix that shows three chosen bands as red, green and blue: the nearest to each wavelength, unscaled.
-
-    Raises:
-        SpectrumError: not three wavelengths, or one that no band covers.
 
     >>> band_composite_matrix(Bands.of([550, 650, 860]), (860, 650, 550))
     tensor([[0., 0., 1.],
@@ -275,9 +256,7 @@ def band_composite_matrix(bands: Bands, wavelengths_nm: Sequence[float | int]) -
 
 
 def linear_to_srgb(linear_rgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Encode linear light for a display (IEC 61966-2-1:1999; below 0 the linear piece goes on).
-
-    Increasing everywhere, gradients finite, nothing clamped.
+    """Encode linear light for a display (IEC 61966-2-1:1999; below 0 the linear piece goes on, gradients are finite).
 
     >>> linear_to_srgb(torch.tensor([0.0, 0.2140, 1.0]))
     tensor([0.0000, 0.5000, 1.0000])
@@ -332,13 +311,8 @@ def _thirds_of_range(bands: Bands) -> Float64[np.ndarray, "B 3"]:
 
 
 def agx(light: Float[Tensor, "*pixels 3"]) -> Float[Tensor, "*pixels 3"]:
-    """Light as AgX encodes it for an sRGB display; differentiable between its black and its white.
-
-    Args:
-        light: Linear RGB in sRGB primaries, 0 and up.
-    Returns:
-        About [0, 1]; saturated colours may leave it a little.
-    """
+    """Linear light in sRGB primaries, 0 and up, as AgX encodes it for an sRGB display: in about [0, 1], which saturated
+    colours may leave a little. Differentiable between its black and its white."""
     low, high = _LOG2_BOUNDS
     inset = light.clamp(min=0) @ light.new_tensor(_INSET).T
     x = ((inset.clamp(min=2.0**low).log2() - low) / (high - low)).clamp(0, 1)

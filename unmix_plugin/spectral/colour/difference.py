@@ -26,11 +26,7 @@ from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 def reflectance_to_lab(
     reflectance: Float[np.ndarray, "*shape B"], light: Float[np.ndarray, " B"], bands: Bands
 ) -> Float64[np.ndarray, "*shape 3"]:
-    """L*a*b* of surfaces to an eye that is adapted to the light: a perfect white is (100, 0, 0) under every light.
-
-    Raises:
-        SpectrumError: the bands hold no visible light.
-    """
+    """L*a*b* of surfaces to an eye that is adapted to the light: a perfect white is (100, 0, 0) under every light."""
     lit = light[:, None] * xyz_matrix(bands, torch.float64).numpy()
     return _xyz_to_lab(reflectance @ lit, lit.sum(axis=0))
 
@@ -103,13 +99,9 @@ def metameric_pairs(
     alike: float = 2.0,
     different: float = 4.0,
 ) -> list[MetamericPair]:
-    """All pairs that look alike in one of the lights and different in another, those that differ most first.
+    """All pairs of surfaces that look alike in one of the lights (relative power) and different in another, those that
+    differ most first; `alike` and `different` are the CIEDE2000 up to and from which they look so.
 
-    Args:
-        reflectance, lights: Of each surface; relative power of each light, none of them invisible.
-        bands: Of both.
-        alike: CIEDE2000 up to which two surfaces look alike.
-        different: CIEDE2000 from which they look different.
     Raises:
         SpectrumError: fewer than two lights, bands in which colours can't be told, or thresholds the wrong way round.
     """

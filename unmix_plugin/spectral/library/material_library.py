@@ -119,10 +119,7 @@ class MaterialLibrary:
 
     def find(self, name: str) -> LibraryMaterial:
         """The material of exactly this name; or else in any case, in full (`ColorChecker/blue`), or its last part
-        where only one has it.
-
-        Raises:
-            SpectrumError: no material or several of that name; the message has the nearest names.
+        where only one has it. Errors have the nearest names.
         """
         if name in self.names:
             return self.materials[self.names.index(name)]
@@ -142,9 +139,6 @@ class MaterialLibrary:
         """Reflectance of a material at other wavelengths, by linear interpolation.
 
         Where it was not measured (`beyond`) it is refused; or the outermost value is held, and gaps are bridged.
-
-        Raises:
-            SpectrumError: as `find`; or bands where it was not measured that are not to be held.
         """
         material = self.find(name)
         if beyond == "hold":
@@ -214,10 +208,7 @@ class MaterialLibrary:
         count: int = 3,
         comparison: Comparison = "scale",
     ) -> list[list[LibraryMatch]]:
-        """The materials that resemble each spectrum most by their `angles`, nearest first.
-
-        Fewer than `count` come back if the library holds no more that can be compared.
-        """
+        """The materials that resemble each spectrum most by their `angles`, nearest first, at most `count`."""
         angles, counts = self.angles(spectra, bands, light, comparison)
         return [
             [

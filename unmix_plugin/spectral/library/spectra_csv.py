@@ -55,22 +55,14 @@ class SpectraTable:
                 )
 
     def resampled(self, bands: Bands) -> SpectraTable:
-        """The same spectra at other wavelengths, by linear interpolation; at the same ones, unchanged.
-
-        Raises:
-            SpectrumError: a wanted wavelength lies outside the table's (nothing is extrapolated).
-        """
+        """The same spectra at other wavelengths, as `resample_spectra` interpolates them."""
         return SpectraTable(bands, self.names, resample_spectra(self.spectra, self.bands, bands))
 
 
 def resample_spectra(
     spectra: Float64[np.ndarray, "*batch B"], source: Bands, target: Bands
 ) -> Float64[np.ndarray, "*batch C"]:
-    """Linear interpolation between band centres, bands last.
-
-    Raises:
-        SpectrumError: a target centre lies outside the source's centres; the message says by how much.
-    """
+    """Linear interpolation between band centres, bands last; a target centre outside the source's is refused."""
     if spectra.shape[-1] != len(source):
         raise SpectrumError(f"spectra of {spectra.shape[-1]} values do not fit {source}")
     below = source.centers_nm[0] - target.centers_nm[0]
@@ -92,8 +84,7 @@ def read_spectra_csv(path: Path) -> SpectraTable:
     """Read and validate a table of spectra.
 
     Raises:
-        SpectrumError: missing, unreadable or empty; no `wavelength` column; names missing or repeated; a row of another
-            length; a value that is not a number, not finite or negative; wavelengths that do not increase.
+        SpectrumError: it can't be read, or is no such table; the message has the file and the place.
     """
     try:
         header, values = read_number_table(path)
@@ -111,11 +102,7 @@ def read_spectra_csv(path: Path) -> SpectraTable:
 
 
 def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]]:
-    """The header of a CSV file, and its rows of numbers; at least one.
-
-    Raises:
-        SpectrumError: missing, unreadable or empty; a row of another length; a value that is not a number.
-    """
+    """The header of a CSV file, and its rows of numbers, at least one; errors name the line, but not the file."""
     header, values = [], array("d")  # a value takes 8 bytes so, and 60 as a text
     try:
         with io.TextIOWrapper(io.BytesIO(read_bounded(path, _MOST_BYTES)), "utf-8-sig", newline="") as file:
@@ -140,11 +127,7 @@ def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]
 
 
 def write_spectra_csv(path: Path, table: SpectraTable) -> None:
-    """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write a table with 9 significant digits, exact for float32; an older file is replaced in one step."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["wavelength", *table.names])

@@ -79,8 +79,6 @@ class _Formula:
         Args:
             at: Reflectance at one of `wavelengths_nm`; asked again at each mention, so that few are held at a time.
             like: Of the type and on the device to compute with.
-        Raises:
-            ConfigError: an operation that is not allowed.
         """
 
         def value(node: ast.AST) -> Tensor:
@@ -251,11 +249,7 @@ class _SpectralIndex:
     formula: _Formula
 
     def __call__(self, reflectance: Float[Tensor, "*rays B"]) -> Float[Tensor, "*rays"]:
-        """The index of each spectrum; NaN where any part of the formula is undefined, as in 0/0, or overflows.
-
-        Raises:
-            SpectrumError: another number of bands than those the index was made for.
-        """
+        """The index of each spectrum; NaN where any part of the formula is undefined, as in 0/0, or overflows."""
         if reflectance.shape[-1] != len(self.bands):
             raise SpectrumError(
                 f"index {self.name} is made for {self.bands}; found spectra of {reflectance.shape[-1]}"

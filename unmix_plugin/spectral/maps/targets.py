@@ -64,11 +64,7 @@ class Background:
 
     @staticmethod
     def fit(spectra: Float[Tensor, "N B"]) -> Background:
-        """Of a sample of pixels; those not finite or zero in all bands do not count.
-
-        Raises:
-            SpectrumError: fewer than two pixels that count, or all are equal.
-        """
+        """Of a sample of pixels; those not finite or zero in all bands do not count, and two that differ are needed."""
         counted = spectra[_is_defined(spectra)].double()
         if len(counted) < 2:
             raise SpectrumError(
@@ -157,11 +153,8 @@ class _Target:
     ) -> Callable[[Float[Tensor, "*rays B"]], Float[Tensor, "*rays"]]:
         """From reflectances to scores, or to 1 and 0 with a threshold: of the spectra's type and on their device.
 
-        Args:
-            background: A sample of the scene's reflectances to judge against; the angle ignores it.
-        Raises:
-            SpectrumError: another number of bands than the target's; fewer than two pixels in which something is; all
-                are equal; their mean is the target.
+        A sample of the scene's reflectances, which may not have the target as its mean, is the background to judge
+        against; the angle ignores it.
         """
         if background.shape[1] != len(self.reflectance):
             raise SpectrumError(
@@ -191,12 +184,8 @@ class _Target:
 
 
 def parse_target(text: str, bands: Bands, read: Callable[[Path], Sequence[LibraryMaterial]]) -> _Target:
-    """The text after `target:` in the name of an output, `[METHOD:]FILE[#NAME][<VALUE | >VALUE]`.
-
-    Args:
-        text: `FILE` is any that `read` takes.
-        bands: Of the reflectances to come.
-        read: Reads a library of spectra.
+    """The text after `target:` in the name of an output, `[METHOD:]FILE[#NAME][<VALUE | >VALUE]`, for reflectances of
+    these bands; `read` reads the file's spectra.
 
     Raises:
         ConfigError: text of another form, no such file, no or several spectra that could be meant, a threshold on the
