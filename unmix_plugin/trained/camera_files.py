@@ -77,11 +77,7 @@ def check_frames_per_second(value: float | int | None, where: str) -> float:
 
 
 def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
-    """Read the cameras of a file; `frame` leads from world to model space.
-
-    Raises:
-        ConfigError: it is missing, empty, no camera file, from a newer version, or a camera in it is impossible.
-    """
+    """Read the cameras of a file, or raise a ConfigError; `frame` leads from world to model space."""
     try:
         content = read_json_file(path)
     except OSError as error:
@@ -113,13 +109,7 @@ def read_camera_file(path: Path, frame: Normalisation) -> _CameraFile:
 def camera_file_bytes(
     views: Sequence[RunView], frames_per_second: float | None, frame: Normalisation
 ) -> bytes:
-    """The cameras as JSON that `read_camera_file` reads, in world space.
-
-    Args:
-        views: All of one size, model space.
-        frames_per_second: Of a path; None for single views.
-        frame: From world to model space.
-    """
+    """Cameras of one size as JSON that `read_camera_file` reads, in world space; a path where there is a speed."""
     camera = views[0].camera
     content = {
         "format_version": _FORMAT_VERSION,

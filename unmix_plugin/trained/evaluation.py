@@ -94,11 +94,8 @@ def predicted_view(view: MaterialView) -> PredictedView:
 
 
 def subpixels_for(scene: Scene, index: int, subpixels: int, pixel_size: float) -> int:
-    """Rays along the edge of a pixel with which to render a view, so that coarse sensors' pixels are means too.
-
-    Args:
-        subpixels, pixel_size: Rays along the edge of a pixel of this size, in the middle of the scene.
-    """
+    """Rays along the edge of a pixel with which to render a view, so that coarse sensors' pixels are means too: from
+    those of a pixel of this size in the middle of the scene."""
     if not scene.is_rig:
         return subpixels
     distance = scene.cameras.camera_to_world[index, :, 3] - scene.scene_box.aabb.mean(dim=0)
@@ -284,11 +281,7 @@ class Evaluation:
         self._tally = SegmentationTally(len(endmembers), truth.num_materials) if truth.num_materials else None
 
     def add(self, view: ViewTruth, predicted: PredictedView) -> dict[str, float]:
-        """Count one view; its figures.
-
-        Raises:
-            RunError: what was measured has another size than the run's camera of that view.
-        """
+        """Count one view; its figures. A RunError where it was measured in another size than the run's camera has."""
         measured, rendered = tuple(view.spectra.shape[:2]), tuple(predicted.spectra.shape[:2])
         if measured != rendered:
             raise RunError(

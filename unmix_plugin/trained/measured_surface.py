@@ -58,11 +58,7 @@ class MeasuredSurface:
     """The surface of a scene, in which any region can be measured."""
 
     def __init__(self, scene: TrainedScene, mesh: TriangleMesh) -> None:
-        """
-        Args:
-            scene: Unedited or edited.
-            mesh: Its surface, model space.
-        """
+        """Of a scene, unedited or edited, whose surface is the mesh in model space."""
         self.scene, self.mesh = scene, mesh
         positions, normals = (torch.from_numpy(values).float() for values in (mesh.vertices, mesh.normals))
         self._abundances, self._diffuse = look_from_above(scene, positions, normals)
@@ -75,12 +71,7 @@ class MeasuredSurface:
         follow: Follow = lambda _doing, items: items,
         working: Working = lambda _doing: nullcontext(),
     ) -> MeasuredSurface:
-        """The surface that `mesh` exports, with cells half as large as a pixel; `follow` and `working` as `surface_of`
-        takes them.
-
-        Raises:
-            RunError: no camera of the run sees a surface.
-        """
+        """The surface that `mesh` exports, with cells half as large as a pixel, as `surface_of` finds it."""
         cells = _CELLS_PER_PIXEL * float(scene.scene_box.size.max()) / scene.pixel_size
         resolution = round(min(max(cells, _RESOLUTIONS[0]), _RESOLUTIONS[1]))
         mesh, _ = surface_of(scene, resolution, follow=follow, working=working)
@@ -111,11 +102,7 @@ class MeasuredSurface:
         return np.bincount(self.mesh.faces.ravel(), weights.ravel(), len(self.mesh.vertices))
 
     def measure(self, region: Region, name: str) -> MeasuredRegion:
-        """What a region is.
-
-        Raises:
-            ConfigError: nothing of the surface is in it, or the scene has no such material.
-        """
+        """What a region is; a ConfigError where it has nothing of the surface, or the scene no such material."""
         shares = self.shares(region)
         weights = self.vertex_areas(shares)
         area = float(weights.sum())
@@ -137,11 +124,7 @@ class MeasuredSurface:
 def points_in(
     scene: TrainedScene, region: Box | InView, positions: Float[Tensor, "P 3"]
 ) -> Bool[np.ndarray, " P"]:
-    """Which points of a scene's surface are in a box or in a part of a view.
-
-    Args:
-        positions: Model space, on the CPU.
-    """
+    """Which points of a scene's surface (model space, on the CPU) are in a box or in a part of a view."""
     if isinstance(region, Box):
         world = scene.frame.to_world(positions.double().numpy())
         return np.all((world >= region.low) & (world <= region.high), axis=1, keepdims=False)

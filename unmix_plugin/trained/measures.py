@@ -62,11 +62,7 @@ class Measures:
     """By name, in the order in which they were kept."""
 
     def region(self, name: str) -> Region:
-        """A region by its name.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """A region by its name; a ConfigError where there is none."""
         if name not in self.regions:
             kept = ", ".join(self.regions) or "none; unmix-export regions --add NAME keeps one"
             hint = did_you_mean(name, list(self.regions), likeness=0.4, form=" ({})")

@@ -63,9 +63,8 @@ def parse_reflectance_map(name: str, bands: Bands, lit: Bool[Tensor, "B"] | None
     """What an output such as `index:ndvi`, `target:ace:paint.csv>0.5`, `library:mine.csv<0.1` or
     `absorption:centre:650-700` is.
 
-    Args:
-        name, bands: Of the output, and of what it is made of.
-        lit: Bands with light; targets, libraries and absorptions are made of these alone, and say so. None: all.
+    Targets, libraries and absorptions are made of the bands with light alone (`lit`; None: all), and say so.
+
     Raises:
         ConfigError: an unknown index, or a formula, a threshold or wavelengths that can't be read.
         SpectrumError: the bands, or those with light, do not cover what it needs, or a file that can't be read.

@@ -73,13 +73,10 @@ Region: TypeAlias = Box | OfMaterial | InView
 
 
 def check_name(name: str, others: Iterable[str] = ()) -> str:
-    """A name for a region, without spaces around it.
+    """A name for a region, without spaces around it; a ConfigError where it can't be one.
 
-    Args:
-        others: Names of the run's regions, whose files the new one's must not replace on any system; the same name
-            may be among them.
-    Raises:
-        ConfigError: it can't be one, not that of a file, tables take it for a formula, or another differs in capitals.
+    It has to be fit for files, beside those of `others` on any system (the same name may be among them), and for
+    tables, which take some for a formula.
     """
     name, refused = unicodedata.normalize("NFC", name.strip()), "can't be the name of a region"
     is_safe = 0 < len(name) <= _LONGEST_NAME and name == safe_name(name, NOT_PORTABLE)
@@ -99,11 +96,8 @@ def check_name(name: str, others: Iterable[str] = ()) -> str:
 
 
 def polygon_mask(corners: Sequence[tuple[float, float]], size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Pixels of an image of this width and height whose centres lie inside a polygon.
-
-    Args:
-        corners: x, y in pixels from the top left corner of the image; fewer than 3 or no pixel inside are refused.
-    """
+    """Pixels of an image of this width and height whose centres lie inside a polygon of 3 corners or more (x, y from
+    the top left corner); a ConfigError where there are none."""
     from skimage.draw import polygon2mask
 
     if len(corners) < 3:
@@ -125,11 +119,7 @@ def region_to_json(region: Region) -> dict[str, Any]:
 
 
 def region_from_json(values: Any) -> Region:
-    """The region that `region_to_json` wrote.
-
-    Raises:
-        LookupError, TypeError, ValueError, RuntimeError, ConfigError: it is none.
-    """
+    """The region that `region_to_json` wrote; where it is none, the errors are of many kinds."""
     kind = values["kind"]
     if kind == "box":
         low, high = ([float(number) for number in values[key]] for key in ("low", "high"))

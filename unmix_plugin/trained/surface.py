@@ -224,11 +224,7 @@ class GridPoints:
 
     @staticmethod
     def over(aabb: Float[Tensor, "2 3"], resolution: int) -> GridPoints:
-        """A grid with `resolution` cells along the longest edge of a box.
-
-        Raises:
-            ConfigError: fewer than 8 cells, or more than 1024.
-        """
+        """A grid with `resolution` cells, from 8 to 1024, along the longest edge of a box."""
         low, high = _RESOLUTIONS
         if not low <= resolution <= high:
             raise ConfigError(

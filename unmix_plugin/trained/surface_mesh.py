@@ -110,11 +110,8 @@ def _extract_mesh(
 ) -> TriangleMesh:
     """Marching cubes where the density passes a threshold.
 
-    The cubes go through the opacity of a pixel's length rather than the density itself, which differs by many orders
-    of magnitude between neighbours.
-
-    Source:
-        Lewiner et al. 2003, as in scikit-image.
+    The cubes (Lewiner et al. 2003, as in scikit-image) go through the opacity of a pixel's length rather than the
+    density itself, which differs by many orders of magnitude between neighbours.
     """
     from scipy.ndimage import gaussian_filter
     from skimage.measure import marching_cubes

@@ -32,11 +32,7 @@ from unmix_plugin.trained.run_views import RunView
 
 
 def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
-    """A view of one pixel of an image: what is rendered of it is that pixel.
-
-    Raises:
-        ConfigError: the pixel is outside the image.
-    """
+    """A view of one pixel of an image: what is rendered of it is that pixel; a ConfigError where it is outside."""
     if not (0 <= column < camera.width and 0 <= row < camera.height):
         raise ConfigError(
             f"pixel {column},{row} (column, row) is outside the image; "
@@ -152,11 +148,7 @@ class TrainedScene:
 
     @torch.no_grad()
     def probe_point(self, x: float, y: float, z: float) -> Probe:
-        """What a point of the world is made of, lit squarely, without the view-dependent part.
-
-        Raises:
-            ConfigError: the point is outside the scene box.
-        """
+        """What a point of the world in the scene box is made of, lit squarely, without the view-dependent part."""
         world = np.array([x, y, z], dtype=np.float64)
         place = self.frame.to_model(world)
         inside = torch.from_numpy(place).float()[None].to(self.device)

@@ -43,12 +43,9 @@ def nnls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Floa
     """Non-negative least squares: the amounts a >= 0 that minimise |E^T a - x|.
 
     Amounts are not shares: they sum to a pixel's brightness, so divide by their sum. They are exact up to rounding,
-    and of linearly dependent endmembers one solution is chosen.
+    and of linearly dependent endmembers one solution is chosen. All values have to be finite.
 
-    Raises:
-        SpectrumError: no endmember, or values that are not finite.
-    Source:
-        Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23, each step for all pixels at once.
+    Source: Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23, each step for all pixels at once.
     """
     _require_fitting(pixels, endmembers)
     spectra = endmembers.double()
@@ -63,10 +60,7 @@ def fcls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Floa
     There is no shading in this model: a pixel in shadow is explained by dark endmembers. Scale pixels and endmembers
     to one brightness (such as a sum of 1) to ignore it.
 
-    Raises:
-        SpectrumError: as `nnls`.
-    Source:
-        Heinz and Chang, IEEE TGRS 39(3), 2001: a heavy band, 1 in all spectra, enforces the sum.
+    Source: Heinz and Chang, IEEE TGRS 39(3), 2001: a heavy band, 1 in all spectra, enforces the sum.
     """
     _require_fitting(pixels, endmembers)
     weight = _SUM_WEIGHT * float(endmembers.double().norm(dim=1).max().clamp(min=1e-12))

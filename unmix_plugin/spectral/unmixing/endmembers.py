@@ -114,8 +114,8 @@ def _log_volume(spectra: Float[Tensor, "K B"]) -> float:
 def usable_pixels(
     pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator
 ) -> Float[Tensor, "kept B"]:
-    """Pixels that show a spectral shape, thinned out at random where there are more than 20,000; they have to be finite,
-    and no fewer bands and distinct pixels than endmembers."""
+    """Pixels that show a spectral shape, thinned out at random where there are more than 20,000; they have to be
+    finite, and bands and distinct pixels no fewer than endmembers."""
     num_bands = pixels.shape[1]
     if not 1 <= num_endmembers <= num_bands:
         raise SpectrumError(

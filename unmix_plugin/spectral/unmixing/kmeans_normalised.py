@@ -29,11 +29,8 @@ def normalised_kmeans(
     restarts: int = 5,
     max_iterations: int = 100,
 ) -> tuple[Float[Tensor, "K B"], Int[Tensor, " N"]]:
-    """Cluster spectra by shape; the best of several restarts.
+    """Cluster spectra by shape; the best of several restarts. Drop dark ones first: noise is all the shape they have.
 
-    Args:
-        pixels: Spectra of non-zero length. Drop dark ones first: noise is all the shape they have.
-        generator: On the CPU; the only source of randomness.
     Returns:
         The mean shape of each cluster at the brightness of its well-lit pixels, the largest cluster first, and the
         cluster of each pixel.

@@ -59,12 +59,8 @@ class _MaterialCount:
 
 
 def propose_num_materials(pixels: Float[Tensor, "N B"], generator: torch.Generator) -> _MaterialCount:
-    """Number of materials from the elbow of the distance to mixtures of two, and HySime's count beside it.
-
-    Args:
-        pixels: Spectra of a scene's training views, neither dark nor saturated, background left out.
-        generator: On the CPU; the only source of randomness.
-    """
+    """Number of materials from the elbow of the distance to mixtures of two, and HySime's count beside it, of pixels
+    that are neither dark nor saturated, background left out."""
     num_pixels, num_bands = pixels.shape
     fits = two_material_fits(pixels, min(_MOST_MATERIALS, num_bands), generator)
     is_enough = num_bands > 2 and num_pixels > num_bands
@@ -92,9 +88,8 @@ def hysime(pixels: Float[Tensor, "N B"]) -> int:
     """Number of dimensions in which pixels of two bands or more, of which there are more than bands, hold more signal
     than noise.
 
-    Source:
-        J. M. Bioucas-Dias and J. M. P. Nascimento, "Hyperspectral Subspace Identification", IEEE TGRS 46(8), 2008,
-        algorithms 1 and 2.
+    Source: J. M. Bioucas-Dias and J. M. P. Nascimento, "Hyperspectral Subspace Identification", IEEE TGRS 46(8), 2008,
+    algorithms 1 and 2.
     """
     num_pixels, num_bands = pixels.shape
     if num_bands < 2 or num_pixels <= num_bands:
@@ -123,11 +118,7 @@ def _noise_distance(pixels: Float[Tensor, "N B"]) -> float:
 
 
 def estimate_noise(pixels: Float[Tensor, "N B"]) -> Float[Tensor, "N B"]:
-    """What of each band the other bands can't predict linearly.
-
-    Source:
-        Bioucas-Dias and Nascimento 2008, algorithm 1: regression of every band on all others.
-    """
+    """What of each band the other bands can't predict linearly (Bioucas-Dias and Nascimento 2008, algorithm 1)."""
     data = pixels.double()
     num_bands = data.shape[1]
     correlation = data.T @ data

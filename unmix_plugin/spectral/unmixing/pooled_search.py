@@ -90,15 +90,8 @@ class PooledEndmembers:
 def pooled_search(
     pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator
 ) -> PooledEndmembers:
-    """The best of the sets that several searches find, averaged with what is the same in others.
-
-    Args:
-        pixels: Spectra of non-zero length. Drop dark and saturated ones first.
-        num_endmembers: K, from 1 to 64.
-        generator: On the CPU; the only source of randomness.
-    Raises:
-        SpectrumError: as `two_material_endmembers`.
-    """
+    """The best of the sets that several searches find, averaged with what is the same in others, among pixels neither
+    dark nor saturated; errors are those of `two_material_endmembers`."""
     enough = max(_NUM_CANDIDATES, num_endmembers)
     if not 2 <= num_endmembers <= MOST_ENDMEMBERS or count_shapes(pixels, enough) < enough:
         few = two_material_endmembers(pixels, num_endmembers, generator)

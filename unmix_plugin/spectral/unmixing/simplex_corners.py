@@ -50,7 +50,6 @@ def vca(
 
     Args:
         pixels: Spectra in any unit. Drop dark ones first: the scaling divides by brightness.
-        generator: On the CPU; the only source of randomness.
         snr_db: Signal to noise ratio in dB; None estimates it.
     Returns:
         The pixels without most of their noise, and which they are, in the order of choice.
@@ -77,11 +76,8 @@ def nfindr(
 ) -> Int[Tensor, " K"]:
     """Indices of the pixels whose simplex has (locally) the largest volume; the best of several restarts.
 
-    Args:
-        pixels: Spectra in one unit. Brightness counts: scale spectra to one brightness to ignore shading.
-        generator: On the CPU; seeds the start.
-    Raises:
-        SpectrumError: K below 2, above the bands or the pixels, or the pixels' simplex is flat in K - 1 dimensions.
+    Brightness counts: scale spectra to one brightness to ignore shading. Errors are those of `vca`, or that the pixels'
+    simplex is flat in K - 1 dimensions.
     """
     lifted, _ = _lifted(pixels.double(), num_endmembers)
     runs = []
@@ -103,13 +99,8 @@ def minimum_volume_simplex(
 ) -> Float[Tensor, "K B"]:
     """Corners of the smallest simplex around the shapes of the pixels, each with a sum over bands of 1.
 
-    As SISAL, least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay outside.
-
-    Args:
-        pixels: Spectra of positive sum, in any unit. Drop dark ones first: noise is all the shape they have.
-        generator: On the CPU; seeds the start, the only source of randomness.
-    Raises:
-        SpectrumError: as `nfindr`; pixels without light.
+    As SISAL, least -log|det Q| plus a hinge on negative abundances, so that a few outliers may stay outside. Of pixels
+    in any unit that have light; drop dark ones first: noise is all the shape they have. Errors are those of `nfindr`.
     """
     sums = pixels.double().sum(dim=1, keepdim=True)
     if not bool((sums > 0).all()):

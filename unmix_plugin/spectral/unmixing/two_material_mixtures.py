@@ -47,14 +47,9 @@ class _TwoMaterialFit:
 def two_material_fits(
     pixels: Float[Tensor, "N B"], most_endmembers: int, generator: torch.Generator
 ) -> list[_TwoMaterialFit]:
-    """The best sets found of 1, 2, ... endmembers; fewer sets if there are fewer distinct shapes.
+    """The best sets found of 1, 2, ..., at most 64, endmembers; fewer sets if there are fewer distinct shapes.
 
-    Args:
-        pixels: Spectra of non-zero length. Drop dark and saturated ones first.
-        most_endmembers: Size of the largest set, at most 64.
-        generator: On the CPU; the only source of randomness.
-    Raises:
-        SpectrumError: more than 64 endmembers, no pixels, or a zero spectrum.
+    Pixels are spectra of non-zero length; drop dark and saturated ones first.
     """
     if not 1 <= most_endmembers <= MOST_ENDMEMBERS:
         raise SpectrumError(
@@ -75,11 +70,7 @@ def two_material_fits(
 def two_material_endmembers(
     pixels: Float[Tensor, "N B"], num_endmembers: int, generator: torch.Generator
 ) -> Float[Tensor, "K B"]:
-    """K spectra of length 1 of which two at a time explain the pixels best.
-
-    Raises:
-        SpectrumError: as `two_material_fits`; fewer distinct shapes than endmembers.
-    """
+    """K spectra of length 1 of which two at a time explain the pixels best; as many distinct shapes are needed."""
     fits = two_material_fits(pixels, num_endmembers, generator)
     if len(fits) < num_endmembers:
         raise SpectrumError(
