@@ -146,10 +146,7 @@ def _library(argument: str, bands: Bands, lit: Bool[np.ndarray, " B"]) -> Reflec
 
 
 def _nearest(
-    library: MaterialLibrary,
-    bands: Bands,
-    lit: Bool[np.ndarray, " B"],
-    spectra: Float[Tensor, "*rays B"],
+    library: MaterialLibrary, bands: Bands, lit: Bool[np.ndarray, " B"], spectra: Float[Tensor, "*rays B"]
 ) -> tuple[Float[Tensor, "*rays"], Tensor]:
     """Angle to the nearest spectrum of a library, NaN where there is none, and its number."""
     rows = spectra.reshape(-1, len(bands)).double().cpu().numpy()

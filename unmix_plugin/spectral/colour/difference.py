@@ -15,11 +15,7 @@ from jaxtyping import Float, Float64
 
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import (
-    XYZ_TO_LINEAR_SRGB,
-    colour_mode,
-    xyz_matrix,
-)
+from unmix_plugin.spectral.colour.conversion import XYZ_TO_LINEAR_SRGB, colour_mode, xyz_matrix
 from unmix_plugin.spectral.colour.srgb import decode_srgb, encode_srgb
 
 

@@ -46,10 +46,7 @@ EndmemberMethod = Literal["kmeans", "vca", "nfindr", "minimum-volume", "pairs", 
 
 
 def initialise_endmembers(
-    pixels: Float[Tensor, "N B"],
-    num_endmembers: int,
-    method: EndmemberMethod,
-    generator: torch.Generator,
+    pixels: Float[Tensor, "N B"], num_endmembers: int, method: EndmemberMethod, generator: torch.Generator
 ) -> Float[Tensor, "K B"]:
     """Endmember spectra in [0, 1], as bright as the well-lit pixels that look like them.
 
