@@ -28,7 +28,7 @@ from unmix_plugin.trained.measures import Measures, Scale, read_measures, record
 from unmix_plugin.trained.model_scene import frozen_parameters, model_scene
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_views import recorded_views, world_frame
-from unmix_plugin.trained.trained_scene import TrainedScene
+from unmix_plugin.trained.trained_scene import TrainedScene, with_cells
 
 
 def unmix_scene(
@@ -40,7 +40,7 @@ def unmix_scene(
     are those of `world_frame` and `recorded_scale`.
     """
     frozen = frozen_parameters(model, averages)
-    materials, renderer = model.materials, model.renderer
+    materials = model.materials
     specular = frozen.get(id(materials.specular_spectra), materials.specular_spectra)
     if model.poses is not None:
         own = copy.deepcopy(model.poses, frozen)  # type: ignore[arg-type]
@@ -51,16 +51,9 @@ def unmix_scene(
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     gains = copy.deepcopy(model.view_gains, frozen)  # type: ignore[arg-type]
-    opaque = renderer.opaque_skips
-    renderer = replace(
-        renderer,
-        skips=renderer.skips.clone(),
-        reachable=renderer.reachable.clone(),
-        opaque_skips=None if opaque is None else opaque.clone(),
-    )
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
-        renderer,
+        with_cells(model.renderer, torch.clone),
         materials.to(model.device),
         world_frame(record),
         recorded_views(record),

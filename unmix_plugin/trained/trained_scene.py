@@ -8,7 +8,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -39,6 +39,17 @@ def one_pixel(camera: Cameras, column: int, row: int) -> Cameras:
             f"columns are 0 to {camera.width - 1}, rows 0 to {camera.height - 1}"
         )
     return camera.crop(column, row, 1, 1)
+
+
+def with_cells(renderer: VolumeRenderer, change: Callable[[Tensor], Tensor]) -> VolumeRenderer:
+    """The renderer with its tensors of cells changed."""
+    opaque = renderer.opaque_skips
+    return replace(
+        renderer,
+        skips=change(renderer.skips),
+        reachable=change(renderer.reachable),
+        opaque_skips=None if opaque is None else change(opaque),
+    )
 
 
 def _row(values: Tensor) -> Float64[np.ndarray, " n"]:
@@ -182,13 +193,8 @@ class TrainedScene:
         """The same scene on another device; `self` stays where it is."""
         if torch.device(device) == self.device:
             return self
-        opaque = self.renderer.opaque_skips
         renderer = replace(
-            self.renderer,
-            box=self.renderer.box.to(device),
-            skips=self.renderer.skips.to(device),
-            reachable=self.renderer.reachable.to(device),
-            opaque_skips=None if opaque is None else opaque.to(device),
+            with_cells(self.renderer, lambda cells: cells.to(device)), box=self.scene_box.to(device)
         )
         field = copy.deepcopy(self.field).to(device)
         return replace(self, field=field, renderer=renderer, materials=self.materials.to(device))

@@ -12,11 +12,13 @@ an outermost band it is that band's; beyond, an index is refused: nothing is ext
 from __future__ import annotations
 
 import ast
+import csv
 import difflib
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import reduce
+from importlib import resources
 
 import torch
 from jaxtyping import Float
@@ -161,77 +163,20 @@ class _NamedIndex:
     """As `parse_formula` reads it."""
     source: str
     """Who published it."""
-    usual_range: tuple[float, float] = (-1.0, 1.0)
+    usual_range: tuple[float, float]
     """Values that pictures spread their colours over."""
 
 
-NAMED_INDICES: dict[str, _NamedIndex] = {
-    "ndvi": _NamedIndex(
-        "normalised difference vegetation index", "(r800-r670)/(r800+r670)", "Rouse et al. 1974"
-    ),
-    "gndvi": _NamedIndex(
-        "green normalised difference vegetation index",
-        "(r800-r550)/(r800+r550)",
-        "Gitelson, Kaufman & Merzlyak 1996",
-    ),
-    "evi": _NamedIndex(
-        "enhanced vegetation index", "2.5*(r800-r670)/(r800+6*r670-7.5*r470+1)", "Huete et al. 2002"
-    ),
-    "savi": _NamedIndex("soil-adjusted vegetation index", "1.5*(r800-r670)/(r800+r670+0.5)", "Huete 1988"),
-    "osavi": _NamedIndex(
-        "optimised soil-adjusted vegetation index",
-        "(r800-r670)/(r800+r670+0.16)",
-        "Rondeaux, Steven & Baret 1996",
-    ),
-    "ndre": _NamedIndex("normalised difference red edge", "(r790-r720)/(r790+r720)", "Barnes et al. 2000"),
-    "pri": _NamedIndex(
-        "photochemical reflectance index",
-        "(r531-r570)/(r531+r570)",
-        "Gamon, Peñuelas & Field 1992, in the form of Gamon, Serrano & Surfus 1997",
-        (-0.2, 0.2),
-    ),
-    "mcari": _NamedIndex(
-        "modified chlorophyll absorption ratio index",
-        "((r700-r670)-0.2*(r700-r550))*(r700/r670)",
-        "Daughtry et al. 2000",
-        (0.0, 1.0),
-    ),
-    "tvi": _NamedIndex(
-        "triangular vegetation index",
-        "0.5*(120*(r750-r550)-200*(r670-r550))",
-        "Broge & Leblanc 2001",
-        (0.0, 50.0),
-    ),
-    "sipi": _NamedIndex(
-        "structure-insensitive pigment index (carotenoids to chlorophyll a)",
-        "(r800-r445)/(r800-r680)",
-        "Peñuelas, Baret & Filella 1995",
-        (0.0, 2.0),
-    ),
-    "psri": _NamedIndex(
-        "plant senescence reflectance index", "(r678-r500)/r750", "Merzlyak et al. 1999", (-0.5, 0.5)
-    ),
-    "cri1": _NamedIndex(
-        "carotenoid reflectance index 1", "1/r510-1/r550", "Gitelson et al. 2002", (0.0, 15.0)
-    ),
-    "ari1": _NamedIndex(
-        "anthocyanin reflectance index 1",
-        "1/r550-1/r700",
-        "Gitelson, Merzlyak & Chivkunova 2001",
-        (0.0, 10.0),
-    ),
-    "ndwi": _NamedIndex(
-        "normalised difference water index (open water)", "(r550-r800)/(r550+r800)", "McFeeters 1996"
-    ),
-    "ndwi-gao": _NamedIndex(
-        "normalised difference water index (water in leaves)", "(r860-r1240)/(r860+r1240)", "Gao 1996"
-    ),
-    "nbr": _NamedIndex("normalised burn ratio", "(r830-r2215)/(r830+r2215)", "Key & Benson 2006"),
-    "redness": _NamedIndex(
-        "redness index of soils (iron oxides)", "(r660-r560)/(r660+r560)", "Escadafal & Huete 1991"
-    ),
-    "iron-oxide": _NamedIndex("iron oxide ratio, red over blue", "r660/r485", "Segal 1982", (0.0, 5.0)),
-}
+def _named_indices() -> dict[str, _NamedIndex]:
+    """The rows of indices.csv."""
+    table = (resources.files("unmix_plugin.spectral.maps") / "indices.csv").read_text(encoding="utf-8")
+    return {
+        name: _NamedIndex(title, formula, source, (float(low), float(high)))
+        for name, title, formula, source, low, high in list(csv.reader(table.splitlines()))[1:]
+    }
+
+
+NAMED_INDICES = _named_indices()
 """By the name after `index:`, in the order in which they are listed."""
 
 
