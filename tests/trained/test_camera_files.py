@@ -110,20 +110,15 @@ def test_the_one_pose_of_a_line_camera_is_halfway_through_its_image(tmp_path):
         matrix = np.eye(4)
         matrix[1, 3] = row
         keys.append({"row": row, "transform_matrix": matrix.tolist()})
-    [view] = read_camera_file(
-        written(tmp_path, frames(space="model", frames=[{"key_poses": keys}])), FRAME
-    ).views
+    content = frames(space="model", frames=[{"key_poses": keys}])
+    [view] = read_camera_file(written(tmp_path, content), FRAME).views
     assert float(view.camera.camera_to_world[0, 1, 3]) == pytest.approx(29.5, abs=1e-4)
 
 
-def test_names_that_would_give_one_file_are_numbered(tmp_path):
+def test_names_that_would_give_one_file_are_numbered_and_frames_with_a_speed_are_a_path(tmp_path):
     entries = [{"name": name, "transform_matrix": POSE.tolist()} for name in ("leaf a", "leaf  a", "stem")]
-    found = read_camera_file(written(tmp_path, frames(frames=entries)), FRAME)
+    found = read_camera_file(written(tmp_path, frames(frames=entries, space="model", fps=12.5)), FRAME)
     assert [view.name for view in found.views] == ["0_leaf_a", "1_leaf_a", "2_stem"]
-
-
-def test_frames_may_be_in_model_space_and_are_a_path_if_they_have_a_speed(tmp_path):
-    found = read_camera_file(written(tmp_path, frames(space="model", fps=12.5)), FRAME)
     np.testing.assert_allclose(found.views[0].camera.camera_to_world[0], POSE[:3], atol=1e-6)
     assert found.frames_per_second == 12.5
 
@@ -157,8 +152,6 @@ TWINS = [{"name": "a", "transform_matrix": POSE.tolist()}] * 2
 BAD = {
     "missing": (None, "can't read the camera file .*: No such file"),
     "blank": (" \n", "is empty"),
-    "cut short": ('{"frames": [', "is not valid JSON .* at line 1"),
-    "no text": (b"\x80\x00 not text \xff", "is not readable as JSON"),
     "no object": ("[1, 2]", "holds a list of 2; expected an object with cameras"),
     "something else": ({"wavelengths": [1]}, "is not a camera file: .* found the keys wavelengths"),
     "newer": (frames(format_version=2), "has format_version 2; this version reads 1"),
@@ -174,21 +167,12 @@ BAD = {
     "no size of frames": (frames(w=None), r"frames\[0\]: 'w' and 'h' are absent"),
     "no lens": (frames(fl_x=None), "'fl_x' is absent"),
     "lens of the file": (frames(fl_x=-1), r"path\.json: 'fl_x' is -1; expected a focal length above 0"),
-    "lens of no kind": (frames(camera_model="EQUIRECTANGULAR"), '"EQUIRECTANGULAR" is not supported'),
     "fov": (path_of(FLAT, 180), r"camera_path\[0\]: 'fov' is 180; expected degrees between 0 and 180"),
     "speed": (nerfstudio(fps=0), "'fps': 0.0 frames a second; expected a number above 0"),
     "speed of no kind": (frames(fps="fast"), "'fps': None frames a second"),
     "space": (frames(space="outer"), "'space' is \"outer\"; expected world or model"),
     "names": (frames(frames=TWINS), "two frames have one name"),
-    "scaled": (
-        path_of([*(1.1 * POSE[:3]).ravel(), 0, 0, 0, 1]),
-        r"camera_path\[0\]: .* not rigid: .* \(1.1, 1.1",
-    ),
     "15 numbers": (path_of([1.0] * 15), "'camera_to_world' is a list of 15 with 1.0 in row 0; expected 4"),
-    "too few rows": (
-        frames(h=100, frames=[{"row_poses": [POSE.tolist()] * 10}]),
-        r"frames\[0\]: 'row_poses' has 10 poses, but the image has 100 rows",
-    ),
     "key poses that end early": (
         frames(frames=[{"key_poses": [{"row": row, "transform_matrix": POSE.tolist()} for row in (0, 50)]}]),
         r"'key_poses' reach from row 0 to row 50, but the image has rows 0 to 59",
