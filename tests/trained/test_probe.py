@@ -42,47 +42,36 @@ def test_a_pixel_tells_where_its_surface_is_in_the_world():
     assert corner.abundances.max() == 0
 
 
-def test_a_point_is_what_the_field_says_there():
-    world = FRAME.to_world(np.array([0.3, 0.1, -0.3]))
-    probe = BALL.probe_point(*world.tolist())
-    assert list(probe.spectra) == ["predicted"]
-    np.testing.assert_allclose(probe.abundances, [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(probe.spectra["predicted"], SHADE * BALL.materials.endmembers[1], atol=1e-6)
-    assert probe.opacity > 0.99
-    np.testing.assert_array_equal(probe.world_position, world)
-
-
 class LampOnCamera(BallField):
     """The ball in a light that stands at the camera: as bright as it is lit squarely."""
 
     def get_outputs(self, positions, directions, features, light=None):
         found = super().get_outputs(positions, directions, features, light)
-        squareness = -(torch.nn.functional.normalize(positions, dim=-1) * directions).sum(
-            dim=-1, keepdim=True
-        )
+        outwards = torch.nn.functional.normalize(positions, dim=-1)
+        squareness = -(outwards * directions).sum(dim=-1, keepdim=True)
         return {**found, "scaled_abundances": squareness.clamp(min=0) * found["scaled_abundances"]}
 
 
+@pytest.mark.parametrize("field", [BALL.field, LampOnCamera()])
 @pytest.mark.parametrize("away", [(1.0, 0.0, 0.2), (0.3, -0.5, -0.8)])
-def test_a_point_in_a_light_that_moves_with_the_camera_is_lit_squarely(away):
-    scene = replace(BALL, field=LampOnCamera())
-    place = RADIUS * np.array(away) / np.linalg.norm(away)
-    probe = scene.probe_point(*FRAME.to_world(place).tolist())
+def test_a_point_is_what_the_field_says_there_lit_squarely(field, away):
+    world = FRAME.to_world(RADIUS * np.array(away) / np.linalg.norm(away))
+    probe = replace(BALL, field=field).probe_point(*world.tolist())
     material = 0 if away[2] > 0 else 1
-    np.testing.assert_allclose(
-        probe.spectra["predicted"], SHADE * BALL.materials.endmembers[material], atol=1e-4
-    )
+    assert list(probe.spectra) == ["predicted"]
+    np.testing.assert_allclose(probe.abundances, np.eye(3)[material], atol=1e-6)
+    expected = SHADE * BALL.materials.endmembers[material]
+    np.testing.assert_allclose(probe.spectra["predicted"], expected, atol=1e-4)
+    np.testing.assert_array_equal(probe.world_position, world)
 
 
-def test_empty_space_has_no_opacity():
-    world = FRAME.to_world(np.array([0.9, 0.9, 0.9]))
-    assert BALL.probe_point(*world.tolist()).opacity < 1e-6
-    scene = make_scene()
-    empty = replace(scene.renderer, skips=torch.ones(8, 8, 8, dtype=torch.uint8))
-    nothing = replace(scene, renderer=empty, frame=FRAME).probe_point(*world.tolist())
-    assert nothing.opacity == 0
-    assert nothing.abundances.max() == 0
-    assert nothing.spectra["predicted"].max() == 0
+def test_inside_a_point_is_opaque_and_empty_space_is_not():
+    assert BALL.probe_point(*FRAME.to_world(np.array([0.3, 0.1, -0.3])).tolist()).opacity > 0.99
+    world = FRAME.to_world(np.array([0.9, 0.9, 0.9])).tolist()
+    assert BALL.probe_point(*world).opacity < 1e-6
+    empty = replace(SCENE.renderer, skips=torch.ones(8, 8, 8, dtype=torch.uint8))
+    nothing = replace(SCENE, renderer=empty, frame=FRAME).probe_point(*world)
+    assert (nothing.opacity, nothing.abundances.max(), nothing.spectra["predicted"].max()) == (0, 0, 0)
 
 
 def test_what_is_outside_the_image_or_the_box_is_refused_with_its_bounds():

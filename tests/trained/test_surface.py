@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
 from unmix_plugin.products.mesh import gltf_content
@@ -21,33 +22,23 @@ def ball():
     return seen(ALL_ROUND)
 
 
-def test_points_lie_on_the_surface_and_cover_all_that_is_seen(ball):
+def test_points_cover_all_of_the_surface_that_is_seen_with_its_mixture_light_and_direction(ball):
     points = ball.points()
     radii = points.positions.norm(dim=-1)
     assert len(points) > 1000
     assert float((radii - RADIUS).abs().max()) < 0.04
     assert float(radii.mean()) == pytest.approx(RADIUS, abs=0.01)
-    octants = {tuple(row) for row in (points.positions > 0).tolist()}
-    assert len(octants) == 8
-
-
-def test_points_carry_the_mixture_and_the_light_of_their_surface(ball):
-    points = ball.points()
+    assert len({tuple(row) for row in (points.positions > 0).tolist()}) == 8  # octants
     clear = points.positions[:, 2].abs() > 0.05
     above = (points.positions[:, 2] > 0)[clear]
-    torch.testing.assert_close(points.abundances[clear, 0], above.float(), atol=5e-3, rtol=0)
-    torch.testing.assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
+    assert_close(points.abundances[clear, 0], above.float(), atol=5e-3, rtol=0)
+    assert_close(points.abundances.sum(dim=-1), torch.ones(len(points)), atol=1e-4, rtol=0)
     expected = SHADE * points.abundances @ SCENE.materials.endmembers
-    torch.testing.assert_close(points.diffuse(SCENE.materials), expected, atol=1e-4, rtol=0)
-
-
-def test_directions_lead_from_a_camera_to_the_point(ball):
-    points = ball.points()
-    origins = torch.tensor(ALL_ROUND, dtype=torch.float32)
-    origins = 3 * origins / origins.norm(dim=-1, keepdim=True)
+    assert_close(points.diffuse(SCENE.materials), expected, atol=1e-4, rtol=0)
+    origins = 3 * torch.nn.functional.normalize(torch.tensor(ALL_ROUND), dim=-1)
     towards = torch.nn.functional.normalize(points.positions[:, None] - origins, dim=-1)
     cosines = (towards * points.directions[:, None]).sum(dim=-1).max(dim=1).values
-    torch.testing.assert_close(cosines, torch.ones(len(points)), atol=1e-4, rtol=0)
+    assert_close(cosines, torch.ones(len(points)), atol=1e-4, rtol=0)
 
 
 def test_rays_that_end_in_the_air_between_two_surfaces_give_no_points():
@@ -67,30 +58,25 @@ def test_rays_that_end_in_the_air_between_two_surfaces_give_no_points():
     assert len(points) > 0.9 * len(everything)
 
 
-def test_only_what_a_camera_sees_counts_as_seen(ball):
-    places = torch.tensor(
-        [[0.0, 0.0, 0.6], [0.0, 0.0, -0.6], [0.0, 0.0, 0.35], [0.0, 0.0, 0.0], [0.5, 0.5, 0.5]]
+def test_seen_is_what_lies_on_a_surface_and_hidden_what_lies_behind_it_for_every_camera(ball):
+    """Hidden are the middle and a place just inside, not places in the air, nor what no image shows."""
+    top, below, inside, middle, air, far = torch.tensor(
+        [[0, 0, 0.6], [0, 0, -0.6], [0, 0, 0.35], [0, 0, 0.0], [0.5, 0.5, 0.5], [0, 0, -50.0]]
     )
+    places = torch.stack([top, below, inside, middle, air])
     assert ball.shows(places).tolist() == [True, True, False, False, False]
     assert seen(FROM_ABOVE).shows(places).tolist() == [True, False, False, False, False]
-
-
-def test_hidden_is_what_lies_behind_a_surface_for_every_camera(ball):
-    """The middle and a place just inside are; places on the surface and in the air aren't, nor what no image shows."""
-    places = torch.tensor(
-        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.35], [0.0, 0.0, 0.6], [0.5, 0.5, 0.5], [0.0, 0.0, -50.0]]
+    assert (
+        ball.hides(torch.stack([middle, inside, top, below, air, far])).tolist() == [True] * 2 + [False] * 4
     )
-    assert ball.hides(places).tolist() == [True, True, False, False, False]
-    below = torch.tensor([[0.0, 0.0, -0.6]])
-    assert seen(FROM_ABOVE).hides(below).tolist() == [True]
-    assert ball.hides(below).tolist() == [False]
+    assert seen(FROM_ABOVE).hides(below[None]).tolist() == [True]
 
 
 def test_from_straight_above_a_point_looks_as_its_surface():
     normals = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, 0.9], [0.3, 0.1, -0.8]]), dim=-1)
     abundances, diffuse = look_from_above(SCENE, RADIUS * normals, normals)
-    torch.testing.assert_close(abundances, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-4, rtol=0)
-    torch.testing.assert_close(diffuse, SHADE * SCENE.materials.endmembers[:2].detach(), atol=1e-3, rtol=0)
+    assert_close(abundances, torch.tensor([[1.0, 0, 0], [0, 1, 0]]), atol=1e-4, rtol=0)
+    assert_close(diffuse, SHADE * SCENE.materials.endmembers[:2].detach(), atol=1e-3, rtol=0)
     nothing, light = look_from_above(SCENE, torch.zeros(0, 3), torch.zeros(0, 3))
     assert (nothing.shape, light.shape) == ((0, 3), (0, 5))
     assert np.isfinite(diffuse.numpy()).all()
