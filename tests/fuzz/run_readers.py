@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -35,21 +37,26 @@ from unmix_plugin.trained.run_views import recorded_views, world_frame
 from unmix_plugin.viewer.connections import _is_heard
 
 
+def _json_reader(
+    file_name: str,
+    contents: Iterable[dict[str, Any]],
+    read: Callable[[Path], None],
+    beside: tuple[tuple[str, bytes], ...] = (),
+) -> Reader:
+    """Of a file of a run, of which valid ones say their format."""
+    samples = (json.dumps({"format_version": RUN_FORMAT, **content}).encode() for content in contents)
+    return Reader(tuple(samples), file_name, read, (RunError,), mutate_json, beside)
+
+
 def config_reader() -> Reader:
     configs = (config_to_json(find_method(name).config) for name in ("unmix-nerf", "neumatex"))
-    samples = tuple(
-        json.dumps({"format_version": RUN_FORMAT, "config": config}).encode() for config in configs
-    )
-    beside = (("scene.json", b"{}"),)
-    return Reader(samples, "config.json", _read_config, (RunError,), mutate_json, beside)
+    contents = ({"config": config} for config in configs)
+    return _json_reader("config.json", contents, _read_config, (("scene.json", b"{}"),))
 
 
 def _read_config(path: Path) -> None:
-    config = load_config(path.parent)
-    assert (
-        config.pipeline.model.eval_num_rays_per_chunk == "auto"
-        or config.pipeline.model.eval_num_rays_per_chunk > 0
-    )
+    rays = load_config(path.parent).pipeline.model.eval_num_rays_per_chunk
+    assert rays == "auto" or rays > 0
 
 
 def _cameras(count: int = 1) -> Cameras:
@@ -81,15 +88,13 @@ def scene_record_reader() -> Reader:
         "options": asdict(SceneOptions()),
     }
     content = {
-        "format_version": RUN_FORMAT,
         "scene_box": [[-1, -1, -1], [1, 1, 1.5]],
         "metadata": metadata,
         "train_cameras": cameras,
         "eval_cameras": cameras,
         "summary": summary,
     }
-    samples = (json.dumps(content).encode(),)
-    return Reader(samples, "scene.json", _read_scene_record, (RunError,), mutate_json)
+    return _json_reader("scene.json", [content], _read_scene_record)
 
 
 def _read_scene_record(path: Path) -> None:
@@ -99,33 +104,27 @@ def _read_scene_record(path: Path) -> None:
         assert (path.parent / view.name).parent == path.parent
 
 
-def _checkpoint() -> dict[str, bytes]:
-    """Files of a checkpoint by suffix."""
+def _checkpoint() -> tuple[dict[str, Any], bytes]:
+    """Record and tensors of a checkpoint."""
     tensors = safetensors.torch.save({"model/a": torch.ones(2, 3), "model/n": torch.tensor(2)})
     record = TrainingRecord(2, 0.5, 100, 0, 50, 1, 0.2, {"grid": 0.01}).to_json()
-    record = {
-        "format_version": RUN_FORMAT,
-        **record,
-        "step": 2,
-        "sha256": hashlib.sha256(tensors).hexdigest(),
-    }
-    return {".json": json.dumps(record).encode(), ".safetensors": tensors}
+    return {**record, "step": 2, "sha256": hashlib.sha256(tensors).hexdigest()}, tensors
 
 
 def checkpoint_record_reader() -> Reader:
-    files = _checkpoint()
-    beside = (("step-000002.safetensors", files[".safetensors"]),)
-    read = _read_checkpoint
-    return Reader((files[".json"],), "step-000002.json", read, (RunError,), mutate_json, beside)
+    record, tensors = _checkpoint()
+    beside = (("step-000002.safetensors", tensors),)
+    return _json_reader("step-000002.json", [record], _read_checkpoint, beside)
 
 
 def checkpoint_tensors_reader() -> Reader:
-    return Reader((_checkpoint()[".safetensors"],), "step-000002.safetensors", _read_tensors, (RunError,))
+    return Reader((_checkpoint()[1],), "step-000002.safetensors", _read_tensors, (RunError,))
 
 
 def _read_tensors(path: Path) -> None:
     """With the right hash, as only malice makes it."""
-    record = {**json.loads(_checkpoint()[".json"]), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    hashed = {"format_version": RUN_FORMAT, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    record = {**_checkpoint()[0], **hashed}
     path.with_suffix(".json").write_text(json.dumps(record))
     _read_checkpoint(path)
 
@@ -137,16 +136,15 @@ def _read_checkpoint(path: Path) -> None:
 def measures_reader() -> Reader:
     regions = {"crown": Box((0.0, 0.1, 0.2), (0.5, 0.6, 1.0)), "leaves": OfMaterial(1)}
     content = {
-        "format_version": RUN_FORMAT,
         "scale": {"metres_per_unit": 0.5, "how": "a ruler"},
         "regions": {name: region_to_json(region) for name, region in regions.items()},
     }
     content["regions"]["seen"] = {"kind": "view", "camera": _cameras().to_json(), "runs": [3, 4, 313]}
+    return _json_reader("measures.json", [content], _read_measures)
 
-    def read(path: Path) -> None:
-        read_measures(RunFolder(path.parent))
 
-    return Reader((json.dumps(content).encode(),), "measures.json", read, (RunError,), mutate_json)
+def _read_measures(path: Path) -> None:
+    read_measures(RunFolder(path.parent))
 
 
 def metrics_reader() -> Reader:
@@ -192,17 +190,8 @@ def _read_recipe(path: Path) -> None:
 
 
 def viewer_message_reader() -> Reader:
-    camera = {
-        "wxyz": (1.0, 0.0, 0.0, 0.0),
-        "position": (0.5, 0.0, 2.0),
-        "fov": 0.8,
-        "near": 0.1,
-        "far": 10.0,
-        "image_height": 20,
-        "image_width": 30,
-        "look_at": (0, 0, 0),
-        "up_direction": (0, 0, 1),
-    }
+    camera = {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.5, 0.0, 2.0), "fov": 0.8, "near": 0.1, "far": 10.0}
+    camera |= {"image_height": 20, "image_width": 30, "look_at": (0, 0, 0), "up_direction": (0, 0, 1)}
     pointer = {"event_type": "click", "ray_origin": None, "ray_direction": (0, 0, 1)}
     messages = (
         {"type": "ViewerCameraMessage", **camera},
