@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch.testing import assert_close
 
 from tests.method_factory import make_scene
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.poses.refinement import LARGEST_STEP
 from unmix_plugin.spectral.sensor import SceneSensor
-from unmix_plugin.trained import alignment as pose_alignment
 from unmix_plugin.trained.alignment import _moved, align_pose, align_rows
 from unmix_plugin.trained.evaluation import ViewTruth
 
@@ -83,13 +81,6 @@ def test_a_view_of_something_else_does_not_leave_the_scene():
     found = align_pose(SCENE, CAMERA, ViewTruth("a", noise, torch.ones(32, 32, dtype=torch.bool)))
     turn = found.camera_to_world[0, :, :3].diagonal().sum()
     assert float(((turn - 1) / 2).arccos()) <= LARGEST_STEP * 3**0.5 + 1e-4
-
-
-def test_a_smaller_picture_shows_the_same_view():
-    small = pose_alignment._shrunk(swept(), 24)
-    assert (small.width, small.height) == (24, 24)
-    mine, theirs = points_seen(small) / 24, points_seen(swept()) / 32
-    assert_close(mine, theirs, atol=1e-3, rtol=0)
 
 
 def swept_rows(wobble: float) -> Cameras:

@@ -17,10 +17,9 @@ SCRIPT = Path(__file__).parents[3] / "benchmarks" / "unmixing_2d.py"
 
 EACH = """
 import contextlib, io, json, runpy, sys
-script, calls = sys.argv[1], json.loads(sys.argv[2])
+script, ended = sys.argv[1], []
 sys.path.insert(0, script.rpartition("/")[0])
-ended = []
-for arguments in calls:
+for arguments in json.loads(sys.argv[2]):
     out, err, code, sys.argv = io.StringIO(), io.StringIO(), 0, [script, *arguments]
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -31,16 +30,12 @@ for arguments in calls:
 print(json.dumps(ended))
 """
 """Runs the script once for each list of arguments, in one process, which imports everything once."""
-
-
 SOUND = ("plain.mat", "turned.mat")
 WORDS = ("--endmembers", "3", "--seeds", "2", "--json", "--rows", "pairs, NNLS", "VCA, FCLS")
 BAD = {
-    ("absent.mat",): "there is no file or folder",
     ("text.mat",): "can't be read as a .mat file",
     ("no_truth.mat",): "has no 'A'; found Y",
     ("short.mat",): "expected Y (bands, pixels)",
-    ("plain.mat", "--endmembers", "4"): "there are 3 true materials",
     ("plain.mat", "--rows", "magic"): "no method is called 'magic'",
 }
 
@@ -71,11 +66,10 @@ def test_medians_and_spreads_are_printed_as_json_whatever_is_transposed(ended):
     assert reports[0]["methods"] == reports[1]["methods"]
     assert set(reports[0]["methods"]) == {"pairs, NNLS", "VCA, FCLS"}
     for figures in reports[0]["methods"].values():
-        for key in ("abundance_rmse", "endmember_angle"):
-            values = figures[key]["values"]
-            assert figures[key]["median"] == pytest.approx(np.median(values))
-            assert figures[key]["spread"] == pytest.approx(max(values) - min(values))
-            assert figures[key]["standard_deviation"] == pytest.approx(np.std(values))
+        for found in (figures["abundance_rmse"], figures["endmember_angle"]):
+            values = found["values"]
+            figured = (np.median(values), max(values) - min(values), np.std(values))
+            assert (found["median"], found["spread"], found["standard_deviation"]) == pytest.approx(figured)
     assert reports[0]["methods"]["VCA, FCLS"]["abundance_rmse"]["median"] < 0.1
 
 

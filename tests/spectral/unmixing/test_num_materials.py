@@ -39,10 +39,8 @@ def test_a_gloss_on_some_pixels_counts_as_one_material_at_most():
 
 def test_the_proposal_comes_with_its_evidence():
     count = propose_num_materials(surface_pixels(smooth_endmembers(3), noise=0.001), seeded())
-    assert len(count.mean_distances) == 12
     assert list(count.mean_distances) == sorted(count.mean_distances, reverse=True)
     lines = count.evidence().splitlines()
-    assert [line.split()[0] for line in lines[1:13]] == [str(number) for number in range(1, 13)]
     assert [line.endswith("<- proposed") for line in lines[1:13]] == [number == 3 for number in range(1, 13)]
     assert f"HySime: {count.signal_dimensions} dimensions" in lines[-1]
     few = propose_num_materials(smooth_endmembers(3).repeat(5, 1), seeded())  # of many bands: without HySime

@@ -1,15 +1,13 @@
 """Endmembers on which several searches agree."""
 
-import numpy as np
 import pytest
 import torch
-from torch.nn.functional import normalize
 from torch.testing import assert_close
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, surface_pixels, worst_angle
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.metrics import spectral_angle
-from unmix_plugin.spectral.unmixing.pooled_search import _archetypes, pooled_search
+from unmix_plugin.spectral.unmixing.pooled_search import pooled_search
 
 
 def dark_water(seed=0):
@@ -52,14 +50,6 @@ def test_spectra_have_length_one_and_the_best_sets_the_same_order():
     assert float(spectral_angle(found.others, found.endmembers).mean(dim=1).min()) < 0.06
     again = pooled_search(pixels, 3, seeded())
     assert torch.equal(found.endmembers, again.endmembers)
-
-
-def test_archetypes_are_corners_of_the_pixels_that_make_all_of_them_up():
-    materials = normalize(smooth_endmembers(3), dim=1)
-    shares = torch.rand(900, 3, dtype=torch.float64, generator=seeded()) ** 4
-    pixels = (shares / shares.sum(dim=1, keepdim=True)) @ materials
-    runs = _archetypes(pixels.float(), 3, seeded())
-    assert np.median([worst_angle(run, materials) for run in runs]) < 0.1
 
 
 def test_few_shapes_are_searched_in_pairs_and_too_many_endmembers_refused():
