@@ -1,16 +1,13 @@
 """Evaluation views aligned with what was measured of them, where training fitted the like for each of its own views.
 
-Nothing of the field changes.
-
 *Gain.* A trained gain says nothing of views that were not trained on, so exposure and a smooth white balance are
 fitted. Figures after it say how well a view is predicted but for these.
 
 *Pose.* Corrected poses and field move together, so a given pose no longer says exactly from where a view was taken. One
 turn and one shift are found with which the field shows it best, coarse pictures first. A view that is off by a tenth of
-its width must first be brought near: pictures three pixels wide are alike within a third of the width. A turn alone
-does so first, since a shift as well would be drawn away. What is found is taken only where it is clearly better than
-what the given pose leads to: coarse pictures also move a view that is right, and a line camera whose rows can hardly be
-told apart. The rows of a line camera wobble, so they are fitted one by one afterwards. Where gains are fitted too, each
+its width must first be brought near, by a turn alone: pictures three pixels wide are alike within a third of the width.
+That is taken only where it is clearly better than what the given pose leads to: coarse pictures also move a view that
+is right. The rows of a line camera wobble, so they are fitted one by one afterwards. Where gains are fitted too, each
 pose that is tried has its own, so that none makes up for an exposure; rows are fitted to what was measured divided by
 the gain of the means, which hardly depends on how rows wobble.
 

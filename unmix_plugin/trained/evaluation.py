@@ -407,12 +407,8 @@ def _num_materials(scene: Scene) -> int:
     for known in (scene.material_names, scene.endmembers):
         if known is not None:
             return len(known)
-    greatest = -1
-    for index in scene.eval_indices:
-        labels = scene.labels(index)
-        if labels is not None:
-            greatest = max(greatest, int(labels.max(where=labels != NOTHING_ID, initial=0)))
-    return greatest + 1
+    labels = (found for index in scene.eval_indices if (found := scene.labels(index)) is not None)
+    return max((int(one.max(where=one != NOTHING_ID, initial=0)) + 1 for one in labels), default=0)
 
 
 def _tensor(array: np.ndarray | None) -> Tensor | None:

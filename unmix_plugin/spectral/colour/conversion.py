@@ -10,8 +10,7 @@ White. The flat spectrum 1 (illuminant E at the sensor's full scale) is rendered
 (1, 1, 1), hence Y = 1. Each colour matching function is integrated between each band's edges, gaps included, and the
 three linear RGB columns are then scaled one by one to sum to 1 (a von Kries adaptation whose cones are the sRGB
 primaries; it also compensates a channel that a range cut at 450 or 650 nm shortens). The scene's lamp is not divided
-out: a yellow lamp stays yellow. Of the conventions tried (no adaptation, Bradford from E or from the lamp to D65, XYZ
-scaling), this one reproduces the sRGB images that come with path-traced cubes, to within their 8 bits.
+out: a yellow lamp stays yellow. This reproduces the sRGB images that come with path-traced cubes, to within 8 bits.
 
 Sensors whose bands cannot tell colours get a false-colour composite instead: see `colour_mode`.
 """
@@ -141,14 +140,12 @@ def brightness(power: Float64[np.ndarray, " B"], bands: Bands) -> float:
 
 
 def _table(light: str | Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
-    return _read(light) if isinstance(light, Path) else _tables()[str(parse_light(light))]
-
-
-def _read(path: Path) -> tuple[Bands, Float64[np.ndarray, " N"]]:
-    table = read_spectra_csv(path)
+    if not isinstance(light, Path):
+        return _tables()[str(parse_light(light))]
+    table = read_spectra_csv(light)
     if len(table.names) != 1:
         raise SpectrumError(
-            f"{path}: a light has two columns, wavelength and power; found {len(table.names) + 1}"
+            f"{light}: a light has two columns, wavelength and power; found {len(table.names) + 1}"
         )
     return table.bands, table.spectra[0]
 

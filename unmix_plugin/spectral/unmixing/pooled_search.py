@@ -3,19 +3,14 @@
 Each search for endmembers has scenes on which it fails: pairs where a dark material varies more in shape than others
 differ, archetypes where materials meet in sharp edges, corners where noise or a rare colour sticks out, cluster means
 where nothing is pure. And each scatters with chance. So many sets of K spectra are made, by all of them, and one is
-chosen by a measure that knows neither the scene nor the search. A good set explains pixels as mixtures of any number
-(reconstruction), does so with two (sparsity), and lies where there are pixels (each is near one of them). Corners fail
-the last, cluster means the first. Of sets that do about as well, that is chosen which most searches found, and it is
-averaged with those that are nearly the same: chance decides less. The measure is not minimised over single spectra,
-only used to choose among whole sets, since each search keeps to what real materials look like, and a free minimum does
-not.
+chosen by a measure that knows neither the scene nor the search: a good set explains pixels as mixtures of any number
+(reconstruction), does so with two (sparsity), and lies where there are pixels (each is near one of them). Of sets that
+do about as well, that is chosen which most searches found, and it is averaged with those that are nearly the same:
+chance decides less. The measure only chooses among whole sets, since a free minimum does not look like real materials.
 
-Archetypes are convex mixtures of pixels of which convex mixtures make up all pixels; they are found by entropic
-descent, several runs at once on few pixels each.
-
-Source: archetypal analysis, A. Cutler and L. Breiman, Technometrics 36(4), 1994; by entropic descent, A. Zouaoui, G.
-Muhawenayo, B. Rasti, J. Chanussot and J. Mairal, "Entropic Descent Archetypal Analysis for Blind Hyperspectral
-Unmixing", IEEE TIP 32, 2023.
+Archetypes are convex mixtures of pixels of which convex mixtures make up all pixels (A. Cutler and L. Breiman,
+Technometrics 36(4), 1994), found by entropic descent, several runs at once on few pixels each (A. Zouaoui et al.,
+"Entropic Descent Archetypal Analysis for Blind Hyperspectral Unmixing", IEEE TIP 32, 2023).
 
 Notation: `N` pixels, `d` principal directions kept, `K` endmembers, `R` runs, `n` pixels a run. All spectra have length
 1, which removes shading, or a little less where noise is left out.
@@ -97,7 +92,9 @@ def pooled_search(
         few = two_material_endmembers(pixels, num_endmembers, generator)
         return PooledEndmembers(few, few[None])
     shapes = normalize(pixels, dim=1)
-    axes = _principal_axes(shapes, 3 * num_endmembers + 10)
+    # Principal directions hold most of the pixels; the others hold noise.
+    directions = torch.linalg.eigh((shapes.T @ shapes).double()).eigenvectors.flip(1)
+    axes = directions[:, : 3 * num_endmembers + 10].to(shapes)
     shapes = shapes @ axes
     measured = torch.randperm(len(pixels), generator=generator)[:_NUM_MEASURED].to(pixels.device)
     lengths = pixels[measured].norm(dim=1).double()
@@ -113,12 +110,6 @@ def pooled_search(
     spectra = torch.stack([_averaged(sets), *sets[:_SETS_KEPT]]) @ axes.T.double()
     spectra = normalize(spectra.clamp(min=0), dim=-1).to(pixels.dtype)
     return PooledEndmembers(spectra[0], spectra[1:])
-
-
-def _principal_axes(shapes: Float[Tensor, "N B"], count: int) -> Float[Tensor, "B d"]:
-    """Directions that hold most of the pixels; the others hold noise."""
-    gram = (shapes.T @ shapes).double()
-    return torch.linalg.eigh(gram).eigenvectors.flip(1)[:, :count].to(shapes)
 
 
 def _pair_sets(
