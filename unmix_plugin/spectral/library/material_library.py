@@ -106,11 +106,9 @@ class MaterialLibrary:
     materials: tuple[LibraryMaterial, ...]
 
     def __post_init__(self) -> None:
-        repeated = [name for name, count in Counter(self.names).items() if count > 1]
-        if repeated:
-            raise SpectrumError(
-                f"materials of a library must have different names; found {repeated[0]!r} twice"
-            )
+        for name, count in Counter(self.names).items():
+            if count > 1:
+                raise SpectrumError(f"materials of a library must have different names; found {name!r} twice")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -45,7 +45,11 @@ class SpectraTable:
                 f"{len(self.names)} names and {len(self.bands)} bands need spectra of shape "
                 f"({len(self.names)}, {len(self.bands)}); found {self.spectra.shape}"
             )
-        _validate_names(self.names)
+        if not self.names or not all(name.strip() for name in self.names):
+            raise SpectrumError(f"each spectrum needs a name; found {name_some(self.names, 8)}")
+        for name, count in Counter(self.names).items():
+            if count > 1:
+                raise SpectrumError(f"names of spectra must differ; found '{name}' {count} times")
         for rule, holds in (("be finite", np.isfinite(self.spectra)), ("not be negative", self.spectra >= 0)):
             if not holds.all():
                 k, b = np.unravel_index(np.argmin(holds), holds.shape)
@@ -92,11 +96,9 @@ def read_spectra_csv(path: Path) -> SpectraTable:
             raise SpectrumError(f"the first column must be headed 'wavelength' (in nm); found '{header[0]}'")
         if len(header) == 1:
             raise SpectrumError("no spectra: there is no column beside 'wavelength'")
-        names = tuple(header[1:])
-        _validate_names(names)
         bands = Bands(values[:, 0].copy())
         require_nanometres(bands.centers_nm)
-        return SpectraTable(bands, names, np.ascontiguousarray(values[:, 1:].T))
+        return SpectraTable(bands, tuple(header[1:]), np.ascontiguousarray(values[:, 1:].T))
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
 
@@ -155,13 +157,3 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _validate_names(names: tuple[str, ...]) -> None:
-    if not names or not all(name.strip() for name in names):
-        raise SpectrumError(f"each spectrum needs a name; found {name_some(names, 8)}")
-    repeated = [name for name, count in Counter(names).items() if count > 1]
-    if repeated:
-        raise SpectrumError(
-            f"names of spectra must differ; found '{repeated[0]}' {names.count(repeated[0])} times"
-        )
