@@ -27,50 +27,48 @@ from unmix_plugin.trained.evaluation import (
 SHUFFLED = [2, 0, 1]
 
 
-@pytest.fixture
-def scene() -> _SceneTruth:
-    """Three materials in five bands."""
-    endmembers = torch.tensor(
-        [[0.9, 0.1, 0.1, 0.2, 0.3], [0.1, 0.8, 0.3, 0.1, 0.1], [0.2, 0.2, 0.2, 0.9, 0.6]]
-    )
-    return _SceneTruth(Bands.of([450, 500, 550, 600, 650]), 3, endmembers.double(), ("a", "b", "c"))
+SCENE = _SceneTruth(
+    Bands.of([450, 500, 550, 600, 650]),
+    3,
+    torch.tensor([[9, 1, 1, 2, 3], [1, 8, 3, 1, 1], [2, 2, 2, 9, 6]], dtype=torch.float64) / 10,
+    ("a", "b", "c"),
+)
+"""Three materials in five bands."""
 
 
-@pytest.fixture
-def view(scene: _SceneTruth) -> ViewTruth:
+def striped() -> ViewTruth:
     """Stripes of the materials, mixed a little, half covered along one edge, nothing beyond it."""
-    assert scene.endmembers is not None
     labels = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
     abundances = 0.8 * torch.nn.functional.one_hot(labels.long(), 3).float() + 0.2 / 3
     alpha = torch.ones(10, 12)
     alpha[0], alpha[1] = 0.0, 0.5
     abundances[0] = 0
     labels[:2] = 255
-    spectra = (alpha[..., None] * abundances).double() @ scene.endmembers
+    spectra = (alpha[..., None] * abundances).double() @ SCENE.endmembers
     return ViewTruth("view", spectra.float(), torch.ones(10, 12, dtype=torch.bool), alpha, labels, abundances)
 
 
-def perfect(view: ViewTruth, order: list[int]) -> PredictedView:
+VIEW = striped()
+
+
+def perfect(order: list[int] = SHUFFLED) -> PredictedView:
     """What a model renders that knows the truth, its endmembers numbered in another order."""
-    assert view.labels is not None
-    assert view.abundances is not None
     position = torch.zeros(256, dtype=torch.uint8)
     position[order] = torch.arange(len(order), dtype=torch.uint8)
     position[255] = 255
-    composited = (view.abundances * view.opacity[..., None])[..., order]
-    return PredictedView(view.spectra, view.opacity, composited, position[view.labels.long()], composited)
+    composited = (VIEW.abundances * VIEW.opacity[..., None])[..., order]
+    return PredictedView(VIEW.spectra, VIEW.opacity, composited, position[VIEW.labels.long()], composited)
 
 
-def evaluated(scene: _SceneTruth, view: ViewTruth, predicted: PredictedView, order: list[int]) -> Evaluation:
+def evaluated(view: ViewTruth, predicted: PredictedView, order: list[int] = SHUFFLED) -> Evaluation:
     """An evaluation of one view."""
-    assert scene.endmembers is not None
-    evaluation = Evaluation(scene, scene.endmembers[order])
+    evaluation = Evaluation(SCENE, SCENE.endmembers[order])
     evaluation.add(view, predicted)
     return evaluation
 
 
-def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(scene, view):
-    figures = evaluated(scene, view, perfect(view, SHUFFLED), SHUFFLED).figures()
+def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers():
+    figures = evaluated(VIEW, perfect()).figures()
     assert figures["psnr"] == figures["rgb_psnr"] == math.inf
     for name in ("rmse", "sam", "abundance_rmse", "endmember_angle"):
         assert figures[name] == pytest.approx(0.0, abs=1e-7), name
@@ -80,39 +78,39 @@ def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(
     assert finite_or_none(figures)["psnr"] is None
 
 
-def test_figures_without_truth_are_unknown_and_the_others_stay(scene, view):
+def test_figures_without_truth_are_unknown_and_the_others_stay():
     """Half the light costs PSNR and no angle; a small image has no SSIM, and an empty one no PSNR of matter."""
-    evaluation = Evaluation(_SceneTruth(scene.bands, 0), scene.endmembers)
-    dim = replace(perfect(view, [0, 1, 2]), spectra=view.spectra * 0.5)
-    evaluation.add(ViewTruth("view", view.spectra, view.valid), dim)
+    evaluation = Evaluation(_SceneTruth(SCENE.bands, 0), SCENE.endmembers)
+    dim = replace(perfect([0, 1, 2]), spectra=VIEW.spectra * 0.5)
+    evaluation.add(ViewTruth("view", VIEW.spectra, VIEW.valid), dim)
     figures = finite_or_none(evaluation.figures())
     unknown = {"psnr_white", "miou", "macro_f1", "accuracy", "abundance_rmse", "endmember_angle"}
     assert {name for name, value in figures.items() if value is None} == unknown
-    assert figures["psnr"] == pytest.approx(psnr(view.spectra * 0.5, view.spectra))
+    assert figures["psnr"] == pytest.approx(psnr(VIEW.spectra * 0.5, VIEW.spectra))
     assert figures["sam"] == pytest.approx(0.0, abs=1e-7)
     flat, blank = torch.zeros(6, 9, 3), torch.zeros(6, 9)
     small = PredictedView(torch.rand(6, 9, 5), blank, flat, blank.byte(), flat)
     seen = ViewTruth("small", small.spectra, torch.ones(6, 9, dtype=torch.bool), blank)
-    found = Evaluation(scene, scene.endmembers).add(seen, small)
+    found = Evaluation(SCENE, SCENE.endmembers).add(seen, small)
     assert math.isnan(found["ssim"])
     assert math.isnan(found["psnr_matter"])
 
 
-def test_the_angle_counts_labelled_or_opaque_pixels_only(scene, view):
-    spectra, order = view.spectra.clone(), [0, 1, 2]
+def test_the_angle_counts_labelled_or_opaque_pixels_only():
+    spectra, order = VIEW.spectra.clone(), [0, 1, 2]
     spectra[:2] = spectra[:2].flip(-1)  # half covered and empty pixels
-    predicted = replace(perfect(view, order), spectra=spectra)
-    assert evaluated(scene, view, predicted, order).figures()["sam"] == pytest.approx(0.0, abs=1e-7)
-    labelled = replace(view, labels=torch.zeros_like(view.labels))
-    found = evaluated(scene, labelled, predicted, order).figures()["sam"]
-    assert found == pytest.approx(sam(spectra, view.spectra))
+    predicted = replace(perfect(order), spectra=spectra)
+    assert evaluated(VIEW, predicted, order).figures()["sam"] == pytest.approx(0.0, abs=1e-7)
+    labelled = replace(VIEW, labels=torch.zeros_like(VIEW.labels))
+    found = evaluated(labelled, predicted, order).figures()["sam"]
+    assert found == pytest.approx(sam(spectra, VIEW.spectra))
     assert found > 0.01
 
 
-def test_invalid_pixels_count_for_nothing(scene, view):
-    valid = view.valid.clone()
+def test_invalid_pixels_count_for_nothing():
+    valid = VIEW.valid.clone()
     valid[4:6] = False
-    predicted = perfect(view, SHUFFLED)
+    predicted = perfect()
 
     def spoil(values, wrong):
         return torch.where(valid if values.dim() == 2 else valid[..., None], values, wrong)
@@ -121,31 +119,31 @@ def test_invalid_pixels_count_for_nothing(scene, view):
     spoilt = {name: spoil(values, 1 - values) for name, values in spoilt.items()}
     ids = spoil(predicted.segmentation, (predicted.segmentation + 1) % 3)
     wrong = replace(predicted, segmentation=ids, **spoilt)
-    figures = evaluated(scene, replace(view, valid=valid), wrong, SHUFFLED).figures()
+    figures = evaluated(replace(VIEW, valid=valid), wrong).figures()
     for name in ("rmse", "sam", "abundance_rmse"):
         assert figures[name] == pytest.approx(0.0, abs=1e-7), name
     assert figures["miou"] == 1.0
-    assert evaluated(scene, view, wrong, SHUFFLED).figures()["miou"] < 1
+    assert evaluated(VIEW, wrong).figures()["miou"] < 1
 
 
-def test_missing_matter_is_an_error_of_its_abundances(scene, view):
-    whole = perfect(view, [0, 1, 2])
+def test_missing_matter_is_an_error_of_its_abundances():
+    whole = perfect([0, 1, 2])
     thin = replace(whole, accumulation=whole.accumulation * 0.25, abundances=whole.abundances * 0.25)
-    evaluation = evaluated(scene, view, thin, [0, 1, 2])
+    evaluation = evaluated(VIEW, thin, [0, 1, 2])
     assert evaluation.matching is not None
     expected = abundance_rmse(
-        view.abundances * 0.25, view.abundances, evaluation.matching, view.opacity >= 0.5
+        VIEW.abundances * 0.25, VIEW.abundances, evaluation.matching, VIEW.opacity >= 0.5
     )
     assert evaluation.figures()["abundance_rmse"] == pytest.approx(expected, rel=1e-6)
     assert expected > 0.3
 
 
-def test_means_are_over_views_that_have_the_figure(scene, view):
-    evaluation = Evaluation(scene, scene.endmembers)
-    dim = replace(perfect(view, [0, 1, 2]), abundances=perfect(view, [0, 1, 2]).abundances * 0.5)
-    first = evaluation.add(view, dim)["abundance_rmse"]
+def test_means_are_over_views_that_have_the_figure():
+    evaluation = Evaluation(SCENE, SCENE.endmembers)
+    dim = replace(perfect([0, 1, 2]), abundances=perfect([0, 1, 2]).abundances * 0.5)
+    first = evaluation.add(VIEW, dim)["abundance_rmse"]
     assert first > 0.1
-    second = evaluation.add(replace(view, name="other", abundances=None), dim)["abundance_rmse"]
+    second = evaluation.add(replace(VIEW, name="other", abundances=None), dim)["abundance_rmse"]
     assert math.isnan(second)
     assert evaluation.figures()["abundance_rmse"] == pytest.approx(first)
     assert set(evaluation.per_view) == {"view", "other"}
@@ -160,39 +158,39 @@ def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(tmp_path):
     assert not torch.allclose(lit, flat, rtol=1e-2)
 
 
-def test_psnr_of_matter_leaves_the_background_and_invalid_and_blown_out_pixels_out(scene, view):
+def test_psnr_of_matter_leaves_the_background_and_invalid_and_blown_out_pixels_out():
     """A background that is rendered as black as it is raises PSNR, by however much there is of it."""
-    matter = view.shows_matter[..., None]
-    flat = replace(view, spectra=torch.where(matter, 0.5, view.spectra))
-    predicted = replace(perfect(view, SHUFFLED), spectra=torch.where(matter, 0.4, view.spectra))
-    found = evaluated(scene, flat, predicted, SHUFFLED).per_view["view"]
+    matter = VIEW.shows_matter[..., None]
+    flat = replace(VIEW, spectra=torch.where(matter, 0.5, VIEW.spectra))
+    predicted = replace(perfect(), spectra=torch.where(matter, 0.4, VIEW.spectra))
+    found = evaluated(flat, predicted).per_view["view"]
     assert found["psnr_matter"] == pytest.approx(20.0, abs=1e-4)
     assert found["psnr"] == pytest.approx(20.0 + 10 * math.log10(120 / 96), abs=1e-4)
     spoiled = replace(flat, spectra=flat.spectra.clone(), valid=flat.valid.clone())
     spoiled.spectra[5], spoiled.valid[5] = 1.0, False
-    found = evaluated(scene, spoiled, predicted, SHUFFLED).per_view["view"]
+    found = evaluated(spoiled, predicted).per_view["view"]
     assert found["psnr_matter"] == pytest.approx(20.0, abs=1e-4)
     measured = flat.spectra.clone()  # some pixels are blown out
-    rows = view.shows_matter.nonzero()[:4]
+    rows = VIEW.shows_matter.nonzero()[:4]
     measured[rows[:, 0], rows[:, 1], 0] = 0.95
-    found = evaluated(scene, replace(view, spectra=measured), predicted, SHUFFLED).per_view["view"]
+    found = evaluated(replace(VIEW, spectra=measured), predicted).per_view["view"]
     assert found["psnr_matter_unsaturated"] == pytest.approx(20.0, abs=1e-4)
     assert found["psnr_matter"] < 19.9
     assert found["psnr"] < found["psnr_unsaturated"] - 0.1
 
 
-def test_a_white_pixel_that_the_mask_calls_matter_is_right_over_white_if_nothing_is_there(scene, view):
+def test_a_white_pixel_that_the_mask_calls_matter_is_right_over_white_if_nothing_is_there():
     """Gaps through which a white backdrop shows: an error on black, whatever a prediction without it does."""
-    measured, alpha = view.spectra.clone(), view.opacity.clone()
+    measured, alpha = VIEW.spectra.clone(), VIEW.opacity.clone()
     measured[4, 4], alpha[4, 4] = 1.0, 1.0
-    gap = replace(view, spectra=measured, alpha=alpha)
-    seen, opacity = view.spectra.clone(), view.opacity.clone()
+    gap = replace(VIEW, spectra=measured, alpha=alpha)
+    seen, opacity = VIEW.spectra.clone(), VIEW.opacity.clone()
     seen[4, 4], opacity[4, 4] = 0.0, 0.0
-    predicted = replace(perfect(view, SHUFFLED), spectra=seen, accumulation=opacity)
-    found = evaluated(scene, gap, predicted, SHUFFLED).per_view["view"]
+    predicted = replace(perfect(), spectra=seen, accumulation=opacity)
+    found = evaluated(gap, predicted).per_view["view"]
     assert found["psnr"] == pytest.approx(10 * math.log10(120), abs=1e-4)
     assert found["psnr_white"] == math.inf
-    bare = evaluated(scene, replace(gap, alpha=None), predicted, SHUFFLED).per_view["view"]
+    bare = evaluated(replace(gap, alpha=None), predicted).per_view["view"]
     assert math.isnan(bare["psnr_white"])
 
 
@@ -216,13 +214,13 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
     assert_close(relit.spectra, (measured * torch.tensor([2.0, 0.5])).clamp(max=1))
 
 
-def test_views_counted_apart_and_merged_are_views_counted_together(scene, view):
+def test_views_counted_apart_and_merged_are_views_counted_together():
     """The second prediction has two materials exchanged, so that order and figures matter."""
-    predictions = [perfect(view, order) for order in ([0, 1, 2], SHUFFLED, [0, 1, 2])]
-    together, first, second = (Evaluation(scene, scene.endmembers) for _ in range(3))
+    predictions = [perfect(order) for order in ([0, 1, 2], SHUFFLED, [0, 1, 2])]
+    together, first, second = (Evaluation(SCENE, SCENE.endmembers) for _ in range(3))
     for name, predicted, part in zip("cab", predictions, (first, second, first), strict=True):
-        together.add(replace(view, name=name), predicted)
-        part.add(replace(view, name=name), predicted)
+        together.add(replace(VIEW, name=name), predicted)
+        part.add(replace(VIEW, name=name), predicted)
     first.merge([second], "cab")
     assert finite_or_none(first.figures()) == finite_or_none(together.figures())
     assert list(first.per_view) == ["c", "a", "b"]
@@ -247,9 +245,9 @@ def test_pixels_that_were_measured_blown_out_stay_so_in_another_light_and_others
     assert figures["psnr"] < 20
 
 
-def test_errors_of_bands_are_of_clamped_predictions_as_all_figures_are(scene, view):
-    bright = replace(perfect(view, SHUFFLED), spectra=torch.full_like(view.spectra, 3.0))
-    evaluation = evaluated(scene, view, bright, SHUFFLED)
+def test_errors_of_bands_are_of_clamped_predictions_as_all_figures_are():
+    bright = replace(perfect(), spectra=torch.full_like(VIEW.spectra, 3.0))
+    evaluation = evaluated(VIEW, bright)
     errors = evaluation.bands["view"].mse
-    assert errors == pytest.approx(((1 - view.spectra.double()) ** 2).mean(dim=(0, 1)).numpy())
+    assert errors == pytest.approx(((1 - VIEW.spectra.double()) ** 2).mean(dim=(0, 1)).numpy())
     assert math.sqrt(errors.mean()) == pytest.approx(evaluation.per_view["view"]["rmse"])
