@@ -27,28 +27,18 @@ from unmix_plugin.trained.evaluation import (
 SHUFFLED = [2, 0, 1]
 
 
-SCENE = _SceneTruth(
-    Bands.of([450, 500, 550, 600, 650]),
-    3,
-    torch.tensor([[9, 1, 1, 2, 3], [1, 8, 3, 1, 1], [2, 2, 2, 9, 6]], dtype=torch.float64) / 10,
-    ("a", "b", "c"),
-)
+BANDS = Bands.of([450, 500, 550, 600, 650])
+ENDMEMBERS = torch.tensor([[9, 1, 1, 2, 3], [1, 8, 3, 1, 1], [2, 2, 2, 9, 6]], dtype=torch.float64) / 10
+SCENE = _SceneTruth(BANDS, 3, ENDMEMBERS, ("a", "b", "c"))
 """Three materials in five bands."""
 
-
-def striped() -> ViewTruth:
-    """Stripes of the materials, mixed a little, half covered along one edge, nothing beyond it."""
-    labels = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
-    abundances = 0.8 * torch.nn.functional.one_hot(labels.long(), 3).float() + 0.2 / 3
-    alpha = torch.ones(10, 12)
-    alpha[0], alpha[1] = 0.0, 0.5
-    abundances[0] = 0
-    labels[:2] = 255
-    spectra = (alpha[..., None] * abundances).double() @ SCENE.endmembers
-    return ViewTruth("view", spectra.float(), torch.ones(10, 12, dtype=torch.bool), alpha, labels, abundances)
-
-
-VIEW = striped()
+LABELS = (torch.arange(12) // 4).to(torch.uint8).repeat(10, 1)
+ABUNDANCES = 0.8 * torch.nn.functional.one_hot(LABELS.long(), 3).float() + 0.2 / 3
+ALPHA = torch.ones(10, 12)
+ALPHA[0], ALPHA[1], ABUNDANCES[0], LABELS[:2] = 0.0, 0.5, 0.0, 255
+SPECTRA = ((ALPHA[..., None] * ABUNDANCES).double() @ ENDMEMBERS).float()
+VIEW = ViewTruth("view", SPECTRA, torch.ones(10, 12, dtype=torch.bool), ALPHA, LABELS, ABUNDANCES)
+"""Stripes of the materials, mixed a little, half covered along one edge, nothing beyond it."""
 
 
 def perfect(order: list[int] = SHUFFLED) -> PredictedView:
@@ -56,13 +46,13 @@ def perfect(order: list[int] = SHUFFLED) -> PredictedView:
     position = torch.zeros(256, dtype=torch.uint8)
     position[order] = torch.arange(len(order), dtype=torch.uint8)
     position[255] = 255
-    composited = (VIEW.abundances * VIEW.opacity[..., None])[..., order]
-    return PredictedView(VIEW.spectra, VIEW.opacity, composited, position[VIEW.labels.long()], composited)
+    composited = (ABUNDANCES * VIEW.opacity[..., None])[..., order]
+    return PredictedView(VIEW.spectra, VIEW.opacity, composited, position[LABELS.long()], composited)
 
 
 def evaluated(view: ViewTruth, predicted: PredictedView, order: list[int] = SHUFFLED) -> Evaluation:
     """An evaluation of one view."""
-    evaluation = Evaluation(SCENE, SCENE.endmembers[order])
+    evaluation = Evaluation(SCENE, ENDMEMBERS[order])
     evaluation.add(view, predicted)
     return evaluation
 
@@ -80,7 +70,7 @@ def test_a_perfect_prediction_has_no_error_whatever_the_order_of_its_endmembers(
 
 def test_figures_without_truth_are_unknown_and_the_others_stay():
     """Half the light costs PSNR and no angle; a small image has no SSIM, and an empty one no PSNR of matter."""
-    evaluation = Evaluation(_SceneTruth(SCENE.bands, 0), SCENE.endmembers)
+    evaluation = Evaluation(_SceneTruth(BANDS, 0), ENDMEMBERS)
     dim = replace(perfect([0, 1, 2]), spectra=VIEW.spectra * 0.5)
     evaluation.add(ViewTruth("view", VIEW.spectra, VIEW.valid), dim)
     figures = finite_or_none(evaluation.figures())
@@ -91,7 +81,7 @@ def test_figures_without_truth_are_unknown_and_the_others_stay():
     flat, blank = torch.zeros(6, 9, 3), torch.zeros(6, 9)
     small = PredictedView(torch.rand(6, 9, 5), blank, flat, blank.byte(), flat)
     seen = ViewTruth("small", small.spectra, torch.ones(6, 9, dtype=torch.bool), blank)
-    found = Evaluation(SCENE, SCENE.endmembers).add(seen, small)
+    found = Evaluation(SCENE, ENDMEMBERS).add(seen, small)
     assert math.isnan(found["ssim"])
     assert math.isnan(found["psnr_matter"])
 
@@ -101,7 +91,7 @@ def test_the_angle_counts_labelled_or_opaque_pixels_only():
     spectra[:2] = spectra[:2].flip(-1)  # half covered and empty pixels
     predicted = replace(perfect(order), spectra=spectra)
     assert evaluated(VIEW, predicted, order).figures()["sam"] == pytest.approx(0.0, abs=1e-7)
-    labelled = replace(VIEW, labels=torch.zeros_like(VIEW.labels))
+    labelled = replace(VIEW, labels=torch.zeros_like(LABELS))
     found = evaluated(labelled, predicted, order).figures()["sam"]
     assert found == pytest.approx(sam(spectra, VIEW.spectra))
     assert found > 0.01
@@ -131,15 +121,13 @@ def test_missing_matter_is_an_error_of_its_abundances():
     thin = replace(whole, accumulation=whole.accumulation * 0.25, abundances=whole.abundances * 0.25)
     evaluation = evaluated(VIEW, thin, [0, 1, 2])
     assert evaluation.matching is not None
-    expected = abundance_rmse(
-        VIEW.abundances * 0.25, VIEW.abundances, evaluation.matching, VIEW.opacity >= 0.5
-    )
+    expected = abundance_rmse(ABUNDANCES * 0.25, ABUNDANCES, evaluation.matching, VIEW.opacity >= 0.5)
     assert evaluation.figures()["abundance_rmse"] == pytest.approx(expected, rel=1e-6)
     assert expected > 0.3
 
 
 def test_means_are_over_views_that_have_the_figure():
-    evaluation = Evaluation(SCENE, SCENE.endmembers)
+    evaluation = Evaluation(SCENE, ENDMEMBERS)
     dim = replace(perfect([0, 1, 2]), abundances=perfect([0, 1, 2]).abundances * 0.5)
     first = evaluation.add(VIEW, dim)["abundance_rmse"]
     assert first > 0.1
@@ -154,6 +142,8 @@ def test_true_endmembers_are_reflectances_in_the_light_of_the_scene(tmp_path):
     make_demo_scene(tmp_path, 16, 8, 4)
     demo = load_scene(tmp_path, SceneOptions())
     lit, flat = (scene_truth(one).endmembers for one in (demo, replace(demo, illuminant=None)))
+    assert lit is not None
+    assert flat is not None
     torch.testing.assert_close(lit, flat * torch.from_numpy(demo.illuminant), rtol=1e-6, atol=0)
     assert not torch.allclose(lit, flat, rtol=1e-2)
 
@@ -217,7 +207,7 @@ def test_a_view_is_measured_as_its_sensor_sees_it():
 def test_views_counted_apart_and_merged_are_views_counted_together():
     """The second prediction has two materials exchanged, so that order and figures matter."""
     predictions = [perfect(order) for order in ([0, 1, 2], SHUFFLED, [0, 1, 2])]
-    together, first, second = (Evaluation(SCENE, SCENE.endmembers) for _ in range(3))
+    together, first, second = (Evaluation(SCENE, ENDMEMBERS) for _ in range(3))
     for name, predicted, part in zip("cab", predictions, (first, second, first), strict=True):
         together.add(replace(VIEW, name=name), predicted)
         part.add(replace(VIEW, name=name), predicted)
