@@ -44,17 +44,8 @@ _HALF_OPAQUE = 0.5
 def outline_overlaps(
     ray_mesh: RayMesh, cameras: Cameras, alphas: Sequence[Float[np.ndarray, "_ _"] | None]
 ) -> Float64[np.ndarray, " V"]:
-    """How well a mesh covers what pictures show of it: in each view, the part that silhouette and alpha share.
-
-    Args:
-        ray_mesh: The mesh in the space of the cameras.
-        cameras: Of the pictures.
-        alphas: Opacity of each picture, None where it has none: then the mesh has only to be in the view.
-    Returns:
-        Of the views that are compared, [0, 1].
-    Raises:
-        SceneError: no pixel of any picture is opaque.
-    """
+    """How well a mesh covers what pictures show of it: in each view that is compared, the part that silhouette and
+    alpha share; without alpha 1 where the mesh is in the view. Raises SceneError: no pixel of any picture is opaque."""
     if all(alpha is not None and not (alpha > _HALF_OPAQUE).any() for alpha in alphas):
         raise SceneError(
             "alpha of all pictures is below one half everywhere, so that no pixel shows the object; write alpha "
@@ -69,7 +60,6 @@ def _some_views(count: int) -> range:
 
 
 def _overlap(ray_mesh: RayMesh, camera: Cameras, alpha: Float[np.ndarray, "_ _"] | None) -> float:
-    """Shared part of silhouette and alpha; without alpha 1 where the mesh is in the view."""
     small = camera.shrunk(LONGEST_EDGE_PX**2)
     rays = small.image_rays(0).to(ray_mesh.device)
     seen = ray_mesh.blocked(rays.origins, rays.directions).cpu()
@@ -92,14 +82,7 @@ def is_misplaced(overlaps: Float64[np.ndarray, " V"]) -> bool:
 def misplacement(
     overlaps: Float64[np.ndarray, " V"], cameras: Cameras, frame: Normalisation, where: str
 ) -> str:
-    """How far off a misplaced mesh is.
-
-    Args:
-        overlaps: Of `outline_overlaps`.
-        cameras: Of the pictures, model space.
-        frame: To give places in the world.
-        where: What the message calls the mesh.
-    """
+    """How far off a misplaced mesh is, with places in the world."""
     wrong, edge, poses = int((overlaps < LEAST_OVERLAP).sum()), 2 / frame.scale, cameras.camera_to_world
     positions = frame.to_world(poses[:, :, 3].double().numpy())
     middle, target = frame.to_world(np.zeros(3)), frame.to_world(nearest_to_axes(poses.double().numpy()))
@@ -116,15 +99,16 @@ def misplacement(
     )
 
 
-def outline_doubt(overlaps: Float64[np.ndarray, " V"], where: str) -> str | None:
-    """What to say of a mesh that is somewhat off; None if it fits."""
+def outline_doubts(overlaps: Float64[np.ndarray, " V"], where: str) -> list[str]:
+    """What to say of a mesh that is somewhat off."""
     median = float(np.median(overlaps))
     if median >= DOUBTFUL_OVERLAP:
-        return None
-    return (
+        return []
+    said = (
         f"{where} and alpha show different outlines: their overlap is {median:.0%} (median of {len(overlaps)} views; "
         "90% and more is usual), which blurs materials. Check size and place of the mesh, lenses and alpha"
     )
+    return [said]
 
 
 def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
@@ -140,19 +124,17 @@ def sides_seen(ray_mesh: RayMesh, cameras: Cameras) -> Float[Tensor, " F"]:
     return seen
 
 
-def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None:
-    """What to say of pictures that are much too bright or too dark for their light; None if they are right.
-
-    Only pictures of linear light with alpha are compared: others say nothing of a unit, or of what is background.
-    """
+def light_doubts(pictures: PosedPictures, environment: Environment) -> list[str]:
+    """What to say of pictures that are much too bright or too dark for their light. Those that are not linear, or have
+    no alpha, say nothing of a unit, or of what is background."""
     if pictures.tone != "linear":
-        return None
+        return []
     read = [pictures.read(view) for view in _some_views(len(pictures))]
     shown = [picture.numbers[picture.opacity >= OPAQUE_ALPHA] for picture in read if picture.has_alpha]
     found = np.concatenate(shown).mean(axis=1) if shown else np.zeros(0)
     mean = float(environment.mean_radiance().mean())
     if not (found.size and mean > 0):
-        return None
+        return []
     middle, bright = (float(np.quantile(found, share)) / mean for share in (0.5, 0.95))
     low, high = BOUNDS
     if middle > high:
@@ -160,9 +142,10 @@ def light_doubt(pictures: PosedPictures, environment: Environment) -> str | None
     elif 0 < bright < low:
         ratio, what = bright, "95 % of the object's pixels are less than"
     else:
-        return None
-    return (
+        return []
+    said = (
         f"{what} {ratio:.2g} times as bright as the mean of the environment map; {low:g} to {high:g} times is usual. "
         "Pictures and map seem to have different units, and materials come out wrong then. Scale one of them: an "
         f"'environment_exposure_stops' {math.log2(ratio / _USUAL):.0f} higher would be about right"
     )
+    return [said]

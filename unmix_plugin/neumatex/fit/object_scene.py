@@ -19,14 +19,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from unmix_plugin.errors import SceneError
-from unmix_plugin.neumatex.fit.checks import (
-    is_misplaced,
-    light_doubt,
-    misplacement,
-    outline_doubt,
-    outline_overlaps,
-    sides_seen,
-)
+from unmix_plugin.neumatex.fit import checks
 from unmix_plugin.neumatex.fit.pictures import PosedPictures, read_picture, read_posed_pictures
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, ToneMapping
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -105,11 +98,8 @@ class ObjectScene:
 
     def truth(self, index: int) -> dict[str, np.ndarray]:
         """What is known of a view's materials, float32: `base_colour` (H W 3), linear; or of spectral pictures
-        `true_abundances` (H W M) and `true_endmembers` (M B).
-
-        Raises:
-            SceneError: a file is malformed, or has another size than the view.
-        """
+        `true_abundances` (H W M) and `true_endmembers` (M B). Raises SceneError: a file is malformed, or has another
+        size than the view."""
         if self.bands is None:
             path = self.root / "truth" / "base_colour" / f"{self.pictures.names[index]}.exr"
             if not path.is_file():
@@ -140,7 +130,6 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     """Read and check an object's folder.
 
     Args:
-        root: The folder.
         lamp: For pictures of many bands: what lit them, as `read_lamp` takes it, instead of what the folder says.
     Raises:
         SceneError: the folder is not a sound object; the message says what is wrong with it.
@@ -155,8 +144,7 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         )
     power = folder.lamp(bands) if bands is None or lamp is None else read_lamp(lamp, bands)
     environment = folder.environment(bands, power)
-    doubt = light_doubt(pictures, environment)
-    notes += [] if doubt is None else [doubt]
+    notes += checks.light_doubts(pictures, environment)
     relit = root / "relit"
     places = sorted(path for path in relit.iterdir() if path.is_dir()) if relit.is_dir() else []
     held_out = [_read_held_out(place, frame, pictures, bands, power, notes) for place in places]
@@ -218,11 +206,7 @@ class _Folder:
 
 
 def _read_folder(root: Path, notes: list[str], needs_mesh: bool) -> _Folder:
-    """Read and check the keys of a folder's transforms.json; `notes` gets what it says beside them.
-
-    Raises:
-        SceneError: what is wrong, in one message.
-    """
+    """Read and check the keys of a folder's transforms.json; `notes` gets what is unusual."""
     faults = Faults(root)
     entry = read_transforms(root, faults, needs_cubes=False)
     content = read_json_file(root / FILE_NAME)
@@ -317,11 +301,7 @@ def _read_truth(
 
 
 def _placed(folder: _Folder, notes: list[str]) -> tuple[Normalisation, Mesh, PosedPictures]:
-    """The mesh and the pictures in model space; a mesh that fits clearly better with its y axis upwards is turned.
-
-    Raises:
-        SceneError: it fits neither way; the message says how far off it is as it was given.
-    """
+    """The mesh and the pictures in model space; a mesh that fits clearly better with its y axis upwards is turned."""
     given, name = read_mesh(folder.mesh_path, notes), folder.mesh_path.name
     frame, mesh, pictures = _in_model_space(given, folder)
     read = (pictures.read(index) for index in range(len(pictures)))
@@ -329,25 +309,25 @@ def _placed(folder: _Folder, notes: list[str]) -> tuple[Normalisation, Mesh, Pos
     scale, offset = given.to_model_space()
     turned = given.with_y_upwards()
     overlaps, upright = (
-        outline_overlaps(RayMesh(one.transformed(scale, offset)), pictures.cameras, alphas)
+        checks.outline_overlaps(RayMesh(one.transformed(scale, offset)), pictures.cameras, alphas)
         for one in (given, turned)
     )
     has_outlines = any(alpha is not None for alpha in alphas)
     is_better = has_outlines and upright.mean() > overlaps.mean() + _CLEARLY_BETTER
-    if (is_better or is_misplaced(overlaps)) and not is_misplaced(upright):
+    if (is_better or checks.is_misplaced(overlaps)) and not checks.is_misplaced(upright):
         notes.append(f"{name} has y as its upward axis, the poses have z: the mesh was turned")
         overlaps = upright
         frame, mesh, pictures = _in_model_space(turned, folder)
-    if is_misplaced(overlaps):
-        raise SceneError(misplacement(overlaps, pictures.cameras, frame, name))
-    doubt = outline_doubt(overlaps, name)
-    if not has_outlines:
-        doubt = (
+    if checks.is_misplaced(overlaps):
+        raise SceneError(checks.misplacement(overlaps, pictures.cameras, frame, name))
+    if has_outlines:
+        notes += checks.outline_doubts(overlaps, name)
+    else:
+        notes.append(
             f"the pictures have no alpha: whether {name} lies as they show the object, and which of its axes is "
             "upwards, could not be checked"
         )
-    notes += [] if doubt is None else [doubt]
-    mesh, count = turned_to_viewers(mesh, sides_seen(RayMesh(mesh), pictures.cameras))
+    mesh, count = turned_to_viewers(mesh, checks.sides_seen(RayMesh(mesh), pictures.cameras))
     if count:
         notes.append(
             f"{name}: cameras saw {count} of {len(mesh.faces)} triangles from behind; they were turned"

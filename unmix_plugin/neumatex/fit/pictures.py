@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from unmix_plugin.engine import Cameras
-from unmix_plugin.errors import CaptureError, SceneError, counted
+from unmix_plugin.errors import CaptureError, SceneError
 from unmix_plugin.neumatex.fit.tone import ToneMapping
+from unmix_plugin.neumatex.tracing.light_files import read_exr, require_light
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
@@ -57,7 +58,6 @@ def read_picture(path: Path, value_scale: float | None = None) -> Picture:
     """Read and check one picture; colours are 0 where alpha is, where they mean nothing.
 
     Args:
-        path: Its file.
         value_scale: Stored number of a .npy cube that stands for 1; None for floats of light as they are.
     Raises:
         SceneError: it can't be read, has less than 3 colours, or values that are negative or not finite.
@@ -72,12 +72,7 @@ def read_picture(path: Path, value_scale: float | None = None) -> Picture:
     except OSError as error:
         raise SceneError(f"{path} can't be read ({error.strerror or error})") from error
     shown = picture.numbers if picture.alpha is None else picture.numbers[picture.alpha > 0]
-    if not (np.isfinite(shown).all() and (shown >= 0).all()):
-        bad = int((~np.isfinite(shown) | (shown < 0)).any(axis=-1).sum())
-        raise SceneError(
-            f"{path}: negative values, NaN or infinity in {counted(bad, 'pixel')}; expected light, 0 and up: "
-            "repair the picture"
-        )
+    require_light(path, shown)
     if picture.alpha is None:
         return picture
     return replace(picture, numbers=np.where(picture.alpha[..., None] > 0, picture.numbers, np.float32(0)))
@@ -90,19 +85,16 @@ def _read_display(path: Path) -> Picture:
 
 def _read_exr(path: Path) -> Picture:
     from unmix_plugin.captures.readers.exr import channel_names
-    from unmix_plugin.captures.readers.opening import open_spectral_file
-    from unmix_plugin.captures.spectral_file import ReadOptions
 
-    channels = channel_names(path)  # refuses other files
-    opened = open_spectral_file(path)
-    numbers, nm, alpha = opened.read().astype(np.float32), opened.bands.wavelengths_nm, None
+    numbers, _, nm = read_exr(path)
     if numbers.shape[2] < 3:
         raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
-    if "A" in channels:
-        alpha = (
-            open_spectral_file(path, ReadOptions(dataset="A")).read()[..., 0].astype(np.float32).clip(0, 1)
-        )
-    return Picture(numbers, alpha, wavelengths_nm=None if nm is None else tuple(nm.tolist()))
+    alpha = None
+    if "A" in channel_names(path):
+        alpha = read_exr(path, "A")[0][..., 0].astype(np.float32).clip(0, 1)
+    return Picture(
+        numbers.astype(np.float32), alpha, wavelengths_nm=None if nm is None else tuple(nm.tolist())
+    )
 
 
 def _read_npy(path: Path, value_scale: float | None) -> Picture:
@@ -134,11 +126,7 @@ class _PictureFiles:
     """Stored number of a .npy array that stands for 1."""
 
     def read(self) -> Picture:
-        """The picture; colours of a cube whose alpha is apart are divided by it.
-
-        Raises:
-            SceneError: a file can't be read, or their sizes differ.
-        """
+        """The picture; colours of a cube whose alpha is apart are divided by it."""
         picture = read_picture(self.colours, self.value_scale)
         height, width = picture.numbers.shape[:2]
         if self.mask is not None:
@@ -178,11 +166,7 @@ class PosedPictures:
         return len(self.files)
 
     def read(self, index: int) -> Picture:
-        """One picture, checked.
-
-        Raises:
-            SceneError: it can't be read, or its size has changed.
-        """
+        """One picture, checked. Raises SceneError: it can't be read, or its size has changed."""
         picture, (width, height) = self.files[index].read(), self.cameras.size(index)
         if picture.numbers.shape[:2] != (height, width):
             raise SceneError(f"{self.files[index].colours} has changed since it was first read; start again")
@@ -205,7 +189,6 @@ def read_posed_pictures(
     """Find and check the pictures of a transforms.json.
 
     Args:
-        root: Its folder.
         entry: Its content, without faults.
         frame: From the space of its poses to model space.
         tone: What it says of the pictures; None for light in files that hold light, an unknown response in others.

@@ -66,8 +66,18 @@ def read_environment(
         raise SceneError(
             f"{path}: is not an environment map; convert it to one of {', '.join(ENVIRONMENT_SUFFIXES)}"
         )
-    image, is_spectral = _read_exr(path, bands) if suffix == ".exr" else (_read_hdr(path), False)
-    _check_environment(path, image)
+    image, is_spectral = _light_of_exr(path, bands) if suffix == ".exr" else (_read_hdr(path), False)
+    height, width = image.shape[:2]
+    if width != 2 * height:
+        raise SceneError(
+            f"{path}: is {width} x {height} pixels; a latitude-longitude map is twice as wide as high, so crop or "
+            "convert it"
+        )
+    require_light(path, image)
+    if not (image > 0).any():
+        raise SceneError(
+            f"{path}: is black everywhere, so nothing would be lit; choose another environment map"
+        )
     light = Environment(torch.from_numpy(np.ascontiguousarray(image)), rotation_deg, exposure_stops)
     if bands is None or is_spectral:
         return light
@@ -87,16 +97,23 @@ def of_lamp(environment: Environment, lamp: Float[Tensor, "B"]) -> Environment:
     return replace(environment, image=luminance[..., None] * lamp.to(luminance))
 
 
-def _read_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
-    """Colours, or where bands are wanted and there are channels of wavelengths, spectra at them; and whether they are
-    spectra."""
+def read_exr(path: Path, channel: str | None = None) -> tuple[np.ndarray, list[str], np.ndarray | None]:
+    """Numbers (H, W, C) of an OpenEXR picture, without alpha, or of one channel; names of the channels, and their
+    wavelengths in nm if they are such. Raises CaptureError: the file is damaged, or of another kind."""
     from unmix_plugin.captures.readers.exr import channel_names
     from unmix_plugin.captures.readers.opening import open_spectral_file
+    from unmix_plugin.captures.spectral_file import ReadOptions
 
+    channel_names(path)  # refuses other files
+    file = open_spectral_file(path, ReadOptions(dataset=channel))
+    return file.read(), list(file.bands.names or ()), file.bands.wavelengths_nm
+
+
+def _light_of_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
+    """Colours, or where bands are wanted and there are channels of wavelengths, spectra at them; and whether they are
+    spectra."""
     try:
-        channels = channel_names(path)  # refuses other files
-        file = open_spectral_file(path)
-        values, names, nm = file.read(), list(file.bands.names or ()), file.bands.wavelengths_nm
+        values, names, nm = read_exr(path)
     except CaptureError as error:
         raise SceneError(str(error)) from error
     if bands is not None and nm is not None:
@@ -110,61 +127,27 @@ def _read_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
         return spectra.astype(np.float32), True
     colours = next((colours for colours in ("RGB", "Y") if set(colours) <= set(names)), None)
     if colours is None:
-        raise SceneError(f"{path}: has channels {', '.join(channels)}; an environment map needs R, G and B")
+        raise SceneError(f"{path}: has channels {', '.join(names)}; an environment map needs R, G and B")
     planes = [values[..., names.index(colour)] for colour in colours]
     return np.stack(3 // len(planes) * planes, axis=-1).astype(np.float32), False
 
 
-def _check_environment(path: Path, image: np.ndarray) -> None:
-    height, width = image.shape[:2]
-    if width != 2 * height:
+def require_light(path: Path, numbers: Float32[np.ndarray, "*pixels C"]) -> None:
+    """Refuse what is no light."""
+    bad = ~(np.isfinite(numbers) & (numbers >= 0)).all(axis=-1)
+    if bad.any():
         raise SceneError(
-            f"{path}: is {width} x {height} pixels; a latitude-longitude map is twice as wide as high, so crop or "
-            "convert it"
-        )
-    for fault, where in {
-        "a value that is not finite": ~np.isfinite(image).all(axis=-1),
-        "a negative value": (image < 0).any(axis=-1),
-    }.items():
-        if where.any():
-            row, column = (int(index[0]) for index in np.nonzero(where))
-            values = image[row, column].tolist()
-            raise SceneError(
-                f"{path}: has {fault} in {counted(int(where.sum()), 'pixel')}, first in row {row}, column {column}: "
-                f"{values}; repair the picture"
-            )
-    if not (image > 0).any():
-        raise SceneError(
-            f"{path}: is black everywhere, so nothing would be lit; choose another environment map"
+            f"{path}: negative values, NaN or infinity in {counted(int(bad.sum()), 'pixel')}, such as "
+            f"{numbers[bad][0].tolist()}; expected light, 0 and up: repair the picture"
         )
 
 
 def _read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
-    """Linear radiance of a picture whose rows run from the top, each from the left.
-
-    Raises:
-        SceneError: the file is damaged, holds XYZ instead of RGB, or stores its pixels in another order.
-    """
+    """Linear radiance of a picture whose rows run from the top, each from the left."""
     try:
         data = read_bounded(path, MOST_TABLE_BYTES)
     except OSError as error:
         raise SceneError(f"{path}: can't be read ({error.strerror})") from error
-    height, width, start = _header(path, data)
-    allow_decoded(path, height * width * 4, SceneError)
-    rgbe = np.empty((height, width, 4), dtype=np.uint8)
-    row = 0
-    try:
-        for row in range(height):
-            start = _read_row(data, start, rgbe[row])
-    except (IndexError, ValueError) as error:
-        raise SceneError(f"{path}: ends or breaks in row {row} of {height}; copy the file again") from error
-    exponents = rgbe[..., 3:].astype(np.int32)
-    scale = np.where(exponents > 0, np.ldexp(np.float32(1.0), exponents - 136), np.float32(0.0))
-    return (rgbe[..., :3] * scale).astype(np.float32)
-
-
-def _header(path: Path, data: bytes) -> tuple[int, int, int]:
-    """Rows, columns and where the pixels start."""
     match = re.search(rb"\n\n(\S+) (\d+) (\S+) (\d+)\n", data[:65536])
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or match is None:
         raise SceneError(f"{path}: is no Radiance picture (its header is missing); convert it to .exr")
@@ -174,7 +157,20 @@ def _header(path: Path, data: bytes) -> tuple[int, int, int]:
         raise SceneError(
             f"{path}: has its rows in the order {match[0].strip()[:80]!r}, not -Y +X; convert it"
         )
-    return int(match[2]), int(match[4]), match.end()
+    height, width, start = int(match[2]), int(match[4]), match.end()
+    allow_decoded(path, height * width * 4, SceneError)
+    rgbe = np.empty((height, width, 4), dtype=np.uint8)
+    row = 0
+    try:
+        for row in range(height):
+            start = _read_row(data, start, rgbe[row])
+    except (IndexError, ValueError) as error:
+        raise SceneError(
+            f"{path}: ends or breaks in row {row} of {height} ({error}); copy the file again, or convert it to .exr"
+        ) from error
+    exponents = rgbe[..., 3:].astype(np.int32)
+    scale = np.where(exponents > 0, np.ldexp(np.float32(1.0), exponents - 136), np.float32(0.0))
+    return (rgbe[..., :3] * scale).astype(np.float32)
 
 
 def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
@@ -182,7 +178,10 @@ def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
     width = len(row)
     coded = _NEW_RUNS[0] <= width <= _NEW_RUNS[1] and data[start : start + 2] == b"\x02\x02"
     if not coded:
-        return _read_old_row(data, start, row)
+        row[:] = np.frombuffer(data, np.uint8, 4 * width, start).reshape(width, 4)
+        if (row[:, :3] == 1).all(axis=1).any():  # no brightness is written so
+            raise ValueError("runs as they were written before 1991")
+        return start + 4 * width
     if data[start + 2] << 8 | data[start + 3] != width:
         raise ValueError("length of the row")
     start += 4
@@ -199,24 +198,6 @@ def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
                 raise ValueError("run")
             row[column : column + count, channel] = values
             column, start = column + count, start + used
-    return start
-
-
-def _read_old_row(data: bytes, start: int, row: np.ndarray) -> int:
-    """A row of plain pixels, in which (1, 1, 1, n) repeats the pixel before it."""
-    column, shift = 0, 0
-    while column < len(row):
-        pixel = np.frombuffer(data, np.uint8, 4, start)
-        start += 4
-        if tuple(pixel[:3]) == (1, 1, 1):
-            count = int(pixel[3]) << shift
-            if column == 0 or column + count > len(row):
-                raise ValueError("run")
-            row[column : column + count] = row[column - 1]
-            column, shift = column + count, shift + 8
-        else:
-            row[column] = pixel
-            column, shift = column + 1, 0
     return start
 
 
