@@ -86,21 +86,6 @@ def test_samples_are_drawn_from_the_density(family: MaterialFamily):
 
 
 @each_family
-def test_sampling_estimates_the_same_reflected_light_as_a_uniform_sphere(family: MaterialFamily):
-    parameters = 0.3 + 0.7 * wide_parameters(4, family.num_parameters)
-    grid, solid_angles = spherical_grid(400)
-    for row, wo in zip(parameters, eye_directions(4), strict=True):
-        light = 1.0 + grid[:, :1] + grid[:, 2:]
-        values = family.evaluate(row.expand(len(grid), -1), grid, wo.expand_as(grid)) * light
-        expected = (values * (grid[:, 2].clamp_min(0) * solid_angles)[:, None]).sum(0)
-        rows, eyes = row.expand(60_000, -1), wo.expand(60_000, 3)
-        wi = family.sample(rows, eyes, numbers(60_000, 3))
-        values = family.evaluate(rows, wi, eyes) * (1.0 + wi[:, :1] + wi[:, 2:])
-        found = values * (wi[:, 2].clamp_min(0) / family.density(rows, wi, eyes))[:, None]
-        assert_close(found.mean(0), expected, rtol=0.015, atol=1e-3)
-
-
-@each_family
 def test_importance_sampling_keeps_weights_small(family: MaterialFamily):
     parameters = wide_parameters(100_000, family.num_parameters)
     wo = eye_directions(100_000, lowest=0.01)
@@ -148,8 +133,8 @@ def test_the_base_colour_of_a_neural_metal_is_what_it_reflects():
     parameters = family.from_layered(layered)
     parameters[0, :3] = 0.2
     assert_close(family.base_colour(parameters), layered[:, :3], atol=0.06, rtol=0)
-    decoded = family.decoded_family.base_colour(family.decoded(parameters))
-    assert_close(decoded, family.base_colour(parameters))
+    decoded_family, decoded = family.decoded(parameters)
+    assert_close(decoded_family.base_colour(decoded), family.base_colour(parameters))
 
 
 FAMILY = LayeredFamily()
@@ -190,17 +175,14 @@ def test_a_white_dielectric_gives_back_all_light(roughness: float):
         assert albedo(white, wo).tolist() == pytest.approx([1.0] * 3, abs=0.01)
 
 
-def test_without_layers_or_gloss_only_the_base_is_left():
-    parameters = material(specular_level=0.0, roughness=1.0)[None]
-    wi = wo = torch.tensor([[0.0, 0.0, 1.0]])
-    assert FAMILY.evaluate(parameters, wi, wo)[0].tolist() == pytest.approx([0.5 / math.pi] * 3, rel=0.03)
+UP = torch.tensor([[0.0, 0.0, 1.0]])
 
 
-def test_metal_reflects_in_its_colour_and_passes_nothing():
-    parameters = material(metallicity=1.0)
-    parameters[:3] = torch.tensor([0.9, 0.6, 0.2])
-    wo = torch.tensor([[0.0, 0.0, 1.0]])
-    passed, specular = FAMILY.stack(parameters[None]).reflectance(wo.T, wo.T)
+def test_without_gloss_only_the_base_is_left_and_metal_passes_nothing_and_reflects_in_its_colour():
+    matt, metal = material(specular_level=0.0, roughness=1.0)[None], material(metallicity=1.0)
+    assert FAMILY.evaluate(matt, UP, UP)[0].tolist() == pytest.approx([0.5 / math.pi] * 3, rel=0.03)
+    metal[:3] = torch.tensor([0.9, 0.6, 0.2])
+    passed, specular = FAMILY.stack(metal[None]).reflectance(UP.T, UP.T)
     assert float(passed) == 0.0
     assert (specular[:, 0] / specular[0, 0]).tolist() == pytest.approx([1.0, 2 / 3, 2 / 9], rel=1e-4)
 
@@ -214,11 +196,11 @@ def test_a_layer_dims_the_base_below_it(layer: str):
 
 
 def test_haze_moves_light_from_the_highlight_to_its_surroundings():
-    wo = torch.tensor([[0.0, 0.0, 1.0]])
     aside = torch.tensor([[math.sin(0.3), 0.0, math.cos(0.3)]])
-    sharp, hazy = (material(roughness=0.2, haze_weight=weight)[None] for weight in (0.0, 1.0))
-    assert FAMILY.evaluate(hazy, wo, wo)[0, 0] < 0.5 * FAMILY.evaluate(sharp, wo, wo)[0, 0]
-    assert FAMILY.evaluate(hazy, aside, wo)[0, 0] > FAMILY.evaluate(sharp, aside, wo)[0, 0]
+    materials = (material(roughness=0.2, haze_weight=weight)[None] for weight in (0.0, 1.0))
+    sharp, hazy = ([FAMILY.evaluate(one, wi, UP)[0, 0] for wi in (UP, aside)] for one in materials)
+    assert hazy[0] < 0.5 * sharp[0]
+    assert hazy[1] > sharp[1]
 
 
 def test_albedo_of_the_tables_is_that_of_the_lobes():
@@ -239,35 +221,16 @@ LIGHT = torch.tensor([0.2, 1.0, 0.6, 0.9, 0.4])
 ENDMEMBERS = torch.tensor([[0.9, 0.5, 0.1, 0.3, 0.0], [0.0, 0.2, 1.0, 0.6, 0.1], [0.3, 0.3, 0.3, 0.3, 0.3]])
 
 
-def _ball_in_even_light(family, values, samples=256):
-    """Radiance (N B) of a ball of one material, and cosines to the eye."""
-    rays, origins = RayMesh(ball(4)), torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
-    _, points = rays.seen(origins, unit(numbers(100, 3) - 0.5 - origins))
-    light = Environment(LIGHT.expand(8, 16, 5).contiguous())
-    radiance = TracedObject(rays, light, Uniform(family, values)).light(
-        points, samples, generator=generator(1)
-    )
-    return radiance, (points.to_eye * points.normals).sum(dim=-1)
-
-
 @pytest.mark.parametrize(("roughness", "level"), [(0.3, 0.2), (0.6, 0.7), (1.0, 0.0)])
 def test_a_constant_mixture_in_even_light_is_its_closed_form_in_every_band(roughness, level):
-    shares = torch.tensor([0.5, 0.2, 0.3])
-    values = [*shares.tolist(), roughness, level]
-    radiance, cosine = _ball_in_even_light(SpectralFamily(ENDMEMBERS), values)
+    rays, origins = RayMesh(ball(4)), torch.tensor((0.0, -4.0, 0.0)).expand(100, 3)
+    _, points = rays.seen(origins, unit(numbers(100, 3) - 0.5 - origins))
+    shares, light = torch.tensor([0.5, 0.2, 0.3]), Environment(LIGHT.expand(8, 16, 5).contiguous())
+    surface = Uniform(SpectralFamily(ENDMEMBERS), [*shares.tolist(), roughness, level])
+    radiance = TracedObject(rays, light, surface).light(points, 256, generator=generator(1))
+    cosine = (points.to_eye * points.normals).sum(dim=-1)
     a, b = ggx_albedo(torch.full((1, len(cosine)), roughness), cosine)
     gloss = (level**2 * a + b)[0, :, None]
     expected = LIGHT * (gloss + (1 - gloss) * (shares @ ENDMEMBERS))
     assert_close(radiance, expected, rtol=0.02, atol=0.004)
     assert_close(radiance.mean(dim=0), expected.mean(dim=0), rtol=0.003, atol=0)
-
-
-def test_light_tells_endmembers_by_their_share():
-    endmembers = ENDMEMBERS.clone().requires_grad_()
-    radiance, cosine = _ball_in_even_light(SpectralFamily(endmembers), [0.5, 0.0, 0.5, 0.5, 0.2], samples=64)
-    (gradient,) = torch.autograd.grad(radiance.mean(dim=0).sum(), endmembers)
-    a, b = ggx_albedo(torch.full((1, len(cosine)), 0.5), cosine)
-    passed = float((1 - (0.04 * a + b)).mean())
-    assert_close(gradient[0], 0.5 * passed * LIGHT, rtol=0.01, atol=0)
-    assert_close(gradient[0], gradient[2])
-    assert gradient[1].abs().max() == 0

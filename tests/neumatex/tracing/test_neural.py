@@ -35,26 +35,11 @@ def test_encoded_materials_look_like_the_layered_ones():
 def test_decoded_parameters_reflect_and_are_drawn_alike():
     rows, wi, wo = numbers(200, 9), eye_directions(200, seed=5), eye_directions(200, seed=6)
     uniforms = torch.rand(200, 3, generator=torch.Generator().manual_seed(7))
-    decoded, family = FAMILY.decoded(rows), FAMILY.decoded_family
+    family, decoded = FAMILY.decoded(rows)
     assert_close(family.evaluate(decoded, wi, wo), FAMILY.evaluate(rows, wi, wo))
     assert_close(family.density(decoded, wi, wo), FAMILY.density(rows, wi, wo))
     assert_close(family.sample(decoded, wo, uniforms), FAMILY.sample(rows, wo, uniforms))
     assert torch.equal(family.base_colour(decoded), FAMILY.base_colour(rows))
-
-
-def test_the_specular_part_does_not_know_the_base_colour():
-    rows = numbers(100, 9)
-    black, white = rows.clone(), rows.clone()
-    black[:, :3], white[:, :3] = 0.0, 1.0
-    wi, wo = eye_directions(100, seed=3), eye_directions(100, seed=4)
-    passed, specular = FAMILY.stack(rows).reflectance(wi.T, wo.T)
-    assert_close(FAMILY.evaluate(black, wi, wo), specular.T)
-    assert_close(
-        FAMILY.evaluate(white, wi, wo) - specular.T,
-        (passed / math.pi)[:, None].expand(-1, 3),
-        rtol=1e-3,
-        atol=1e-4,
-    )
 
 
 def test_training_is_the_same_twice():
@@ -65,13 +50,6 @@ def test_training_is_the_same_twice():
         decoder, _ = train(settings, lambda _, psnr, figures=figures: figures.append(psnr))
         runs.append((figures, decoder.last.weight.tolist()))
     assert runs[0] == runs[1]
-
-
-@pytest.mark.slow
-def test_training_gets_better():
-    figures: list[float] = []
-    train(DecoderTraining(steps=300, materials=32, lights=2), lambda _, psnr: figures.append(psnr))
-    assert figures[1] > figures[0] + 0.4
 
 
 def test_the_record_belongs_to_the_shipped_file():

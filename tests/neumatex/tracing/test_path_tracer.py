@@ -246,14 +246,6 @@ def test_left_and_up_are_where_they_belong():
     assert picture[:, half:, 1].mean() > 2 * picture[:, :half, 1].mean()
 
 
-def test_a_white_sphere_in_a_white_world_is_its_alpha():
-    traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
-    picture, alpha = traced.picture(_camera(), 0, 256)
-    expected = alpha[..., None].expand_as(picture)
-    assert_close(picture.mean(), expected.mean(), atol=0.004, rtol=0)
-    assert_close(picture, expected, atol=0.06, rtol=0)
-
-
 def test_a_camera_that_sees_nothing_gives_black_and_alpha_zero():
     traced = TracedObject(_sphere(4), _white(), Uniform(Lambert(), [1.0] * 3))
     picture, alpha = traced.picture(_camera(8, (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)), 0, 64)

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE, PLANE_AXES, Triplane, encode, look_up
+from unmix_plugin.neumatex.tracing.surface import LOG_VARIANCE_RANGE, PLANE_AXES, Triplane, look_up
 
 
 def look_up_twin(planes: torch.Tensor, positions: torch.Tensor) -> torch.Tensor:
@@ -69,12 +69,3 @@ def test_parameters_are_in_the_unit_interval_and_log_variances_in_theirs():
     assert 0.9 < parameters.max() <= 1
     assert LOG_VARIANCE_RANGE[0] <= log_variance.min()
     assert log_variance.max() <= LOG_VARIANCE_RANGE[1]
-
-
-def test_the_encoding_has_its_three_periods():
-    position = torch.tensor([[0.25, 0.0, -0.5]], dtype=torch.float64)
-    half_turn = torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
-    here, there = encode(position).reshape(6, 3), encode(position + half_turn).reshape(6, 3)
-    assert_close(there[0, 0], -here[0, 0])  # sin of pi x
-    assert_close(there[1:3], here[1:3])  # 2 pi x and 4 pi x have come round
-    assert encode(position).shape == (1, 18)

@@ -54,13 +54,10 @@ class Environment:
 
         A pixel is drawn by its mean radiance and solid angle; within it, directions are uniform in solid angle. An
         alias table would be as fast, but scatter numbers that are evenly spread: with 160 samples a point the noise of
-        pictures would be twice as large.
-
-        Args:
-            uniforms: In [0, 1); float64 ones place directions more finely within a pixel.
+        pictures would be twice as large. Uniforms are in [0, 1); float64 ones place directions more finely in a pixel.
         """
         height, width = self.image.shape[:2]
-        rows, columns, down, across = self._inversion.draw(uniforms)
+        rows, columns, down, across = self._pixels.draw(uniforms)
         azimuth = 2 * math.pi * (0.5 - (columns + across) / width) + math.radians(self.rotation_deg)
         top, bottom = torch.cos(math.pi * rows / height), torch.cos(math.pi * (rows + 1) / height)
         z = top + (bottom - top) * down
@@ -108,12 +105,12 @@ class Environment:
         return weights if bool(weights.sum() > 0) else self._solid_angles[:, None].expand_as(grey)
 
     @cached_property
-    def _densities(self) -> Float64[Tensor, "H W"]:
-        return self._weights / self._weights.sum() / self._solid_angles[:, None]
+    def _pixels(self) -> _PictureInversion:
+        return _PictureInversion(self._weights)
 
     @cached_property
-    def _inversion(self) -> _PictureInversion:
-        return _PictureInversion(self._weights)
+    def _densities(self) -> Float64[Tensor, "H W"]:
+        return self._weights / self._weights.sum() / self._solid_angles[:, None]
 
 
 def solid_angles(height: int, width: int) -> Float64[Tensor, " H"]:

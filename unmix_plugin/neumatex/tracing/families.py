@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Bool, Float
@@ -25,13 +26,13 @@ from unmix_plugin.neumatex.tracing.microfacet import (
 )
 
 _DIELECTRIC_F0 = 0.04
+Parameters: TypeAlias = Float[Tensor, "N P"]
+Directions: TypeAlias = Float[Tensor, "N 3"]
+Colours: TypeAlias = Float[Tensor, "N C"]
 
 
 class MaterialFamily(ABC):
-    """Reflectances with a common set of parameters, each in [0, 1]; differentiable by the parameters.
-
-    Directions are drawn from a cosine lobe and visible GGX normals.
-    """
+    """Reflectances with a common set of parameters, each in [0, 1]; differentiable by them."""
 
     PARAMETERS: tuple[str, ...]
     """Their names."""
@@ -41,74 +42,55 @@ class MaterialFamily(ABC):
     """C."""
 
     @abstractmethod
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
+    def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         """Reflectance, 1/sr, without the cosine; 0 where a direction is below the surface."""
 
     @abstractmethod
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+    def base_colour(self, parameters: Parameters) -> Colours:
         """Base colour, linear, [0, 1]: what a metal reflects, and the diffuse albedo of everything else."""
 
-    def _mixture(self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "3 N"]) -> LobeMixture:
+    def _mixture(self, parameters: Parameters, wo: Float[Tensor, "3 N"]) -> LobeMixture:
         """The lobes of each point, seen along a direction; a family that draws in a way of its own has none."""
         raise NotImplementedError
 
     @torch.no_grad()
-    def sample(
-        self, parameters: Float[Tensor, "N P"], wo: Float[Tensor, "N 3"], uniforms: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Directions to the light, drawn about as the reflectance times the cosine is distributed; no gradient.
-
-        Args:
-            uniforms: Independent numbers in [0, 1).
-        """
+    def sample(self, parameters: Parameters, wo: Directions, uniforms: Directions) -> Directions:
+        """Directions to the light, drawn about as the reflectance times the cosine is distributed, by independent
+        numbers in [0, 1); no gradient."""
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).sample(wo, uniforms.T.contiguous()).T.contiguous()
 
     @torch.no_grad()
-    def density(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, " N"]:
+    def density(self, parameters: Parameters, wi: Directions, wo: Directions) -> Float[Tensor, " N"]:
         """Probability density of `sample`, 1/sr; no gradient."""
         wo = wo.T.contiguous()
         return self._mixture(parameters, wo).density(wi.T.contiguous(), wo)
 
-    @property
-    def decoded_family(self) -> MaterialFamily:
-        """The same reflectances by the parameters that `decoded` gives, without a network for each direction."""
-        return self
-
-    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
-        """Parameters of `decoded_family`, once for all directions at a point; differentiable."""
-        return parameters
+    def decoded(self, parameters: Parameters) -> tuple[MaterialFamily, Float[Tensor, "N D"]]:
+        """The same reflectances by parameters of another family, if need be, without a network for each direction."""
+        return self, parameters
 
 
 class StackFamily(MaterialFamily):
-    """Layers over a diffuse base: the first three parameters are its linear colour, and all of them give the layers."""
+    """Layers over a diffuse base: the first three parameters are its linear colour, which says nothing of a metal, and
+    all of them give the layers."""
 
     num_colours = 3
 
     @abstractmethod
-    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+    def stack(self, parameters: Parameters) -> LayerStack:
         """The layers that the parameters stand for."""
 
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
+    def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         passed, specular = self.stack(parameters).reflectance(wi.T.contiguous(), wo.T.contiguous())
-        return ((passed / math.pi) * self.diffuse_colour(parameters).T + specular).T
+        return ((passed / math.pi) * parameters[:, :3].T + specular).T
 
-    def diffuse_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
-        """Linear albedo of what is below the layers; a metal has nothing there, and the colour says nothing."""
-        return parameters[:, :3]
-
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+    def base_colour(self, parameters: Parameters) -> Colours:
         layers = self.stack(parameters)
-        return torch.lerp(self.diffuse_colour(parameters), layers.metal_colour.T, layers.metallicity[:, None])
+        return torch.lerp(parameters[:, :3], layers.metal_colour.T, layers.metallicity[:, None])
 
     def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
-        return self.stack(parameters).mixture(wo, self.diffuse_colour(parameters).T)
+        return self.stack(parameters).mixture(wo, parameters[:, :3].T)
 
 
 class LayeredFamily(StackFamily):
@@ -138,7 +120,7 @@ class LayeredFamily(StackFamily):
     )  # fmt: skip
     num_parameters = len(PARAMETERS)
 
-    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+    def stack(self, parameters: Parameters) -> LayerStack:
         base, *scalars = parameters.T.contiguous().split([3, *[1] * (parameters.shape[1] - 3)])
         metallicity, roughness, level, coat, coat_roughness, *others = scalars
         sheen, sheen_roughness, tint, haze, spread, dust = others
@@ -164,16 +146,14 @@ class PbrFamily(MaterialFamily):
     num_parameters = len(PARAMETERS)
     num_colours = 3
 
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
+    def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         base, roughness, metallicity = parameters.T.contiguous().split([3, 1, 1])
         f0 = _DIELECTRIC_F0 + metallicity * (base - _DIELECTRIC_F0)
         fresnel, facets, masking, above = _gloss(roughness, f0, wi.T.contiguous(), wo.T.contiguous())
         diffuse = (1.0 - fresnel) * ((1.0 - metallicity) / math.pi) * base
         return ((diffuse + fresnel * (facets * masking)) * above).T
 
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+    def base_colour(self, parameters: Parameters) -> Colours:
         return parameters[:, :3]
 
     def _mixture(self, parameters: Tensor, wo: Tensor) -> LobeMixture:
@@ -198,11 +178,11 @@ class SpectralFamily(MaterialFamily):
     """
 
     def __init__(self, endmembers: Float[Tensor, "K B"], gains: Float[Tensor, " K"] | None = None) -> None:
-        """
+        """Keep tensors as they are given, so that their gradients arrive there.
+
         Args:
-            endmembers: Reflectances, [0, 1]; kept as they are given, so that their gradients arrive there.
-            gains: Factors of the endmembers, whose gradients tell how bright these should be. They are 1 except within
-                a step of training, so that `endmembers` are the whole reflectances.
+            endmembers: Reflectances, [0, 1].
+            gains: Factors of the endmembers, 1 except within a step of training.
         """
         self.endmembers = endmembers
         self.gains = endmembers.new_ones(len(endmembers)) if gains is None else gains
@@ -211,13 +191,11 @@ class SpectralFamily(MaterialFamily):
         self.PARAMETERS = (*shares, "roughness", "specular level")
         self.num_parameters = len(self.PARAMETERS)
 
-    def abundances(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N K"]:
+    def abundances(self, parameters: Parameters) -> Float[Tensor, "N K"]:
         """Share of each endmember."""
         return parameters[:, : self.num_endmembers]
 
-    def evaluate(
-        self, parameters: Float[Tensor, "N P"], wi: Float[Tensor, "N 3"], wo: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N C"]:
+    def evaluate(self, parameters: Parameters, wi: Directions, wo: Directions) -> Colours:
         roughness, f0 = self._roughness_and_f0(parameters)
         wi, wo = wi.T.contiguous(), wo.T.contiguous()
         fresnel, facets, masking, above = _gloss(roughness, f0, wi, wo)
@@ -227,7 +205,7 @@ class SpectralFamily(MaterialFamily):
             fresnel * facets * masking * above
         ).T
 
-    def base_colour(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N C"]:
+    def base_colour(self, parameters: Parameters) -> Colours:
         """Diffuse reflectance of each band, [0, 1]."""
         return self.abundances(parameters) @ (self.gains[:, None] * self.endmembers)
 

@@ -22,6 +22,9 @@ from torch import Tensor
 from unmix_plugin.neumatex.tracing.microfacet import (
     SMALLEST_COSINE,
     LobeMixture,
+    Lobes,
+    Numbers,
+    Vectors,
     alpha_of,
     distribution,
     dot,
@@ -49,23 +52,16 @@ _COAT_F0 = 0.04
 _ROWS, _COLUMNS, _STRATA = 32, 48, 32
 
 
-def _mean_held(cover: Float[Tensor, " N"]) -> Float[Tensor, " N"]:
-    """Share of cosine-weighted light of the whole hemisphere that the dust holds back.
-
-    With tau = -log(1 - cover) it is 1 - 2 E3(tau); the exponential integral is summed at Gauss-Legendre nodes.
-    """
+def _mean_held(cover: Numbers) -> Numbers:
+    """Share of cosine-weighted light of the whole hemisphere that the dust holds back: with tau = -log(1 - cover) it is
+    1 - 2 E3(tau), an exponential integral, summed at Gauss-Legendre nodes."""
     log_passed = torch.log1p(-cover)
     nodes = zip(DUST_NODES, DUST_WEIGHTS, strict=True)
     passed = [2.0 * weight * mu * torch.exp(log_passed * (1.0 / mu)) for mu, weight in nodes]
     return 1.0 - torch.stack(passed).sum(0)
 
 
-def _sheen_reflection(
-    roughness: Float[Tensor, " N"],
-    half: Float[Tensor, "3 N"],
-    n_i: Float[Tensor, " N"],
-    n_o: Float[Tensor, " N"],
-) -> Float[Tensor, " N"]:
+def _sheen_reflection(roughness: Numbers, half: Vectors, n_i: Numbers, n_o: Numbers) -> Numbers:
     """White sheen, 1/sr, at a half vector; both directions above the surface.
 
     Source:
@@ -78,69 +74,62 @@ def _sheen_reflection(
     return density / (4.0 * (n_i + n_o - n_i * n_o))
 
 
-def ggx_albedo(
-    roughness: Float[Tensor, "K N"], cosine: Float[Tensor, " N"]
-) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
+def ggx_albedo(roughness: Lobes, cosine: Numbers) -> Float[Tensor, "2 K N"]:
     """`(a, b)`: a GGX lobe of Schlick's Fresnel term reflects `f0 a + b` of what comes from this cosine."""
-    a, b = _look_up(_cells(ggx_table, roughness.device), roughness, cosine).unbind(0)
-    return a, b
+    return _look_up(_cells(ggx_table, roughness.device), roughness, cosine)
 
 
-def mean_ggx_albedo(roughness: Float[Tensor, "K N"]) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
+def mean_ggx_albedo(roughness: Lobes) -> Float[Tensor, "2 K N"]:
     """`(a, b)` of `ggx_albedo`, averaged over the hemisphere with the cosine as weight."""
     means = _ggx_means(roughness.device)
     row = (roughness.detach() * (_ROWS - 1)).floor().clamp(0, _ROWS - 2)
     index = row.long().reshape(-1)
     low, rise = (each.index_select(1, index).reshape(2, *roughness.shape) for each in means)
-    a, b = (low + (roughness * (_ROWS - 1) - row) * rise).unbind(0)
-    return a, b
+    return low + (roughness * (_ROWS - 1) - row) * rise
 
 
 @lru_cache(maxsize=1)
 def ggx_table() -> Float[Tensor, "R M 2"]:
     """Quasi Monte Carlo over visible normals, on a grid of strata."""
-    roughness, cosine = _nodes(alpha_of(torch.linspace(0.0, 1.0, _ROWS)))
-    table = torch.empty(_ROWS * _COLUMNS, 2)
     steps = (torch.arange(_STRATA) + 0.5) / _STRATA
     uniforms = torch.cartesian_prod(steps, steps).T
-    for node in range(_ROWS * _COLUMNS):
-        wo = _direction(cosine[node])[:, None].expand(3, uniforms.shape[1])
-        alpha = roughness[node].expand(uniforms.shape[1])
+
+    def reflected(width: Tensor, eye: Tensor) -> Tensor:
+        wo, alpha = eye[:, None].expand(3, uniforms.shape[1]), width.expand(uniforms.shape[1])
         wi = sample_reflections(alpha, wo, uniforms)
         a2, n_i, n_o = alpha[0] ** 2, wi[2].clamp_min(0.0), wo[2]
         root_i, root_o = (torch.sqrt(a2 + (1.0 - a2) * n * n) for n in (n_i, n_o))
         # Reflectance times cosine over density: masking of both directions over masking of the eye's alone.
         passed = n_i * (n_o + root_o) / (n_o * root_i + n_i * root_o).clamp_min(1e-9)
         edge = schlick(dot(half_vectors(wi, wo), wo))
-        table[node] = torch.stack([((1.0 - edge) * passed).mean(), (edge * passed).mean()])
-    return table.reshape(_ROWS, _COLUMNS, 2)
+        return torch.stack([((1.0 - edge) * passed).mean(), (edge * passed).mean()])
+
+    return _tabulated(alpha_of(torch.linspace(0.0, 1.0, _ROWS)), reflected)
 
 
 @lru_cache(maxsize=1)
 def sheen_table() -> Float[Tensor, "R M 1"]:
     """A product rule over the hemisphere."""
-    roughness, cosine = _nodes(torch.linspace(0.0, 1.0, _ROWS))
     steps = (torch.arange(2 * _STRATA) + 0.5) / (2 * _STRATA)
     u, v = torch.cartesian_prod(steps, steps).unbind(-1)
     # Squared steps crowd at the horizon; du of the cosine is 2 u.
     wi_z, weight = u * u, 2.0 * u
     sine = torch.sqrt(1.0 - wi_z * wi_z)
     wi = torch.stack([sine * torch.cos(math.pi * v), sine * torch.sin(math.pi * v), wi_z])
-    table = torch.empty(_ROWS * _COLUMNS, 1)
-    for node in range(_ROWS * _COLUMNS):
-        wo = _direction(cosine[node])[:, None].expand_as(wi)
-        value = _sheen_reflection(roughness[node].expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
-        table[node] = (value * wi_z * weight).mean() * 2.0 * math.pi
-    return table.reshape(_ROWS, _COLUMNS, 1)
+
+    def reflected(roughness: Tensor, eye: Tensor) -> Tensor:
+        wo = eye[:, None].expand_as(wi)
+        value = _sheen_reflection(roughness.expand_as(wi_z), half_vectors(wi, wo), wi_z, wo[2])
+        return (value * wi_z * weight).mean()[None] * 2.0 * math.pi
+
+    return _tabulated(torch.linspace(0.0, 1.0, _ROWS), reflected)
 
 
-def _nodes(rows: Tensor) -> tuple[Tensor, Tensor]:
+def _tabulated(rows: Tensor, reflected: Callable[[Tensor, Tensor], Tensor]) -> Float[Tensor, "R M channels"]:
+    """What comes back to eyes at each column's cosine, by each row's number."""
     cosine = torch.linspace(0.0, 1.0, _COLUMNS).square().clamp_min(SMALLEST_COSINE)
-    return rows.repeat_interleave(_COLUMNS), cosine.repeat(len(rows))
-
-
-def _direction(cosine: Tensor) -> Tensor:
-    return torch.stack([torch.sqrt(1.0 - cosine * cosine), torch.zeros_like(cosine), cosine])
+    eyes = torch.stack([torch.sqrt(1.0 - cosine * cosine), torch.zeros_like(cosine), cosine], dim=1)
+    return torch.stack([torch.stack([reflected(row, eye) for eye in eyes]) for row in rows])
 
 
 @lru_cache(maxsize=4)
@@ -179,18 +168,18 @@ def _look_up(cells: Tensor, roughness: Tensor, cosine: Tensor) -> Tensor:
 class LayerStack:
     """Materials at N points; every number in [0, 1]."""
 
-    dust_cover: Float[Tensor, " N"]
+    dust_cover: Numbers
     """How much of light at normal incidence meets dust."""
-    sheen_colour: Float[Tensor, "3 N"]
-    sheen_roughness: Float[Tensor, " N"]
-    coat_weight: Float[Tensor, " N"]
-    roughness: Float[Tensor, "3 N"]
+    sheen_colour: Vectors
+    sheen_roughness: Numbers
+    coat_weight: Numbers
+    roughness: Vectors
     """Perceptual: of the coat, of the surface, of its haze."""
-    haze_weight: Float[Tensor, " N"]
+    haze_weight: Numbers
     """How much of the surface's reflection is spread into the haze."""
-    metallicity: Float[Tensor, " N"]
-    metal_colour: Float[Tensor, "3 N"]
-    dielectric_f0: Float[Tensor, " N"]
+    metallicity: Numbers
+    metal_colour: Vectors
+    dielectric_f0: Numbers
 
     @staticmethod
     def of_numbers(numbers: Float[Tensor, "15 N"]) -> "LayerStack":
@@ -215,13 +204,9 @@ class LayerStack:
             dielectric_f0=LARGEST_DIELECTRIC_F0 * level[0],
         )
 
-    def reflectance(
-        self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
-    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"]]:
-        """`(passed, specular)`: what passes down to the base and up again, and what the layers reflect, 1/sr.
-
-        Both are 0 where a direction is below the surface.
-        """
+    def reflectance(self, wi: Vectors, wo: Vectors) -> tuple[Numbers, Vectors]:
+        """`(passed, specular)`: what passes down to the base and up again, and what the layers reflect, 1/sr; 0 where a
+        direction is below the surface."""
         light, eye = self._passing(wi[2]), self._passing(wo[2])
         dust = light.dust * eye.dust
         sheen = dust * light.sheen * eye.sheen
@@ -241,7 +226,7 @@ class LayerStack:
         passed = coat * (1.0 - self.metallicity) * light.surface * eye.surface / self._surface_mean()
         return passed * above, specular * above
 
-    def mixture(self, wo: Float[Tensor, "3 N"], base: Float[Tensor, "C N"]) -> LobeMixture:
+    def mixture(self, wo: Vectors, base: Float[Tensor, "C N"]) -> LobeMixture:
         """A density about like the reflectance times the cosine; without gradient."""
         with torch.no_grad():
             eye = self._passing(wo[2])
@@ -255,7 +240,7 @@ class LayerStack:
             return LobeMixture.of_albedos(alpha_of(self.roughness), diffuse, specular)
 
     @property
-    def _f0(self) -> Float[Tensor, "3 N"]:
+    def _f0(self) -> Vectors:
         """What the surface reflects at normal incidence."""
         return self.dielectric_f0 + self.metallicity * (self.metal_colour - self.dielectric_f0)
 
@@ -263,7 +248,7 @@ class LayerStack:
         held = (1.0 - passed_light) * (1.0 - passed_eye) / _mean_held(self.dust_cover).clamp_min(1e-6)
         return held * (torch.tensor(DUST_COLOUR, device=held.device)[:, None] / math.pi)
 
-    def _passing(self, cosine: Float[Tensor, " N"]) -> "_Passing":
+    def _passing(self, cosine: Numbers) -> "_Passing":
         """What each layer lets through from one direction to what is below."""
         cosine = cosine.clamp_min(0.0)
         (coat_a, *surface_a), (coat_b, *surface_b) = (x.unbind(0) for x in ggx_albedo(self.roughness, cosine))

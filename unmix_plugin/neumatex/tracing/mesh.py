@@ -115,18 +115,16 @@ def turned_to_viewers(mesh: Mesh, seen: Float[Tensor, " F"]) -> tuple[Mesh, int]
     Returns:
         The mesh, with normals on the front, and how many triangles were turned.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from trimesh.graph import connected_component_labels
 
     corners = _places(mesh.vertices.numpy())[mesh.faces.numpy()]
-    starts, ends = corners[:, [0, 1]].reshape(-1), corners[:, [1, 2]].reshape(-1)
-    size = int(corners.max()) + 1
-    links = coo_matrix((np.ones(len(starts)), (starts, ends)), shape=(size, size))
-    count, of_places = connected_components(links, directed=False)
+    edges = np.concatenate([corners[:, :2], corners[:, 1:]])
+    of_places = connected_component_labels(edges, node_count=int(corners.max()) + 1)
     pieces = torch.from_numpy(of_places[corners[:, 0]]).long()
 
     def is_negative(values: Float[Tensor, " F"]) -> Bool[Tensor, " F"]:
-        return (torch.zeros(count, dtype=torch.float64).index_add(0, pieces, values.double()) < 0)[pieces]
+        sums = torch.zeros(len(pieces), dtype=torch.float64).index_add(0, pieces, values.double())
+        return (sums < 0)[pieces]
 
     is_turned = is_negative(seen)
     faces = torch.where(is_turned[:, None], mesh.faces.flip(1), mesh.faces)
@@ -142,7 +140,6 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     """The triangles of a file in units of the world, all objects of its scene graph in one mesh.
 
     Args:
-        path: A .glb, .gltf, .obj or .ply file.
         notes: Gets a sentence if the mesh is open, which is unusual but usable.
     Raises:
         SceneError: the file is missing, damaged or of another kind, or has no triangle with an area, positions that
@@ -221,17 +218,12 @@ def _allow_numbers(path: Path) -> None:
     """Ask glTF before it is decoded how many numbers it has without any bytes in the file: they would be zeros."""
     try:
         with open_regular(path) as file:
-            head = file.read(20)
-            is_binary = head.startswith(b"glTF")
-            text = (
-                file.read(int.from_bytes(head[12:16], "little"))
-                if is_binary
-                else head + file.read(MOST_TEXT_BYTES)
-            )
-        content = parse_json(text.decode("utf-8-sig"))
-        zeros = sum(
-            int(one.get("count", 0)) for one in content.get("accessors", ()) if "bufferView" not in one
-        )
+            head, size = file.read(20), MOST_TEXT_BYTES
+            if head.startswith(b"glTF"):
+                head, size = b"", int.from_bytes(head[12:16], "little")
+            content = parse_json((head + file.read(size)).decode("utf-8-sig"))
+        unfilled = [one for one in content.get("accessors", ()) if "bufferView" not in one]
+        zeros = sum(int(one.get("count", 0)) for one in unfilled)
     except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
         raise SceneError(
             f"{path}: can't be read as a mesh ({type(error).__name__}); export it again"

@@ -7,11 +7,15 @@ lobes come first, `3 N` and `K N`: numbers that meet are then side by side in me
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Numbers: TypeAlias = Float[Tensor, " N"]
+Vectors: TypeAlias = Float[Tensor, "3 N"]
+Lobes: TypeAlias = Float[Tensor, "K N"]
 SMALLEST_ALPHA = 0.002
 """Width of the sharpest lobe; a perfect mirror has no reflectance that could be evaluated."""
 SMALLEST_COSINE = 1e-4
@@ -57,12 +61,12 @@ def alpha_of(roughness: Tensor) -> Tensor:
     return SMALLEST_ALPHA + (1.0 - SMALLEST_ALPHA) * roughness * roughness
 
 
-def half_vectors(wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
+def half_vectors(wi: Vectors, wo: Vectors) -> Vectors:
     """Unit vectors halfway; short ones where the directions are opposite."""
     return _unit(wi + wo)
 
 
-def dot(a: Float[Tensor, "3 N"], b: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+def dot(a: Vectors, b: Vectors) -> Numbers:
     """Inner products."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -74,7 +78,7 @@ def schlick(cosine: Tensor) -> Tensor:
     return x2 * x2 * x
 
 
-def distribution(alpha: Float[Tensor, "K N"], half: Float[Tensor, "3 N"]) -> Float[Tensor, "K N"]:
+def distribution(alpha: Lobes, half: Vectors) -> Lobes:
     """GGX density of microfacet normals, 1/sr; 0 below the surface."""
     # The sine comes from x and y: one minus the squared cosine would lose the digits of a sharp lobe.
     sine2 = half[0] * half[0] + half[1] * half[1]
@@ -84,9 +88,7 @@ def distribution(alpha: Float[Tensor, "K N"], half: Float[Tensor, "3 N"]) -> Flo
     return ((cosine > 0) / math.pi) * a2 / (spread * spread)
 
 
-def visibility(
-    alpha: Float[Tensor, "K N"], n_i: Float[Tensor, " N"], n_o: Float[Tensor, " N"]
-) -> Float[Tensor, "K N"]:
+def visibility(alpha: Lobes, n_i: Numbers, n_o: Numbers) -> Lobes:
     """Smith's height-correlated masking and shadowing over 4 n_i n_o."""
     a2 = alpha * alpha
     n_i, n_o = n_i.clamp_min(SMALLEST_COSINE), n_o.clamp_min(SMALLEST_COSINE)
@@ -95,9 +97,7 @@ def visibility(
     return 0.5 / (of_eye + of_light)
 
 
-def sample_reflections(
-    alpha: Float[Tensor, " N"], wo: Float[Tensor, "3 N"], uniforms: Float[Tensor, "2 N"]
-) -> Float[Tensor, "3 N"]:
+def sample_reflections(alpha: Numbers, wo: Vectors, uniforms: Float[Tensor, "2 N"]) -> Vectors:
     """Directions to the light by reflection of `wo` at visible normals; some point below the surface.
 
     Source:
@@ -113,16 +113,14 @@ def sample_reflections(
     return 2.0 * dot(wo, normals) * normals - wo
 
 
-def reflection_density(
-    alpha: Float[Tensor, "K N"], wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]
-) -> Float[Tensor, "K N"]:
+def reflection_density(alpha: Lobes, wi: Vectors, wo: Vectors) -> Lobes:
     """Density of `sample_reflections` on the whole sphere, 1/sr; `wo` must be above the surface."""
     n_o = wo[2].clamp_min(SMALLEST_COSINE)
     root = torch.sqrt(n_o * n_o + alpha * alpha * (1.0 - n_o * n_o))
     return distribution(alpha, half_vectors(wi, wo)) * 0.5 / (n_o + root)
 
 
-def _unit(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
+def _unit(vectors: Vectors) -> Vectors:
     return vectors * torch.rsqrt(dot(vectors, vectors).clamp_min(1e-12))
 
 
@@ -130,33 +128,31 @@ def _unit(vectors: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
 class LobeMixture:
     """A density of directions to the light for one `wo` per point."""
 
-    alphas: Float[Tensor, "K N"]
+    alphas: Lobes
     """Widths of the GGX lobes."""
     shares: Float[Tensor, "K1 N"]
     """Of the cosine lobe, then of each GGX lobe; they sum to 1."""
 
     @staticmethod
-    def of_albedos(
-        alphas: Float[Tensor, "K N"], diffuse: Float[Tensor, " N"], specular: Float[Tensor, "K N"]
-    ) -> "LobeMixture":
+    def of_albedos(alphas: Lobes, diffuse: Numbers, specular: Lobes) -> "LobeMixture":
         """Shares in proportion to what each lobe reflects; every lobe keeps a small one, which bounds estimates."""
         albedos = torch.cat([diffuse[None] + 0.05, specular + 0.005])
         return LobeMixture(alphas, albedos / albedos.sum(0))
 
-    def sample(self, wo: Float[Tensor, "3 N"], uniforms: Float[Tensor, "3 N"]) -> Float[Tensor, "3 N"]:
+    def sample(self, wo: Vectors, uniforms: Vectors) -> Vectors:
         """Directions to the light; those of GGX lobes can point below the surface."""
         lobe = (uniforms[2] >= self.shares.cumsum(0)).sum(0).clamp_max(len(self.alphas))
         alpha = self.alphas.gather(0, (lobe - 1).clamp_min(0)[None])[0]
         reflected = sample_reflections(alpha, wo, uniforms[:2])
         return torch.where(lobe == 0, cosine_directions(uniforms[:2]), reflected)
 
-    def density(self, wi: Float[Tensor, "3 N"], wo: Float[Tensor, "3 N"]) -> Float[Tensor, " N"]:
+    def density(self, wi: Vectors, wo: Vectors) -> Numbers:
         """Of `sample`, 1/sr, on the whole sphere."""
         lobes = (self.shares[1:] * reflection_density(self.alphas, wi, wo)).sum(0)
         return self.shares[0] * (wi[2].clamp_min(0.0) / math.pi) + lobes
 
 
-def cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Float[Tensor, "3 N"]:
+def cosine_directions(uniforms: Float[Tensor, "2 N"]) -> Vectors:
     """Directions above the surface whose density is their cosine over pi."""
     radius, angle = torch.sqrt(uniforms[1]), 2.0 * math.pi * uniforms[0]
     z = torch.sqrt((1.0 - uniforms[1]).clamp_min(0.0))

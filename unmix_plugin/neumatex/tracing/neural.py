@@ -26,7 +26,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from unmix_plugin.errors import ConfigError
-from unmix_plugin.neumatex.tracing.families import LayeredFamily, StackFamily
+from unmix_plugin.neumatex.tracing.families import LayeredFamily, MaterialFamily, Parameters, StackFamily
 from unmix_plugin.neumatex.tracing.layers import (
     LARGEST_COVER,
     LARGEST_DIELECTRIC_F0,
@@ -93,11 +93,7 @@ def _features(stack: LayerStack) -> Tensor:
 
 
 def _read_weights(path: Path = SHIPPED) -> tuple[Decoder, Encoder]:
-    """Decoder and encoder, frozen.
-
-    Raises:
-        ConfigError: the file can't be read, or its weights have other names or shapes.
-    """
+    """Decoder and encoder, frozen. Raises ConfigError: they can't be read, or have other names or shapes."""
     decoder, encoder = Decoder(), Encoder()
     both = nn.ModuleDict({"decoder": decoder, "encoder": encoder}).requires_grad_(False)
     try:
@@ -118,7 +114,7 @@ class _DecodedFamily(StackFamily):
 
     num_parameters = 3 + NUM_NUMBERS
 
-    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+    def stack(self, parameters: Parameters) -> LayerStack:
         return LayerStack.of_numbers(parameters[:, 3:].T.contiguous())
 
 
@@ -135,15 +131,12 @@ class NeuralFamily(StackFamily):
         """Take copies of the package's decoder and encoder. Raises ConfigError: their weights can't be read."""
         self.decoder, self.encoder = deepcopy(_shipped_weights())
 
-    def stack(self, parameters: Float[Tensor, "N P"]) -> LayerStack:
+    def stack(self, parameters: Parameters) -> LayerStack:
         return self.decoder(parameters[:, 3:])
 
-    @property
-    def decoded_family(self) -> _DecodedFamily:
-        return _DecodedFamily()
-
-    def decoded(self, parameters: Float[Tensor, "N P"]) -> Float[Tensor, "N D"]:
-        return torch.cat([parameters[:, :3], self.decoder.numbers(parameters[:, 3:]).T], -1)
+    def decoded(self, parameters: Parameters) -> tuple[MaterialFamily, Float[Tensor, "N D"]]:
+        numbers = self.decoder.numbers(parameters[:, 3:]).T
+        return _DecodedFamily(), torch.cat([parameters[:, :3], numbers], -1)
 
     @torch.no_grad()
     def from_layered(self, parameters: Float[Tensor, "N L"]) -> Float[Tensor, "N P"]:

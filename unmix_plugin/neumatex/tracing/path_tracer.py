@@ -19,7 +19,7 @@ Randomization of Number Theoretic Methods for Multiple Integration.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -48,26 +48,13 @@ class TracedObject:
     environment: Environment
     surface: Surface
 
-    @property
-    def _family(self) -> MaterialFamily:
-        """With which light is worked out, at what `_parameters` gives."""
-        return self.surface.family.decoded_family
-
-    def _parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
-        return self.surface.family.decoded(self.surface.parameters(positions))
-
     def light(
-        self,
-        points: SurfacePoints,
-        samples: int,
-        bounces: int = 1,
-        generator: torch.Generator | None = None,
+        self, points: SurfacePoints, samples: int, bounces: int = 1, generator: torch.Generator | None = None
     ) -> Float[Tensor, "N C"]:
         """Light that points send to the eye, an unbiased estimate, differentiable by the materials; two calls are
         independent.
 
         Args:
-            points: As the eye sees them.
             samples: Paths a point, spread evenly over what can be drawn.
             bounces: Reflections before the last one: 0 is direct light only.
             generator: Of torch's numbers, on the device of the points.
@@ -77,7 +64,13 @@ class TracedObject:
         device, dimensions = points.positions.device, _NUMBERS_A_VERTEX * (bounces + 1)
         sequence = torch.quasirandom.SobolEngine(dimensions).draw(samples, dtype=torch.float64).to(device)
         shifts = torch.rand(num_points, dimensions, generator=generator, dtype=torch.float64, device=device)
-        vertices = _first_vertices(self, points, samples)
+        # Materials are looked up once a point, not once a sample.
+        rows, white = (
+            torch.arange(num_points, device=device),
+            torch.ones(num_points, num_colours, device=device),
+        )
+        vertices = _Vertices.of(self.surface, rows, points, white).select(rows.repeat_interleave(samples))
+        vertices = replace(vertices, paths=torch.arange(num_points * samples, device=device))
         radiance = torch.zeros(num_points, num_colours, device=device)
         for depth in range(bounces + 1):
             part = slice(_NUMBERS_A_VERTEX * depth, _NUMBERS_A_VERTEX * (depth + 1))
@@ -137,49 +130,54 @@ class _Vertices:
     parameters: Float[Tensor, "M P"]
     throughput: Float[Tensor, "M C"]
     """Light that reaches the eye from this vertex, a part of it, divided by the density of the path."""
+    family: MaterialFamily
+    """Of the parameters."""
+
+    @staticmethod
+    def of(surface: Surface, paths: Tensor, points: SurfacePoints, throughput: Tensor) -> _Vertices:
+        """Paths that have reached points."""
+        axes = frames(points.normals)
+        family, parameters = surface.family.decoded(surface.parameters(points.positions))
+        return _Vertices(paths, points, axes, to_local(axes, points.to_eye), parameters, throughput, family)
 
     def front(self, directions: Float[Tensor, "M 3"], cosines: Float[Tensor, " M"]) -> Bool[Tensor, " M"]:
         """Whether directions (world) leave the surface: above the shading normal's horizon and the triangle's."""
         return (cosines > 0) & ((directions * self.points.geometric_normals).sum(dim=-1) > 0)
 
+    def reflection(self, wi: Float[Tensor, "M 3"]) -> tuple[Float[Tensor, "M C"], Float[Tensor, " M"]]:
+        """Reflectance of light from local directions, and the density with which the material draws these."""
+        density = self.family.density(self.parameters.detach(), wi, self.wo)
+        return self.family.evaluate(self.parameters, wi, self.wo), density
+
     def select(self, rows: Int[Tensor, " M"]) -> _Vertices:
-        others = {name: part[rows] for name, part in vars(self).items() if name != "points"}
-        return _Vertices(points=self.points.select(rows), **others)
-
-
-def _first_vertices(world: TracedObject, points: SurfacePoints, samples: int) -> _Vertices:
-    # Materials are looked up once a point, not once a sample.
-    parameters, axes = world._parameters(points.positions), frames(points.normals)
-    wo = to_local(axes, points.to_eye)
-    rows = torch.arange(len(wo), device=wo.device).repeat_interleave(samples)
-    throughput = torch.ones(len(rows), world.environment.num_colours, device=wo.device)
-    paths = torch.arange(len(rows), device=wo.device)
-    return _Vertices(paths, points.select(rows), axes[rows], wo[rows], parameters[rows], throughput)
+        names = ("paths", "axes", "wo", "parameters", "throughput")
+        return replace(
+            self, points=self.points.select(rows), **{name: getattr(self, name)[rows] for name in names}
+        )
 
 
 def _shade(
     world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M D"], is_last: bool
 ) -> tuple[list[_Light], _Vertices]:
-    """Direct light at vertices by both strategies, and the vertices that the paths reach next, if that counts."""
+    """Direct light at vertices by both strategies, and the vertices that the paths reach next; none from the last."""
     light = _light_by_environment(world, vertices, drawn[:, :2])
-    wi = world._family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
+    wi = vertices.family.sample(vertices.parameters.detach(), vertices.wo, drawn[:, 2:].float())
     directions = to_world(vertices.axes, wi)
     rows = vertices.front(directions, wi[:, 2]).nonzero()[:, 0]
     vertices, wi, directions = vertices.select(rows), wi[rows], directions[rows]
     hits = world.ray_mesh.closest(vertices.points.positions, directions)
+    if is_last:  # what is met sends no more light
+        rows = (~hits.found).nonzero()[:, 0]
+        vertices, wi, directions, hits = vertices.select(rows), wi[rows], directions[rows], hits.select(rows)
     free, met = (~hits.found).nonzero()[:, 0], hits.found.nonzero()[:, 0]
-    if is_last:
-        carried, density = _carried(world, vertices.select(free), wi[free])
-        return [
-            light,
-            _light_by_material(world, vertices.paths[free], directions[free], carried, density),
-        ], vertices
-    carried, density = _carried(world, vertices, wi)
-    escaped = _light_by_material(world, vertices.paths[free], directions[free], carried[free], density[free])
+    reflectance, density = vertices.reflection(wi)
+    usable = torch.isfinite(density) & (density > 0)
+    carried = vertices.throughput * reflectance * torch.where(usable, wi[:, 2] / density, 0.0)[:, None]
+    weight = _power_heuristic(density[free], world.environment.density(directions[free]))
+    escaped = carried[free] * (weight[:, None] * world.environment.radiance(directions[free]))
     points = world.ray_mesh.points(hits.select(met), directions[met])
-    axes, parameters = frames(points.normals), world._parameters(points.positions)
-    wo = to_local(axes, points.to_eye)
-    return [light, escaped], _Vertices(vertices.paths[met], points, axes, wo, parameters, carried[met])
+    reached = _Vertices.of(world.surface, vertices.paths[met], points, carried[met])
+    return [light, (vertices.paths[free], escaped)], reached
 
 
 def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float[Tensor, "M 2"]) -> _Light:
@@ -189,32 +187,10 @@ def _light_by_environment(world: TracedObject, vertices: _Vertices, drawn: Float
     rows = (vertices.front(directions, cosines) & (density > 0)).nonzero()[:, 0]
     rows = rows[~world.ray_mesh.blocked(vertices.points.positions[rows], directions[rows])]
     vertices, directions, density = vertices.select(rows), directions[rows], density[rows]
-    family, wi = world._family, to_local(vertices.axes, directions)
-    reflectance = family.evaluate(vertices.parameters, wi, vertices.wo)
-    other = family.density(vertices.parameters.detach(), wi, vertices.wo)
+    reflectance, other = vertices.reflection(to_local(vertices.axes, directions))
     factor = (cosines[rows] * _power_heuristic(density, other) / density)[:, None]
     radiance = world.environment.radiance(directions)
     return vertices.paths, vertices.throughput * reflectance * (factor * radiance)
-
-
-def _carried(
-    world: TracedObject, vertices: _Vertices, wi: Float[Tensor, "M 3"]
-) -> tuple[Float[Tensor, "M C"], Float[Tensor, " M"]]:
-    """Throughput behind a reflection into directions that the material drew, and their density."""
-    family = world._family
-    density = family.density(vertices.parameters.detach(), wi, vertices.wo)
-    usable = torch.isfinite(density) & (density > 0)
-    factor = torch.where(usable, wi[:, 2] / density, 0.0)[:, None]
-    reflectance = family.evaluate(vertices.parameters, wi, vertices.wo)
-    return vertices.throughput * reflectance * factor, density
-
-
-def _light_by_material(
-    world: TracedObject, paths: Tensor, directions: Tensor, carried: Tensor, density: Tensor
-) -> _Light:
-    """Direct light of paths that leave the scene in directions that the material drew."""
-    weight = _power_heuristic(density, world.environment.density(directions))
-    return paths, carried * (weight[:, None] * world.environment.radiance(directions))
 
 
 def _power_heuristic(chosen: Float[Tensor, " M"], other: Float[Tensor, " M"]) -> Float[Tensor, " M"]:

@@ -65,10 +65,7 @@ class Readers(nn.Module):
     """Two networks that read features of points: the material's parameters, and how wrong they may be."""
 
     def __init__(
-        self,
-        num_parameters: int,
-        generator: torch.Generator | None = None,
-        num_shares: int = 0,
+        self, num_parameters: int, generator: torch.Generator | None = None, num_shares: int = 0
     ) -> None:
         """Random networks.
 
