@@ -19,7 +19,7 @@ from torch import Tensor
 from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.formats.files import eight_bits, make_folder, rgba_png_bytes, write_file
 from unmix_plugin.formats.meshes import write_textured_glb
-from unmix_plugin.neumatex.export.pbr_fit import PbrFit, fit_pbr
+from unmix_plugin.neumatex.export.pbr_fit import fit_pbr
 from unmix_plugin.neumatex.export.shader import shader_paths, write_shader
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
 from unmix_plugin.neumatex.tracing.mesh import Mesh
@@ -126,10 +126,7 @@ def write_material(
     """Write a material on a mesh.
 
     Args:
-        folder: Where to write; it is made.
-        mesh: Model space.
-        surface: Its materials.
-        frame: From the world to model space; files are in the world.
+        mesh, surface: In model space; files are in the world.
         texture_size: Width and height of the textures, texels.
         bands: Of a spectral material.
         metres_per_unit: Of the world, to which glTF is scaled; None: unknown.
@@ -137,14 +134,13 @@ def write_material(
         The files, and the mean error of the glTF material as a part of the reflected light.
     Raises:
         ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
-        RunError: the disk is full or refuses.
     """
     family, baked = surface.family, _Baked.of(mesh, surface, texture_size)
     if isinstance(family, SpectralFamily):
         family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
     seen = InColours(family, bands) if isinstance(family, SpectralFamily) and bands is not None else family
-    fit = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(0))
-    textures = _textures_of(seen, baked.parameters, fit.parameters)
+    fitted, error = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(0))
+    textures = _textures_of(seen, baked.parameters, fitted)
     written, pictures = list[Path](), dict[str, bytes]()
     for texture in textures:
         paths, pictures[texture.name] = texture.write(folder, baked)
@@ -157,7 +153,7 @@ def write_material(
         extras["metres_per_unit"] = metres_per_unit
     shown = (pictures["gltf_base_colour"], pictures["gltf_metallic_roughness"])
     written.append(_write_glb(folder / "material.glb", mesh, baked.atlas, frame, shown, extras))
-    report = json.dumps(_report(baked, family, fit, textures), indent=1)
+    report = json.dumps(_report(baked, family, error, textures), indent=1)
     written.append(write_file(folder / "material.json", report.encode()))
     if isinstance(family, NeuralFamily):
         written += write_shader(folder, family)
@@ -170,7 +166,7 @@ def write_material(
         written.append(baked.write_channels(folder / "abundances.exr", shares, names, about))
         write_spectra_csv(table, SpectraTable(bands, names, family.endmembers.double().numpy()))
         written.append(table)
-    return written, fit.mean_error
+    return written, error
 
 
 def _textures_of(
@@ -216,7 +212,7 @@ def _write_glb(
 
 
 def _report(
-    baked: _Baked, family: MaterialFamily, fit: PbrFit, textures: Sequence[_Texture]
+    baked: _Baked, family: MaterialFamily, error: float, textures: Sequence[_Texture]
 ) -> dict[str, Any]:
     """What the other files are."""
     return {
@@ -239,7 +235,7 @@ def _report(
         },
         "gltf": {
             "model": "metallic-roughness (glTF 2.0, appendix B)",
-            "mean_error_of_reflected_light": round(fit.mean_error, 6),
+            "mean_error_of_reflected_light": round(error, 6),
         },
     }
 

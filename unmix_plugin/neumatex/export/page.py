@@ -66,15 +66,15 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
         arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
         family = InColours(family, scene.bands)
-    fit = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
+    fitted, error = fit_pbr(family, parameters, torch.Generator().manual_seed(0))
     if not isinstance(family, PbrFamily):
         notes.append(
             "The page lights the nearest metallic-roughness material, which differs from the trained one by "
-            f"{100 * fit.mean_error:.1f} % of the reflected light."
+            f"{100 * error:.1f} % of the reflected light."
         )
     if len(mesh.faces) < len(scene.mesh.faces):
         notes.append(f"The mesh of {len(scene.mesh.faces):,} triangles is reduced to {len(mesh.faces):,}.")
-    lit, roughness, metallicity = fit.parameters.clamp(0, 1).split([3, 1, 1], dim=1)
+    lit, roughness, metallicity = fitted.clamp(0, 1).split([3, 1, 1], dim=1)
     transfer = _transfer(mesh, lit.mean(dim=1) * (1 - metallicity[:, 0]))
     openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
     lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
@@ -93,10 +93,10 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         "tones": _tone_table(scene),
     }
     num_bands = 0 if materials is None else len(materials.bands)
+    harmonics = [rounded(_projected(picture).numpy()) for picture in maps]
     relit_lights = [
-        {"name": name, "factors": [1.0] * num_bands, "notes": []}
-        | {"harmonics": rounded(_projected(picture).numpy())}
-        for name, picture in zip(scene.lights, maps, strict=True)
+        {"name": name, "factors": [1.0] * num_bands, "notes": [], "harmonics": numbers}
+        for name, numbers in zip(scene.lights, harmonics, strict=True)
     ]
     facts: dict[str, Any] = {
         "lights": relit_lights,
@@ -120,10 +120,13 @@ def _resampled(mesh: Mesh, cell: float) -> Mesh:
     vertices, faces = mesh.vertices.cpu().double().numpy(), mesh.faces.cpu().long().numpy()
     normals = mesh.normals.cpu().double().numpy()
     if len(faces) > _MOST_TRIANGLES:
-        _, first, of = np.unique(np.round(vertices / cell), axis=0, return_index=True, return_inverse=True)
+        _, of = np.unique(np.round(vertices / cell), axis=0, return_inverse=True)
         faces = of.reshape(-1)[faces]
         count = np.bincount(of.reshape(-1))[:, None]
-        vertices, normals = (_summed(values, of.reshape(-1), len(first)) for values in (vertices, normals))
+        vertices, normals = (
+            np.stack([np.bincount(of.reshape(-1), weights=column) for column in values.T], axis=1)
+            for values in (vertices, normals)
+        )
         vertices = vertices / count
         apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         faces = np.unique(faces[apart], axis=0)
@@ -135,22 +138,13 @@ def _resampled(mesh: Mesh, cell: float) -> Mesh:
     return mesh_of(torch.from_numpy(vertices), torch.from_numpy(faces), torch.from_numpy(normals))
 
 
-def _summed(values: Float[np.ndarray, "V 3"], of: Int[np.ndarray, " V"], count: int) -> np.ndarray:
-    return np.stack([np.bincount(of, weights=column, minlength=count) for column in values.T], axis=1)
-
-
 def _usual_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> float:
     return float(np.quantile(np.linalg.norm(vertices[faces] - vertices[np.roll(faces, 1, 1)], axis=2), 0.9))
 
 
 def _transfer(mesh: Mesh, reflected: Float[Tensor, " V"]) -> Float[Tensor, "V 16"]:
     """What a white matt surface at each vertex sends back of each harmonic of light, less what the object hides, and
-    with what comes by one reflection on it.
-
-    Args:
-        mesh: Model space.
-        reflected: Share of light that each vertex sends back.
-    """
+    with what comes by one reflection on it, given the share of light that each vertex sends back."""
     traced, steps = RayMesh(mesh), torch.arange(_RAYS, dtype=torch.float32)
     height = ((steps + 0.5) / _RAYS).sqrt()  # density: the cosine
     angle, flat = math.pi * (3 - math.sqrt(5)) * steps, (1 - height * height).sqrt()
@@ -212,9 +206,8 @@ def _blurred(pictures: Float[Tensor, "lights rows columns 3"]) -> Any:
         for part in directions.split(512):
             cosine = part @ directions.T
             # Density of the microfacets that reflect the one direction into the other, seen from the first.
-            lobe = (
-                a2 / ((1 + cosine) / 2 * (a2 - 1) + 1).clamp(min=1e-9).square() * cosine.clamp(min=0) * solid
-            )
+            density = a2 / ((1 + cosine) / 2 * (a2 - 1) + 1).clamp(min=1e-9).square()
+            lobe = density * cosine.clamp(min=0) * solid
             rows.append(lobe @ light / lobe.sum(dim=1, keepdim=True))
         levels.append(torch.cat(rows))
     colours = torch.stack(levels).unflatten(-1, (-1, 3)).permute(2, 0, 1, 3)

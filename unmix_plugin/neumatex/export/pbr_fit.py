@@ -8,8 +8,6 @@ Notation: `T` materials, `P` their parameters, `D` pairs of directions for each.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -23,61 +21,43 @@ _JUDGED = 512
 """Materials whose error is measured."""
 
 
-@dataclass(frozen=True)
-class PbrFit:
-    """Parameters of `PbrFamily`, and how well they stand for what they replace."""
-
-    parameters: Float[Tensor, "T 5"]
-    mean_error: float
-    """Mean absolute difference of reflected light x, cosine included, between all directions, as a part of its mean;
-    light is compressed to x / (1 + x), as by an eye. 0 where nothing was to be fitted."""
-
-
-def fit_pbr(family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator) -> PbrFit:
+def fit_pbr(
+    family: MaterialFamily, parameters: Float[Tensor, "T P"], generator: torch.Generator
+) -> tuple[Float[Tensor, "T 5"], float]:
     """Base colour, roughness and metallicity of materials; those of `PbrFamily` stay as they are.
 
     Args:
         family: Of the materials, in three colours.
         parameters: [0, 1].
         generator: For the drawn materials and directions, on the CPU.
+    Returns:
+        Parameters of `PbrFamily`, and the mean absolute difference of reflected light x, cosine included, between all
+        directions, as a part of its mean; light is compressed to x / (1 + x), as by an eye.
     """
     if isinstance(family, PbrFamily):
-        return PbrFit(parameters.clone(), 0.0)
-    network = _Regression(family).to(parameters.device)
+        return parameters.clone(), 0.0
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(1 << 31, (1,), generator=generator)))
-        network.reset()
+        network = _Regression(family).to(parameters.device)
     with torch.enable_grad():
         _train(network, family, parameters, generator)
     with torch.no_grad():
         fitted = torch.cat([network(part) for part in parameters.split(_CHUNK)])
-        return PbrFit(fitted, _mean_error(family, parameters, fitted, generator))
+        return fitted, _mean_error(family, parameters, fitted, generator)
 
 
 class _Regression(nn.Module):
-    """From parameters of a family to those of `PbrFamily`; begins at the family's own base colour."""
+    """From parameters of a family to those of `PbrFamily`; begins at a half rough dielectric of its base colour."""
 
     def __init__(self, family: MaterialFamily) -> None:
         super().__init__()
         self._family = family
-        self.layers = nn.Sequential(
-            nn.Linear(family.num_parameters, _WIDTH),
-            nn.ReLU(),
-            nn.Linear(_WIDTH, _WIDTH),
-            nn.ReLU(),
-            nn.Linear(_WIDTH, 5),
-        )
-
-    def reset(self) -> None:
-        """Draw first values; a half rough dielectric of the family's base colour."""
-        for layer in self.layers:
-            if isinstance(layer, nn.Linear):
-                layer.reset_parameters()
-        last = self.layers[-1]
-        assert isinstance(last, nn.Linear)
+        first, second = nn.Linear(family.num_parameters, _WIDTH), nn.Linear(_WIDTH, _WIDTH)
+        last = nn.Linear(_WIDTH, 5)
+        self.layers = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), last)
         with torch.no_grad():
             last.weight.mul_(0.1)
-            last.bias.copy_(last.bias.new_tensor([0.0, 0.0, 0.0, 0.0, -2.0]))
+            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, -2.0]))
 
     def forward(self, parameters: Float[Tensor, "T P"]) -> Float[Tensor, "T 5"]:
         base = torch.logit(self._family.base_colour(parameters).detach(), eps=1e-3)

@@ -48,14 +48,12 @@ class MaterialProduct(RunProduct):
                 bands=scene.bands,
                 metres_per_unit=None if job.loaded.scale is None else job.loaded.scale.metres_per_unit,
             )
-        job.say(
-            f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
-            + (
+        said = f"the glTF material differs from the trained one by {100 * error:.1f} % of the reflected light"
+        if error > _FAR_OFF:
+            said += (
                 ": its base colour, roughness and metallicity can't express it. Where that shows, draw it with "
                 "decoder.glsl, or with unmix-render, which traces the trained one"
-                if error > _FAR_OFF
-                else ""
             )
-        )
+        job.say(said)
         say_units(job, "material.glb")
         return written

@@ -16,6 +16,9 @@ from unmix_plugin.neumatex.tracing.neural import NeuralFamily
 
 _PLACE = "//@constants"
 _NUMBERS_A_LINE = 8
+_SCALARS = tuple(f"LARGEST_{name}" for name in ("COVER", "SHEEN", "COAT_ROUGHNESS", "HAZE", "DIELECTRIC_F0"))
+_SCALARS += ("SMALLEST_SHEEN_WIDTH",)
+"""Constants of the layers that the shader has by the same names."""
 
 
 def shader_paths(folder: Path) -> list[Path]:
@@ -24,18 +27,19 @@ def shader_paths(folder: Path) -> list[Path]:
 
 
 def write_shader(folder: Path, family: NeuralFamily) -> list[Path]:
-    """Write `decoder.glsl`, a function `reflectance` with all its numbers, and `decoder.json`, the numbers.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write `decoder.glsl`, a function `reflectance` with all its numbers, and `decoder.json`, the numbers."""
     constants = _decoder_constants(family)
     text, numbers = shader_paths(make_folder(folder))
-    write_file(text, _shader_text(constants).encode())
+    template = files("unmix_plugin.neumatex.export").joinpath("decoder.glsl").read_text(encoding="utf-8")
+    assert _PLACE in template
+    declared = "\n".join(_declaration(name, value) for name, value in constants.items())
     about = (
         "numbers of decoder.glsl, by the same names; matrices row after row, tables a row for each roughness"
     )
-    return [text, write_file(numbers, json.dumps({"about": about, **constants}).encode())]
+    return [
+        write_file(text, template.replace(_PLACE, declared).encode()),
+        write_file(numbers, json.dumps({"about": about, **constants}).encode()),
+    ]
 
 
 def _decoder_constants(family: NeuralFamily) -> dict[str, Any]:
@@ -53,12 +57,7 @@ def _decoder_constants(family: NeuralFamily) -> dict[str, Any]:
     means = layers.mean_ggx_albedo(torch.linspace(0, 1, ggx.shape[0])[None])
     return {
         **constants,
-        "LARGEST_COVER": layers.LARGEST_COVER,
-        "LARGEST_SHEEN": layers.LARGEST_SHEEN,
-        "LARGEST_COAT_ROUGHNESS": layers.LARGEST_COAT_ROUGHNESS,
-        "LARGEST_HAZE": layers.LARGEST_HAZE,
-        "LARGEST_DIELECTRIC_F0": layers.LARGEST_DIELECTRIC_F0,
-        "SMALLEST_SHEEN_WIDTH": layers.SMALLEST_SHEEN_WIDTH,
+        **{name: getattr(layers, name) for name in _SCALARS},
         "DUST_COLOUR": list(layers.DUST_COLOUR),
         "NODES": len(layers.DUST_NODES),
         "NODE_PLACES": list(layers.DUST_NODES),
@@ -71,13 +70,6 @@ def _decoder_constants(family: NeuralFamily) -> dict[str, Any]:
         "GGX_MEAN_B": _floats(means[1]),
         "SHEEN": _floats(white[..., 0]),
     }
-
-
-def _shader_text(constants: dict[str, Any]) -> str:
-    template = files("unmix_plugin.neumatex.export").joinpath("decoder.glsl").read_text(encoding="utf-8")
-    assert _PLACE in template
-    declared = [_declaration(name, value) for name, value in constants.items()]
-    return template.replace(_PLACE, "\n".join(declared))
 
 
 def _floats(values: Tensor) -> list[float]:
