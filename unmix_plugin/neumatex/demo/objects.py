@@ -73,14 +73,7 @@ Say = Callable[[str], object]
 
 def demo_object_path(name: str, say: Say) -> Path:
     """The folder of a default demo object, written on first use, which takes a minute or two; kept in the user's cache,
-    where a changed generator writes into a new folder.
-
-    Args:
-        name: `demo-object`, or `demo-spectral-object`.
-        say: Gets a line for each light.
-    Raises:
-        SceneError: the cache can't be written.
-    """
+    where a changed generator writes into a new folder. Raises SceneError: the cache can't be written."""
     digest = hashlib.sha256()
     for room in ("demo", "tracing"):
         for path in sorted((Path(__file__).parent.parent / room).glob("*.py")):
@@ -188,12 +181,10 @@ def write_object(
     """Write an object in colours.
 
     Args:
-        folder: Not there yet.
         lights: Built-in ones; the first is that of training.
         size: Rows and columns of the pictures.
         views: Pictures under the light of training.
         seed: Of the lights, and of the paths that are traced.
-        say: Gets a line for each light.
     """
     subject = _Subject(RayMesh(mesh), surface, torch.Generator().manual_seed(seed), size)
     subject.write_mesh(folder / "mesh.glb", surface.kinds)

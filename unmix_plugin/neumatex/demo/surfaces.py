@@ -220,12 +220,7 @@ class SpectralSurface:
     def __init__(
         self, seed: int, wavelengths_nm: Float[np.ndarray, " B"], positions: Float[Tensor, "N 3"]
     ) -> None:
-        """
-        Args:
-            seed: Which materials and where.
-            wavelengths_nm: Band centres.
-            positions: Points of the surface, of which each material covers about the same part.
-        """
+        """Materials in bands with these centres, each covering about the same part of points of the surface."""
         rng = np.random.default_rng([4, seed])
         chosen = np.sort(rng.choice(len(MATERIALS), _NUM_MATERIALS, replace=False))
         self.names = tuple(MATERIALS[index] for index in chosen)

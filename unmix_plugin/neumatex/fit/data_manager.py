@@ -67,11 +67,7 @@ class ObjectDataManagerConfig(DataManagerConfig):
     (D65, A, ...); None takes 'illuminant_path' of transforms.json."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
+        """Refuse impossible settings."""
         super().__post_init__()
         require("the data manager", self, {"max-pixels of at least 1": self.max_pixels >= 1})
 
@@ -89,13 +85,14 @@ class ObjectDataManager(DataManager):
     def __init__(
         self, config: ObjectDataManagerConfig, *, data: Path, device: torch.device, seed: int = 0
     ) -> None:
-        """
-        Raises:
-            SceneError: the object is missing or malformed.
-        """
+        """Read the object. Raises SceneError: it is missing or malformed."""
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.object = load_object(_object_folder(data), config.lamp)
+        if str(data) in _DEMOS:
+            from unmix_plugin.neumatex.demo.objects import demo_object_path
+
+            data = demo_object_path(str(data), lambda line: sys.stderr.write(f"{line}\n"))
+        self.object = load_object(data, config.lamp)
         pictures, split = self.object.pictures, self.object.split
         self.train_cameras = pictures.cameras[list(split.train)]
         self.eval_cameras = pictures.cameras[list(split.evaluation)]
@@ -231,11 +228,7 @@ class _PixelList:
     `numbers` (M C)."""
 
     def __init__(self, scene: ObjectScene, most: int, seed: int) -> None:
-        """Read the training views; of more pixels than `most`, so many are drawn.
-
-        Raises:
-            SceneError: no view shows the mesh.
-        """
+        """Read the training views; of more pixels than `most`, so many are drawn."""
         ray_mesh, parts = RayMesh(scene.mesh), []
         generator = torch.Generator().manual_seed(seed)
         share = most // len(scene.split.train) + 1
@@ -288,11 +281,3 @@ def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
         arrays[f"view_{number}_pose"] = cameras.camera_to_world[row].numpy()
         arrays[f"view_{number}_lens"] = torch.cat([lens, cameras.distortion[row]]).numpy()
     return arrays
-
-
-def _object_folder(data: Path) -> Path:
-    if str(data) not in _DEMOS:
-        return data
-    from unmix_plugin.neumatex.demo.objects import demo_object_path
-
-    return demo_object_path(str(data), lambda line: sys.stderr.write(f"{line}\n"))

@@ -8,6 +8,7 @@ Notation: `M` pixels that count, `C` colours, `B` bands, `T` true materials, `P`
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -17,8 +18,8 @@ from torch import Tensor
 from unmix_plugin.engine import Cameras
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS, SpectralDisplay, psnr_db, tone_curve
+from unmix_plugin.neumatex.tracing.environment import Environment
 from unmix_plugin.neumatex.tracing.families import MaterialFamily, SpectralFamily
-from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
 from unmix_plugin.neumatex.tracing.rays import pixel_hits
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb
 from unmix_plugin.spectral.evidence import OPAQUE_ALPHA
@@ -36,9 +37,14 @@ _SPECTRAL_TRUTHS = ("base_colour_psnr", "reflectance_angle", "abundance_rmse", "
 
 
 def evaluation_outputs(
-    model: NeumatexModel, traced: TracedObject, camera: Cameras, batch: dict[str, Tensor]
+    model: NeumatexModel, camera: Cameras, batch: dict[str, Tensor]
 ) -> dict[str, Float[Tensor, "H W C"]]:
-    """`light` and `base_colour`, both linear, and `parameters` of the material, where pixels count; 0 elsewhere."""
+    """`light` and `base_colour`, both linear, and `parameters` of the material where pixels count, 0 elsewhere; in the
+    light that the batch may hold."""
+    traced = model.traced
+    if "environment" in batch:
+        light = Environment(batch["environment"], *batch["environment_placement"].tolist())
+        traced = replace(traced, environment=light)
     hits = pixel_hits(traced.ray_mesh, camera, 0, SUBPIXELS)
     hits = hits.select((batch["alpha"] >= OPAQUE_ALPHA).flatten()[hits.pixels])
     generator = torch.Generator(model.device).manual_seed(0)
@@ -61,28 +67,26 @@ def evaluate_object_image(
     colour); of spectral pictures `base_colour_psnr` (reflectance in every band), `reflectance_angle`,
     `abundance_rmse` and `endmember_angle` (mean over the true endmembers, each with its match). Where the truth is not
     known they are nan.
-
-    Args:
-        outputs: Of `evaluation_outputs`.
     """
     shown, display = batch["alpha"] >= OPAQUE_ALPHA, model.curve
     light, numbers = outputs["light"][shown], batch["numbers"][shown]
+    prefix = "relit_" if "environment" in batch else ""
+    spectral: dict[str, float] = {}
     if isinstance(display, SpectralDisplay):
         predicted, true = light.clamp(0, 1), numbers.clamp(0, 1)
         colours = display(true), display(predicted)
+        spectral[f"{prefix}sam"] = float(spectral_angle(predicted.double(), true.double()).mean())
     else:
         tone = TONE_MAPPINGS[int(batch["tone"])]
         predicted, true = model.compared(light, numbers, tone, tone_curve("agx"))
         colours = true, predicted
     error = (predicted - true).square()
-    prefix = "relit_" if "environment" in batch else ""
-    metrics = {
+    metrics: dict[str, float] = {
         f"{prefix}psnr": float(psnr_db(error)),
         f"{prefix}psnr_image": float(psnr_db(error.sum() / (shown.numel() * error.shape[-1]))),
+        **spectral,
+        "lights": float(batch["lights"]),
     }
-    if isinstance(display, SpectralDisplay):
-        metrics[f"{prefix}sam"] = float(spectral_angle(predicted.double(), true.double()).mean())
-    metrics["lights"] = float(batch["lights"])
     pictures = {f"{prefix}rgb": _side_by_side(shown, *colours)}
     if prefix:
         return metrics, pictures
@@ -93,17 +97,16 @@ def evaluate_object_image(
             return metrics | dict.fromkeys(_SPECTRAL_TRUTHS, float("nan")), pictures
         shares, endmembers = batch["true_abundances"][shown], batch["true_endmembers"]
         reflectance = shares @ endmembers
-        colours = [linear_to_srgb(display.rgb(values)) for values in (reflectance, base)]
+        colours = [display.rgb(values) for values in (reflectance, base)]
         found = _material_metrics(model.family, outputs["parameters"][shown], base, shares, endmembers)
     else:
         if "base_colour" not in batch:
             return metrics | dict.fromkeys(_COLOUR_TRUTHS, float("nan")), pictures
-        colour = batch["base_colour"][shown]
-        colours = [linear_to_srgb(values) for values in (colour, base)]
-        factor = (base * colour).sum(dim=0) / base.square().sum(dim=0).clamp(min=1e-12)
-        errors = (base - colour).square(), (factor * base - colour).square()
+        colours = batch["base_colour"][shown], base
+        factor = (base * colours[0]).sum(dim=0) / base.square().sum(dim=0).clamp(min=1e-12)
+        errors = ((scale * base - colours[0]).square() for scale in (1.0, factor))
         found = {name: float(psnr_db(one)) for name, one in zip(_COLOUR_TRUTHS, errors, strict=True)}
-    pictures["base_colour"] = _side_by_side(shown, *colours)
+    pictures["base_colour"] = _side_by_side(shown, *map(linear_to_srgb, colours))
     return {**metrics, **found}, pictures
 
 
@@ -118,12 +121,13 @@ def _material_metrics(
     reflectance = true_shares @ true_endmembers
     shares, endmembers = family.abundances(parameters), family.endmembers.detach()
     matching = match_endmembers(endmembers, true_endmembers)
-    return {
-        "base_colour_psnr": float(psnr_db((base - reflectance).square())),
-        "reflectance_angle": float(spectral_angle(base.double(), reflectance.double()).mean()),
-        "abundance_rmse": abundance_rmse(shares[:, None], true_shares[:, None], matching),
-        "endmember_angle": endmember_angle(endmembers, true_endmembers),
-    }
+    found = (
+        float(psnr_db((base - reflectance).square())),
+        float(spectral_angle(base.double(), reflectance.double()).mean()),
+        abundance_rmse(shares[:, None], true_shares[:, None], matching),
+        endmember_angle(endmembers, true_endmembers),
+    )
+    return dict(zip(_SPECTRAL_TRUTHS, found, strict=True))
 
 
 def _side_by_side(

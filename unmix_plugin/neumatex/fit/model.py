@@ -15,7 +15,6 @@ and `B` bands of a spectral one; `H x W` pixels.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -187,11 +186,7 @@ class NeumatexModel(Model):
     @torch.no_grad()
     def get_evaluation_outputs(self, camera: Cameras, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Light and base colour of the pixels that count, under the light that the batch may hold."""
-        traced = self.traced
-        if "environment" in batch:
-            light = Environment(batch["environment"], *batch["environment_placement"].tolist())
-            traced = replace(traced, environment=light)
-        return evaluation_outputs(self, traced, camera.to(self.device), batch)
+        return evaluation_outputs(self, camera.to(self.device), batch)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
@@ -217,12 +212,8 @@ class NeumatexModel(Model):
         tone: ToneMapping,
         light_curve: nn.Module,
     ) -> tuple[Tensor, Tensor]:
-        """Predicted light and a picture's numbers as they are compared.
-
-        Args:
-            tone: What the numbers are of light.
-            light_curve: What light and numbers go through where the numbers are light.
-        """
+        """Predicted light and a picture's numbers, which are light or what `tone` makes of it, as they are compared;
+        `light_curve` is what both go through where the numbers are light."""
         if tone == "linear":
             return light_curve(light), light_curve(numbers)
         curve = self.curve if tone == self.record.tone_mapping else tone_curve(tone)

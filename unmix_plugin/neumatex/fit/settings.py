@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -62,12 +62,12 @@ class ObjectRecord:
     @staticmethod
     def of(scene: ObjectScene) -> ObjectRecord:
         """The record of an object."""
-        mesh, light = scene.mesh, scene.environment
+        light = scene.environment
         height, width, light_colours = light.image.shape
         return ObjectRecord(
-            num_vertices=len(mesh.vertices),
-            num_faces=len(mesh.faces),
-            has_uv=mesh.uv is not None,
+            num_vertices=len(scene.mesh.vertices),
+            num_faces=len(scene.mesh.faces),
+            has_uv=scene.mesh.uv is not None,
             environment_size=(height, width),
             num_light_colours=light_colours,
             rotation_deg=light.rotation_deg,
@@ -80,20 +80,16 @@ class ObjectRecord:
 
     def to_json(self) -> dict[str, Any]:
         """As JSON-able values."""
-        values = asdict(self)
-        lists = {name: list(value) for name, value in values.items() if isinstance(value, tuple)}
-        return {**values, **lists}
+        return {
+            name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()
+        }
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> ObjectRecord:
-        """What `to_json` wrote.
-
-        Raises:
-            ConfigError, ValueError: a value is of the wrong type or out of its range.
-        """
+        """What `to_json` wrote. Raises ConfigError, ValueError: a value is of the wrong type or out of its range."""
         record = config_from_json(dict(values), ObjectRecord(), "the object")
         counts = (record.num_vertices, record.num_faces, *record.environment_size, record.num_colours)
-        if min(counts) < 1 or record.num_light_colours < 1:
+        if min(*counts, record.num_light_colours) < 1:
             raise ValueError(f"an object needs sizes of at least 1; found {counts}")
         if record.is_spectral and {len(record.lamp), len(record.wavelengths_nm)} != {record.num_colours}:
             raise ValueError(
@@ -145,12 +141,9 @@ class NeumatexModelConfig(ModelConfig):
     is agx for colours; for bands light over the lamp's power, its logarithm above 1, so that dim bands count too."""
 
     def __post_init__(self) -> None:
-        """Refuse impossible settings.
-
-        Raises:
-            ConfigError: a number out of its range.
-        """
+        """Refuse impossible settings."""
         super().__post_init__()
+        count = self.num_endmembers
         rules = {
             "samples of 2 to 1024": 2 <= self.samples <= 1024,
             "bounces of 0 to 8": 0 <= self.bounces <= 8,
@@ -158,23 +151,16 @@ class NeumatexModelConfig(ModelConfig):
             "eval-samples of 1 to 65536": 1 <= self.eval_samples <= 65536,
             "regularisation of at least 0": 0 <= self.regularisation < float("inf"),
             "plane-resolution of 2 to 2048": 2 <= self.plane_resolution <= 2048,
+            "num-endmembers of 1 to 64 or auto": count in (None, "auto") or 1 <= int(count) <= 64,
+            "from-run with the material spectral only": self.from_run is None or self.material == "spectral",
         }
-        count = self.num_endmembers
-        rules["num-endmembers of 1 to 64 or auto"] = count in (None, "auto") or 1 <= int(count) <= 64
-        rules["from-run with the material spectral only"] = (
-            self.from_run is None or self.material == "spectral"
-        )
         require("the model", self, rules)
 
     def resolve_auto(
         self, initial_data: Callable[[], Mapping[str, np.ndarray]], generator: torch.Generator
     ) -> tuple[NeumatexModelConfig, str]:
-        """With a number of endmembers, where the material is spectral.
-
-        Raises:
-            SpectrumError: no pixel is neither dark nor saturated.
-            ConfigError, RunError: the run to start from is unusable.
-        """
+        """With a number of endmembers, where the material is spectral. Raises SpectrumError: no pixel is neither dark
+        nor saturated. Raises ConfigError, RunError: the run to start from is unusable."""
         if self.material != "spectral" or isinstance(self.num_endmembers, int):
             return self, ""
         from unmix_plugin.neumatex.fit.start import resolved_num_endmembers

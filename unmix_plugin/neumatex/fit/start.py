@@ -63,7 +63,7 @@ _LEAST_FOUND = 0.5
 
 def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
     """Make a new triplane give a plain material nearly everywhere."""
-    *_, last = triplane.readers.material_network.children()
+    last = triplane.readers.material_network[-1]
     assert isinstance(last, nn.Linear)
     plain, shares = _plain_parameters(family), triplane.readers.num_shares
     with torch.no_grad():
@@ -73,11 +73,8 @@ def start_plain(triplane: Triplane, family: MaterialFamily) -> None:
 
 
 def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
-    """Parameters of a rough grey surface that is not metal and has no layers.
-
-    From the middle of all parameters, which is half a metal, a fit puts the colours of what is diffuse into what the
-    metal reflects.
-    """
+    """Parameters of a rough grey surface that is not metal and has no layers: from half a metal, a fit puts the colours
+    of what is diffuse into what the metal reflects."""
     if isinstance(family, NeuralFamily):
         layered = torch.zeros(1, LayeredFamily.num_parameters)
         layered[0, :3], layered[0, 4:6] = 0.5, 0.5
@@ -104,12 +101,7 @@ def views_of(arrays: Mapping[str, np.ndarray]) -> PosedViews:
 def resolved_num_endmembers(
     config: NeumatexModelConfig, arrays: Mapping[str, np.ndarray], generator: torch.Generator
 ) -> tuple[int, str]:
-    """K where the settings leave it open, and why.
-
-    Raises:
-        SpectrumError: no pixel is neither dark nor saturated.
-        ConfigError, RunError: the run to start from is unusable.
-    """
+    """K where the settings leave it open, and why; see `NeumatexModelConfig.resolve_auto`."""
     if "lamp" not in arrays:  # pictures in colours, which the model refuses
         return _USUAL_ENDMEMBERS, ""
     if config.from_run is not None:
@@ -124,12 +116,8 @@ def resolved_num_endmembers(
 def start_spectral(
     model: NeumatexModel, arrays: Mapping[str, np.ndarray], generator: torch.Generator
 ) -> None:
-    """Give a new model its first endmembers and abundances.
-
-    Raises:
-        SpectrumError: the pixels don't allow so many endmembers.
-        ConfigError, RunError: the run to start from is unusable.
-    """
+    """Give a new model its first endmembers and abundances. Raises SpectrumError: the pixels don't allow so many.
+    Raises ConfigError, RunError: the run to start from is unusable."""
     assert model.endmembers is not None
     pixels, origins, directions = (
         torch.from_numpy(arrays[name]).to(model.device)
@@ -189,11 +177,7 @@ def _as_bright(
     spectra: Float[Tensor, "K B"], pixels: Float[Tensor, "N B"], purity: Float[Tensor, "N K"]
 ) -> Float[Tensor, "K B"]:
     """Spectra of the same shape, each as bright as the purest of its pixels: in known light a pixel is as bright as its
-    material, but one that shows others, too, is as bright as the mixture.
-
-    Args:
-        purity: The larger, the more a pixel is of an endmember alone.
-    """
+    material, but one that shows others, too, is as bright as the mixture."""
     count = min(len(pixels), max(_FEWEST_PURE, round(_PURE * len(pixels))))
     purest = purity.topk(count, dim=0).indices
     brightness = pixels.norm(dim=1)[purest].median(dim=0).values
@@ -240,15 +224,8 @@ class _RunMaterials:
     def reflectances(
         self, bands: Bands | None, lamp: Float64[np.ndarray, " B"], count: int
     ) -> Float[Tensor, "K B"]:
-        """Endmembers over the light that they were seen in, of any brightness.
-
-        Args:
-            bands: That the run must have.
-            lamp: For a run that does not know its light.
-            count: How many endmembers it must have.
-        Raises:
-            ConfigError: other bands, or another number of endmembers.
-        """
+        """Endmembers over the light that they were seen in, of any brightness; `lamp` is for a run that does not know
+        it. Raises ConfigError: the run has other bands, or another number of endmembers."""
         materials = self.scene.materials
         if bands is None or materials.bands != bands:
             raise ConfigError(
@@ -274,8 +251,6 @@ class _RunMaterials:
         Args:
             positions, normals: In the mesh's model space.
             world_corners: Where its origin and the ends of its unit vectors are in the world.
-        Raises:
-            ConfigError: the run has nothing at most of the points.
         """
         frame = self.scene.frame
         origin, axes = world_corners[0], world_corners[1:] - world_corners[0]

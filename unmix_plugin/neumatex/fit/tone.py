@@ -11,7 +11,7 @@ picture's numbers in [0, 1]. `S` steps of the response, `F` curves of the family
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal, get_args
 
@@ -22,9 +22,8 @@ from torch import Tensor, nn
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import agx, linear_to_srgb, rgb_matrix
 
-NUM_STEPS = 256
-NUM_COEFFICIENTS = 6
-MAX_STOPS = 8.0
+NUM_STEPS, NUM_COEFFICIENTS = 256, 6
+_MAX_STOPS = 8.0
 """Exposure that can be learnt, either way."""
 ToneMapping = Literal["linear", "srgb", "agx", "camera"]
 """How pictures were made of light: `linear` is light itself, `camera` an unknown response."""
@@ -48,16 +47,13 @@ class _CameraResponse(nn.Module):
         self.coefficients = nn.Parameter(torch.zeros(NUM_COEFFICIENTS))
         self.exposure_stops = nn.Parameter(torch.zeros(()))
 
-    def curve(self) -> Float[Tensor, "S_plus_1"]:
-        """The response at (i / S)^2 of full exposure, from 0 to 1."""
-        increments = (self.mean + self.coefficients @ self.components).softmax(dim=0)
-        return torch.cat([increments.new_zeros(1), increments.cumsum(dim=0)])
-
     def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
         """Numbers in [0, 1] of linear light; no gradient where light is beyond white."""
-        stops = self.exposure_stops.clamp(-MAX_STOPS, MAX_STOPS)
+        stops = self.exposure_stops.clamp(-_MAX_STOPS, _MAX_STOPS)
         exposed = (light * torch.exp2(stops)).clamp(1e-8, 1)
-        curve = self.curve()
+        increments = (self.mean + self.coefficients @ self.components).softmax(dim=0)
+        # The response at (i / S)^2 of full exposure, from 0 to 1.
+        curve = torch.cat([increments.new_zeros(1), increments.cumsum(dim=0)])
         place = exposed.sqrt() * NUM_STEPS
         step = place.detach().long().clamp(max=NUM_STEPS - 1)
         low, high = (step / NUM_STEPS).square(), ((step + 1) / NUM_STEPS).square()
@@ -67,10 +63,8 @@ class _CameraResponse(nn.Module):
 
 @lru_cache(maxsize=1)
 def _response_basis() -> tuple[Float[Tensor, " S"], Float[Tensor, "K S"]]:
-    """Mean and principal components of the logarithm of the steps of all curves of the family.
-
-    A component is scaled by its spread, so that coefficients of about 1 are usual.
-    """
+    """Mean and principal components of the logarithm of the steps of all curves of the family, each scaled by its
+    spread, so that coefficients of about 1 are usual."""
     logs = _curve_family().diff(dim=1).clamp(min=1e-12).log()
     mean = logs.mean(dim=0)
     _, spreads, axes = torch.linalg.svd(logs - mean, full_matrices=False)
@@ -99,25 +93,20 @@ TONE_MAPPINGS: tuple[ToneMapping, ...] = get_args(ToneMapping)
 class _FixedCurve(nn.Module):
     """A tone curve without parameters."""
 
-    def __init__(self, curve: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, name: ToneMapping) -> None:
         super().__init__()
-        self._curve = curve
+        self._name = name
 
     def forward(self, light: Float[Tensor, "*pixels C"]) -> Float[Tensor, "*pixels C"]:
         """Numbers in [0, 1], but of `linear`; no gradient where light is beyond white."""
-        return self._curve(light)
-
-
-_FIXED: dict[str, Callable[[Tensor], Tensor]] = {
-    "linear": lambda light: light,
-    "srgb": lambda light: linear_to_srgb(light.clamp(0, 1)),
-    "agx": lambda light: agx(light).clamp(0, 1),
-}
+        if self._name == "linear":
+            return light
+        return agx(light).clamp(0, 1) if self._name == "agx" else linear_to_srgb(light.clamp(0, 1))
 
 
 def tone_curve(name: ToneMapping) -> nn.Module:
     """The curve of that name; only `camera` has parameters."""
-    return _CameraResponse() if name == "camera" else _FixedCurve(_FIXED[name])
+    return _CameraResponse() if name == "camera" else _FixedCurve(name)
 
 
 def psnr_db(squared_error: Float[Tensor, "*pixels"]) -> Float[Tensor, ""]:
@@ -136,10 +125,7 @@ class LampRatio(nn.Module):
     lamp: Tensor
 
     def __init__(self, lamp: Sequence[float]) -> None:
-        """
-        Args:
-            lamp: Power of each band, above 0.
-        """
+        """For a lamp of this power in each band, above 0."""
         super().__init__()
         self.register_buffer("lamp", torch.tensor(lamp, dtype=torch.float32), persistent=False)
 
@@ -149,12 +135,9 @@ class LampRatio(nn.Module):
         return torch.where(ratio < 1, ratio, 1 + ratio.clamp(min=1).log())
 
     def weights(self, light: Float[Tensor, "R B"]) -> Float[Tensor, "R 1"]:
-        """Of errors of a picture's pixels, with which relative errors count: else materials that are dark or in the
-        shade would be fitted last. Pixels far darker than the mean get no more, since they hold little but noise.
-
-        Weights follow from the picture alone, so that the noise of rendered light makes no bias; the mean of their
-        squares is 1.
-        """
+        """Of errors of a picture's pixels, so that relative errors count, but in those far darker than the mean, which
+        hold little but noise. They follow from the picture alone, so that the noise of rendered light makes no bias;
+        the mean of their squares is 1."""
         brightness = (light / self.lamp).mean(dim=-1, keepdim=True).clamp(min=0)
         weights = 1 / (_DARK * brightness.mean().clamp(min=1e-6) + brightness)
         return weights / weights.square().mean().sqrt()

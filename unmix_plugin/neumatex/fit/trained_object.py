@@ -128,11 +128,7 @@ class TrainedObject:
         return (*_COMMON, *own.get(type(self.surface.family), ()), *uncertainty, *_GEOMETRY)
 
     def output(self, name: str) -> Output:
-        """An output by its name.
-
-        Raises:
-            ConfigError: there is none.
-        """
+        """An output by its name."""
         return named_output(self.outputs, name)
 
     @property
@@ -141,12 +137,7 @@ class TrainedObject:
         return (OWN_LIGHT, *NAMES)
 
     def with_light(self, choice: LightChoice) -> TrainedObject:
-        """The object under another light.
-
-        Raises:
-            ConfigError: there is no such light.
-            SceneError: the file of an environment map is missing, damaged or unusable.
-        """
+        """The object under another light."""
         own = self.own_light or self.environment
         light = own if choice.name in (None, OWN_LIGHT) else self._named_light(str(choice.name))
         angle, stops = light.rotation_deg + choice.rotation_deg, light.exposure_stops + choice.exposure_stops
@@ -184,21 +175,13 @@ class TrainedObject:
         return replace(view, num_wanted=self.num_estimates)
 
     def render(self, camera: Cameras, names: Collection[str]) -> dict[str, Tensor]:
-        """Outputs of a view by name, (H, W, ...).
-
-        Raises:
-            ConfigError: an unknown name.
-        """
+        """Outputs of a view by name, (H, W, ...)."""
         known = [self.output(name).name for name in names]
         view = self.look(camera)
         return {name: view[name] for name in known}
 
     def probe(self, camera: Cameras, column: int, row: int) -> Probe:
-        """All outputs in one pixel, and where its ray meets the mesh.
-
-        Raises:
-            ConfigError: the pixel is outside the image.
-        """
+        """All outputs in one pixel, and where its ray meets the mesh."""
         one = one_pixel(camera, column, row)
         view = self.look(one, 1)
         values = {name: tensor.reshape(-1).double().cpu().numpy() for name, tensor in view.tensors.items()}
@@ -284,12 +267,10 @@ def trained_object(
     Args:
         model, averages: As `frozen_parameters` takes them.
         record: Cameras and frame of its run.
-    Raises:
-        RunError: the record is damaged.
     """
     frozen = frozen_parameters(model, averages)
-    triplane = copy.deepcopy(model.triplane, dict(frozen)).eval()  # type: ignore[arg-type]
-    curve = copy.deepcopy(model.curve, dict(frozen)).eval()  # type: ignore[arg-type]
+    triplane = copy.deepcopy(model.triplane, dict(frozen))  # type: ignore[arg-type]
+    curve = copy.deepcopy(model.curve, dict(frozen))  # type: ignore[arg-type]
     family = copy.deepcopy(model.family, dict(frozen))  # type: ignore[arg-type]
     return TrainedObject(
         model.traced.ray_mesh,

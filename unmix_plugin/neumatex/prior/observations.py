@@ -57,14 +57,8 @@ class PosedViews:
 
 
 def well_spread(positions: Float[Tensor, "V 3"], count: int) -> list[int]:
-    """Which cameras to take: the first, then always the one that is farthest in direction from all taken.
-
-    Args:
-        positions: Of the cameras, model space; directions are from the origin.
-        count: How many at most.
-    Returns:
-        Distinct indices, in increasing order.
-    """
+    """Which cameras to take, in increasing order: the first, then always the one that is farthest in direction, seen
+    from the origin of model space, from all taken."""
     directions = torch.nn.functional.normalize(positions, dim=-1)
     chosen = [0]
     nearest = directions @ directions[0]
@@ -79,27 +73,13 @@ NUM_LOBES = 1 + len(SHARPNESSES)
 """K: the nearly unblurred light and the blurred lobes."""
 
 
-@dataclass(frozen=True)
-class _LightLobes:
-    """A light that was blurred once, so that lobes of it are look-ups."""
-
-    diffuse: Environment
-    """Irradiance over pi of a surface by the direction of its normal; nothing is in the way."""
-    mirrored: tuple[Environment, ...]
-    """Mean radiance of each lobe by its direction, sharpest first."""
-
-    def about(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N K C"]:
-        """Mean radiance of each lobe about directions."""
-        return torch.stack([lobe.radiance(directions) for lobe in self.mirrored], dim=1)
-
-
-def _light_lobes(environment: Environment) -> _LightLobes:
-    """Blur an environment's picture into lobes."""
+def _light_lobes(environment: Environment) -> list[Environment]:
+    """Blurred once, so that lobes are look-ups: irradiance over pi of a surface by the direction of its normal, nothing
+    in the way; then the mean radiance of each lobe by its direction, sharpest first."""
     coarse = _shrunk(environment, _BLURRED_ROWS)
     blurred = [(kernel.to(coarse) @ coarse.flatten(0, 1)).reshape(coarse.shape) for kernel in _kernels()]
     images = [blurred[0], _shrunk(environment, _MIRROR_ROWS), *blurred[1:]]
-    diffuse, *mirrored = [Environment(image, environment.rotation_deg) for image in images]
-    return _LightLobes(diffuse, tuple(mirrored))
+    return [Environment(image, environment.rotation_deg) for image in images]
 
 
 @functools.cache
@@ -173,13 +153,8 @@ def known_light(
     environment: Environment,
     generator: torch.Generator,
 ) -> Observations:
-    """What is known of points of one object before any picture is read.
-
-    Args:
-        eyes: Positions of the cameras, model space, outside the mesh.
-        generator: Draws the directions of shadow rays.
-    """
-    lobes = _light_lobes(environment)
+    """What is known of points of one object, seen from outside the mesh, before any picture is read."""
+    diffuse, *lobes = _light_lobes(environment)
     mean = environment.mean_radiance().mean().clamp(min=1e-12)
     to_eye = functional.normalize(eyes - points.positions[:, None], dim=-1)
     cosines = (to_eye * points.normals[:, None]).sum(dim=-1)
@@ -187,14 +162,15 @@ def known_light(
     facing = (cosines > _LEAST_COSINE) & (above > _LEAST_COSINE)
     mirrored = functional.normalize(2 * cosines[..., None] * points.normals[:, None] - to_eye, dim=-1)
     shape = facing.shape
+    in_lobes = torch.stack([lobe.radiance(mirrored.reshape(-1, 3)) for lobe in lobes], dim=1)
     return Observations(
         positions=points.positions,
         colours=torch.zeros(*shape, 3),
         visible=facing & _open(points, to_eye, facing, ray_mesh),
         cosines=cosines.clamp(0, 1),
-        mirrored=lobes.about(mirrored.reshape(-1, 3)).unflatten(0, shape) / mean,
+        mirrored=in_lobes.unflatten(0, shape) / mean,
         mirror_open=_open(points, mirrored, facing, ray_mesh).float(),
-        irradiance=lobes.diffuse.radiance(points.normals) / mean,
+        irradiance=diffuse.radiance(points.normals) / mean,
         unshadowed=_unshadowed(points, ray_mesh, environment, generator),
     )
 
@@ -250,12 +226,9 @@ def _lobe_fits(
     weights: Float[Tensor, "*n V"],
     reaching: Float[Tensor, "*n 3"],
 ) -> Float[Tensor, "*n 7*K"]:
-    """A constant plus a share of each lobe's light, fitted to a point's colours over the views.
-
-    Returns:
-        For each lobe: the shares of the three colours, the constants over the light that reaches the point (an albedo),
-        and the part of the colours' variance that is left.
-    """
+    """A constant plus a share of each lobe's light, fitted to a point's colours over the views: for each lobe the
+    shares of the three colours, the constants over the light that reaches the point (an albedo), and the part of the
+    colours' variance that is left."""
     colours = colours.clamp(max=_BRIGHTEST)[..., None, :]
     light = mirrored.clamp(max=_BRIGHTEST)
     weights = weights[..., None, None]

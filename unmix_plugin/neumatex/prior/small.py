@@ -188,10 +188,8 @@ def predict(
 
     Args:
         views: RGB pictures of the object, on the CPU; the training views of a scene.
-        ray_mesh: The mesh in model space.
         environment: The light of the pictures, with three colours.
         material: `neural`: base colour and six latents; `pbr`: base colour, roughness, metallicity.
-        resolution: Texels along an edge of the planes.
         generator: Draws surface points and shadow rays, on the CPU.
         prior: Instead of the shipped one.
     Raises:
@@ -249,9 +247,8 @@ def _read_colours(
 def read_small_prior(material: MaterialName, folder: Path = SHIPPED) -> SmallPrior:
     """The prior in a folder, ready to predict.
 
-    Args:
-        material: What it is to predict. Only `neural` depends on the decoder: latents mean something only beside the
-            one that they were made for, so the record has its SHA-256.
+    Latents mean something only beside the decoder that they were made for, so the record has its SHA-256.
+
     Raises:
         RunError: a file is missing or damaged, or the latents belong to another decoder than the shipped one.
     """

@@ -79,8 +79,7 @@ class WanPrior(nn.Module):
         """Planes XY, YZ, XZ of objects.
 
         Args:
-            orbit: Tone-mapped views in order around the object, [-1, 1].
-            canonical: Tone-mapped views along +x, -x, +y, -y, +z, -z, [-1, 1].
+            orbit, canonical: Tone-mapped views, [-1, 1]: in order around the object; along +x, -x, +y, -y, +z, -z.
         """
         return self.decode(self.translate(self.encode(orbit, canonical)))
 
