@@ -15,7 +15,6 @@ from unmix_plugin.formats.exr import write_exr
 from unmix_plugin.trained.model_scene import LightChoice, ModelView, relit
 from unmix_plugin.viewer.panels.probe import _PROBED_ROWS, _first_numbers
 from unmix_plugin.viewer.rendering import render_loop
-from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import camera_of, sized_camera
@@ -114,23 +113,6 @@ def test_a_click_reads_the_numbers_of_the_light_that_is_shown(source):
             plain = scene.probe(camera, camera.width // 2, camera.height // 2)
     assert _first_numbers(lit.values["linear_rgb"]) in page.texts
     assert _first_numbers(lit.values["linear_rgb"]) != _first_numbers(plain.values["linear_rgb"])
-
-
-def test_a_video_of_an_object_is_rendered_in_the_light_that_is_shown(source, monkeypatch):
-    jobs: list[VideoJob] = []
-    monkeypatch.setattr(VideoQueue, "start", lambda _, job: jobs.append(job))
-    with serving(source) as (viewer, _), opened(viewer, rows=48) as page:
-        page.set("environment", "studio")
-        for number, angle in enumerate((0.3, 0.6), 1):
-            page.look_from(angle)
-            page.set("add a key frame here", True)
-            key = page.controls[page.control("key frame")]
-            page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
-        page.set("render a video", True)
-        page.wait_until(lambda: bool(page.notices))
-    assert [title for title, _ in page.notices] == ["video"]
-    [job] = jobs
-    assert {"rgb", "mp4", "studio"} <= set(job.argv)
 
 
 def test_the_strips_of_a_screenshot_have_the_scale_of_the_picture_on_screen(source, monkeypatch):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.testing import assert_close
 
 from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, uneven_light
 from unmix_plugin.errors import ConfigError, SceneError
@@ -31,7 +32,7 @@ def test_it_offers_what_commands_and_viewer_ask_of_scenes(scene):
         assert view[output.name].shape == (18, 24, *channels), output.name
         assert view[output.name].isfinite().all()
         assert (view[output.name][empty] == 0).all(), output.name
-    torch.testing.assert_close(view["rgb"][solid], scene.curve(view["linear_rgb"][solid]))
+    assert_close(view["rgb"][solid], scene.curve(view["linear_rgb"][solid]))
     with pytest.raises(ConfigError, match=r"no output named 'rouhness' \(did you mean roughness\?\)"):
         scene.render(CAMERA, ["rouhness"])
 
@@ -57,32 +58,28 @@ def test_light_adds_up_and_materials_do_not_change_with_it(scene):
     """Twice the light is twice the radiance; two stops of exposure are four times."""
     brighter = scene.with_light(LightChoice(exposure_stops=2.0))
     before, after = scene.look(CAMERA), brighter.look(CAMERA)
-    torch.testing.assert_close(after["linear_rgb"], 4 * before["linear_rgb"])
+    assert_close(after["linear_rgb"], 4 * before["linear_rgb"])
     for name in ("base_colour", "roughness", "normals", "depth"):
-        torch.testing.assert_close(after[name], before[name])
-    torch.testing.assert_close(scene.look(CAMERA)["rgb"], before["rgb"])
+        assert_close(after[name], before[name])
+    assert_close(scene.look(CAMERA)["rgb"], before["rgb"])
 
 
 def test_light_that_is_turned_once_round_is_the_same_and_half_round_another(scene):
-    before = scene.look(CAMERA)["linear_rgb"]
-    round_once = scene.with_light(LightChoice(rotation_deg=360.0)).look(CAMERA)["linear_rgb"]
-    torch.testing.assert_close(round_once, before, atol=2e-3, rtol=0.05)
-    half = scene.with_light(LightChoice(rotation_deg=180.0)).look(CAMERA)["linear_rgb"]
+    round_once, half, before = (
+        scene.with_light(LightChoice(rotation_deg=angle)).look(CAMERA)["linear_rgb"]
+        for angle in (360.0, 180.0, 0.0)
+    )
+    assert_close(round_once, before, atol=2e-3, rtol=0.05)
     assert float((half - before).abs().mean()) > 0.2 * float(before.mean())
 
 
-def test_another_light_can_be_exchanged_for_the_first_again(scene):
-    other = scene.with_light(LightChoice("studio"))
-    assert other.lights == scene.lights
-    back = other.with_light(LightChoice(OWN_LIGHT))
-    torch.testing.assert_close(back.look(CAMERA)["linear_rgb"], scene.look(CAMERA)["linear_rgb"])
-
-
-def test_a_map_of_the_same_light_in_a_file_gives_the_same_picture(scene, tmp_path):
-    image = uneven_light().image.numpy()
+def test_light_can_be_exchanged_for_the_first_again_or_the_same_from_a_file(scene, tmp_path):
+    image, other = uneven_light().image.numpy(), scene.with_light(LightChoice("studio"))
     path = write_exr(tmp_path / "light.exr", {name: image[..., i] for i, name in enumerate("RGB")}, {})
-    read = scene.with_light(LightChoice(str(path)))
-    torch.testing.assert_close(read.look(CAMERA)["linear_rgb"], scene.look(CAMERA)["linear_rgb"])
+    assert other.lights == scene.lights
+    for choice in (OWN_LIGHT, str(path)):
+        back = other.with_light(LightChoice(choice))
+        assert_close(back.look(CAMERA)["linear_rgb"], scene.look(CAMERA)["linear_rgb"])
     with pytest.raises(SceneError, match="no such environment map"):
         scene.with_light(LightChoice(str(tmp_path / "other.exr")))
     with pytest.raises(ConfigError, match=r"no environment 'studoi' \(did you mean studio\?\)"):

@@ -7,10 +7,9 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import ball, generator, mesh_from, ring_cameras, unit
+from tests.neumatex.surfaces import ball, generator, mesh_from, unit
 from unmix_plugin.neumatex.prior.observations import (
     NUM_LOBES,
-    PosedViews,
     _light_lobes,
     _lobe_fits,
     known_light,
@@ -30,25 +29,18 @@ def test_of_a_ring_the_views_taken_are_evenly_spread():
     assert well_spread(torch.eye(3), 12) == [0, 1, 2]
 
 
-def test_chosen_views_keep_picture_alpha_and_camera_together():
-    pictures, alphas = ([torch.full(size, float(i)) for i in range(3)] for size in ((8, 8, 3), (8, 8)))
-    views = PosedViews(ring_cameras(3, 8), pictures, alphas)[[2, 0]]
-    for parts in (views.pictures, views.alphas):
-        assert [float(part.mean()) for part in parts] == [2.0, 0.0]
-    assert torch.equal(views.cameras.camera_to_world, ring_cameras(3, 8).camera_to_world[[2, 0]])
-
-
 def test_the_irradiance_of_a_bright_half_follows_the_cosine():
     image = (directions_of_pixels(64, 128)[..., 2:] > 0).float().expand(64, 128, 3)
-    lobes = _light_lobes(Environment(image))
+    diffuse, *_ = _light_lobes(Environment(image))
     tilts = torch.tensor([0.0, 60.0, 90.0, 180.0]).deg2rad()
     normals = torch.stack([tilts.sin(), torch.zeros(4), tilts.cos()], dim=-1)
     # The irradiance under a hemisphere of radiance 1 is pi (1 + cos tilt) / 2.
-    assert_close(lobes.diffuse.radiance(normals)[:, 0], (1 + tilts.cos()) / 2, atol=0.01, rtol=0)
+    assert_close(diffuse.radiance(normals)[:, 0], (1 + tilts.cos()) / 2, atol=0.01, rtol=0)
     even = _light_lobes(Environment(torch.full((64, 128, 3), 2.0), exposure_stops=1.0))
     directions = unit(torch.randn(50, 3, generator=generator()))
-    assert_close(even.diffuse.radiance(directions), torch.full((50, 3), 4.0))
-    assert_close(even.about(directions), torch.full((50, NUM_LOBES, 3), 4.0))
+    assert len(even) == 1 + NUM_LOBES
+    for lobe in even:
+        assert_close(lobe.radiance(directions), torch.full((50, 3), 4.0))
 
 
 @pytest.mark.parametrize("turn", [0.0, 70.0])
@@ -56,7 +48,8 @@ def test_a_spot_is_widened_more_by_blunter_lobes_and_turns_with_the_light(turn):
     angle, image = math.radians(turn), torch.zeros(64, 128, 3)
     spot = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
     image[31:33, 63:65] = 100.0  # the picture's centre is +x before the turn
-    found = _light_lobes(Environment(image, turn)).about(torch.stack([spot, -spot]))
+    _, *lobes = _light_lobes(Environment(image, turn))
+    found = torch.stack([lobe.radiance(torch.stack([spot, -spot])) for lobe in lobes], dim=1)
     at_spot, opposite = found[0, :, 0], found[1, :, 0]
     assert (at_spot[:-1] > 2 * at_spot[1:]).all()
     assert (opposite[:-1] < 1e-6).all()

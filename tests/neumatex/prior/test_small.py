@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import pytest
 import torch
@@ -26,7 +25,6 @@ from tools.train_prior import (
     selected,
     train,
     train_readers,
-    true_layers,
     true_pbr,
     write_small_prior,
 )
@@ -70,9 +68,8 @@ def test_a_fit_moves_the_planes_to_what_is_said_and_leaves_the_readers():
     features = plane_features(planes[0], said.positions[0])
     with torch.no_grad():
         assert (networks.material(features) - said.parameters[0]).square().mean().sqrt() < 0.05
-        assert (
-            networks.log_variance(features) + 6.0
-        ).abs().mean() < 1.2  # from 1.5 and more; these readers were never trained
+        # From 1.5 and more; these readers were never trained.
+        assert (networks.log_variance(features) + 6.0).abs().mean() < 1.2
     for parameter, old in zip(networks.parameters(), before, strict=True):
         assert torch.equal(parameter, old)
 
@@ -80,16 +77,14 @@ def test_a_fit_moves_the_planes_to_what_is_said_and_leaves_the_readers():
 def test_points_that_are_sure_count_more():
     said, networks = estimates(), readers()
     planes = torch.zeros(1, 3, 12, RESOLUTION, RESOLUTION)
-    moved = said.parameters.clone()
-    moved[:, 0] = 0.0
-    unsure = said.log_variance.clone()
-    unsure[:, 0] = 0.0
+    moved, unsure = said.parameters.clone(), said.log_variance.clone()
+    moved[:, 0] = unsure[:, 0] = 0.0
     sure_loss, unsure_loss = (
         fit_loss(networks, planes, Estimates(said.positions, moved, variance))
         - fit_loss(networks, planes, Estimates(said.positions, said.parameters, variance))
         for variance in (said.log_variance, unsure)
     )
-    assert_close(unsure_loss, sure_loss * torch.exp(torch.tensor(-3.0)), rtol=1e-3, atol=1e-7)
+    assert_close(unsure_loss, sure_loss * math.exp(-3), rtol=1e-3, atol=1e-7)
 
 
 def test_objects_are_fitted_apart():
@@ -106,28 +101,15 @@ def make_prior() -> SmallPrior:
 
 
 @pytest.fixture(scope="module")
-def paths(tmp_path_factory):
+def objects(tmp_path_factory) -> TrainingObjects:
+    """Read from two files, in half precision."""
     folder = tmp_path_factory.mktemp("objects")
-    found = [folder / "first.safetensors", folder / "second.safetensors"]
-    for seed, path in enumerate(found):
-        write_objects(
-            path, [training_object(2 * seed + k, num_points=64, num_views=4, samples=4) for k in (0, 1)]
-        )
+    made = [training_object(seed, num_points=64, num_views=4, samples=4) for seed in range(4)]
+    write_objects(folder / "first.safetensors", made[:2])
+    write_objects(folder / "second.safetensors", made[2:])
+    found = read_objects(sorted(folder.iterdir()))
+    assert_close(found.select([2]).materials, made[2].materials, atol=1e-3, rtol=0)
     return found
-
-
-@pytest.fixture(scope="module")
-def objects(paths) -> TrainingObjects:
-    return read_objects(paths)
-
-
-def test_objects_come_back_from_their_files_in_half_precision(objects):
-    assert len(objects) == 4
-    expected = training_object(2, num_points=64, num_views=4, samples=4)
-    found = objects.select([2])
-    assert_close(found.materials, expected.materials, atol=1e-3, rtol=0)
-    assert torch.equal(found.observations.visible, expected.observations.visible)
-    assert_close(found.observations.colours, expected.observations.colours, atol=1e-3, rtol=1e-3)
 
 
 def test_a_batch_is_turned_but_keeps_what_belongs_to_a_point(objects):
@@ -167,15 +149,6 @@ def test_training_ends_by_the_clock_and_changes_the_weights_that_are_asked_for(o
     )
     assert changed
     assert all(name.startswith("pbr_readers.") for name in changed)
-
-
-def test_layers_that_are_absent_have_no_description():
-    materials = torch.full((1, 14), 0.5)
-    materials[:, [6, 8, 11]] = 0
-    layers = true_layers(materials)
-    assert (layers[:, [6, 7, 8, 9, 10, 11, 12]] == 0).all()
-    assert (layers[:, [0, 1, 2, 3, 4, 5, 13]] == 0.5).all()
-    assert_close(true_pbr(torch.arange(14.0)), torch.tensor([0.0, 1.0, 2.0, 4.0, 3.0]))
 
 
 @pytest.mark.parametrize("axis", [1, 2])
@@ -218,26 +191,20 @@ def test_a_point_learns_from_those_that_are_seen_alone(objects):
         assert (prior(of_seen)[:, 0] - seen).abs().max() > 1e-4
 
 
-class Scene(NamedTuple):
-    views: PosedViews
-    ray_mesh: RayMesh
-    light: Environment
+def posed_views(alpha: float = 1.0) -> PosedViews:
+    """In which pixels are coloured by where they are in the picture."""
+    ramp = ((torch.arange(32) + 0.5) / 32).expand(32, 32)
+    picture = torch.stack([ramp, ramp.T, torch.full((32, 32), 0.5)], dim=-1)
+    return PosedViews(ring_cameras(5, 32), [picture] * 5, [torch.full((32, 32), alpha)] * 5)
 
 
 @pytest.fixture(scope="module")
-def scene():
-    """Views of a sphere-like object in which pixels are coloured by where they are in the picture."""
-    ray_mesh = RayMesh(random_mesh(generator(3)))
-    ramp = (torch.arange(32) + 0.5) / 32
-    picture = torch.stack(
-        [ramp.expand(32, 32), ramp[:, None].expand(32, 32), torch.full((32, 32), 0.5)], dim=-1
-    )
-    views = PosedViews(ring_cameras(5, 32), [picture] * 5, [torch.ones(32, 32)] * 5)
-    return Scene(views, ray_mesh, random_environment(generator(4)))
+def given() -> tuple[RayMesh, Environment]:
+    return RayMesh(random_mesh(generator(3))), random_environment(generator(4))
 
 
-def test_colours_are_read_where_a_point_is_seen(scene):
-    views = scene.views
+def test_colours_are_read_where_a_point_is_seen():
+    views = posed_views()
     positions = 0.3 * torch.randn(40, 3, generator=generator())
     colours, shown = _read_colours(views, positions)
     for index in range(5):
@@ -248,9 +215,10 @@ def test_colours_are_read_where_a_point_is_seen(scene):
 
 
 @pytest.mark.parametrize("material", ["neural", "pbr"])
-def test_a_prediction_is_a_triplane_of_the_resolution_asked_for(scene, material):
+def test_a_prediction_is_a_triplane_of_the_resolution_asked_for(given, material):
     options = {"resolution": 63, "generator": generator(), "prior": make_prior()}
-    triplane = predict(scene.views, scene.ray_mesh, scene.light, material, **options)
+    ray_mesh, light = given
+    triplane = predict(posed_views(), ray_mesh, light, material, **options)
     assert triplane.planes.shape == (3, 12, 63, 63)
     parameters = triplane.parameters_at(2 * torch.rand(50, 3, generator=generator()) - 1)
     assert parameters.shape == (50, NUM_PARAMETERS[material])
@@ -266,10 +234,10 @@ def test_planes_in_a_resolution_that_subdivides_theirs_are_the_same_material():
     assert_close(finer.parameters_at(positions), own.parameters_at(positions), atol=1e-4, rtol=0)
 
 
-def test_views_beside_the_object_are_refused(scene):
-    empty = PosedViews(scene.views.cameras, scene.views.pictures, [torch.zeros(32, 32)] * 5)
+def test_views_beside_the_object_are_refused(given):
+    ray_mesh, light = given
     with pytest.raises(SceneError, match="none of 5 views shows the mesh"):
-        predict(empty, scene.ray_mesh, scene.light, "pbr", generator=generator(), prior=make_prior())
+        predict(posed_views(alpha=0.0), ray_mesh, light, "pbr", generator=generator(), prior=make_prior())
 
 
 def test_weights_come_back_and_latents_are_bound_to_their_decoder(tmp_path):
