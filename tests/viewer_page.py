@@ -60,7 +60,6 @@ class Page:
             compression=None,
         )
         self._changed = threading.Condition()
-        self._seen_texts: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
         return self
@@ -74,32 +73,15 @@ class Page:
     def look_from(self, angle: float, distance: float = 4.0, height: float = 1.5, **changes: Any) -> None:
         """Send a camera on a circle around the origin that looks at it; `changes` replace parts of the message."""
         place = (distance * math.cos(angle), distance * math.sin(angle), height)
-        self.send(
-            "ViewerCameraMessage",
-            **{
-                "wxyz": _looking_at_origin(place),
-                "position": place,
-                "fov": 0.8,
-                "near": 0.01,
-                "far": 1000.0,
-                "image_height": self.height,
-                "image_width": self.width,
-                "look_at": (0.0, 0.0, 0.0),
-                "up_direction": (0.0, 0.0, 1.0),
-                **changes,
-            },
-        )
+        camera = {"wxyz": _looking_at_origin(place), "position": place, "look_at": (0.0, 0.0, 0.0)}
+        lens = {"fov": 0.8, "near": 0.01, "far": 1000.0, "up_direction": (0.0, 0.0, 1.0)}
+        size = {"image_height": self.height, "image_width": self.width}
+        self.send("ViewerCameraMessage", **{**camera, **lens, **size, **changes})
 
     def click(self, x: float, y: float) -> None:
         """Click a point of the picture, given in parts of its width and height."""
-        self.send(
-            "ScenePointerMessage",
-            event_type="click",
-            ray_origin=(0.0, 0.0, 0.0),
-            ray_direction=(0.0, 0.0, 1.0),
-            screen_pos=((x, y),),
-            modifier=None,
-        )
+        ray = {"ray_origin": (0.0, 0.0, 0.0), "ray_direction": (0.0, 0.0, 1.0)}
+        self.send("ScenePointerMessage", event_type="click", **ray, screen_pos=((x, y),), modifier=None)
 
     def control(self, label: str) -> str:
         """Identifier of the control with a label; the newest if there are several.
@@ -107,15 +89,17 @@ class Page:
         Raises:
             KeyError: there is none.
         """
-        found = [key for key, props in self.controls.items() if props.get("label") == label]
-        if not found:
-            raise KeyError(
-                f"{label}; there are {sorted(str(one.get('label')) for one in self.controls.values())}"
-            )
-        return found[-1]
+        labels = {str(props.get("label")): key for key, props in self.controls.items()}
+        if label not in labels:
+            raise KeyError(f"{label}; there are {sorted(labels)}")
+        return labels[label]
 
-    def set(self, label: str, value: Any) -> None:
-        """Change a control, or press a button with `True`."""
+    def props(self, label: str) -> dict[str, Any]:
+        """Properties of a control, among them its value; they follow what the page is told."""
+        return self.controls[self.control(label)]
+
+    def set(self, label: str, value: Any = True) -> None:
+        """Change a control, or press a button."""
         self.send("GuiUpdateMessage", uuid=self.control(label), updates={"value": value})
 
     def send(self, kind: str, **content: Any) -> None:
@@ -138,10 +122,13 @@ class Page:
                     f"{len(self.pictures)} pictures, notices {self.notices}, closed {self.is_closed}"
                 )
 
-    @property
-    def seen_texts(self) -> str:
-        """All HTML that controls were changed to so far."""
-        return "\n".join(self._seen_texts)
+    def wait_for_notice(self, text: str) -> None:
+        """Wait for a notice that has a text."""
+        self.wait_until(lambda: any(text in said for _, said in self.notices))
+
+    def wait_for_text(self, *texts: str) -> None:
+        """Wait until the page shows all texts."""
+        self.wait_until(lambda: all(text in self.texts for text in texts))
 
     @property
     def texts(self) -> str:
@@ -173,7 +160,6 @@ class Page:
             self.pictures.append((time.monotonic(), len(message["rgb_data"])))
         elif kind == "GuiUpdateMessage":
             self.controls.setdefault(message["uuid"], {}).update(message["updates"])
-            self._seen_texts.append(str(message["updates"].get("content", "")))
         elif kind == "GuiRemoveMessage":
             self.controls.pop(message["uuid"], None)
         elif kind.startswith("Gui") and "uuid" in message and "props" in message:

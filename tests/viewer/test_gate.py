@@ -21,16 +21,16 @@ def with_word(word, headers=HERE):
     return {**headers, "authorization": "Basic " + base64.b64encode(f":{word}".encode()).decode()}
 
 
+def asked(gate, headers=HERE, page=0, port=7007) -> Any:
+    return asyncio.run(gate.judge(page, headers, "10.0.0.1", port))
+
+
 @pytest.fixture
 def ask(monkeypatch):
     """Asks a gate, which then answers in no time."""
     monkeypatch.setattr(gates, "_GUESS_S", 0.001)
     monkeypatch.setattr(gates, "_ROOM_S", 0.0)
     return asked
-
-
-def asked(gate, headers=HERE, page=0, address="10.0.0.1", port=7007) -> Any:
-    return asyncio.run(gate.judge(page, headers, address, port))
 
 
 @given(st.text().filter(lambda word: word != "sésame"))
@@ -148,13 +148,17 @@ def test_with_the_token_a_page_may_come_through_a_proxy_but_not_from_elsewhere(o
     assert _is_own_page({"origin": origin, **host}, "127.0.0.1", has_token=True) is is_own
 
 
-def test_a_name_is_own_if_the_viewer_listens_there_and_this_machines_name_if_it_listens_everywhere():
-    def is_own(name, listens_at):
-        return _is_own_page({"origin": f"http://{name}:7007", "host": f"{name}:7007"}, listens_at)
-
-    assert is_own("lab.example", "lab.example")
-    assert not is_own("lab.example", "0.0.0.0")
-    assert is_own(socket.gethostname(), "0.0.0.0")
+@pytest.mark.parametrize(
+    ("name", "listens_at", "is_own"),
+    [
+        ("lab.example", "lab.example", True),
+        ("lab.example", "0.0.0.0", False),
+        (socket.gethostname(), "0.0.0.0", True),
+    ],
+)
+def test_a_name_is_own_if_the_viewer_listens_there_or_everywhere_on_that_machine(name, listens_at, is_own):
+    page = {"origin": f"http://{name}:7007", "host": f"{name}:7007"}
+    assert _is_own_page(page, listens_at) is is_own
 
 
 def test_a_malformed_cookie_of_another_program_does_not_hide_ours_and_malformed_words_are_wrong_ones(ask):

@@ -34,6 +34,11 @@ from unmix_plugin.viewer.rendering.scene import Edit, SceneSource
 from unmix_plugin.viewer.rendering.settings import BACKGROUNDS
 
 
+def put(page, values):
+    for label, value in values.items():
+        page.set(label, value)
+
+
 def source_of_bands(folder, *centers_nm):
     """A model of other bands."""
     model, bands = make_model(), Bands.of(list(centers_nm))
@@ -58,14 +63,14 @@ def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compress
 
 def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_what_is_wrong(viewer):
     with opened(viewer) as page:
-        names = page.controls[page.control("index")]["options"]
+        names = page.props("index")["options"]
         assert "pri" in names
         assert "ndvi" not in names
         first = show_layer(page, "spectral index")
         page.set("index", "redness")
-        page.wait_until(lambda: "redness index of soils" in page.texts)
+        page.wait_for_text("redness index of soils")
         page.set("formula", " r650/r450 ")
-        page.wait_until(lambda: "formula r650/r450" in page.texts)
+        page.wait_for_text("formula r650/r450")
         assert "of radiance: light unknown" in page.texts
         for wrong, said in (
             ("r650/(r450", "expected"),
@@ -74,42 +79,34 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
             ("nvdi", "there is no index"),
         ):
             page.set("formula", wrong)
-            page.wait_until(lambda said=said: html.escape(said) in page.texts)
+            page.wait_for_text(html.escape(said))
         page.set("formula", "")
         page.set("index", names[0])
         page.wait_until(lambda: "characters" not in page.texts and "photochemical" in page.texts)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 
-def test_the_ends_of_a_range_are_shown_when_they_are_ones_own_and_begin_as_they_were(viewer):
+def test_a_range_of_ones_own_begins_as_it_was_and_stays_where_it_would_end_below_its_beginning(viewer):
     with opened(viewer) as page:
         show_layer(page, "depth")
-        page.wait_until(lambda: "distance along the viewing axis" in page.texts)
-        low, high = (page.controls[page.control(label)] for label in ("low", "high"))
+        page.wait_for_text("distance along the viewing axis")
+        (session,) = viewer._sessions.values()
+        low, high = (page.props(label) for label in ("low", "high"))
         assert (low["visible"], high["visible"]) == (False, False)
         before = decoded(page.last_picture)
-        page.set("own range", True)
+        page.set("own range")
         page.wait_until(lambda: low["visible"] and high["visible"] and high["value"] > 2)
-        page.set("high", high["value"] + 5)
+        page.wait_until(lambda: session.view.settings.value_range is not None)
+        assert page.notices == []
+        least, greatest = session.view.settings.value_range
+        page.set("high", least - 1)
+        page.wait_for_notice("until low is below high")
+        assert session.view.settings.value_range == (least, greatest)
+        page.set("high", greatest + 5)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() > 3)
         page.set("own range", False)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
         assert not low["visible"]
-
-
-def test_a_range_that_ends_below_its_beginning_is_refused_and_the_one_before_stays(viewer):
-    with opened(viewer) as page:
-        show_layer(page, "depth")
-        page.set("own range", True)
-        (session,) = viewer._sessions.values()
-        page.wait_until(lambda: session.view.settings.value_range is not None)
-        assert page.notices == []
-        before = session.view.settings.value_range
-        page.set("high", before[0] - 1)
-        page.wait_until(lambda: any("until low is below high" in text for _, text in page.notices))
-        assert session.view.settings.value_range == before
-        page.set("low", before[0] - 2)
-        page.wait_until(lambda: session.view.settings.value_range == (before[0] - 2, before[0] - 1))
 
 
 def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, monkeypatch):
@@ -119,10 +116,10 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
         SceneApi, "add_point_cloud", lambda *args, **more: (clouds.append(args[2:]), add(*args, **more))[1]
     )
     with opened(viewer) as page:
-        page.set("point cloud", True)
+        page.set("point cloud")
         page.wait_until(lambda: len(clouds) == 1)
         page.set("light", "A")
-        recipe = page.controls[page.control("recipe")]
+        recipe = page.props("recipe")
         page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
         (points, colours), (same, relit) = clouds
         assert np.array_equal(points, same)
@@ -131,156 +128,140 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
         page.wait_until(lambda: len(clouds) == 3)
         assert 0 < len(clouds[-1][0]) < len(points)
         page.set("point cloud", False)
-        page.set("visible", True)
+        page.set("visible")
         show_layer(page, "depth")
         assert len(clouds) == 3
-
-
-def test_a_region_that_is_kept_or_removed_elsewhere_is_listed_or_no_longer(tmp_path):
-    source = make_source(tmp_path, initial_opacity=0.6)
-    with serving(source) as (viewer, _), opened(viewer) as page:
-        options = lambda: page.controls[page.control("region")]["options"]  # noqa: E731
-        keep_region(source.run, "cup", Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))
-        page.wait_until(lambda: "cup" in options())
-        keep_region(source.run, "cup", None)
-        page.wait_until(lambda: "cup" not in options())
 
 
 def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(viewer):
     with opened(viewer) as page:
         page.click(0.5, 0.5)
-        page.wait_until(lambda: "endmember_" in page.texts and "position" in page.texts)
+        page.wait_for_text("endmember_", "position")
         assert any(props.get("type") == "GuiUplotMessage" for props in page.controls.values())
-        page.set("save as CSV", True)
+        page.set("save as CSV")
         page.wait_until(lambda: len(page.downloads) == 2)
         saved = sorted(path.name for path in viewer.services.folder.iterdir())
         assert saved == ["probe-abundances.csv", "probes.csv"]
         page.look_from(0.0, distance=40.0)
         page.click(0.01, 0.01)
-        page.wait_until(lambda: any("nothing is there" in text for _, text in page.notices))
-        assert page.controls[page.control("probe")]["options"] == [
-            page.controls[page.control("probe")]["value"]
-        ]
-        page.set("forget all", True)
-        page.wait_until(lambda: page.controls[page.control("probe")]["options"] == ["none yet"])
+        page.wait_for_notice("nothing is there")
+        assert page.props("probe")["options"] == [page.props("probe")["value"]]
+        page.set("forget all")
+        page.wait_until(lambda: page.props("probe")["options"] == ["none yet"])
 
 
 @pytest.mark.slow
 def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
     run = viewer.services.source.run
     with opened(viewer) as page:
-        probing = page.controls[page.control("probe where I click")]
-        page.set("set scale", True)
-        page.wait_until(
-            lambda: any("click two points of the object first" in text for _, text in page.notices)
-        )
-        page.set("measure where I click", True)
+        probing = page.props("probe where I click")
+        page.set("set scale")
+        page.wait_for_notice("click two points of the object first")
+        page.set("measure where I click")
         page.wait_until(lambda: probing["value"] is False)
         page.click(0.5, 0.5)
-        page.wait_until(lambda: "Click a second point" in page.texts)
+        page.wait_for_text("Click a second point")
         page.click(0.4, 0.5)
-        page.wait_until(lambda: " units</td>" in page.texts)
-        assert page.controls[page.control("probe")]["options"] == ["none yet"]
+        page.wait_for_text(" units</td>")
+        assert page.props("probe")["options"] == ["none yet"]
         units = float(re.findall(r"([0-9.]+) units</td>", page.texts)[-1])
-        page.set("set scale", True)
-        page.wait_until(lambda: any("the distance is 0 m" in text for _, text in page.notices))
+        page.set("set scale")
+        page.wait_for_notice("the distance is 0 m")
         assert not (run.path / "measures.json").exists()
         page.set("distance (m)", 0.05)
         in_the_way = run.path / ".measures.json.tmp"
         in_the_way.mkdir()
-        page.set("set scale", True)
-        page.wait_until(lambda: any("can't write" in text for _, text in page.notices))
+        page.set("set scale")
+        page.wait_for_notice("can't write")
         in_the_way.rmdir()
-        page.set("set scale", True)
-        page.wait_until(lambda: "5 cm</td>" in page.texts and "1 unit is" in page.texts)
+        page.set("set scale")
+        page.wait_for_text("5 cm</td>", "1 unit is")
         scale = read_measures(run).scale
         assert scale is not None
         assert scale.metres_per_unit == pytest.approx(0.05 / units, rel=1e-3)
-        page.set("probe where I click", True)
-        page.wait_until(lambda: page.controls[page.control("measure where I click")]["value"] is False)
+        page.set("probe where I click")
+        page.wait_until(lambda: page.props("measure where I click")["value"] is False)
     (run.path / "measures.json").unlink()
 
 
 def test_no_scale_is_set_before_training_has_ended(tmp_path):
     with serving(make_source(tmp_path, TrainingControl())) as (viewer, _), opened(viewer) as page:
-        page.set("set scale", True)
-        page.wait_until(lambda: any("when training has ended" in text for _, text in page.notices))
+        page.set("set scale")
+        page.wait_for_notice("when training has ended")
 
 
 @pytest.mark.slow
 def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
     source = make_source(tmp_path, initial_opacity=0.6)
     with serving(source) as (viewer, _), opened(viewer) as page:
-        options = lambda: page.controls[page.control("region")]["options"]  # noqa: E731
-        page.set("keep the region", True)
-        page.wait_until(lambda: any("can't be the name of a region" in text for _, text in page.notices))
+        options = lambda: page.props("region")["options"]  # noqa: E731
+        page.set("keep the region")
+        page.wait_for_notice("can't be the name of a region")
         page.set("region name", "middle part")
-        page.set("keep the region", True)
-        page.wait_until(lambda: any("draw a region first" in text for _, text in page.notices))
-        page.set("draw where I click", True)
-        page.wait_until(lambda: page.controls[page.control("probe where I click")]["value"] is False)
+        page.set("keep the region")
+        page.wait_for_notice("draw a region first")
+        page.set("draw where I click")
+        page.wait_until(lambda: page.props("probe where I click")["value"] is False)
         page.click(0.4, 0.4)
-        page.wait_until(lambda: "Corners: 1" in page.texts)
+        page.wait_for_text("Corners: 1")
         page.click(0.6, 0.6)
-        page.wait_until(lambda: "Corners: 2" in page.texts)
-        page.set("keep the region", True)
+        page.wait_for_text("Corners: 2")
+        page.set("keep the region")
         page.wait_until(lambda: options() == ["none: choose one", "middle part"])
-        page.wait_until(lambda: " square units</td>" in page.texts)
+        page.wait_for_text(" square units</td>")
         kept = read_measures(source.run).regions["middle part"]
         assert isinstance(kept, InView)
         rows, columns = np.nonzero(kept.mask())
         height, width = kept.mask().shape
-        assert (rows.min() / height, columns.max() / width) == (
-            pytest.approx(0.4, abs=0.01),
-            pytest.approx(0.6, abs=0.01),
-        )
+        assert (rows.min() / height, columns.max() / width) == pytest.approx((0.4, 0.6), abs=0.01)
         with source.borrowed_materials() as scene:
             found = MeasuredSurface.of(scene).measure(kept, "")
         assert f"{found.area:.4g} square units" in page.texts
         page.look_from(0.9)
         page.click(0.5, 0.5)
-        page.wait_until(lambda: "Corners: 1" in page.texts)
+        page.wait_for_text("Corners: 1")
         page.look_from(0.3)
         page.click(0.5, 0.5)
-        page.wait_until(lambda: "The view has changed, so the outline begins here" in page.texts)
+        page.wait_for_text("The view has changed, so the outline begins here")
         page.set("shape", "polygon")
-        page.wait_until(lambda: "Tick the box" in page.texts)
+        page.wait_for_text("Tick the box")
         for count, place in enumerate(((0.5, 0.4), (0.6, 0.6), (0.45, 0.6)), 1):
             page.click(*place)
-            page.wait_until(lambda count=count: f"Corners: {count}." in page.texts)
+            page.wait_for_text(f"Corners: {count}.")
         page.set("region name", "wedge")
-        page.set("keep the region", True)
+        page.set("keep the region")
         page.wait_until(lambda: options() == ["none: choose one", "middle part", "wedge"])
         for name in ("wedge", "middle part"):
             page.set("region", name)
-            page.set("remove the region", True)
+            page.set("remove the region")
             page.wait_until(lambda name=name: ("region removed", name) in page.notices)
             assert name not in options()
         assert read_measures(source.run).regions == {}
 
 
-def test_numbers_of_a_region_go_when_one_is_chosen_that_cannot_be_measured(tmp_path):
+def test_a_region_kept_or_removed_elsewhere_is_listed_or_not_and_numbers_are_of_the_one_chosen(tmp_path):
     source = make_source(tmp_path, initial_opacity=0.6)
-    keep_region(source.run, "all of it", Box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0)))
     keep_region(source.run, "far away", Box((50.0, 50.0, 50.0), (51.0, 51.0, 51.0)))
     with serving(source) as (viewer, _), opened(viewer) as page:
+        keep_region(source.run, "all of it", Box((-5.0, -5.0, -5.0), (5.0, 5.0, 5.0)))
+        page.wait_until(lambda: "all of it" in page.props("region")["options"])
         page.set("region", "all of it")
-        page.wait_until(lambda: " square units</td>" in page.texts)
+        page.wait_for_text(" square units</td>")
         page.set("region", "far away")
-        page.wait_until(lambda: any("far away has nothing" in text for _, text in page.notices))
+        page.wait_for_notice("far away has nothing")
         assert " square units</td>" not in page.texts
+        keep_region(source.run, "all of it", None)
+        page.wait_until(lambda: "all of it" not in page.props("region")["options"])
 
 
 def test_depth_comes_with_objects_and_goes_with_them(viewer):
     with opened(viewer) as page:
-        page.set("scene box", True)
+        page.set("scene box")
         page.wait_until(lambda: page.last_depth is not None)
-        for label, is_on in (("cameras", True), ("point cloud", True), ("scene box", False)):
-            page.set(label, is_on)
+        put(page, {"cameras": True, "point cloud": True, "scene box": False})
         show_layer(page, "depth")
         assert page.last_depth is not None
-        page.set("cameras", False)
-        page.set("point cloud", False)
+        put(page, {"cameras": False, "point cloud": False})
         page.wait_until(lambda: page.last_depth is None)
         assert page.notices == []
 
@@ -290,15 +271,15 @@ def test_materials_are_edited_undone_saved_and_loaded(viewer):
         before, count = decoded(page.last_picture), len(other.pictures)
         page.set("brightness", 4.0)
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() > 10)
-        page.wait_until(lambda: "scale" in page.controls[page.control("recipe")]["value"])
+        page.wait_until(lambda: "scale" in page.props("recipe")["value"])
         page.set("save as", "../../bright")
-        page.set("save", True)
+        page.set("save")
         page.wait_until(lambda: bool(page.downloads))
         saved = list((viewer.services.source.run.path / "recipes").iterdir())
         assert [path.name for path in saved] == ["bright.yml"]
         page.set("changes", "undo")
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() < 3)
-        page.set("load", True)
+        page.set("load")
         page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).max() > 10)
         assert len(other.pictures) == count  # another page's materials are its own
 
@@ -319,25 +300,22 @@ CHANGES = (
 @pytest.mark.slow
 def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
     with opened(viewer) as page:
-        recipe = page.controls[page.control("recipe")]
-        assert page.controls[page.control("known material")]["value"] == "choose one"
+        recipe = page.props("recipe")
+        assert page.props("known material")["value"] == "choose one"
         page.set("known material", "ColorChecker/red")
         for label, value, written in CHANGES:
-            page.set(label, value)
-            page.wait_until(lambda written=written: written in recipe["value"])
-            page.set("changes", "undo")
-            page.wait_until(lambda: recipe["value"] == "edits: []\n")
-            page.set("changes", "redo")
-            page.wait_until(lambda written=written: written in recipe["value"])
-            page.set("changes", "undo")
-            page.wait_until(lambda: recipe["value"] == "edits: []\n")
+            for control, action in ((label, value), ("changes", "redo")):
+                page.set(control, action)
+                page.wait_until(lambda written=written: written in recipe["value"])
+                page.set("changes", "undo")
+                page.wait_until(lambda: recipe["value"] == "edits: []\n")
         assert not any(title == "not done" for title, _ in page.notices)
 
 
 @pytest.mark.slow
 def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(viewer):
     with opened(viewer) as page:
-        name, recipe = (page.controls[page.control(label)] for label in ("name", "recipe"))
+        name, recipe = (page.props(label) for label in ("name", "recipe"))
         for length in range(len("blue cloth") + 1):
             page.set("name", "blue cloth"[:length])
         page.wait_until(lambda: "name: blue cloth" in recipe["value"])
@@ -348,7 +326,7 @@ def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes
         page.wait_until(lambda: recipe["value"] == "edits: []\n" and name["value"] == "endmember_0")
         assert page.notices == []
         page.set("name", "endmember_1")
-        page.wait_until(lambda: any("is called 'endmember_1' already" in text for _, text in page.notices))
+        page.wait_for_notice("is called 'endmember_1' already")
         assert recipe["value"] == "edits: []\n"
         page.wait_until(lambda: name["value"] == "endmember_0")
 
@@ -356,9 +334,9 @@ def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes
 def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_changes_nothing(viewer):
     def load(page, name, said):
         page.set("saved", name)
-        page.set("load", True)
-        page.wait_until(lambda: any(said in text for _, text in page.notices))
-        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+        page.set("load")
+        page.wait_for_notice(said)
+        assert page.props("recipe")["value"] == "edits: []\n"
 
     recipes = viewer.services.recipes_folder
     (recipes.parent / "secret.yml").write_text("edits:\n  - scale: {endmember: 0, factor: 3}\n")
@@ -382,7 +360,7 @@ def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it
     source = source_of_bands(tmp_path, *(first_nm + 50.0 * index for index in range(5)))
     with serving(source) as (viewer, _), opened(viewer) as page:
         page.set("known material", "ColorChecker/red")
-        page.set("replace by the known material", True)
+        page.set("replace by the known material")
         page.wait_until(lambda: any(title == one and said in text for one, text in page.notices))
 
 
@@ -390,24 +368,28 @@ def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it
 def test_every_light_that_is_offered_can_be_chosen(tmp_path):
     source = source_of_bands(tmp_path, 700.0, 800.0, 900.0, 1000.0, 1100.0)
     with serving(source) as (viewer, _), opened(viewer) as page:
-        offered = page.controls[page.control("light")]["options"]
+        offered = page.props("light")["options"]
         assert 3 < len(offered) < len(illuminant_names())
         for name in offered[1:]:
             edited = viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))
             assert edited.light_power is not None
 
 
-def test_a_screenshot_has_the_size_asked_for_and_lies_in_the_run_folder(viewer):
+def test_pictures_and_spectra_have_the_size_asked_for_and_lie_in_the_run_folder(viewer):
     with opened(viewer) as page:
-        for label, value in (("width", 60), ("height", 40), ("file name", "../../../evil/../shot")):
-            page.set(label, value)
-        page.set("save a screenshot (PNG)", True)
+        put(page, {"width": 60, "height": 40, "file name": "../../../evil/../shot"})
+        page.set("save a screenshot (PNG)")
         page.wait_until(lambda: bool(page.downloads))
         (path,) = viewer.services.folder.iterdir()
         assert path.name == "evil_.._shot.png"
         picture = Image.open(path)
         assert picture.size == (60, 40)
         assert np.asarray(picture).std() > 5
+        put(page, {"width": 32, "height": 24, "file name": "view"})
+        page.set("save the spectra (EXR)")
+        page.wait_until(lambda: "view.exr" in page.downloads)
+        found = read_exr(viewer.services.folder / "view.exr")
+        assert found["S0.450,000000nm"].shape == (24, 32)
 
 
 @pytest.mark.slow
@@ -435,7 +417,7 @@ def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
     with opened(viewer) as page:
         page.set("colour", (120, 110, 100))
         page.wait_until(lambda: bool(page.notices))
-        recipe = page.controls[page.control("recipe")]
+        recipe = page.props("recipe")
         for label, value, written in (("brightness", 2.0, "scale"), ("light", "A", "illuminant: A")):
             page.set(label, value)
             page.wait_until(lambda written=written: written in recipe["value"])
@@ -462,29 +444,16 @@ def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
         page.wait_until(lambda: axes(page) == ["radiance", "radiance", "radiance or reflectance"])
 
 
-def test_spectra_are_saved_as_exr(viewer):
-    with opened(viewer) as page:
-        page.set("width", 32)
-        page.set("height", 24)
-        page.set("save the spectra (EXR)", True)
-        page.wait_until(lambda: page.downloads == ["view.exr"])
-        (path,) = viewer.services.folder.iterdir()
-        assert read_exr(path)["S0.450,000000nm"].shape == (24, 32)
-
-
 @pytest.mark.slow
 def test_sizes_that_are_too_large_or_out_of_bounds_are_refused(viewer):
     with opened(viewer) as page:
         for label, value in (("width", 100_000), ("height", 1e9), ("width", -3)):
-            for one in ("width", "height"):
-                page.set(one, value if one == label else 1024)
-            page.set("save the spectra (EXR)" if value < 0 else "save a screenshot (PNG)", True)
-            said = f"{label} is a number of pixels from 16 to 8192; found {value:g}"
-            page.wait_until(lambda said=said: any(said in text for _, text in page.notices))
-        page.set("width", 8192)
-        page.set("height", 8192)
-        page.set("save a screenshot (PNG)", True)
-        page.wait_until(lambda: "8192 x 8192 pixels are too many" in page.notices[-1][1])
+            put(page, {"width": 1024, "height": 1024, label: value})
+            page.set("save the spectra (EXR)" if value < 0 else "save a screenshot (PNG)")
+            page.wait_for_notice(f"{label} is a number of pixels from 16 to 8192; found {value:g}")
+        put(page, {"width": 8192, "height": 8192})
+        page.set("save a screenshot (PNG)")
+        page.wait_for_notice("8192 x 8192 pixels are too many")
         assert not viewer.services.folder.exists()
 
 
@@ -492,12 +461,11 @@ def test_a_path_through_key_frames_is_a_camera_file(viewer):
     with opened(viewer) as page:
         for number, angle in enumerate((0.3, 0.8, 1.3), start=1):
             page.look_from(angle)
-            page.set("add a key frame here", True)
-            key = page.controls[page.control("key frame")]
+            page.set("add a key frame here")
+            key = page.props("key frame")
             page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
-        for label, value in (("seconds", 1.0), ("frames a second", 10), ("width", 641), ("height", 360)):
-            page.set(label, value)
-        page.set("save the path", True)
+        put(page, {"seconds": 1.0, "frames a second": 10, "width": 641, "height": 360})
+        page.set("save the path")
         page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
         (path,) = viewer.services.folder.iterdir()
         found = read_camera_file(path, world_frame(viewer.services.source.record))
@@ -537,7 +505,7 @@ def test_all_that_another_method_names_is_shown_by_its_kind_as_its_scene_renders
     scene = ModelScene(model.eval(), world_frame(record), recorded_views(record), OUTPUTS)
     source = SceneSource(RunFolder(tmp_path), record, DeviceShare(), lambda: scene)
     with serving(source) as (viewer, _), opened(viewer) as page:
-        assert page.controls[page.control("layer")]["options"] == [output.title for output in OUTPUTS]
+        assert page.props("layer")["options"] == [output.title for output in OUTPUTS]
         assert not has_control(page, "known material")
         assert not has_control(page, "save the spectra (EXR)")
         pictures = [show_layer(page, output.title) for output in OUTPUTS[1:]]
@@ -548,12 +516,11 @@ def test_all_that_another_method_names_is_shown_by_its_kind_as_its_scene_renders
         assert (view.frame.camera.width, view.frame.camera.height) == (32, 24)
         torch.testing.assert_close(view.frame["direction"], scene.look(view.frame.camera)["direction"])
         page.click(0.5, 0.5)
-        page.wait_until(lambda: "direction" in page.texts and "rgb" in page.texts)
-        page.set("measure where I click", True)
-        page.wait_until(lambda: page.controls[page.control("probe where I click")]["value"] is False)
+        page.wait_for_text("direction", "rgb")
+        page.set("measure where I click")
+        page.wait_until(lambda: page.props("probe where I click")["value"] is False)
         page.click(0.5, 0.5)
         page.wait_until(lambda: "Click a second point" in page.texts or bool(page.notices))
-        page.set("width", 32)
-        page.set("height", 24)
-        page.set("save a screenshot (PNG)", True)
+        put(page, {"width": 32, "height": 24})
+        page.set("save a screenshot (PNG)")
         page.wait_until(lambda: page.downloads == ["view.png"])

@@ -36,57 +36,44 @@ from unmix_plugin.viewer.recipes import (
     with_visible,
 )
 
-
-def test_the_last_change_of_a_kind_to_an_endmember_counts():
-    recipe = with_change(Recipe(), Scale(0, 2.0))
-    recipe = with_change(recipe, Scale(1, 3.0))
-    recipe = with_change(recipe, Retint(0, (0.1, 0.2, 0.3)))
-    recipe = with_change(recipe, Scale(0, 5.0))
-    assert recipe.operations == (Scale(1, 3.0), Retint(0, (0.1, 0.2, 0.3)), Scale(0, 5.0))
-    assert change_of(recipe, Scale, 0) == Scale(0, 5.0)
-    assert change_of(recipe, Gloss, 0) is None
+RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
+CLAY = Rename(0, "clay")
 
 
 def test_a_change_takes_the_place_of_those_of_which_it_leaves_nothing():
-    red, blue = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
-    recipe = with_change(Recipe((Scale(1, 2.0), Rename(0, "clay"))), Scale(0, 3.0))
-    coloured = with_change(recipe, Retint(0, red))
-    assert coloured.operations == (Scale(1, 2.0), Rename(0, "clay"), Retint(0, red))
+    recipe = Recipe((Scale(1, 2.0), CLAY))
+    for change in (Scale(0, 2.0), Scale(0, 3.0)):
+        recipe = with_change(recipe, change)
+        assert recipe.operations == (Scale(1, 2.0), CLAY, change)
+    assert (change_of(recipe, Scale, 0), change_of(recipe, Gloss, 0)) == (Scale(0, 3.0), None)
+    coloured = with_change(recipe, Retint(0, RED))
+    assert coloured.operations == (Scale(1, 2.0), CLAY, Retint(0, RED))
     brighter = with_change(coloured, Scale(0, 1.5))
-    assert change_of(brighter, Retint, 0) == Retint(0, red)
+    assert change_of(brighter, Retint, 0) == Retint(0, RED)
     replaced = with_change(brighter, Replace(0, "ColorChecker/blue"))
-    assert replaced.operations == (Scale(1, 2.0), Rename(0, "clay"), Replace(0, "ColorChecker/blue"))
-    by_hand = Recipe((Scale(0, 3.0), Retint(0, red), Replace(0, "ColorChecker/blue")))
+    assert replaced.operations == (Scale(1, 2.0), CLAY, Replace(0, "ColorChecker/blue"))
+    by_hand = Recipe((Scale(0, 3.0), Retint(0, RED), Replace(0, "ColorChecker/blue")))
     assert change_of(by_hand, Scale, 0) is change_of(by_hand, Retint, 0) is None
-    assert change_of(with_change(by_hand, Retint(0, blue)), Replace, 0) == Replace(0, "ColorChecker/blue")
+    assert change_of(with_change(by_hand, Retint(0, BLUE)), Replace, 0) == Replace(0, "ColorChecker/blue")
 
 
-def test_a_swap_carries_the_changes_of_a_spectrum_along():
-    red, blue = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
-    swapped = with_swap(Recipe((Rename(0, "clay"), Retint(0, red), Scale(3, 2.0))), Swap(0, 3))
-    assert change_of(swapped, Retint, 3) == Retint(0, red)
-    assert change_of(swapped, Retint, 0) is change_of(swapped, Scale, 3) is None
-    assert change_of(swapped, Scale, 0) == Scale(3, 2.0)
-    assert change_of(swapped, Rename, 0) == Rename(0, "clay")
-    both = with_change(swapped, Retint(0, blue))
-    assert both.operations == (Rename(0, "clay"), Retint(0, red), Swap(0, 3), Retint(0, blue))
-    assert with_change(swapped, Retint(3, blue)).operations[1:] == (
-        Scale(3, 2.0),
-        Swap(0, 3),
-        Retint(3, blue),
-    )
+@pytest.mark.parametrize("first", [Retint(0, RED), Scale(0, 2.0), Replace(0, "x/y")])
+def test_a_swap_carries_the_changes_of_a_spectrum_along_but_not_names_and_gloss(first):
+    recipe = with_swap(Recipe((CLAY, Gloss(0, 0.5), first)), Swap(0, 3))
+    assert change_of(recipe, type(first), 3) == first
+    assert change_of(recipe, type(first), 0) is None
+    assert (change_of(recipe, Rename, 0), change_of(recipe, Gloss, 0)) == (CLAY, Gloss(0, 0.5))
+    assert with_change(recipe, first).operations == (*recipe.operations, first)
+    moved, glossy = replace(first, endmember=3), Gloss(0, 2.0)
+    assert with_change(recipe, moved).operations == (CLAY, Gloss(0, 0.5), Swap(0, 3), moved)
+    assert with_change(recipe, glossy).operations == (CLAY, first, Swap(0, 3), glossy)
 
 
+endmembers, colours = st.integers(0, 2), st.tuples(*[st.floats(0.2, 0.8)] * 3)
 panel_changes = st.one_of(
-    st.builds(partial, st.just(Scale), st.integers(0, 2), st.floats(0.1, 5.0)),
-    st.builds(
-        partial,
-        st.just(Retint),
-        st.integers(0, 2),
-        st.tuples(*[st.floats(0.2, 0.8)] * 3),
-        st.just("spectrum"),
-    ),
-    st.builds(partial, st.just(Replace), st.integers(0, 2), st.just("ColorChecker/red")),
+    st.builds(partial, st.just(Scale), endmembers, st.floats(0.1, 5.0)),
+    st.builds(partial, st.just(Retint), endmembers, colours, st.just("spectrum")),
+    st.builds(partial, st.just(Replace), endmembers, st.just("ColorChecker/red")),
     st.sampled_from([partial(Swap, 0, 1), partial(Swap, 1, 2), partial(Swap, 0, 2)]),
 )
 
@@ -107,22 +94,6 @@ def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_
         assert change_of(recipe, type(change), change.endmember) == change
         others = [index for index in range(3) if index != change.endmember]
         torch.testing.assert_close(after[others], before[others])
-
-
-@pytest.mark.parametrize("first", [Retint(0, (0.1, 0.2, 0.3)), Scale(0, 2.0), Replace(0, "x/y")])
-def test_a_change_stays_with_the_look_that_a_swap_has_taken_elsewhere(first):
-    recipe = with_swap(with_change(Recipe(), first), Swap(0, 3))
-    assert change_of(recipe, type(first), 3) == first
-    assert change_of(recipe, type(first), 0) is None
-    assert with_change(recipe, first).operations == (first, Swap(0, 3), first)
-    moved = replace(first, endmember=3)
-    assert with_change(recipe, moved).operations == (Swap(0, 3), moved)
-
-
-def test_names_and_gloss_stay_where_they_are_when_looks_are_swapped():
-    recipe = with_swap(with_change(Recipe(), Gloss(0, 0.5)), Swap(0, 3))
-    assert change_of(recipe, Gloss, 0) == Gloss(0, 0.5)
-    assert with_change(recipe, Gloss(0, 2.0)).operations == (Swap(0, 3), Gloss(0, 2.0))
 
 
 def test_the_same_swap_twice_in_a_row_takes_it_back():
@@ -156,21 +127,11 @@ def test_changes_are_undone_and_redone_in_order():
 
 
 def test_names_become_numbers_also_where_they_were_given_in_the_recipe():
-    operations = (
-        Rename("b", "clay"),
-        Swap("clay", "a"),
-        Remove(("clay", 2)),
-        Gloss(None, 0.5),
-        Replace("a", "x/y"),
-    )
-    assert numbered(Recipe((*operations, Scale("x", 2.0))), ("a", "b", "c")).operations == (
-        Rename(1, "clay"),
-        Swap(1, 0),
-        Remove((1, 2)),
-        Gloss(None, 0.5),
-        Replace(0, "x/y"),
-        Scale("x", 2.0),  # left for whoever applies it
-    )
+    named = (Rename("b", "clay"), Swap("clay", "a"), Remove(("clay", 2)), Replace("a", "x/y"))
+    as_they_are = (Gloss(None, 0.5), Scale("x", 2.0))  # the latter is left for whoever applies it
+    expected = (Rename(1, "clay"), Swap(1, 0), Remove((1, 2)), Replace(0, "x/y"))
+    found = numbered(Recipe((*named, *as_they_are)), ("a", "b", "c"))
+    assert found.operations == (*expected, *as_they_are)
 
 
 @pytest.mark.parametrize("isolated", [None, 2])

@@ -35,7 +35,7 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
     with opened(viewer, storage=storage) as page:
         page.look_from(1.7)
         page.set("brightness", 3.0)
-        page.wait_until(lambda: "scale" in page.controls[page.control("recipe")]["value"])
+        page.wait_until(lambda: "scale" in page.props("recipe")["value"])
         before = show_layer(page, "all abundances")
         page.wait_until(lambda: len(decoded(page.last_picture)) == 24)
         time.sleep(0.5)  # the edit can reach the picture after the layer
@@ -44,13 +44,13 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         page.look_from(0.3)
         page.wait_until(lambda: bool(page.pictures) and len(decoded(page.last_picture)) == 24)
         page.wait_until(lambda: np.allclose(decoded(page.last_picture), before, rtol=0, atol=2))
-        assert page.controls[page.control("layer")]["value"] == "all abundances"
-        assert "scale" in page.controls[page.control("recipe")]["value"]
+        assert page.props("layer")["value"] == "all abundances"
+        assert "scale" in page.props("recipe")["value"]
         page.set("changes", "undo")
-        page.wait_until(lambda: page.controls[page.control("recipe")]["value"] == "edits: []\n")
+        page.wait_until(lambda: page.props("recipe")["value"] == "edits: []\n")
     with opened(viewer) as page:
-        assert page.controls[page.control("layer")]["value"] == "colour"
-        assert page.controls[page.control("recipe")]["value"] == "edits: []\n"
+        assert page.props("layer")["value"] == "colour"
+        assert page.props("recipe")["value"] == "edits: []\n"
 
 
 def test_the_curve_of_a_training_has_every_point_once_stays_small_and_covers_all_of_it(tmp_path):

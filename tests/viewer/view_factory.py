@@ -27,7 +27,6 @@ from unmix_plugin.viewer.rendering.pictures import PictureMaker, Shown, _Speedom
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.rendering.settings import LayerSettings
-from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import ViewPose, pose_of
 
 WIDTH, HEIGHT, FOCAL = 24, 16, 20.0
@@ -56,13 +55,6 @@ def source_of_model(model: UnmixModel, folder: Path, control: TrainingControl | 
 def no_scene() -> Scene:
     """A reader of a scene that is not at hand."""
     raise SceneError("the scene has gone")
-
-
-def make_services(source: SceneSource) -> Services:
-    """What sessions share, rendering."""
-    services = Services(source, no_scene)
-    services.start()
-    return services
 
 
 def make_frame(source: SceneSource, camera: Cameras | None = None) -> MaterialView:

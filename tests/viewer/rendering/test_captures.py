@@ -12,7 +12,7 @@ import pytest
 import torch
 import tyro
 
-from tests.viewer.view_factory import make_frame, make_services, some_pose
+from tests.viewer.view_factory import make_frame, no_scene, some_pose
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import RenderOptions
@@ -35,12 +35,14 @@ from unmix_plugin.viewer.rendering.captures import (
 from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
+from unmix_plugin.viewer.session import Services
 from unmix_plugin.viewer.view_cameras import sized_camera
 
 
 @pytest.fixture
 def services(source):
-    running = make_services(source)
+    running = Services(source, no_scene)
+    running.start()
     yield running
     running.stop()
 

@@ -51,8 +51,8 @@ anything = st.recursive(
 def test_settings_are_always_valid(name, value):
     settings = LayerSettings().changed(name, value)
     assert isinstance(settings.layer, str)
-    assert EXPOSURE_BOUNDS[0] <= settings.exposure_ev <= EXPOSURE_BOUNDS[1]
-    assert GAMMA_BOUNDS[0] <= settings.gamma <= GAMMA_BOUNDS[1]
+    for number, (low, high) in ((settings.exposure_ev, EXPOSURE_BOUNDS), (settings.gamma, GAMMA_BOUNDS)):
+        assert low <= number <= high
     assert settings.background in BACKGROUNDS
     assert settings.colour_map in COLOUR_MAPS
     assert settings.view_transform in VIEW_TRANSFORMS
@@ -83,33 +83,17 @@ def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_
     assert kept.changed("index", 3.0).index == "r600 / r650"
 
 
-def test_what_is_remembered_survives_another_thread_that_forgets_it(source):
-    class Forgetful(dict):
-        def __setitem__(self, key, value):
-            super().__setitem__(key, value)
-            self.clear()  # as another thread may, at just this moment
-
-    aids = replace(make_aids(source), _kept=Forgetful())
-    with source.borrowed() as scene:
-        materials = scene.materials
-    assert aids.colours_of(materials).shape == (len(materials.names), 3)
-
-
 greys = torch.logspace(-3, 2, 200)[:, None].expand(-1, 3)
 
 
-def test_the_srgb_transform_is_srgb_up_to_white_and_gamma_lifts_the_dark():
+def test_the_srgb_transform_is_srgb_up_to_white_gamma_lifts_the_dark_and_a_stop_doubles_the_light():
     light = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     plain = _to_display(light, 0.0, 1.0, "srgb")
     assert_close(plain, linear_to_srgb(light))
     assert_close(_to_display(light + 1, 0.0, 1.0, "srgb"), torch.ones(50, 3), atol=1e-6, rtol=0)
     assert_close(_to_display(light, 0.0, 2.0, "srgb"), plain**0.5)
-
-
-@given(st.floats(-4, 4))
-def test_a_stop_of_exposure_doubles_the_light(stops):
-    light = torch.tensor([[0.01, 0.02, 0.03]])
-    assert_close(_to_display(light, stops, 1.0, "agx"), _to_display(light * 2**stops, 0.0, 1.0, "agx"))
+    for stops in (-3.0, 0.5, 2.0):
+        assert_close(_to_display(light, stops, 1.0, "agx"), _to_display(light * 2**stops, 0.0, 1.0, "agx"))
 
 
 @pytest.mark.parametrize("transform", list(VIEW_TRANSFORMS))
@@ -149,6 +133,13 @@ def aids(source):
     return make_aids(source)
 
 
+@pytest.fixture(scope="module")
+def single(tmp_path_factory):
+    """A frame of one material without gloss, and what layers need of it."""
+    source = make_source(tmp_path_factory.mktemp("single"), num_endmembers=1, specular="none")
+    return make_frame(source), make_aids(source)
+
+
 def painted(frame, aids, layer, **settings) -> tuple[Any, Any]:
     """The picture of a layer, and its legend."""
     return paint_layer(frame, replace(LayerSettings(layer=layer, index="r600/r500"), **settings), aids)
@@ -163,15 +154,15 @@ def solid(frame):
 
 
 @pytest.mark.parametrize("layer", PAINTED)
-def test_every_layer_is_a_picture_that_shows_something(frame, aids, layer):
+def test_every_layer_is_a_picture_that_shows_something_also_of_a_single_material(frame, aids, single, layer):
     picture, legend = painted(frame, aids, layer)
-    height, width = frame.coefficients.accumulation.shape
-    assert picture.shape == (height, width, 3)
-    assert picture.isfinite().all()
-    assert float(picture.min()) >= 0
-    assert float(picture.max()) <= 1
+    assert picture.shape == (*frame.opacity.shape, 3)
     assert picture.flatten(0, 1).std(dim=0).max() > 0.01
     assert isinstance(legend, ColourScale | tuple | str)
+    for shown in (picture, painted(single[0], single[1], layer)[0]):
+        assert picture.isfinite().all()
+        assert float(shown.min()) >= 0
+        assert float(shown.max()) <= 1
 
 
 def test_colour_is_the_output_of_renders_mixed_with_the_background_in_linear_light(frame, aids):
@@ -276,20 +267,7 @@ def test_an_error_is_painted_where_it_is_known(frame, aids):
     assert "train_007" in legend.label
 
 
-def test_a_single_material_has_every_layer(tmp_path):
-    source = make_source(tmp_path, num_endmembers=1, specular="none")
-    frame, aids = make_frame(source), make_aids(source)
-    for layer in PAINTED:
-        picture, _ = painted(frame, aids, layer)
-        assert picture.isfinite().all(), layer
-
-
 FORMULA = "(r650-r450)/(r650+r450)"
-
-
-def with_materials(frame, materials):
-    """The same view with other spectra."""
-    return replace(frame, scene=replace(frame.scene, materials=materials))
 
 
 @pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
@@ -298,7 +276,7 @@ def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_und
 ):
     monkeypatch.setattr(painting, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
-    shown = with_materials(frame, lit)
+    shown = replace(frame, scene=replace(frame.scene, materials=lit))
     values = shown[f"index:{FORMULA}"]
     assert 0.05 < float(values.isnan().float().mean()) < 0.95
     settings = LayerSettings(layer="index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
@@ -335,12 +313,7 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
     [
         ("error", "", ConfigError, "no error to show: the scene is not at hand"),
         ("x-ray", "", ConfigError, "there is no layer named 'x-ray'; known: rgb, false-colour"),
-        (
-            "index",
-            "",
-            ConfigError,
-            r"type a formula of wavelengths that the bands cover, 425-675 nm, .*r650/r450",
-        ),
+        ("index", "", ConfigError, r"wavelengths that the bands cover, 425-675 nm, .*r650/r450"),
         ("index", "prri", ConfigError, "nearest: pri"),
         ("index", "ndvi", SpectrumError, "needs 800 nm"),
     ],

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,10 +63,10 @@ def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
         asked.append(scene.field)
         return sample_seen(scene)
 
-    Edit(Recipe((Retint(0, (0.5, 0.4, 0.3), "spectrum"),))).apply(trained, 0, see)
-    assert asked == []
-    Edit(Recipe((Retint(0, (0.5, 0.4, 0.3)),))).apply(trained, 0, see)
-    assert asked == [trained.field]
+    colour = (0.5, 0.4, 0.3)
+    for edit, expected in ((Retint(0, colour, "spectrum"), []), (Retint(0, colour), [trained.field])):
+        Edit(Recipe((edit,))).apply(trained, 0, see)
+        assert asked == expected
 
 
 def test_what_cameras_see_is_sampled_once_while_colours_change_and_again_where_parts_go(
@@ -137,6 +138,18 @@ def ball_frame(camera, trained_on=()):
     return MaterialView(ball, camera, coefficients.unflatten(camera.height, camera.width))
 
 
+def difference(scene, index, gain: Any = 1.0, light: Any = 1.0):
+    """Between the ball and what a view measured, as exposed and lit as the ball."""
+    measured = torch.from_numpy(scene.cube(index))
+    return ((measured / gain - 0.25).abs() * light).mean(dim=-1)
+
+
+def on_ball(camera):
+    """The point of the ball nearest to a camera."""
+    place = camera.camera_to_world[0, :, 3]
+    return BALL * place / place.norm()
+
+
 def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene, ball_of):
     index = 2
     camera = scene.cameras[scene.train_indices[index]]
@@ -146,7 +159,7 @@ def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, sc
     hits = frame.coefficients.accumulation > 0.5
     assert bool(hits.any())
     assert torch.equal(is_known, hits)
-    expected = (torch.from_numpy(scene.cube(scene.train_indices[index])) - 0.25).abs().mean(dim=-1)
+    expected = difference(scene, scene.train_indices[index])
     assert_close(errors[hits], expected[hits], atol=1e-6, rtol=0)
     assert float(errors[~hits].abs().max()) == 0
 
@@ -166,28 +179,21 @@ def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, s
 
 def test_views_stand_where_training_corrected_them(views, scene, ball_of):
     index = scene.train_indices[2]
-    given = scene.cameras[index]
-    shifted = replace(given, center_px=given.center_px + 2.0)
-    frame = ball_of(shifted)
-    corrected = tuple(
-        replace(one, camera=replace(one.camera, center_px=one.camera.center_px + 2.0))
-        for one in frame.scene.views
-    )
-    frame = replace(frame, scene=replace(frame.scene, views=corrected))
-    errors, is_known, _ = views.error(frame)
-    expected = (torch.from_numpy(scene.cube(index)) - 0.25).abs().mean(dim=-1)
-    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
+    shift = lambda camera: replace(camera, center_px=camera.center_px + 2.0)  # noqa: E731
+    frame = ball_of(shift(scene.cameras[index]))
+    corrected = tuple(replace(one, camera=shift(one.camera)) for one in frame.scene.views)
+    errors, is_known, _ = views.error(replace(frame, scene=replace(frame.scene, views=corrected)))
+    assert_close(errors[is_known], difference(scene, index)[is_known], atol=1e-6, rtol=0)
 
 
 def test_a_point_is_measured_by_the_view_nearest_to_the_camera_and_one_inside_by_none(views, scene, ball_of):
     index = scene.train_indices[1]
     camera = scene.cameras[index]
-    towards = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
-    found = views.measurement(BALL * towards, camera, None, ball_of(camera).scene)
+    found = views.measurement(on_ball(camera), camera, None, ball_of(camera).scene)
     assert found is not None
     name, spectrum = found
     assert name == scene.frames[index].name
-    coords, _ = camera.project((BALL * towards)[None], 0)
+    coords, _ = camera.project(on_ball(camera)[None], 0)
     column, row = (int(value) for value in coords[0])
     np.testing.assert_allclose(spectrum, scene.cube(index)[row, column])
     assert views.measurement(torch.zeros(3), camera, None, ball_of(camera).scene) is None
@@ -206,8 +212,7 @@ def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_
     _, is_known, _ = holed.error(frame)
     assert torch.equal(is_known, was_known & torch.from_numpy(np.isfinite(cube).all(axis=-1)))
     assert 0 < int(is_known.sum()) < int(was_known.sum())
-    point = BALL * camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm()
-    found = holed.measurement(point, camera, None, frame.scene)
+    found = holed.measurement(on_ball(camera), camera, None, frame.scene)
     assert found is not None  # by another view, which sees the point too
     assert found[0] != scene.frames[index].name
     assert float(found[1].min()) > 0
@@ -217,33 +222,26 @@ def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(v
     index = scene.train_indices[2]
     camera, frame = scene.cameras[index], ball_of(scene.cameras[index])
     light = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
-    endmembers = frame.materials.endmembers * light
-    materials = replace(frame.materials, endmembers=endmembers, light=light)
+    materials = replace(frame.materials, endmembers=frame.materials.endmembers * light, light=light)
     relit_frame = replace(frame, scene=replace(frame.scene, materials=materials))
     errors, is_known, _ = views.error(relit_frame)
-    measured = torch.from_numpy(scene.cube(index))
-    expected = ((measured - 0.25).abs() * light).mean(dim=-1)
-    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
-    distance = camera.camera_to_world[0, :, 3].norm()
-    point = camera.camera_to_world[0, :, 3] / distance * BALL
-    plain, relit = (
-        views.measurement(point, camera, shown, frame.scene) for shown in (None, light.double().numpy())
-    )
+    assert_close(errors[is_known], difference(scene, index, light=light)[is_known], atol=1e-6, rtol=0)
+    lights = (None, light.double().numpy())
+    plain, relit = (views.measurement(on_ball(camera), camera, shown, frame.scene) for shown in lights)
     assert_close(relit[1], plain[1] * light)
 
 
 def test_what_was_measured_is_compared_as_exposed_as_the_scene(views, scene, ball_of):
     number = 2
-    camera, frame = scene.cameras[scene.train_indices[number]], ball_of(scene.cameras[scene.train_indices[2]])
+    index = scene.train_indices[number]
+    camera, frame = scene.cameras[index], ball_of(scene.cameras[index])
     gains = torch.ones(len(scene.train_indices), 6)
     gains[number] = torch.linspace(0.5, 2.0, 6)
     fitted = replace(frame.scene, view_gains=gains)
     errors, is_known, _ = views.error(replace(frame, scene=fitted))
-    measured = torch.from_numpy(scene.cube(scene.train_indices[number]))
-    expected = (measured / gains[number] - 0.25).abs().mean(dim=-1)
-    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
-    point = camera.camera_to_world[0, :, 3] / camera.camera_to_world[0, :, 3].norm() * BALL
-    plain, alike = (views.measurement(point, camera, None, shown) for shown in (frame.scene, fitted))
+    assert_close(errors[is_known], difference(scene, index, gains[number])[is_known], atol=1e-6, rtol=0)
+    scenes = (frame.scene, fitted)
+    plain, alike = (views.measurement(on_ball(camera), camera, None, shown) for shown in scenes)
     assert_close(alike[1], plain[1] / gains[number])
 
 
