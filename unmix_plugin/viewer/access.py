@@ -45,13 +45,8 @@ class ViewerOptions:
             raise ConfigError("--viewer.token is empty; leave it out or give a word that others can't guess")
 
     def secret(self, environment: Mapping[str, str]) -> str | None:
-        """The token itself, from wherever it is given; None without one.
-
-        Args:
-            environment: Variables of the process.
-        Raises:
-            ConfigError: its file can't be read, or is no text of one word; the variable is empty.
-        """
+        """The token itself, from its file or a variable of the process; None without one, a ConfigError if where it is
+        given holds none."""
         if self.token is None:
             word = environment.get(TOKEN_VARIABLE)
             if word is not None and not word.strip():
@@ -95,11 +90,8 @@ _PORTS_TRIED = 100
 
 
 def free_port(host: str, port: int) -> int:
-    """The port, or the next free one after it; for 0 any free one.
-
-    Raises:
-        ConfigError: the host is not an address of this machine, or no port near is free.
-    """
+    """The port, or the next free one after it, for 0 any; a ConfigError if the host is not an address of this machine
+    or no port near is free."""
     for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
         if (found := _bound_port(host, candidate)) is not None:
             return found
@@ -130,13 +122,7 @@ def _bound_port(host: str, port: int) -> int | None:
 
 
 def start_notices(options: ViewerOptions, port: int, environment: Mapping[str, str]) -> list[str]:
-    """What a user should read when the viewer starts: its URL first, then what they must know.
-
-    Args:
-        options: As given.
-        port: Where it listens.
-        environment: Variables of the process.
-    """
+    """What a user should read when the viewer starts to listen at a port: its URL first, then what they must know."""
     host = options.host
     shown = "localhost" if host in ANYWHERE else host
     lines = [f"viewer: http://[{shown}]:{port}" if ":" in shown else f"viewer: http://{shown}:{port}"]

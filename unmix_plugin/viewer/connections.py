@@ -123,10 +123,7 @@ _KINDS = {kind.__struct_config__.tag for kind in (_Camera, _Update, _Stored, _Po
 
 def _is_heard(data: bytes) -> bool:
     """Whether a message is one that the viewer listens to; others, such as uploads and requests for a tunnel, are not.
-
-    Raises:
-        ValueError: it is no message of a page.
-    """
+    A ValueError if it is no message of a page."""
     try:
         if _ANY_DECODER.decode(data).type not in _KINDS:
             return False
@@ -216,12 +213,8 @@ _NAME = "websockets"
 def open_server(
     host: str, port: int, gate: Gate, say: Callable[[str], None], title: str = LABEL
 ) -> viser.ViserServer:
-    """A server that listens, and lets in what the gate does.
-
-    Args:
-        title: Of its pages.
-        say: Told of what pages caused that should not have happened, in a short line each.
-    """
+    """A server that listens, and lets in what the gate does; `title` is that of its pages, and `say` is told of what
+    pages caused that should not have happened, in a short line each."""
     before = infra.WebsockServer, getattr(_infra, _NAME)
     infra.WebsockServer = partial(_PageServer, title)  # type: ignore[misc, assignment]
     # viser asks websockets for its server in this module's name of it, once, while it starts.

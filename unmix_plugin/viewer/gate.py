@@ -65,13 +65,9 @@ class Gate:
     ) -> _Refusal | None:
         """What to answer to a request instead of what it asks for; None if it is let in.
 
-        A connection that is let in takes a place, to be given back by `leave`.
-
-        Args:
-            page: Stands for the connection.
-            headers: Of the request, names in lower case.
-            address: Where it comes from.
-            port: Where the server listens; the cookie's name has it, since browsers share cookies between ports.
+        A connection that is let in takes a place, to be given back by `leave`; `page` stands for it. Names of `headers`
+        are in lower case; `address` is where the request comes from, `port` where the server listens: the cookie's name
+        has it, since browsers share cookies between ports.
         """
         opens = headers.get("upgrade", "").lower() == "websocket"
         cookie = f"unmix-nerf-{port}"
@@ -158,13 +154,8 @@ def _is_own_page(headers: Mapping[str, str], host: str, has_token: bool = False)
     """Whether a request comes from a page that this server sent, and not from one of another site.
 
     A site can let its own name point here (DNS rebinding), so without a token the name must be one that only this
-    machine has: a loopback name, an IP address, or that of `host`. With a token the viewer may stand behind a proxy,
-    under any name and with TLS; but the page must still be of the host that it connects to.
-
-    Args:
-        headers: Of the request, names in lower case.
-        host: Where the server listens.
-        has_token: The token was given.
+    machine has: a loopback name, an IP address, or that of `host`, where the server listens. With a token the viewer
+    may stand behind a proxy, under any name and with TLS; but the page must still be of the host that it connects to.
     """
     asked = headers.get("host", "").lower()
     origin = headers.get("origin")

@@ -54,11 +54,7 @@ def choice(value: Any, known: Collection[_ChoiceT], fallback: _FallbackT) -> _Ch
 
 
 def index_in(menu: Any) -> int:
-    """Which of a menu's options is chosen.
-
-    Raises:
-        ConfigError: none of them.
-    """
+    """Which of a menu's options is chosen; a ConfigError if none of them."""
     options = tuple(menu.options)
     if menu.value not in options:
         raise ConfigError(f"there is no {menu.label} {str(menu.value)[:40]!r}")
@@ -71,16 +67,9 @@ def text(value: Any) -> str:
 
 
 def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
-    """A path directly in `folder` that no file has, named as asked as far as that is safe.
-
-    Args:
-        folder: Where; it need not exist.
-        name: What was typed. Anything but letters, digits, `_`, `+`, `-` and inner dots becomes `_`.
-        suffix: Ending, with its dot.
-        fallback: Used where nothing is left of the name.
-    Raises:
-        ConfigError: there are too many files of that name.
-    """
+    """A path directly in `folder` that no file has, named as asked as far as that is safe: anything but letters,
+    digits, `_`, `+`, `-` and inner dots becomes `_`, and where nothing is left the name is `fallback`. A ConfigError if
+    there are too many files of that name."""
     stem = safe_name(text(name).strip().removesuffix(suffix).strip("._/\\"), fallback=fallback)
     for count in range(1, 10_000):
         path = folder / f"{stem if count == 1 else f'{stem}-{count}'}{suffix}"
@@ -91,12 +80,8 @@ def new_file(folder: Path, name: Any, suffix: str, fallback: str) -> Path:
 
 @contextmanager
 def failures_said(what: str, say: Callable[[str], None]) -> Iterator[None]:
-    """Context that lets no error out.
-
-    Args:
-        what: What internal errors are reported as; they are logged with their traceback.
-        say: Shows a message to the user. Its own errors are logged.
-    """
+    """Context that lets no error out: `say` shows its message to the user; internal ones are logged with their
+    traceback and reported as `what`, and errors of `say` are logged."""
     try:
         yield
         return

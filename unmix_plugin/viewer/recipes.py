@@ -121,12 +121,8 @@ def is_shown(recipe: Recipe, index: int) -> bool:
 
 
 def numbered(recipe: Recipe, names: tuple[str, ...]) -> Recipe:
-    """The same recipe with endmembers given by their numbers; unknown names stay, and are refused when it is applied.
-
-    Args:
-        recipe: As written by hand, perhaps.
-        names: Of the run's endmembers before any edit.
-    """
+    """The same recipe with endmembers given by their numbers: `names` are those of the run's before any edit, unknown
+    ones stay, and are refused when it is applied."""
     present = list(names)
 
     def number_of(endmember: str | int) -> str | int:

@@ -88,11 +88,7 @@ class Viewer:
         """Where it listens, once started."""
 
     def start(self) -> None:
-        """Listen, and say where.
-
-        Raises:
-            ConfigError: the host is not an address of this machine, or no port near is free.
-        """
+        """Listen, and say where; a ConfigError if the host is not of this machine, or no port near is free."""
         # A page that is closed while it is being sent something is not a reason to print anything.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         port = free_port(self._options.host, self._options.port)

@@ -68,12 +68,9 @@ class Services:
         Args:
             source: The model.
             read_scene: Reads the scene that a run was trained on; an UnmixError if it is not at hand.
-            recipe: What every client sees the scene with at first.
-            environments: Files of lights to offer beside those of the scene.
+            recipe: What every client sees the scene with at first; a ConfigError if it does not fit the run.
+            environments: Files of lights to offer beside those of the scene; an UnmixError if one is unusable.
             library: Known materials; None: the built-in ones.
-        Raises:
-            ConfigError: the recipe does not fit the run, or its method has no environments.
-            SceneError: an environment map is missing, damaged or unusable.
         """
         self.source, self._library = source, library
         self.views = recorded_views(source.record)
@@ -352,11 +349,7 @@ class Session:
         return [tuple(row) for row in aids.colours_of(materials).tolist()]
 
     def change_edit(self, edit: Edit) -> None:
-        """Show the scene with other materials or light.
-
-        Raises:
-            UnmixError: the edit does not fit the run; nothing has changed.
-        """
+        """Show the scene with other materials or light; an UnmixError if the edit does not fit: nothing changes."""
         notes = self.services.maker.edited(edit).notes
         self.services.loop.change(self.view, edit=edit)
         for tell in self.on_edit:
@@ -370,11 +363,7 @@ class Session:
             self.services.loop.change(self.view, wants_depth=wanted)
 
     def pose(self) -> ViewPose:
-        """Where the client looks from now.
-
-        Raises:
-            ConfigError: its camera is invalid.
-        """
+        """Where the client looks from now; a ConfigError if its camera is invalid."""
         return pose_from(self.client.camera)
 
     def look_from(self, camera: Cameras) -> None:

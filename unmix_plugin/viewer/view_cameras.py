@@ -65,11 +65,7 @@ def _checked_pose(wxyz: Any, position: Any, fov: Any, aspect: Any) -> ViewPose:
 
 
 def pose_from(camera: viser.CameraHandle) -> ViewPose:
-    """The pose of a client's camera.
-
-    Raises:
-        ConfigError: it is invalid, or its canvas has no size.
-    """
+    """The pose of a client's camera; a ConfigError if it is invalid, or its canvas has no size."""
     height, width = camera.image_height, camera.image_width
     has_size = isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0
     aspect = width / height if has_size else math.nan
@@ -140,15 +136,8 @@ def _wxyz(rotation: Rotation) -> np.ndarray:
 
 
 def path_poses(key_frames: Sequence[ViewPose], num_frames: int) -> list[ViewPose]:
-    """Poses along a path through key frames in the order in which they were set, with even time between them: positions
-    and fields of view by splines, turns by slerp.
-
-    Args:
-        key_frames: At least two.
-        num_frames: At least two: the first and the last are at the ends.
-    Raises:
-        ConfigError: fewer than two key frames.
-    """
+    """Poses along a path through key frames in the order in which they were set, from the first to the last with even
+    time between them: positions and fields of view by splines, turns by slerp. A ConfigError for fewer than two."""
     if len(key_frames) < 2:
         raise ConfigError("a path needs at least two key frames; look from elsewhere and add another one")
     keys = np.arange(len(key_frames), dtype=np.float64)

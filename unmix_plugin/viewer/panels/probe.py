@@ -36,11 +36,8 @@ Point = Float64[np.ndarray, "3"]
 def surface_at(
     scene: RenderableScene, camera: Cameras, place: tuple[float, float]
 ) -> tuple[Probe, Point, Point]:
-    """What is seen at a place (column, row) of a picture, and where that is in model space and in the world.
-
-    Raises:
-        ConfigError: nothing is there.
-    """
+    """What is seen at a place (column, row) of a picture, and where that is in model space and in the world; a
+    ConfigError where nothing is."""
     found = scene.probe(camera, int(place[0]), int(place[1]))
     if found.opacity < OCCUPIED_ACCUMULATION or found.position is None or found.world_position is None:
         raise ConfigError("nothing is there: less than half of the light ends on something")

@@ -41,11 +41,7 @@ _LARGEST_SPECTRA_BYTES = 1 << 29
 
 
 def check_size(width: int, height: int, num_bands: int | None = None) -> None:
-    """Refuse pictures that would take too much memory.
-
-    Raises:
-        ConfigError: too many pixels, or too many numbers where spectra are kept.
-    """
+    """Refuse with a ConfigError pictures that would take too much memory, by the bands of which spectra are kept."""
     most, what = _MOST_PIXELS, "pictures"
     if num_bands is not None:
         most, what = min(most, _LARGEST_SPECTRA_BYTES // (4 * num_bands)), "spectra"
@@ -76,11 +72,7 @@ class SpectraCanvas:
         self.coverage[rows] = frame.coverage.cpu().numpy()
 
     def write(self, path: Path) -> Path:
-        """Write a spectral EXR.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
+        """Write a spectral EXR; a RunError if the disk is full or refuses."""
         bands, quantity = self._materials.bands, self._materials.quantity
         about = f"{quantity} on black, 1 = full scale"
         return write_spectral_exr(path, self.spectra, bands, self.linear_rgb, self.coverage, about, quantity)
@@ -184,14 +176,8 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 
 def output_of(settings: LayerSettings, bands: Bands | None) -> str:
-    """The output of renders that a layer shows, by the bands that it shows.
-
-    Args:
-        settings: Of the layer.
-        bands: Of the scene; None of one without spectra.
-    Raises:
-        ConfigError: renders have no such output, or no such picture of it.
-    """
+    """The output of renders that a layer shows, by the bands that it shows (None of a scene without spectra); a
+    ConfigError where renders have no such output, or no such picture of it."""
 
     def shown(wavelength_nm: float) -> str:
         assert bands is not None

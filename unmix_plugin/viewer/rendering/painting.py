@@ -153,11 +153,7 @@ class _Layer:
 
 
 def layer_named(name: str, layers: Mapping[str, _Layer]) -> _Layer:
-    """A layer by its name.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """A layer by its name; a ConfigError if there is none."""
     if name not in layers:
         raise ConfigError(f"there is no layer named {name[:40]!r}; known: {', '.join(layers)}")
     return layers[name]

@@ -282,11 +282,7 @@ class PictureMaker:
         return max(1, min(int(math.sqrt(speed * REFRESH_S / pose.aspect)), largest))
 
     def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> RenderedView | None:
-        """Render a block; the frame if that was the last.
-
-        Raises:
-            UnmixError: the edit does not fit the run.
-        """
+        """Render a block; the frame if that was the last, an UnmixError if the edit does not fit the run."""
         with self._queue:
             self._queue.wait_for(lambda: self._num_asking == 0, _LONGEST_WAIT_S)
         with self.source.borrowed(cost) as scene, torch.no_grad():
@@ -331,11 +327,7 @@ class PictureMaker:
         return replace(frame, scene=self.edited(edit)) if isinstance(frame, MaterialView) else frame
 
     def paint(self, frame: RenderedView, settings: LayerSettings, with_depth: bool, is_moving: bool) -> Shown:
-        """A frame as a picture.
-
-        Raises:
-            UnmixError: the layer can't be shown.
-        """
+        """A frame as a picture; an UnmixError if the layer can't be shown."""
         layer, aids = layer_named(settings.layer, self.layers), self.aids.for_layers()
         with torch.no_grad():
             field = frame.scene.field if isinstance(frame, MaterialView) else None

@@ -47,15 +47,8 @@ class RunRegions:
         return self._measured.get(json.dumps(region_to_json(region)))
 
     def measure(self, name: str, region: Region, show: Callable[[str], None]) -> MeasuredRegion:
-        """What a region of the unedited scene is.
-
-        Args:
-            name, region: Kept or not.
-            show: Told how far it is; the first one takes long.
-        Raises:
-            ConfigError: training goes on, or nothing of the surface is in it.
-            RunError: no camera of the run sees a surface.
-        """
+        """What a region of the unedited scene is; `show` is told how far it is, since the first one takes long. A
+        ConfigError while training goes on or if no surface is in it, a RunError if no camera sees one."""
         self._source.require_final("measure regions")
         with self._measuring:
             surface = self._surface = self._surface or self._find_surface(show)
@@ -66,11 +59,8 @@ class RunRegions:
             return found
 
     def keep(self, name: str, region: Region | None) -> None:
-        """Keep a region with the run, in place of one of its name; None removes that.
-
-        Raises:
-            ConfigError: the name can't be one, or there are too many.
-        """
+        """Keep a region with the run, in place of one of its name, None removes that; a ConfigError if the name can't
+        be one, or there are too many."""
         with self._keeping:
             keep_region(self._source.run, name, region)
 

@@ -138,18 +138,8 @@ class RenderLoop:
         show: Callable[[float], None] = lambda _: None,
     ) -> Iterator[tuple[int, RenderedView]]:
         """A picture of any size apart from any view: strips with their first rows, each rendered in the caller's thread
-        when nothing is more urgent. Pictures of several callers are rendered one after another.
-
-        Args:
-            camera: One camera.
-            edit: What to see the scene with.
-            subpixels: Rays through a pixel along each of its edges.
-            cancelled: Set once the picture is no longer wanted.
-            show: Told the part that is rendered.
-        Raises:
-            ConfigError: it was cancelled, or the loop stopped.
-            UnmixError: the edit does not fit the run.
-        """
+        when nothing is more urgent, one picture after another. `show` is told the part that is rendered; a ConfigError
+        once it is `cancelled` or the loop stopped, another UnmixError if the edit does not fit the run."""
         rows = max(1, _STRIP_PIXELS // camera.width)
         with self._capturing:
             for first in range(0, camera.height, rows):

@@ -53,13 +53,8 @@ class SceneSource:
 
     @contextmanager
     def borrowed(self, cost: float = 1.0) -> Iterator[RenderableScene]:
-        """Context with the scene and the device to render it.
-
-        Turns do not nest: whoever has the device must not ask for it again.
-
-        Args:
-            cost: As `DeviceShare.guest_turn` has it.
-        """
+        """Context with the scene and the device to render it; `cost` as `DeviceShare.guest_turn` has it. Turns do not
+        nest: whoever has the device must not ask for it again."""
         with self.device.guest_turn(cost):
             scene = self._taken.get(self.version)
             if scene is None:
@@ -70,31 +65,18 @@ class SceneSource:
 
     @contextmanager
     def borrowed_materials(self) -> Iterator[TrainedScene]:
-        """The same for a scene that must have endmembers.
-
-        Raises:
-            ConfigError: it has none.
-        """
+        """The same for a scene that must have endmembers; a ConfigError if it has none."""
         with self.borrowed() as scene:
             yield require_materials(scene, "of this run")
 
     @property
     def scale(self) -> Scale | None:
-        """How long a unit of the world is, as kept with the run by now or as its scene says; None where unknown.
-
-        Raises:
-            RunError: what is kept is damaged.
-        """
+        """How long a unit of the world is, as kept with the run by now or as its scene says, None where unknown; a
+        RunError if what is kept is damaged."""
         return read_measures(self.run).scale or recorded_scale(self.record.summary)
 
     def require_final(self, what: str) -> None:
-        """Refuse what is kept with a run while training still changes it.
-
-        Args:
-            what: What to do when training has ended.
-        Raises:
-            ConfigError: it has not.
-        """
+        """Refuse with a ConfigError what is kept with a run while training still changes it, to be done afterwards."""
         control = self.control
         if control is not None and (control.is_running or control.status is None):
             raise ConfigError(f"the scene still changes; {what} when training has ended")
@@ -111,11 +93,7 @@ def source_of_run(run: LoadedRun) -> SceneSource:
 
 
 def source_of_training(trainer: Trainer, record: SceneRecord) -> SceneSource:
-    """The scene of a training, before or while it runs.
-
-    Raises:
-        ConfigError: its method offers no scene.
-    """
+    """The scene of a training, before or while it runs; a ConfigError if its method offers none."""
     name, model = trainer.config.method_name, trainer.pipeline.model
 
     def take() -> RenderableScene:
@@ -156,15 +134,8 @@ class Edit:
     def apply(
         self, scene: RenderableScene, version: int, see: Callable[[TrainedScene], Coefficients]
     ) -> RenderableScene:
-        """The edited scene; must be called while the scene is lent.
-
-        Args:
-            scene: The unedited one, which is left alone.
-            version: Rises as training changes it.
-            see: What cameras see of a scene; asked only if the recipe depends on pictures.
-        Raises:
-            ConfigError: the recipe does not fit the run.
-        """
+        """The edited scene, a ConfigError if the recipe does not fit the run; must be called while the scene is lent.
+        `version` rises as training changes it; `see` is asked what cameras see if the recipe depends on pictures."""
         if not self.has_recipe and self.light == LightChoice():
             return scene
         with self._lock:
@@ -207,11 +178,8 @@ class MeasuredViews:
         self._lock = threading.Lock()
 
     def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
-        """Mean absolute error of the bands against the nearest training view, where that measured the same point.
-
-        Returns:
-            Errors; where they are known; the name of the view.
-        """
+        """Mean absolute error of the bands against the nearest training view, where that measured the same point; where
+        it is known; the name of the view."""
         index = int(self._by_nearness(frame.camera, frame.scene)[0])
         coefficients, device = frame.coefficients.flatten(), frame.coefficients.accumulation.device
         errors = torch.zeros(frame.camera.height * frame.camera.width)
@@ -239,15 +207,9 @@ class MeasuredViews:
         light: Float64[np.ndarray, " B"] | None,
         scene: TrainedScene,
     ) -> tuple[str, Float32[Tensor, "B"]] | None:
-        """Name of the training view nearest to a camera that sees a point in a pixel that counts, and the radiance
-        measured there; None where no view tried does.
-
-        Args:
-            point: Model space.
-            camera: One camera.
-            light: In which the scene is shown, relative power; what was measured is relit to it. None if unknown.
-            scene: The unedited scene, which is lent.
-        """
+        """Name of the training view nearest to a camera that sees a point of model space in a pixel that counts, and
+        the radiance measured there, relit to the light that the scene is shown in (None if unknown); None where no view
+        tried sees it. `scene` is the unedited one, which is lent."""
         for index in self._by_nearness(camera, scene)[:_VIEWS_TRIED].tolist():
             own = self._camera(index, scene)
             rows, columns, sees = self._pixels_of(point[None], index, own, scene)
