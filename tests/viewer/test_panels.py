@@ -73,7 +73,7 @@ def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_w
         page.wait_for_text("formula r650/r450")
         assert "of radiance: light unknown" in page.texts
         for wrong, said in (
-            ("r650/(r450", "expected"),
+            ("r650/(r450", "can't be read here"),
             ("r650/r900", "needs 900 nm"),
             ("r650" + "+r650" * 300, "at most 500 characters"),
             ("nvdi", "there is no index"),
