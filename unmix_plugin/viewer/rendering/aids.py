@@ -22,7 +22,7 @@ from unmix_plugin.spectral.subspace import PcaColours
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.run_materials import endmember_colours
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, MeasuredViews, SceneSource
+from unmix_plugin.viewer.rendering.scene import STEPS_KEPT, MeasuredViews, Renewed, SceneSource
 
 _NUM_CAMERAS = 6
 _NUM_RAYS = 6000
@@ -108,8 +108,7 @@ class SceneAids:
         """What the training views measured, once the scene is read."""
         self._why_not_measured = "the scene is still being read"
         self._source, self._has_materials = source, has_materials
-        self._for_layers: tuple[int, LayerAids] | None = None
-        self._seen: dict[Any, tuple[int, Coefficients]] = {}
+        self._for_layers, self._seen = Renewed(1), Renewed(2)
 
     def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
         """Note what was measured, or why that is unknown."""
@@ -119,24 +118,20 @@ class SceneAids:
         """What layers need; None without materials. Must not be called while the scene is lent."""
         if not self._has_materials:
             return None
-        kept, version = self._for_layers, self._source.version
-        age = 0 if kept is None else version - kept[0]
-        if kept is None or age >= STEPS_KEPT or (age > 0 and not self._source.device.is_training):
-            record = self._source.record
+        record, is_training = self._source.record, self._source.device.is_training
+
+        def make() -> LayerAids:
             with self._source.borrowed_materials() as scene:
-                reference = render_reference(scene, record.train_cameras)
-            kept = self._for_layers = (version, LayerAids(*reference, record.scene_box))
+                return LayerAids(*render_reference(scene, record.train_cameras), record.scene_box)
+
+        # What a training has ended with is looked at for long.
+        aids = self._for_layers.get(None, self._source.version, make, STEPS_KEPT if is_training else 1)
         # Noted by another thread at any moment, also while the reference was rendered.
         error_of = None if self.measured is None else self.measured.error
-        return replace(kept[1], error_of=error_of, why_no_error=self._why_not_measured)
+        return replace(aids, error_of=error_of, why_no_error=self._why_not_measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
         """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while it is
         lent."""
-        version, field = self._source.version, scene.field
-        change = field.change if isinstance(field, EditedField) else None
-        kept = self._seen.get(change)
-        if kept is None or version - kept[0] >= STEPS_KEPT:
-            kept = version, sample_seen(scene)
-            self._seen = dict([*self._seen.items()][-1:]) | {change: kept}
-        return kept[1]
+        change = scene.field.change if isinstance(scene.field, EditedField) else None
+        return self._seen.get(change, self._source.version, lambda: sample_seen(scene))

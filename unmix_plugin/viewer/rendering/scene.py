@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -34,6 +34,30 @@ from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_materials import relit as relit_measurement
 from unmix_plugin.trained.trained_scene import TrainedScene
 
+_ValueT = TypeVar("_ValueT")
+
+STEPS_KEPT = 200
+"""What was rendered so many training steps ago is rendered again."""
+
+
+class Renewed:
+    """Values by key, made again once training has changed the scene."""
+
+    def __init__(self, most: int) -> None:
+        """The `most` that were made last are kept."""
+        self._most = most
+        self._kept: dict[Any, tuple[int, Any]] = {}
+
+    def get(self, key: Any, version: int, make: Callable[[], _ValueT], steps: int = STEPS_KEPT) -> _ValueT:
+        """The value of a key as of a version of the scene, or of fewer steps of a training before."""
+        made_at, value = self._kept.get(key, (version - steps, None))
+        if version - made_at < steps:
+            return value  # type: ignore[return-value]
+        made = make()
+        others = [one for one in self._kept.items() if one[0] != key]
+        self._kept = dict([*others, (key, (version, made))][-self._most :])
+        return made
+
 
 @dataclass(frozen=True)
 class SceneSource:
@@ -49,19 +73,14 @@ class SceneSource:
     """The scene at this moment; called while training waits."""
     control: TrainingControl | None = None
     """The training under way; None for a finished run."""
-    _taken: dict[int, RenderableScene] = field(default_factory=dict, repr=False)
+    _taken: Renewed = field(default_factory=lambda: Renewed(1), repr=False)
 
     @contextmanager
     def borrowed(self, cost: float = 1.0) -> Iterator[RenderableScene]:
         """Context with the scene and the device to render it; `cost` as `DeviceShare.guest_turn` has it. Turns do not
         nest: whoever has the device must not ask for it again."""
         with self.device.guest_turn(cost):
-            scene = self._taken.get(self.version)
-            if scene is None:
-                scene = self.take()
-                self._taken.clear()
-                self._taken[self.version] = scene
-            yield scene
+            yield self._taken.get(None, self.version, self.take, steps=1)
 
     @contextmanager
     def borrowed_materials(self) -> Iterator[TrainedScene]:
@@ -155,9 +174,6 @@ _TOLERANCE = 0.03
 """Depths of a point and of what a view renders there may differ by so much of the depth."""
 
 _VIEWS_KEPT = 4
-STEPS_KEPT = 200
-"""What was rendered so many training steps ago is rendered again."""
-
 _VIEWS_TRIED = 6
 
 
@@ -174,8 +190,7 @@ class MeasuredViews:
         self._source = source
         self._indices = usable_views(scene)
         self._rows = [scene.train_indices.index(index) for index in self._indices]
-        self._distances: OrderedDict[int, tuple[int, Tensor]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._distances = Renewed(_VIEWS_KEPT)
 
     def error(self, frame: MaterialView) -> tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]:
         """Mean absolute error of the bands against the nearest training view, where that measured the same point; where
@@ -234,7 +249,6 @@ class MeasuredViews:
         return spectra if scene.view_gains is None else spectra / scene.view_gains[self._rows[index]]
 
     def _camera(self, index: int, scene: TrainedScene) -> Cameras:
-        """Of a training view, as training corrected it."""
         return scene.views[self._rows[index]].camera
 
     def _by_nearness(self, camera: Cameras, scene: TrainedScene) -> Tensor:
@@ -268,16 +282,10 @@ class MeasuredViews:
 
     def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""
-        step = self._source.version
-        with self._lock:
-            kept = self._distances.get(index)
-        if kept is not None and step - kept[0] < STEPS_KEPT:
-            return kept[1]
-        with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
-            seen = scene.look(camera, subpixels=1).coefficients
-        distance = seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
-        with self._lock:
-            self._distances[index] = (step, distance)
-            while len(self._distances) > _VIEWS_KEPT:
-                self._distances.popitem(last=False)
-        return distance
+
+        def render() -> Float[Tensor, "H W"]:
+            with self._source.borrowed_materials() if lent is None else nullcontext(lent) as scene:
+                seen = scene.look(camera, subpixels=1).coefficients
+            return seen.ray_distance.where(seen.is_occupied, torch.inf).cpu()
+
+        return self._distances.get(index, self._source.version, render)
