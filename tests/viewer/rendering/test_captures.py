@@ -24,13 +24,14 @@ from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.viewer.rendering import captures, render_loop
 from unmix_plugin.viewer.rendering.captures import (
     _NO_VIDEO,
-    SpectraCanvas,
     VideoJob,
     VideoQueue,
     check_size,
     differences,
     output_of,
     render_argv,
+    strip_of_spectra,
+    write_spectra,
 )
 from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.scene import Edit
@@ -47,29 +48,26 @@ def services(source):
     running.stop()
 
 
-def captured(services, camera, take):
-    """Take a picture strip by strip; the parts told."""
+def captured(services, camera, read=lambda strip: strip):
+    """What is read of the strips of a picture, and the parts told."""
     parts = []
-    for strip in services.loop.strips(camera, Edit(), 1, threading.Event(), parts.append):
-        take(*strip)
-    return parts
+    strips = services.loop.strips(camera, Edit(), 1, threading.Event(), parts.append)
+    return [read(strip) for strip in strips], parts
 
 
 @pytest.mark.parametrize("layer", ["rgb", "depth", "segmentation"])
 def test_strips_make_up_the_picture_of_the_whole(services, source, monkeypatch, layer):
     monkeypatch.setattr(render_loop, "_STRIP_PIXELS", 100)
-    camera = sized_camera(some_pose(), 31, 23)
-    settings, pixels = LayerSettings(layer=layer), np.zeros((23, 31, 3), int)
+    camera, settings = sized_camera(some_pose(), 31, 23), LayerSettings(layer=layer)
 
-    def take(row, frame):
-        pixels[row : row + frame.camera.height] = services.maker.paint(frame, settings, False, False).picture
+    def paint(frame):
+        return services.maker.paint(frame, settings, False, False).picture.astype(int)
 
-    parts = captured(services, camera, take)
+    pictures, parts = captured(services, camera, paint)
     assert len(parts) >= 8
     assert parts == sorted(parts)
     assert parts[-1] == pytest.approx(1.0)
-    whole = services.maker.paint(make_frame(source, camera), settings, False, False).picture
-    assert np.abs(pixels - whole.astype(int)).max() <= 1
+    assert np.abs(np.concatenate(pictures) - paint(make_frame(source, camera))).max() <= 1
 
 
 @pytest.mark.parametrize("is_line", [False, True])
@@ -80,19 +78,17 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
         ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     frame = make_frame(source, camera)
-    canvas = SpectraCanvas(camera, frame.materials)
-    captured(services, camera, canvas.take)
-    np.testing.assert_allclose(canvas.spectra, frame["spectral"].numpy(), atol=1e-5)
-    np.testing.assert_allclose(canvas.coverage, frame.coverage.numpy(), atol=1e-5)
+    strips, _ = captured(services, camera, strip_of_spectra)
+    for found, expected in zip(zip(*strips, strict=True), strip_of_spectra(frame), strict=True):
+        np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("light", "quantity"), [(None, "radiance"), (torch.ones(5), "reflectance")])
 def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_path, light, quantity):
     frame = make_frame(source, sized_camera(some_pose(), 17, 13))
-    scene = replace(frame.scene, materials=replace(frame.materials, light=light))
-    canvas = SpectraCanvas(frame.camera, scene.materials)
-    canvas.take(0, replace(frame, scene=scene))
-    file = OpenEXR.File(str(canvas.write(tmp_path / "view.exr")), separate_channels=True)
+    materials = replace(frame.materials, light=light)
+    path = write_spectra(tmp_path / "view.exr", [strip_of_spectra(frame)], materials)
+    file = OpenEXR.File(str(path), separate_channels=True)
     assert file.header()["comments"] == f"{quantity} on black, 1 = full scale"
     layer = "T" if quantity == "reflectance" else "S0"
     assert sum(name.startswith(f"{layer}.") for name in file.channels()) == 5
@@ -105,10 +101,10 @@ def test_a_picture_that_is_cancelled_or_left_ends_and_a_strip_that_is_not_taken_
     cancelled.set()
     with pytest.raises(ConfigError, match="cancelled"):
         next(services.loop.strips(camera, Edit(), 1, cancelled))
-    assert captured(services, camera, lambda *_: None)[-1] == 1.0
+    assert captured(services, camera)[1][-1] == 1.0
     services.stop()
     with pytest.raises(ConfigError, match="the viewer was stopped"):
-        captured(services, camera, lambda *_: None)
+        captured(services, camera)
 
 
 @pytest.mark.parametrize(

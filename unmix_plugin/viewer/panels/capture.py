@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,12 +21,13 @@ from unmix_plugin.trained.run_views import RunView, world_frame
 from unmix_plugin.viewer.page import failures_said, index_in, new_file, number, number_of
 from unmix_plugin.viewer.rendering.captures import (
     SIDE_BOUNDS,
-    SpectraCanvas,
     VideoJob,
     check_size,
     differences,
     output_of,
     render_argv,
+    strip_of_spectra,
+    write_spectra,
 )
 from unmix_plugin.viewer.rendering.painting import layer_named
 from unmix_plugin.viewer.session import Session
@@ -36,6 +37,7 @@ _MOST_KEY_FRAMES = 100
 _PREVIEW_FPS = 12
 _LARGEST_DOWNLOAD = 1 << 26
 _NO_KEYS: tuple[str, ...] = ("none yet",)
+_StripT = TypeVar("_StripT")
 
 
 class CapturePanel:
@@ -92,26 +94,25 @@ class CapturePanel:
         settings, maker = self._session.view.settings, self._session.services.maker
         if self._session.value_range_shown is not None:  # strips would each have a scale of their own
             settings = settings.changed("value_range", self._session.value_range_shown)
-        pixels = np.zeros((camera.height, camera.width, 3), np.uint8)
-        path = self._new_file(".png")
-
-        def take(row: int, frame: RenderedView) -> None:
-            strip = maker.paint(frame, settings, False, False).picture
-            pixels[row : row + len(strip)] = strip
-
-        what = f"{settings.layer}, {camera.width} x {camera.height} pixels"
-        self._begin(camera, take, lambda: write_file(path, rgba_png_bytes(pixels, what)))
+        path, what = self._new_file(".png"), f"{settings.layer}, {camera.width} x {camera.height} pixels"
+        self._begin(
+            camera,
+            lambda strip: maker.paint(strip, settings, False, False).picture,
+            lambda strips: write_file(path, rgba_png_bytes(np.concatenate(strips), what)),
+        )
 
     def _save_spectra(self) -> None:
         materials = self._session.materials()
-        camera = self._camera(len(materials.bands))
-        canvas, path = SpectraCanvas(camera, materials), self._new_file(".exr")
-        self._begin(camera, canvas.take, lambda: canvas.write(path))
+        camera, path = self._camera(len(materials.bands)), self._new_file(".exr")
+        self._begin(camera, strip_of_spectra, lambda strips: write_spectra(path, strips, materials))
 
     def _begin(
-        self, camera: Cameras, take: Callable[[int, RenderedView], None], write: Callable[[], Path]
+        self,
+        camera: Cameras,
+        read: Callable[[RenderedView], _StripT],
+        write: Callable[[list[_StripT]], Path],
     ) -> None:
-        """Render a picture strip by strip in a thread of its own, write it and hand it over."""
+        """Render a picture strip by strip in a thread of its own, write what is read of them and hand it over."""
         if self._capture is not None:
             raise ConfigError("a picture is being rendered already; wait for it or cancel it")
         session, view, cancelled = self._session, self._session.view, threading.Event()
@@ -122,12 +123,11 @@ class CapturePanel:
         def work() -> None:
             with failures_said("the picture failed", lambda reason: session.warn(reason, "no picture")):
                 try:
-                    for first_row, strip in strips:
-                        take(first_row, strip)
+                    found = [read(strip) for strip in strips]
                 finally:
                     self._capture = None
                     show(0.0)
-                session.guarded(lambda: self._hand_over(write()))()
+                session.guarded(lambda: self._hand_over(write(found)))()
 
         threading.Thread(target=work, name="unmix-viewer-picture", daemon=True).start()
 
@@ -165,7 +165,6 @@ class CapturePanel:
             self._list_keys(index)
 
     def _path(self, frames_per_second: float) -> list[ViewPose]:
-        """The path through the key frames; a ConfigError where there are fewer than two."""
         return path_poses(self._keys, max(2, round(number_of(self._seconds, 4.0) * frames_per_second)))
 
     def _play(self, action: str) -> None:
@@ -185,7 +184,6 @@ class CapturePanel:
         threading.Thread(target=play, name="unmix-viewer-preview", daemon=True).start()
 
     def _save_path(self) -> Path:
-        """Write the path as a camera file for `unmix-render`."""
         frames_per_second, services = number_of(self._fps, 24), self._session.services
         width, height = _side(self._width) // 2 * 2, _side(self._height) // 2 * 2
         views = [

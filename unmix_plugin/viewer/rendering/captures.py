@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.exr import write_spectral_exr
 from unmix_plugin.formats.video import OWN_GROUP
@@ -52,30 +51,21 @@ def check_size(width: int, height: int, num_bands: int | None = None) -> None:
         )
 
 
-class SpectraCanvas:
-    """Collects strips of spectra."""
+Strip = tuple[Float32[np.ndarray, "h W B"], Float32[np.ndarray, "h W 3"], Float32[np.ndarray, "h W"]]
 
-    def __init__(self, camera: Cameras, materials: Materials) -> None:
-        """`materials` are those that are shown."""
-        shape, self._materials = (camera.height, camera.width), materials
-        self.spectra: Float32[np.ndarray, "H W B"] = np.zeros((*shape, len(materials.bands)), np.float32)
-        self.linear_rgb: Float32[np.ndarray, "H W 3"] = np.zeros((*shape, 3), np.float32)
-        self.coverage: Float32[np.ndarray, "H W"] = np.zeros(shape, np.float32)
 
-    def take(self, first_row: int, frame: RenderedView) -> None:
-        """Put a strip in its place."""
-        assert isinstance(frame, MaterialView)
-        rows = slice(first_row, first_row + frame.camera.height)
-        self.spectra[rows] = frame["spectral"].cpu().numpy()
-        to_rgb = rgb_matrix(frame.materials.bands)
-        self.linear_rgb[rows] = frame.materials.through(frame.coefficients, to_rgb).cpu().numpy()
-        self.coverage[rows] = frame.coverage.cpu().numpy()
+def strip_of_spectra(frame: RenderedView) -> Strip:
+    """Spectra, linear RGB and coverage of a strip of `h` rows."""
+    assert isinstance(frame, MaterialView)
+    linear_rgb = frame.materials.through(frame.coefficients, rgb_matrix(frame.materials.bands))
+    return frame["spectral"].cpu().numpy(), linear_rgb.cpu().numpy(), frame.coverage.cpu().numpy()
 
-    def write(self, path: Path) -> Path:
-        """Write a spectral EXR; a RunError if the disk is full or refuses."""
-        bands, quantity = self._materials.bands, self._materials.quantity
-        about = f"{quantity} on black, 1 = full scale"
-        return write_spectral_exr(path, self.spectra, bands, self.linear_rgb, self.coverage, about, quantity)
+
+def write_spectra(path: Path, strips: Sequence[Strip], materials: Materials) -> Path:
+    """Write the spectra of these materials as a spectral EXR; a RunError if the disk is full or refuses."""
+    spectra, linear_rgb, coverage = (np.concatenate(parts) for parts in zip(*strips, strict=True))
+    about = f"{materials.quantity} on black, 1 = full scale"
+    return write_spectral_exr(path, spectra, materials.bands, linear_rgb, coverage, about, materials.quantity)
 
 
 _LAUNCH = "from unmix_plugin.commands import scripts; scripts.render()"

@@ -136,8 +136,8 @@ class RenderLoop:
         subpixels: int,
         cancelled: threading.Event,
         show: Callable[[float], None] = lambda _: None,
-    ) -> Iterator[tuple[int, RenderedView]]:
-        """A picture of any size apart from any view: strips with their first rows, each rendered in the caller's thread
+    ) -> Iterator[RenderedView]:
+        """A picture of any size apart from any view: strips from top to bottom, each rendered in the caller's thread
         when nothing is more urgent, one picture after another. `show` is told the part that is rendered; a ConfigError
         once it is `cancelled` or the loop stopped, another UnmixError if the edit does not fit the run."""
         rows = max(1, _STRIP_PIXELS // camera.width)
@@ -151,7 +151,7 @@ class RenderLoop:
                         raise ConfigError("the viewer was stopped" if self._is_stopping else "cancelled")
                     frame = self._maker.advance(render, edit, self._maker.speed.block_rays, RESTING_COST)
                     show((first + part.height * (1 - render.rays_left / render.num_rays)) / camera.height)
-                yield first, frame
+                yield frame
 
     def _give_way(self) -> None:
         """Wait until no view waits for a picture at once."""
@@ -217,7 +217,6 @@ class RenderLoop:
             work(view)
 
     def _answer(self, view: View) -> None:
-        """A small picture at once."""
         with self._changed:
             pose, edit, height = view.pose, view.edit, view.largest_height
             view.moved_at = view.restyled_at = None
@@ -258,7 +257,6 @@ class RenderLoop:
         self._present(view, frame, edit, version)
 
     def _present(self, view: View, frame: RenderedView, edit: Edit, version: int) -> None:
-        """Paint a frame and send it."""
         with self._changed:
             if view not in self._views or view.pose is None:
                 return
