@@ -39,18 +39,22 @@ def named_scene(specular: str = "dictionary") -> TrainedScene:
 
 
 @pytest.mark.parametrize("edit", EVERY_KIND)
-def test_an_edit_leaves_the_scene_as_it_was_and_shares_its_weights(edit):
-    scene = lit_scene()
+def test_an_edit_leaves_the_scene_as_it_was_and_its_coefficients_serve_where_geometry_stays(edit):
+    scene, made = lit_scene(), recipe(edit, light="A")
     before = {name: value.clone() for name, value in tensors_of(scene).items()}
     picture, names = rendered(scene), scene.materials.names
-    result = edited(scene, edit, light="A")
-    rendered(result)
+    result = edit_scene(scene, made)
+    shown = rendered(result)
     assert all(torch.equal(value, before[name]) for name, value in tensors_of(scene).items())
     assert (scene.materials.names, scene.notes) == (names, ())
     assert_close(rendered(scene), picture, rtol=0, atol=0)
     weights = {id(value) for value in scene.field.parameters()}
     assert {id(value) for value in result.field.parameters()} == weights
     assert result.renderer is scene.renderer
+    assert changes_geometry(made) == edit.startswith(("remove", "isolate", "gloss: {endmember"))
+    if not changes_geometry(made):
+        view = MaterialView(result, CAMERAS[0], scene.look(CAMERAS[0]).coefficients)
+        assert_close(view["spectral"], shown["spectral"])
 
 
 @pytest.mark.parametrize("specular", ["none", "dictionary", "full"])
@@ -83,30 +87,38 @@ def test_in_every_view_a_new_spectrum_shows_where_and_as_much_as_its_endmember_d
     assert_close(together.materials.endmembers, one_by_one.materials.endmembers)
 
 
-def write_paints(path, wavelengths=(440, 660)):
-    rows = [f"{nm},0.1,0.{6 - index}" for index, nm in enumerate(wavelengths)]
+def paints(path, wavelengths=(440, 660), ochre=(0.6, 0.5)):
+    """The reflectances of two paints in a file, and the edit that takes one."""
+    rows = [f"{nm},0.1,{value}" for nm, value in zip(wavelengths, ochre, strict=True)]
     path.write_text("\n".join(["wavelength,dark,ochre", *rows]) + "\n")
-    return path
+    return f"replace: {{endmember: 0, file: {path}%s}}"
 
 
 def test_a_spectrum_from_a_file_is_found_by_name_and_extrapolated_only_when_asked(tmp_path):
-    path = write_paints(tmp_path / "paints.csv")
-    result = edited(lit_scene(), f"replace: {{endmember: 0, file: {path}, spectrum: ochre}}")
+    path, held = tmp_path / "paints.csv", ", spectrum: ochre, extrapolate: true"
+    result = edited(lit_scene(), paints(path) % ", spectrum: ochre")
     expected = np.interp(WAVELENGTHS_NM, [440, 660], [0.6, 0.5]) * np.array(LIGHT)
     assert_close(result.materials.endmembers[0], torch.tensor(expected, dtype=torch.float32))
-    words = f"endmember: 0, file: {write_paints(path, (480, 640))}, spectrum: ochre"
+    assert edited(lit_scene(), paints(path) % held).notes == ()
+    edit = paints(path, (480, 640))
     with pytest.raises(ConfigError) as caught:
-        edited(lit_scene(), f"replace: {{{words}}}")
+        edited(lit_scene(), edit % ", spectrum: ochre")
     assert "edits.yml, line 2 (replace): ochre" in str(caught.value)
     assert "30 nm below and 10 nm above their range" in str(caught.value)
     assert str(caught.value).endswith("extrapolate: true holds the outermost values instead")
-    result = edited(lit_scene(), f"replace: {{{words}, extrapolate: true}}")
+    result = edited(lit_scene(), edit % held)
     reflectance = (result.materials.endmembers[0] / torch.tensor(LIGHT)).numpy()
     np.testing.assert_allclose(reflectance[[0, -1]], [0.6, 0.5], rtol=1e-5)
     (note,) = result.notes
     assert "ochre was not measured at 2 of 5 bands" in note
-    write_paints(path, (440, 660))
-    assert edited(lit_scene(), f"replace: {{{words}, extrapolate: true}}").notes == ()
+
+
+def test_doubtful_files_of_spectra_are_refused(tmp_path):
+    path = tmp_path / "paints.csv"
+    with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); choose one"):
+        edited(lit_scene(), paints(path) % "")
+    with pytest.raises(ConfigError, match=r"ochre must be in reflectances, 1 for white; found 59\.5"):
+        edited(lit_scene(), paints(path, ochre=(60, 50)) % ", spectrum: ochre")
 
 
 def test_a_scaled_endmember_is_that_much_brighter_by_its_new_name_which_ends_up_in_tables():
@@ -174,18 +186,6 @@ def test_gloss_is_the_sum_of_that_of_all_materials_and_mirrors_in_the_colour_of_
     assert_close(white["specular"], before["specular"], rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("edit", EVERY_KIND)
-def test_coefficients_serve_again_where_geometry_does_not_change(edit):
-    scene = lit_scene()
-    made = recipe(edit, light="A")
-    result = edit_scene(scene, made)
-    coefficients = scene.look(CAMERAS[0]).coefficients
-    assert changes_geometry(made) == edit.startswith(("remove", "isolate", "gloss: {endmember"))
-    if not changes_geometry(made):
-        view = MaterialView(result, CAMERAS[0], coefficients)
-        assert_close(view["spectral"], rendered(result)["spectral"])
-
-
 @pytest.mark.parametrize("specular", ["dictionary", "full"])
 def test_another_light_multiplies_every_spectrum_by_the_same_ratio(specular):
     scene = lit_scene(specular=specular)
@@ -249,20 +249,9 @@ def test_what_does_not_fit_the_run_or_contradicts_is_refused_with_its_line(edits
         edited(scene, *edits)
     assert str(caught.value).startswith("edits.yml, line ")
     assert message in str(caught.value)
-
-
-def test_recipes_made_in_code_are_pointed_at_by_position():
+    in_code = Recipe((Scale(0, 1.0), Remove((NUM_BANDS,))))
     with pytest.raises(ConfigError, match=r"^recipe, edit 2 \(remove\): there is no endmember 5"):
-        edit_scene(lit_scene(), Recipe((Scale(0, 1.0), Remove((NUM_BANDS,)))))
-
-
-def test_doubtful_files_of_spectra_are_refused(tmp_path):
-    path = write_paints(tmp_path / "paints.csv")
-    with pytest.raises(ConfigError, match=r"paints.csv has 2 spectra \(dark, ochre, ...\); choose one"):
-        edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
-    path.write_text("wavelength,ochre\n440,60\n660,50\n")
-    with pytest.raises(ConfigError, match=r"ochre must be in reflectances, 1 for white; found 59\.5"):
-        edited(lit_scene(), f"replace: {{endmember: 0, file: {path}}}")
+        edit_scene(scene, in_code)
 
 
 @pytest.mark.parametrize(
@@ -280,12 +269,9 @@ def test_a_colour_that_no_surface_has_becomes_the_nearest_and_the_user_is_told(e
 
 def test_a_swapped_look_may_be_replaced_where_it_is_now():
     scene = lit_scene()
-    edit = "replace: {{endmember: {}, library: ColorChecker/{}}}"
-    first, second = edit.format(0, "red"), edit.format(0, "green")
-    result = edited(scene, first, "swap: [0, 1]", second)
-    library = measured_library()
+    result = edited(scene, REPLACE % "red", "swap: [0, 1]", REPLACE % "green")
     for k, name in enumerate(["ColorChecker/green", "ColorChecker/red"]):
-        expected = library.reflectance(name, BANDS) * np.array(LIGHT)
+        expected = measured_library().reflectance(name, BANDS) * np.array(LIGHT)
         assert_close(result.materials.endmembers[k], torch.tensor(expected, dtype=torch.float32))
     with pytest.raises(ConfigError, match="'endmember_1' can't be replaced"):
-        edited(scene, first, "swap: [0, 1]", edit.format(1, "green"))
+        edited(scene, REPLACE % "red", "swap: [0, 1]", "replace: {endmember: 1, library: ColorChecker/green}")
