@@ -272,7 +272,7 @@ def test_what_no_control_of_the_viewer_needs_is_not_listened_to():
 
 def test_a_fault_is_said_in_one_short_line_and_once():
     said = []
-    tell, loop = connections._Faults(said.append), asyncio.new_event_loop()
+    tell, loop = connections._fault_handler(said.append), asyncio.new_event_loop()
     for number in range(1000):
         tell(loop, {"exception": ValueError(f"{number} " + "x" * 10_000)})
         tell(loop, {"message": f"{number}"})

@@ -241,7 +241,7 @@ def _serve_through(gate: Gate, say: Callable[[str], None]) -> Callable[..., webs
         async def judge(connection: ServerConnection, request: Request) -> Response | None:
             return await _refusal(gate, connection, request) or process_request(connection, request)
 
-        asyncio.get_running_loop().set_exception_handler(_Faults(say))
+        asyncio.get_running_loop().set_exception_handler(_fault_handler(say))
         ours = {
             "create_connection": partial(_Connection, gate),
             "max_size": _LARGEST_MESSAGE,
@@ -272,20 +272,19 @@ async def _refusal(gate: Gate, connection: ServerConnection, request: Request) -
     return response
 
 
-class _Faults:
+def _fault_handler(say: Callable[[str], None]) -> Callable[[Any, dict[str, Any]], None]:
     """Says what went wrong in handling a message, once for each kind: a traceback for each would fill the disk."""
+    known: set[str] = set()
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
-        self._said: set[str] = set()
-
-    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    def handle(_loop: Any, context: dict[str, Any]) -> None:
         error = context.get("exception")
         kind = type(error).__name__ if error else str(context.get("message", ""))[:_LONGEST_FAULT]
-        if kind not in self._said and len(self._said) < _MOST_FAULTS:
-            self._said.add(kind)
+        if kind not in known and len(known) < _MOST_FAULTS:
+            known.add(kind)
             text = "" if error is None else str(error)[:_LONGEST_FAULT]
-            self._say(f"warning: the viewer could not take something that a page sent ({kind}: {text!r})")
+            say(f"warning: the viewer could not take something that a page sent ({kind}: {text!r})")
+
+    return handle
 
 
 def send_what_is_queued(server: viser.ViserServer) -> None:

@@ -12,9 +12,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-import numpy as np
-from jaxtyping import Float64
-
 from unmix_plugin.editing import Light, Recipe
 from unmix_plugin.editing.apply import relighting_factors
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -22,7 +19,6 @@ from unmix_plugin.engine.training.progress import TrainingStatus
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.figures.pictures import ColourScale
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_names
 from unmix_plugin.spectral.library.material_library import MaterialLibrary, measured_library
 from unmix_plugin.spectral.materials import Materials
@@ -110,8 +106,12 @@ class Services:
     @cached_property
     def usable_lights(self) -> tuple[str, ...]:
         """Names of the lights that the scene can be shown in."""
-        scene = self.maker.edited(Edit())
-        return tuple(name for name in illuminant_names() if _is_usable(name, scene.bands, scene.light_power))
+        scene, names = self.maker.edited(Edit()), []
+        for name in illuminant_names():
+            with suppress(SpectrumError):
+                relighting_factors(scene.bands, scene.light_power, Light(name))
+                names.append(name)
+        return tuple(names)
 
     def start(self) -> None:
         """Begin to render, and to read the scene."""
@@ -149,14 +149,6 @@ class Services:
                 aids.set_measured(MeasuredViews(scene, self.source))
             elif self.has_materials:
                 aids.set_measured(None, "no training view has all bands")
-
-
-def _is_usable(light: str, bands: Bands, recorded: Float64[np.ndarray, " B"] | None) -> bool:
-    try:
-        relighting_factors(bands, recorded, Light(light))
-    except SpectrumError:
-        return False
-    return True
 
 
 @dataclass(frozen=True)
