@@ -182,7 +182,6 @@ def _read_list(node: yaml.Node, kind: type[Operation], folder: Path) -> Operatio
 
 
 def _read_fields(node: yaml.Node, kind: type[_T], what: str, folder: Path) -> _T:
-    """A dataclass from a mapping of its fields."""
     defaults = _defaults(kind)
     required = [name for name, default in defaults.items() if default is MISSING]
     parts = _mapping(node, what, required, [name for name in defaults if name not in required])
@@ -193,7 +192,6 @@ def _read_fields(node: yaml.Node, kind: type[_T], what: str, folder: Path) -> _T
 
 
 def _compose(text: str) -> yaml.Node:
-    """The text's only document."""
     if len(text) > _MOST_CHARACTERS:
         raise _NodeError(None, f"{len(text)} characters are too many; at most {_MOST_CHARACTERS}")
     try:
@@ -306,7 +304,6 @@ def _endmember(node: yaml.Node, _: str, __: Path) -> Endmember:
 
 
 def _endmembers(node: yaml.Node, what: str, folder: Path) -> tuple[Endmember, ...]:
-    """A list of them, or one alone."""
     is_list = isinstance(node, yaml.SequenceNode)
     items = _sequence(node, what, _MOST_ENDMEMBERS) if is_list else [node]
     return tuple(_endmember(item, what, folder) for item in items)
@@ -344,5 +341,4 @@ def _describe(node: yaml.Node) -> str:
 
 
 def _nearest(word: str, known: Collection[str]) -> str:
-    """Words that a reader may have meant, for the end of a message."""
     return did_you_mean(word[:_LONGEST_QUOTE], known) or f"known: {', '.join(known)}"

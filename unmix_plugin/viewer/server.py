@@ -149,7 +149,6 @@ class Viewer:
                     return
 
     def _connected(self, client: viser.ClientHandle) -> None:
-        """Serve a page that was let in."""
 
         def warn(reason: str) -> None:
             client.gui.add_html(paragraph(reason, is_warning=True))
@@ -175,7 +174,6 @@ class Viewer:
             self._kept_pages.leave(session.browser, session.state)
 
     def _tick(self) -> None:
-        """Let panels follow a run that goes on."""
         while not self._stopped.wait(_TICK_S):
             with failures_said("panels could not be renewed", self._say):
                 self.services.tick()

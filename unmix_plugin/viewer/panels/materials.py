@@ -192,7 +192,6 @@ class MaterialsPanel:
 
     @property
     def _index(self) -> int:
-        """Number of the endmember chosen."""
         return index_in(self._chosen)
 
     def _change(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
@@ -237,7 +236,6 @@ class MaterialsPanel:
         return None if name == _NO_MATERIAL else self._library.find(name)
 
     def _show_known(self) -> None:
-        """Say where the known material is from, and over which wavelengths."""
         chosen = self._chosen_known()
         self._known_source.content = "" if chosen is None else paragraph(f"{chosen.source}; {chosen.bands}")
 
@@ -307,7 +305,6 @@ class MaterialsPanel:
 
 
 def _srgb(value: Any) -> tuple[float, float, float]:
-    """A colour picker's value as sRGB in [0, 1]."""
     red, green, blue = (number(part, 0, 255, fallback=128) / 255 for part in tuple(value)[:3])
     return red, green, blue
 

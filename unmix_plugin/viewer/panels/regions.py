@@ -60,7 +60,6 @@ class RegionsPanel:
 
     @property
     def _outline(self) -> list[tuple[float, float]]:
-        """Corners of what is drawn so far."""
         if self._shape.value != _SHAPES[0] or len(self._corners) < 2:
             return self._corners
         (left, top), (right, bottom) = self._corners

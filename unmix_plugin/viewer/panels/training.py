@@ -39,7 +39,6 @@ class TrainingPanel:
         session.on_tick.append(self._tick)
 
     def _tick(self) -> None:
-        """Renew the figures, and now and then the curves."""
         control, status = self._control, self._control.status
         self._pause.label = "resume" if control.is_paused else "pause"
         self._state.content = table(_rows(status, self._condition(), control.is_running))

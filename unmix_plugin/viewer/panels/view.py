@@ -255,7 +255,6 @@ class ScenePanel:
         self._session.on_change(switch, lambda: self._show(label, make if switch.value is True else None))
 
     def _show(self, label: str, make: Callable[[], list[Any]] | None) -> None:
-        """Show objects that are made anew, or none."""
         for handle in self._objects.pop(label, []):
             handle.remove()
         if make is not None:
@@ -298,7 +297,6 @@ class ScenePanel:
         return handles
 
     def _add_box(self) -> list[viser.LineSegmentsHandle]:
-        """The twelve edges of the scene box."""
         low, high = self._session.services.source.record.scene_box.aabb.cpu().numpy()
         corners = np.array([[(low, high)[(i >> axis) & 1][axis] for axis in range(3)] for i in range(8)])
         edges = [(i, i | 1 << axis) for axis in range(3) for i in range(8) if not i & 1 << axis]
@@ -331,14 +329,13 @@ def _thumbnail(scene: Scene, name: str) -> UInt8[np.ndarray, "H W 3"] | None:
     if index is None:
         return None
     picture = scene.srgb(index)
-    if picture is not None:
-        step = max(1, picture.shape[0] // _THUMBNAIL_HEIGHT)
-        return np.ascontiguousarray((picture[::step, ::step] * 255 + 0.5).astype(np.uint8))
-    cube = scene.cube(index)
-    step = max(1, cube.shape[0] // _THUMBNAIL_HEIGHT)
-    spectra = torch.from_numpy(np.ascontiguousarray(cube[::step, ::step]))
-    sensor = scene.sensor_of(index)
-    false_colours = torch.from_numpy(sensor.false_colours).to(spectra)
-    weights = rgb_matrix(Bands.of(scene.wavelengths_nm)) if sensor.sees_all_bands else false_colours
-    linear = (spectra @ weights).clamp(0, 1)
-    return (linear_to_srgb(linear) * 255 + 0.5).to(torch.uint8).numpy()
+    step = max(1, scene.cameras[index].height // _THUMBNAIL_HEIGHT)
+    if picture is None:
+        sensor, spectra = scene.sensor_of(index), torch.from_numpy(scene.cube(index)[::step, ::step].copy())
+        weights = torch.from_numpy(sensor.false_colours)
+        if sensor.sees_all_bands:
+            weights = rgb_matrix(Bands.of(scene.wavelengths_nm))
+        small = linear_to_srgb((spectra @ weights.to(spectra)).clamp(0, 1)).numpy()
+    else:
+        small = picture[::step, ::step]
+    return np.ascontiguousarray((small * 255 + 0.5).astype(np.uint8))

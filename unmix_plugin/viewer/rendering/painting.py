@@ -76,7 +76,6 @@ def _paint_values(values: Float[Tensor, "H W"], scale: tuple[float, float], colo
 
 @lru_cache(maxsize=len(COLOUR_MAPS))
 def _colour_table(colour_map: str) -> Float[Tensor, "levels 3"]:
-    """sRGB colours of a map from its low to its high end."""
     from matplotlib import colormaps
 
     return torch.as_tensor(colormaps[colour_map](np.linspace(0, 1, _LEVELS))[:, :3], dtype=torch.float32)
@@ -169,7 +168,6 @@ _PAINTED_KINDS: dict[OutputKind, frozenset[str]] = {
 
 
 def _layer_of(output: Output) -> _Layer:
-    """The layer of an output of a kind that can be painted."""
 
     def paint(frame: RenderedView, settings: LayerSettings, _: LayerAids | None) -> tuple[_Picture, Legend]:
         values, opacity, kind = frame[output.name], frame.opacity, output.kind

@@ -176,7 +176,6 @@ class FrameRender:
 
 
 def _num_channels(materials: Materials) -> int:
-    """Coefficients of a pixel."""
     return 2 + 2 * len(materials.endmembers) + len(materials.specular_spectra)
 
 
