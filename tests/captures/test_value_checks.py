@@ -10,7 +10,7 @@ from PIL import Image
 
 from tests.captures.file_factory import file_of
 from unmix_plugin.captures.options import ProcessOptions
-from unmix_plugin.captures.spectral_file import CaptureView
+from unmix_plugin.captures.spectral_file import BandTable, CaptureView
 from unmix_plugin.captures.value_checks import ViewSample, check_files, check_values
 from unmix_plugin.captures.writing.view_files import ViewRecord
 
@@ -123,3 +123,10 @@ def test_a_file_of_which_most_was_not_read_is_named(tmp_path: Path):
     path.write_bytes(bytes(30_000))
     check_files(views, OPTIONS, found)
     assert len(found) == 1
+
+
+def test_a_band_too_wide_for_one_wavelength_is_named(tmp_path: Path):
+    table, found = BandTable(np.array([560.0, 634.5]), "tags", fwhm_nm=np.array([27.0, 463.0])), []
+    cube = replace(file_of(np.zeros((4, 5, 2), np.float32)), path=tmp_path / "none", bands=table)
+    check_files([CaptureView("view", cube)], OPTIONS, found)
+    assert "634.5 nm (463 nm wide)" in found[0]

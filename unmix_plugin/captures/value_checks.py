@@ -34,6 +34,8 @@ _MOST_UNREAD, _HEADER_BYTES = 2.5, 20_000
 """Bytes of a file over those of the numbers taken from it, and beyond them, that leave nothing of weight unread."""
 _CHOOSING_LAYOUTS = ("nespof", "nespof-real")
 """Layouts that take one channel of several on purpose."""
+_WIDE_NM = 200.0
+"""Of a band, full width at half maximum; panchromatic ones have 400 and more."""
 _SIDE = 48
 """Of the grid of pixels that are looked at."""
 _LEAST_PIXELS = 200
@@ -64,19 +66,26 @@ _OTHER_COVER = 0.3
 
 
 def check_files(views: Sequence[CaptureView], options: ProcessOptions, findings: list[str]) -> None:
-    """Append files of which most was not read."""
-    left = []
+    """Append files of which most was not read, and bands that are too wide for one wavelength."""
+    left: list[str] = []
+    wide: dict[float, float] = {}
     for view in views:
-        cube = view.cube
+        cube, bands = view.cube, view.cube.bands
         size = sum(path.stat().st_size for path in cube.files if path.is_file())
         if size > _MOST_UNREAD * np.prod(cube.shape) * cube.dtype.itemsize + _HEADER_BYTES:
             left.append(f"{cube.path.name} ({cube.shape[2]} bands of {size / 1e6:.1f} MB)")
-    if not left or options.dataset is not None or options.layout in _CHOOSING_LAYOUTS:
-        return
-    findings.append(
-        f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
-        "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
-    )
+        if bands.wavelengths_nm is not None and bands.fwhm_nm is not None:
+            pairs = zip(bands.wavelengths_nm, bands.fwhm_nm, strict=True)
+            wide |= {nm: width for nm, width in pairs if width > _WIDE_NM}
+    if left and options.dataset is None and options.layout not in _CHOOSING_LAYOUTS:
+        findings.append(
+            f"{counted(len(left), 'file')} of which only a small part was read: {', '.join(left[:3])}. Other parts may "
+            "hold the spectra: see 'unmix-process inspect', and choose with --dataset"
+        )
+    if wide:
+        named = name_some([f"{nm:g} nm ({width:.0f} nm wide)" for nm, width in wide.items()], 5)
+        said = f"{counted(len(wide), 'band')} too wide to stand for one wavelength: {named}"
+        findings.append(f"{said}; --drop-bands leaves them out")
 
 
 @dataclass(frozen=True)
