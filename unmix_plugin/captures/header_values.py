@@ -32,8 +32,8 @@ _CENTRES = re.compile(
 _WIDTHS = re.compile(r"(fwhms?|band_?widths?|list_fwhm_[^_]*)(_?(nm|um))?")
 GOOD = re.compile(r"bbl|good_(wavelengths?|bands?)|list_cw_.*_flags")
 _NAMES = re.compile(r"band_?names?")
-_UNIT_NAMES = ("{}_units", "{}_unit", "wavelength_units", "wavelength_unit")
-"""Of wavelengths whose name is put in."""
+_PARTS = r"[,;\s]"
+"""What parts the items of a text."""
 _DIVISOR = "reflectance_scale_factor"
 """Stored number of full reflectance, under the same name everywhere."""
 _LEAST_WIDTH_NM = 0.05
@@ -55,7 +55,7 @@ def plain_names(entries: Mapping[str, Any]) -> dict[str, str]:
     return named
 
 
-def listed(value: Any, separators: str = r"[,;\s]") -> list[Any]:
+def listed(value: Any, separators: str = _PARTS) -> list[Any]:
     """Items of an entry: numbers of a list, or parts of a text, of which commas in a row part none.
 
     >>> listed("{1, 2,}"), listed([3.0, 4.0])
@@ -94,20 +94,23 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
     """
     named = plain_names(entries)
 
-    def find(
-        names: re.Pattern[str], *units: str, separators: str = r"[,;\s]"
-    ) -> tuple[str, list[Any] | None]:
+    def find(names: re.Pattern[str], *units: str, separators: str = _PARTS) -> tuple[str, list[Any] | None]:
         for unit in units:
-            for name, key in named.items():
-                if not names.fullmatch(name) or _unit_in(name) != unit:
-                    continue
-                items = listed(entries[key], separators)
-                if items and not (name == "bands" and _counts(items, unit_of(name))):
-                    return name, items
+            found = {
+                name: listed(entries[key], separators)
+                for name, key in named.items()
+                if names.fullmatch(name) and _unit_in(name) == unit
+            }
+            if "bands" in found and counts_bands(found["bands"], unit_of("bands")):
+                del found["bands"]
+            if longest := max(found, key=lambda name: len(found[name]), default=""):
+                return longest, found[longest] or None
         return "", None
 
     def unit_of(name: str) -> str | None:
-        keys = [named[key] for key in (form.format(name) for form in _UNIT_NAMES) if key in named]
+        # Those of a list called `wavelength`, or of all bands.
+        of_all = () if _unit_in(name) or "wavelength" in named else ("wavelength_units", "wavelength_unit")
+        keys = [named[key] for key in (f"{name}_units", f"{name}_unit", *of_all) if key in named]
         unit = entries[keys[0]] if keys else _unit_in(name) or None
         return unit if unit is None or isinstance(unit, str) else str(listed(unit)[0])
 
@@ -123,14 +126,14 @@ def _unit_in(name: str) -> str:
     return name[-2:] if name.endswith(("nm", "um")) else ""
 
 
-def _counts(items: Sequence[Any], unit: str | None) -> bool:
+def counts_bands(items: Sequence[Any], unit: str | None) -> bool:
     """Whether a list called `bands` has the number or numbers of bands, and not their wavelengths."""
     try:
         numbers = np.array(items, np.float64)
     except ValueError:
         return True
     has_unit = unit is not None and nm_per_unit(unit) is not None
-    return not has_unit and (len(items) == 1 or are_band_numbers(numbers, may_have_gaps=True))
+    return not has_unit and (len(items) < 2 or are_band_numbers(numbers, may_have_gaps=True))
 
 
 def state_linear(
@@ -163,15 +166,15 @@ def state_linear(
     if len(found) > 1:
         warnings.append(f"{found[0].evidence} is applied, not {found[1].evidence}")
     key = named.get(_DIVISOR, "")
-    factor = _factor(key, entries.get(key, "1"), warnings)
-    if factor == 1:
+    factors = _factors(key, entries.get(key, "1"), warnings)
+    if set(factors) == {1.0}:
         return found[0] if found else None
     if found:
         raise CaptureError(
-            f"{path}: has '{key}' {factor:g} and other gains ({found[0].evidence}); take one of them out of the file, "
-            "as it is unclear which the numbers need"
+            f"{path}: has '{key}' {factors[0]:g} and other gains ({found[0].evidence}); take one out of the file, as "
+            "it is unclear which the numbers need"
         )
-    return linear_values(path, num_bands, [1 / factor], [], f"{where} '{key}'")
+    return linear_values(path, num_bands, [1 / factor for factor in factors], [], f"{where} '{key}'")
 
 
 def _floats(path: Path, what: str, value: Any) -> list[float]:
@@ -182,16 +185,18 @@ def _floats(path: Path, what: str, value: Any) -> list[float]:
         raise CaptureError(f"{path}: {what} has {found}; expected numbers, one a band") from None
 
 
-def _factor(key: str, value: Any, warnings: list[str]) -> float:
-    """A number above 0; 1 with a warning for anything else."""
+def _factors(key: str, value: Any, warnings: list[str]) -> list[float]:
+    """A number above 0 with a comment behind it, or one a band; 1 with a warning for anything else."""
     try:
-        factor = float(listed(value)[0])
-    except (ValueError, IndexError):
-        factor = np.nan
-    if 0 < factor < np.inf:
-        return factor
+        factors = [
+            float(item) for item in ([value.partition(";")[0]] if isinstance(value, str) else listed(value))
+        ]
+    except ValueError:
+        factors = []
+    if factors and all(0 < factor < np.inf for factor in factors):
+        return factors
     warnings.append(f"'{key}' is {value} and is left out; expected a number above 0")
-    return 1.0
+    return [1.0]
 
 
 def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> BandTable:
@@ -316,7 +321,7 @@ _FACTS = {
 }
 """What names say. A plain gain is the whole one; the others multiply each other."""
 _OF_EXIF = ("speed", "f_number")
-"""Facts that count beside a time, and are left out where they make no sense."""
+"""Facts that count beside a time of EXIF or OpenEXR, and are left out where they make no sense."""
 _OWNERS = ("camera", "sensor", "detector", "imager")
 """Words before a name that change nothing."""
 _SECONDS = {
@@ -346,6 +351,7 @@ def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) 
     0.0005
     """
     found: dict[str, tuple[Any, str]] = {}
+    is_exif = False
     named = {name: _split(name) for name in entries}
     units = {name: str(entries[key]) for key, (name, unit) in named.items() if unit == "unit"}
     for key, (name, unit) in named.items():
@@ -362,7 +368,7 @@ def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) 
         if what in _OF_EXIF and (len(values) != 1 or not known or not 0 < known[0][0] < np.inf):
             continue
         if not known or len(known) < len(values):
-            said = f"{where} '{key}' is {str(entries[key])[:60]!r}, which is not understood"
+            said = f"{where} '{key}' is {', '.join(items)[:60]!r}, which is not understood"
             warnings.append(f"{said}: exposures may differ")
         elif what not in found:
             numbers = [number for number, _ in known]
@@ -370,17 +376,17 @@ def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) 
             taken = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if name in _TIMES else "a factor"
             evidence = f"{where} '{key}'" + ("" if has_unit else f", no unit: taken as {taken}")
             found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, evidence
-    return _combined(found, warnings)
+            is_exif |= name in ("exifexposuretime", "exptime")
+    return _combined({what: found[what] for what in found if is_exif or what not in _OF_EXIF}, warnings)
 
 
 def _combined(found: Mapping[str, tuple[Any, str]], warnings: list[str]) -> dict[str, Any]:
-    """Metadata of what was found, with one gain: EXIF's speed beside a time, the whole one, or the product of parts."""
+    """Metadata of what was found, with one gain: EXIF's speed, the whole one, or the product of parts."""
     facts: dict[str, Any] = {}
     if "exposure_s" in found:
         facts["exposure_s"], facts["exposure_evidence"] = found["exposure_s"]
-        facts |= {"f_number": found["f_number"][0]} if "f_number" in found else {}
-    wholes = (["speed"] if "exposure_s" in found else []) + ["gain"]
-    parts = [name for name in wholes if name in found][:1]
+    facts |= {"f_number": found["f_number"][0]} if "f_number" in found else {}
+    parts = [name for name in ("speed", "gain") if name in found][:1]
     if parts := parts or [name for name in ("analog", "digital") if name in found]:
         numbers, evidence = zip(*(found[name] for name in parts), strict=True)
         if len({np.size(number) for number in numbers} - {1}) > 1:

@@ -114,6 +114,15 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 
+def test_what_is_nearest_to_an_image_counts_and_units_are_those_of_their_own_list(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/cube"], file["run/bands"], file["run/more/bands"] = CUBE, np.arange(1, 6), NM + 1
+        file["wavelength"] = NM
+        file["wavelength"].attrs["units"] = "um"
+        file.attrs["scale_factor"], file["run"].attrs["Scale_Factor"] = 0.5, 4.0
+    check_file(open_spectral_file(tmp_path / "a.h5"), nm=NM + 1, scale=4, warnings=())
+
+
 @pytest.mark.parametrize(
     ("gain", "applied", "of_camera"),
     [
@@ -300,6 +309,14 @@ def test_prisma_has_radiance_up_to_level_2b_and_then_reflectance(tmp_path, level
     file = open_spectral_file(prisma(tmp_path / "a.he5", level=level), ReadOptions(dataset=name))
     assert (stated_reflectance(file) is not None) == is_reflectance
     assert f"of {'reflectance' if is_reflectance else 'radiance'}" in present(finished_by(file))
+
+
+def test_a_factor_of_reflectance_may_be_one_a_band(tmp_path):
+    factors = np.array([1.0, 2, 4, 5, 8])
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["cube"].attrs["reflectance_scale_factor"] = factors
+    check_file(open_spectral_file(tmp_path / "a.h5"), calibrated=CUBE / factors)
 
 
 @pytest.mark.parametrize(("unit", "nm"), [("um", [3000, 5000, 8000, 11_000, 12_000]), ("1", None)])

@@ -111,6 +111,7 @@ SAID: dict[str, dict[str, Any]] = {
     "band names = {450 nm, 460 nm, red, 480 nm}": {"nm": None},
     "data ignore value = -9999 ; none measured": {"no_data": (-9999,)},
     "data ignore value = {-9999, 0}": {"no_data": (-9999, 0), "warnings": ()},
+    "reflectance scale factor = {1, 2, 3, 4}": {"linear": None, "warning": "is 1, 2, 3, 4 and is left out"},
     "data ignore value = unset": {"warning": "'data ignore value' is unset, no number: not used"},
     "sensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}": {"nm": NM},
 }
@@ -154,7 +155,7 @@ def test_dark_lines_at_the_end_are_no_image_but_its_dark_frame(tmp_path):
     file = open_spectral_file(tmp_path / "b.tif")
     check_file(file, reader="tiff", values=CUBE[:4])
     check_file(present(file.dark), values=CUBE[4:])
-    for text in ("0", "0.5", "5", "3000", "-1"):  # none are there
+    for text in ("0", "0.5", "5", "3000", "-1", "{2, 3}"):  # none are there
         file = open_spectral_file(write_envi(tmp_path / "c.hdr", CUBE, "bsq", f"autodarkstartline = {text}"))
         check_file(file, values=CUBE, dark=None)
     file = open_spectral_file(write_envi(tmp_path / "c.hdr", CUBE, "bsq", "autodarkstartline = none"))

@@ -17,6 +17,7 @@ import numpy as np
 from unmix_plugin.captures.header_values import (
     GOOD,
     check_bands,
+    counts_bands,
     exposure_facts,
     is_exposure,
     plain_names,
@@ -95,7 +96,8 @@ class FoundArray:
     @property
     def all_attributes(self) -> dict[str, Any]:
         """Its own attributes, and those inherited that it lacks, as texts, numbers or lists."""
-        found = {**self.inherited, **self.attributes}
+        inherited = {key: value for key, value in self.inherited.items() if key not in self.attributes}
+        found = {**self.attributes, **inherited}
         texts = {
             key: value.decode("utf-8", "replace") for key, value in found.items() if isinstance(value, bytes)
         }
@@ -267,36 +269,42 @@ def _pixel_list_size(
 
 
 def _entries(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
-    """What attributes say, and lists beside the image, those in the nearest group first; of bands, lists go before
-    attributes, of which those count that fit an axis, first the one whose name has a word of the image's."""
-
-    def groups_apart(array: FoundArray) -> int:
-        return -common_length([one.name.strip("/").split("/")[:-1] for one in (image, array)])
+    """What attributes say, and lists beside the image; of bands, lists go before attributes, of which those count that
+    fit an axis, first the one whose name has a word of the image's."""
 
     def words_apart(key: str) -> int:
         return -len(words & set(re.split(r"[\W_]+", key.lower())))
 
-    attributes = image.all_attributes
+    attributes, words = image.all_attributes, set(re.split(r"[\W_]+", image.own_name))
     entries = {key: value for key, value in attributes.items() if not says_bands(key.lower())}
-    for array in sorted(arrays, key=groups_apart):
-        name, length = array.own_name, prod(array.shape)
-        if array is image or name in entries or not array.is_vector:
-            continue
-        if (says_bands(name) and length in image.shape) or (
-            is_exposure(name) and length in (1, *image.shape)
-        ):
-            own = plain_names(array.attributes)
-            entries[name] = _unpacked(array)
-            entries |= {
-                f"{name} units": array.all_attributes[own[key]] for key in ("units", "unit") if key in own
-            }
-    words = set(re.split(r"[\W_]+", image.own_name))
+    entries |= _lists_beside(arrays, image)
     for key in sorted(attributes, key=words_apart):
         values = np.atleast_1d(attributes[key])
         kinds = _NUMBERS + "b" * bool(GOOD.fullmatch(key.lower()))
         if values.ndim == 1 and values.dtype.kind in kinds and len(values) in image.shape:
             entries.setdefault(key, values)
     return entries
+
+
+def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, Any]:
+    """Numbers of bands, and exposures with their units, by name; of one name those in the nearest group."""
+
+    def groups_apart(array: FoundArray) -> int:
+        return -common_length([one.name.strip("/").split("/")[:-1] for one in (image, array)])
+
+    beside: dict[str, Any] = {}
+    for array in sorted(arrays, key=groups_apart):
+        name, length = array.own_name, prod(array.shape)
+        lengths = (1, *image.shape) if is_exposure(name) else image.shape if says_bands(name) else ()
+        if array is image or name in beside or not array.is_vector or length not in lengths:
+            continue
+        own, numbers = plain_names(array.attributes), _unpacked(array)
+        unit = next((array.all_attributes[own[key]] for key in ("units", "unit") if key in own), None)
+        if is_exposure(name):
+            beside[name] = numbers if unit is None else [f"{number} {unit}" for number in numbers]
+        elif name != "bands" or not counts_bands(numbers, unit):
+            beside |= {name: numbers} | ({} if unit is None else {f"{name} units": unit})
+    return beside
 
 
 def _unpacked(array: FoundArray) -> list[Any]:

@@ -195,7 +195,8 @@ def open_hdf5(path: Path, options: ReadOptions) -> SpectralFile:
     def visit(group: Any, inside: str, inherited: dict[str, Any]) -> None:
         # Not by `visititems`, which never ends where a damaged tree of names leads back to itself.
         seen.add(group)
-        inherited = inherited | _attributes(path, group)
+        own = _attributes(path, group)
+        inherited = own | {key: value for key, value in inherited.items() if key not in own}
         for link in group:
             if not isinstance(group.get(link, getlink=True), h5py.HardLink) or (item := group[link]) in seen:
                 continue

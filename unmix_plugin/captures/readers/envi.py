@@ -145,7 +145,9 @@ def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) ->
         _numbers(header, _DARK_START, "dark lines may be left in the image", warnings),
         file.shape[0],
     )
-    dark_lines = lines - int(start[0]) if start and 1 <= start[0] < lines else 0
+    dark_lines = lines - int(start[0]) if len(start) == 1 and 1 <= start[0] < lines else 0
+    if len(start) > 1:
+        warnings.append(f"'{_DARK_START}' has {len(start)} numbers: dark lines may be left in the image")
     no_data = _numbers(header, "data ignore value", "not used", warnings)
     shown = {key: value for key, value in header.items() if len(value) < _SHOWN_LENGTH}
     on_map = {key: " ".join(header[key].split()) for key in MAP_KEYS if header.get(key)}
