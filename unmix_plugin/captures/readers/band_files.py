@@ -158,16 +158,18 @@ def _exposure_of_bands(parts: Sequence[SpectralFile], warnings: list[str]) -> di
     exposed = [[part.metadata.get(key, usual) for key, usual in _EXPOSURE.items()] for part in parts]
     lacking = [part.path.name for part in parts if "f_number" not in part.metadata]
     is_exposed = any(time is not None for time, *_ in exposed)
-    if is_exposed and 0 < len(lacking) < len(parts):
-        unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
-        warnings.append(f"{unknown}: exposures are compared without it")
+    is_partial = is_exposed and 0 < len(lacking) < len(parts)
+    if is_partial:
         exposed = [[time, gain, 1.0] for time, gain, _ in exposed]
-    if len(set(map(repr, exposed))) == 1:
-        return None
-    if not all(isinstance(number, float) for numbers in exposed for number in numbers):
+    is_same = len(set(map(repr, exposed))) == 1
+    if not is_same and not all(isinstance(number, float) for numbers in exposed for number in numbers):
         unknown = "one exposure time and gain is not known of every band: exposures are not compared"
         warnings += [unknown] if is_exposed else []
         return {}
+    unknown = f"the f-number of the lens is known of some bands and not of {name_some(lacking)}"
+    warnings += [f"{unknown}: exposures are compared without it"] if is_partial else []
+    if is_same:
+        return None
     of_first = exposed[0][2]  # so that the bands have one f-number again
     times_s = [time * gain * (of_first / own) ** 2 for time, gain, own in exposed]
     return {"exposure_s": times_s} | ({} if lacking else {"f_number": of_first})
