@@ -70,7 +70,7 @@ FAULTS = {
     ),
     "a view far from the others": (
         lambda folder: _views(folder, [*ring_of(6, 60.0), FAR_AWAY]),
-        "1 view with hardly any overlap with another one, take views in smaller steps: view_6",
+        "degrees away), take views in smaller steps: view_6",
     ),
     "few views": (lambda folder: _views(folder, ring_of(6)), "only 6 views"),
     "blur": (
@@ -120,7 +120,7 @@ def test_overlap_of_cameras_in_parallel_takes_sparse_points(tmp_path: Path):
     _overlap(views, None, findings)
     assert findings == []
     assert "least 0%" in _overlap(views, ball_points(), findings)
-    assert "steps: a (at most 0% seen by a neighbour" in findings[0]
+    assert "1 view with hardly any overlap with another one (at most 0%, from 0 degrees away)" in findings[0]
 
 
 def test_detail_falls_when_a_picture_is_blurred():

@@ -228,11 +228,11 @@ def _overlap(views: Sequence[SeenView], points: _Points | None, findings: list[s
         f"views share {np.median(shares):.0%} with a neighbour (median; least {shares.min():.0%}); the nearest one "
         f"looks from {np.median(nearest):.0f} degrees away (median; most {nearest.max():.0f})"
     )
-    names = [
-        f"{views[index].name} (at most {shares[index]:.0%} seen by a neighbour, {nearest[index]:.0f} degrees away)"
-        for index in alone
-    ]
-    what = "with hardly any overlap with another one, take views in smaller steps"
+    names = [views[index].name for index in alone]
+    best = (
+        f"at most {shares[alone].max(initial=0):.0%}, from {nearest[alone].min(initial=180):.0f} degrees away"
+    )
+    what = f"with hardly any overlap with another one ({best}), take views in smaller steps"
     _note(findings, names, what)
     return said
 
