@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.scenes.demo.demo_parts import APPLE, LAMP, row
+from tests.scenes.demo.demo_parts import APPLE, LAMP, PLACEMENTS, row
 from unmix_plugin.scenes.demo.scene import demo_cameras
 from unmix_plugin.scenes.demo.shading import (
     _COAT_REFLECTANCE,
@@ -23,7 +23,7 @@ def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
     point = row(1.1, -0.3, 0)
     towards = LAMP - point[0]
     expected = _LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
-    assert_allclose(_direct_light(point, row(0, 0, 1), LAMP[None]), expected, rtol=1e-5)
+    assert_allclose(_direct_light(point, row(0, 0, 1), LAMP[None], PLACEMENTS), expected, rtol=1e-5)
 
 
 def test_a_point_behind_the_apple_lies_in_its_shadow():
@@ -31,13 +31,13 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     along = center - LAMP
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
-    assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None]) == 0
+    assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None], PLACEMENTS) == 0
 
 
 def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():
     # Eye, lamp and normal coincide: D = 1 / (pi a^2), both Smith terms 1, cosines 1.
     normal = LAMP[None] / np.linalg.norm(LAMP)
-    got = _coat_highlight(np.zeros((1, 3), np.float32), normal, normal, roughness=0.2)
+    got = _coat_highlight(np.zeros((1, 3), np.float32), normal, normal, 0.2, tuple(LAMP.tolist()))
     assert_allclose(got, _COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
 
 

@@ -32,6 +32,7 @@ from unmix_plugin.scenes.demo.shading import (
     MATERIALS,
     THINGS,
     Blend,
+    PerPoint,
     Sky,
     Surface,
     Thing,
@@ -43,7 +44,7 @@ from unmix_plugin.scenes.demo.shading import (
     render_view,
     smooth_step,
 )
-from unmix_plugin.scenes.demo.shapes import Placement
+from unmix_plugin.scenes.demo.shapes import Placement, Points, Rays
 from unmix_plugin.scenes.reading.images import UNLABELLED
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -203,7 +204,7 @@ class Place:
     """What is behind all things; None leaves their pictures an alpha."""
 
 
-def _open_sky(directions: Float[np.ndarray, "R 3"]) -> Float[np.ndarray, "R K"]:
+def _open_sky(directions: Rays) -> Float[np.ndarray, "R K"]:
     """Cyan above, white at the horizon, with broad clouds."""
     x, y, z = directions.T
     haze = np.exp(-4.0 * z.clip(0))
@@ -221,7 +222,7 @@ def _patches(
     """Smooth patches of a surface, about `period` wide, which fade at distances around `fade`; both in units of the
     shape's own coordinates, or of the scene for a shape of these half sizes."""
 
-    def blend(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    def blend(points: Points) -> PerPoint:
         points = points * np.asarray(half_sizes, np.float32)
         x, y = (points[:, :2] * (2 * np.pi / period)).T
         z = points[:, 2] * (2 * np.pi / period)
@@ -302,7 +303,10 @@ PLACES: Mapping[str, Place] = {"table": _TABLE, "world": _WORLD, "room": _ROOM}
 def demo_scene_path(cache_dir: Path | None = None) -> Path:
     """The folder of the default demo scene, in `user_cache` unless another is given, written on first use and again if
     a file of it is missing; a changed generator writes into a new one. Raises SceneError: it can't be written."""
-    target = (cache_dir or user_cache()) / f"demo-{_generator_hash()}" / "demo"
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    target = (cache_dir or user_cache()) / f"demo-{digest.hexdigest()[:12]}" / "demo"
     return written_once(
         target,
         "the demo scene",
@@ -442,11 +446,3 @@ def user_cache() -> Path:
             "there is no home folder to keep the demo scene in; set HOME or XDG_CACHE_HOME to a folder that can be "
             "written, or write the scene with unmix-demo-scene DIR and train on that"
         ) from error
-
-
-def _generator_hash() -> str:
-    """Changes with the generator's code, so that a cached scene is never one of another version."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]

@@ -20,17 +20,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from unmix_plugin.engine.geometry.cameras import Cameras
-from unmix_plugin.scenes.demo.shapes import Placement, dot, first_hits
+from unmix_plugin.scenes.demo.shapes import PerRay, Placement, Points, Rays, dot, first_hits
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import illuminant_power
 
+PerPoint = Float[np.ndarray, " P"]
+_Place = tuple[float, float, float]
 MATERIALS = ("white", "red", "yellow", "green", "cyan", "purple")
 """Six patches of the ColorChecker chart; the spectral angle between any two under the lamp is at least 0.45 rad."""
 _PATCHES = ("white 9.5 (.05 D)", *MATERIALS[1:])
 _RANGE_NM = (400.0, 700.0)
 LAMP = "D50"
 """CIE illuminant of the lamp and of the sky."""
-Blend = Callable[[Float[np.ndarray, "P 3"]], Float[np.ndarray, " P"]]
+Blend = Callable[[Points], PerPoint]
 """Share of the second material at points in a shape's own coordinates."""
 
 
@@ -71,7 +73,7 @@ class Surface:
     roughness: float | None = None
     """GGX alpha of the clear coat; None is matt."""
 
-    def abundances(self, local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P K"]:
+    def abundances(self, local_points: Points) -> Float[np.ndarray, "P K"]:
         """Abundances at points in the shape's own coordinates."""
         share = self.blend(local_points)
         result = np.zeros((len(local_points), len(MATERIALS)), dtype=local_points.dtype)
@@ -80,38 +82,38 @@ class Surface:
         return result
 
 
-def smooth_step(values: Float[np.ndarray, " P"], low: float, high: float) -> Float[np.ndarray, " P"]:
+def smooth_step(values: PerPoint, low: float, high: float) -> PerPoint:
     """0 below `low`, 1 above `high`, a cubic with level ends between."""
     t = ((values - low) / (high - low)).clip(0, 1)
     return t * t * (3 - 2 * t)
 
 
-def _gingham(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _gingham(points: Points) -> PerPoint:
     """Woven squares: warp and weft each carry half of the second material; a plain rim below the top."""
     stripes = [smooth_step(np.sin(points[:, axis] * 10.5 + 0.8), -0.25, 0.25) for axis in (0, 1)]
     on_top = points[:, 2] > 0.999
     return np.where(on_top, (stripes[0] + stripes[1]) / 2, 1)
 
 
-def _blush(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _blush(points: Points) -> PerPoint:
     """A slow gradient over one side."""
     return smooth_step(points @ np.array([0.75, 0.5, 0.43], dtype=points.dtype), -0.15, 1.1)
 
 
-def _ribbon(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _ribbon(points: Points) -> PerPoint:
     """A parcel's crossed ribbons, with slightly soft borders."""
     across = np.minimum(np.abs(points[:, 0]), np.abs(points[:, 1]))
     return 1 - smooth_step(across, 0.2, 0.27)
 
 
-def _candy_stripes(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def _candy_stripes(points: Points) -> PerPoint:
     """A soft helix around the side; a plain top."""
     angle = np.arctan2(points[:, 1], points[:, 0])
     share = smooth_step(np.sin(2 * angle + points[:, 2] * 4.5), -0.45, 0.45)
     return np.where(np.abs(points[:, 2]) > 0.999, 0, share)
 
 
-def plain(points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+def plain(points: Points) -> PerPoint:
     """The first material alone."""
     return np.zeros(len(points), dtype=points.dtype)
 
@@ -165,9 +167,7 @@ THINGS = (
     ),
 )
 
-_PLACEMENTS = tuple(thing.placement for thing in THINGS)
-
-Sky = Callable[[Float[np.ndarray, "R 3"]], Float[np.ndarray, "R K"]]
+Sky = Callable[[Rays], Float[np.ndarray, "R K"]]
 """From directions to what the sky there sends, in multiples of the materials as the lamp shows them."""
 
 
@@ -189,7 +189,7 @@ class _Hits:
     is_hit: Bool[np.ndarray, " R"]
     abundances: Float[np.ndarray, "R K"]
     diffuse: Float[np.ndarray, "R K"]
-    specular: Float[np.ndarray, " R"]
+    specular: PerRay
 
 
 def render_view(
@@ -197,7 +197,7 @@ def render_view(
     index: int,
     subpixels: int = _SUBPIXELS,
     things: Sequence[Thing] = THINGS,
-    lamp: tuple[float, float, float] = _LAMP_POSITION,
+    lamp: _Place = _LAMP_POSITION,
     sky: Sky | None = None,
 ) -> ViewCoefficients:
     """Look at things through one camera with `subpixels`^2 rays a pixel; `lamp` is the middle of its disc."""
@@ -231,11 +231,11 @@ def render_view(
 
 
 def _trace(
-    origins: Float[np.ndarray, "R 3"],
-    directions: Float[np.ndarray, "R 3"],
+    origins: Rays,
+    directions: Rays,
     lamps: Float[np.ndarray, "#R 3"],
     things: Sequence[Thing] = THINGS,
-    lamp_middle: tuple[float, float, float] = _LAMP_POSITION,
+    lamp_middle: _Place = _LAMP_POSITION,
 ) -> _Hits:
     """What each ray sees first, lit by one point of the lamp and by the sky; highlights come from the lamp's middle.
     Directions have length 1."""
@@ -262,9 +262,7 @@ def _trace(
     return _Hits(is_hit, abundances, diffuse, specular)
 
 
-def _lamp_point(
-    i: int, count: int, middle: tuple[float, float, float] = _LAMP_POSITION
-) -> Float[np.ndarray, "3"]:
+def _lamp_point(i: int, count: int, middle: _Place) -> Float[np.ndarray, "3"]:
     """The i-th of `count` points that are spread evenly over the lamp's horizontal disc.
 
     Source:
@@ -278,11 +276,8 @@ def _lamp_point(
 
 
 def _direct_light(
-    points: Float[np.ndarray, "P 3"],
-    normals: Float[np.ndarray, "P 3"],
-    lamps: Float[np.ndarray, "#P 3"],
-    placements: Sequence[Placement] = _PLACEMENTS,
-) -> Float[np.ndarray, " P"]:
+    points: Points, normals: Points, lamps: Float[np.ndarray, "#P 3"], placements: Sequence[Placement]
+) -> PerPoint:
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamps - points
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
@@ -291,12 +286,7 @@ def _direct_light(
     return np.where(np.isfinite(blocked), 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 
-def _sky_light(
-    points: Float[np.ndarray, "P 3"],
-    normals: Float[np.ndarray, "P 3"],
-    thing: Thing,
-    things: Sequence[Thing] = THINGS,
-) -> Float[np.ndarray, " P"]:
+def _sky_light(points: Points, normals: Points, thing: Thing, things: Sequence[Thing]) -> PerPoint:
     """Irradiance from a sky of one brightness and from the ground, less what other things hide of it.
 
     Source:
@@ -319,12 +309,8 @@ def _sky_light(
 
 
 def _coat_highlight(
-    points: Float[np.ndarray, "P 3"],
-    normals: Float[np.ndarray, "P 3"],
-    towards_eye: Float[np.ndarray, "P 3"],
-    roughness: float,
-    lamp_middle: tuple[float, float, float] = _LAMP_POSITION,
-) -> Float[np.ndarray, " P"]:
+    points: Points, normals: Points, towards_eye: Points, roughness: float, lamp_middle: _Place
+) -> PerPoint:
     """Mirrored radiance for irradiance 1 from the lamp's centre, in units of a white matt surface's.
 
     Source:
@@ -368,7 +354,7 @@ def speckled_things() -> Sequence[Thing]:
     )
 
 
-def _solid_noise(points: Float[np.ndarray, "P 3"], seed: int) -> Float32[np.ndarray, " P"]:
+def _solid_noise(points: Points, seed: int) -> Float32[np.ndarray, " P"]:
     """Smooth random values in [0, 1], the same for the same place, in units of the scene, and seed."""
     from scipy.ndimage import map_coordinates
 
@@ -386,7 +372,7 @@ def _speckled(thing: Thing, strength: float, seed: int) -> Blend:
     """The thing's blend with speckles over it."""
     sizes = np.asarray(thing.placement.half_sizes, np.float32)
 
-    def blend(local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, " P"]:
+    def blend(local_points: Points) -> PerPoint:
         speckles = smooth_step(_solid_noise(local_points * sizes, seed), *_CONTRAST)
         return (1 - strength) * thing.surface.blend(local_points) + strength * speckles
 

@@ -15,6 +15,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+Points = Float[np.ndarray, "P 3"]
+Rays = Float[np.ndarray, "R 3"]
+PerRay = Float[np.ndarray, " R"]
 _Primitive = Literal["sphere", "cylinder", "box"]
 _SELF_HIT_DISTANCE = 1e-4
 """A ray that starts on a surface meets it again within this distance, scene units, by rounding alone."""
@@ -39,29 +42,27 @@ class Placement:
         about_x = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
         return about_z @ about_x
 
-    def to_local(self, points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def to_local(self, points: Points) -> Points:
         """World points in own coordinates."""
         center = np.asarray(self.center, dtype=points.dtype)
         return self._directions_to_local(points - center)
 
-    def _directions_to_local(self, directions: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def _directions_to_local(self, directions: Points) -> Points:
         """World directions in own coordinates, lengths scaled."""
         return directions @ (self.axes / self.half_sizes).astype(directions.dtype)
 
-    def _normals_to_world(self, normals: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def _normals_to_world(self, normals: Points) -> Points:
         """Own normals as unit normals in the world."""
         world = normals @ (self.axes / self.half_sizes).T.astype(normals.dtype)
         return world / np.sqrt(dot(world, world))[:, None]
 
-    def entry_distances(
-        self, origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
-    ) -> Float[np.ndarray, " R"]:
+    def entry_distances(self, origins: Rays, directions: Rays) -> PerRay:
         """Distances, in lengths of the direction, at which rays enter from outside; inf where they never do."""
         local_origins, local_directions = self.to_local(origins), self._directions_to_local(directions)
         near, far = _INTERVALS[self.primitive](local_origins, local_directions)
         return np.where((near < far) & (near > _SELF_HIT_DISTANCE), near, np.inf).astype(origins.dtype)
 
-    def normals_at(self, local_points: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "P 3"]:
+    def normals_at(self, local_points: Points) -> Points:
         """Unit normals in the world at points of the surface given in own coordinates."""
         if self.primitive == "sphere":
             return self._normals_to_world(local_points)
@@ -83,16 +84,14 @@ def dot(a: Float[np.ndarray, "P C"], b: Float[np.ndarray, "P C"]) -> Float[np.nd
 
 
 def first_hits(
-    placements: Sequence[Placement], origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
-) -> tuple[Float[np.ndarray, " R"], Int[np.ndarray, " R"]]:
+    placements: Sequence[Placement], origins: Rays, directions: Rays
+) -> tuple[PerRay, Int[np.ndarray, " R"]]:
     """Distance of the nearest surface along each ray (inf where nothing is hit), and which placement it is of."""
     distances = np.stack([placement.entry_distances(origins, directions) for placement in placements])
     return distances.min(axis=0), distances.argmin(axis=0)
 
 
-def _quadratic_interval(
-    a: Float[np.ndarray, " R"], half_b: Float[np.ndarray, " R"], c: Float[np.ndarray, " R"]
-) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+def _quadratic_interval(a: PerRay, half_b: PerRay, c: PerRay) -> tuple[PerRay, PerRay]:
     """Where a t^2 + 2 half_b t + c < 0, for a > 0; an empty interval (inf, -inf) where nowhere."""
     discriminant = half_b**2 - a * c
     root = np.sqrt(np.maximum(discriminant, 0))
@@ -110,17 +109,13 @@ def _slab_interval(
     return np.minimum(low, high), np.maximum(low, high)
 
 
-def _sphere_interval(
-    origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
-) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+def _sphere_interval(origins: Rays, directions: Rays) -> tuple[PerRay, PerRay]:
     return _quadratic_interval(
         dot(directions, directions), dot(origins, directions), dot(origins, origins) - 1
     )
 
 
-def _cylinder_interval(
-    origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
-) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+def _cylinder_interval(origins: Rays, directions: Rays) -> tuple[PerRay, PerRay]:
     flat_origins, flat_directions = origins[:, :2], directions[:, :2]
     # A ray along the axis has a = 0; the floor makes it a very long but right interval.
     a = np.maximum(dot(flat_directions, flat_directions), 1e-12)
@@ -129,9 +124,7 @@ def _cylinder_interval(
     return np.maximum(side[0], caps[0]), np.minimum(side[1], caps[1])
 
 
-def _box_interval(
-    origins: Float[np.ndarray, "R 3"], directions: Float[np.ndarray, "R 3"]
-) -> tuple[Float[np.ndarray, " R"], Float[np.ndarray, " R"]]:
+def _box_interval(origins: Rays, directions: Rays) -> tuple[PerRay, PerRay]:
     near, far = _slab_interval(origins, directions)
     return np.maximum.reduce([*near.T]), np.minimum.reduce([*far.T])
 
