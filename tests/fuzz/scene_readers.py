@@ -25,6 +25,7 @@ from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour
 from unmix_plugin.scenes.reading.splits import split_frames
 from unmix_plugin.scenes.reading.transforms_json import read_transforms
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.settings import SceneOptions
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.spectral.maps.indices import parse_formula
@@ -127,7 +128,7 @@ def _npy(array: np.ndarray) -> bytes:
 def _read_cube(path: Path) -> None:
     header = read_array_header(path)
     if len(header.shape) == 3 and 0 not in header.shape:
-        values = _measure_cube(path, None, "refuse")
+        values = _measure_cube(path, SceneOptions())
         assert 0 <= values.num_invalid_pixels <= values.num_pixels
 
 

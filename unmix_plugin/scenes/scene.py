@@ -126,8 +126,7 @@ class Scene:
         Values above 1 after the division by `value_scale` are clipped to 1, as a saturated sensor does. Unless
         `invalid_pixels` is `refuse`, spectra of invalid pixels are 0 (see `valid_mask`).
         """
-        options = self.options
-        return read_cube(self.frames[index].cube_path, options.value_scale, options.invalid_pixels, part)
+        return read_cube(self.frames[index].cube_path, self.options, part)
 
     def stored_type(self, index: int) -> str:
         """NumPy's code of a cube's numbers, such as f2 or u2, in any byte order."""
@@ -167,12 +166,11 @@ class Scene:
 
     def valid_mask(self, index: int, part: Part = ()) -> Bool[np.ndarray, "*pixels"]:
         """True where a pixel counts: not black in the view's mask and not invalid (see `SceneOptions`)."""
-        path, options = self.frames[index].mask_path, self.options
+        path = self.frames[index].mask_path
         valid = np.ones(self._size(index), bool) if path is None else read_mask(path, self._size(index))
-        if options.invalid_pixels == "refuse":
+        if self.options.invalid_pixels == "refuse":
             return valid[part]
-        cube_path = self.frames[index].cube_path
-        return valid[part] & ~read_invalid(cube_path, options.value_scale, options.invalid_pixels, part)
+        return valid[part] & ~read_invalid(self.frames[index].cube_path, self.options, part)
 
     def abundances(self, index: int) -> Float32[np.ndarray, "H W K"] | None:
         """True abundances of a view; None if it has none."""

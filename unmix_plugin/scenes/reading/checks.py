@@ -85,7 +85,7 @@ def check_files(
 ) -> CheckedFiles | None:
     """Read and check all files of all frames; None with noted faults if a cube or a sensor is not sound."""
     operators = read_operators(frames, wavelengths_nm, faults)
-    sizes, values = check_cubes(frames, operators, options.value_scale, options.invalid_pixels, faults)
+    sizes, values = check_cubes(frames, operators, options, faults)
     shown, masks = check_colours(frames, sizes, faults), check_masks(frames, sizes, faults)
     check_labels(frames, sizes, num_materials, faults)
     check_abundances(frames, sizes, num_materials, faults)

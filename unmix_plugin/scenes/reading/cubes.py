@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from threading import Lock
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float32
 from unmix_plugin.errors import name_some
 from unmix_plugin.scenes.reading.faults import Faults, sha256_of
 from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, FrameEntry, Size
+from unmix_plugin.settings import SceneOptions
 
 READ_HEADER = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 _ONE_PARSER = Lock()
@@ -111,9 +112,6 @@ def map_array(path: Path) -> np.ndarray:
         return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
-InvalidPixels = Literal["refuse", "mask", "clip"]
-
-
 @dataclass(frozen=True)
 class _CubeValues:
     """What one cube holds; counts are of single values unless they say pixels."""
@@ -155,11 +153,9 @@ class _CubeValues:
         return 0 if self.invalid is None else int(self.invalid.sum())
 
 
-def _measure_cube(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, where: str = ""
-) -> _CubeValues:
+def _measure_cube(path: Path, options: SceneOptions, where: str = "") -> _CubeValues:
     """What a checked (H, W, B) cube holds; whatever `read_cube` would make of it."""
-    cube = map_array(path)
+    cube, value_scale = map_array(path), options.value_scale
     scale = np.float32(1.0 if value_scale is None else value_scale)
     totals = np.zeros(5, dtype=np.int64)  # NaN, infinite, negative, further below 0 than noise, above 1
     greatest, least, invalid = 0.0, 0.0, np.zeros(cube.shape[:2], bool)
@@ -180,7 +176,7 @@ def _measure_cube(
             ((block < -_NOISE) & finite).sum(),
             ((block > 1.0) & finite).sum(),
         )
-        invalid[rows] = _find_invalid(block, invalid_pixels)
+        invalid[rows] = _find_invalid(block, options)
         greatest = max(greatest, float(stored.max(where=finite, initial=0.0)))
         least = min(least, float(block.min(where=finite, initial=0.0)))
     return _CubeValues(
@@ -203,37 +199,32 @@ def _row_blocks(cube: np.ndarray) -> Iterator[slice]:
     return (slice(first, first + step) for first in range(0, height, step))
 
 
-def read_cube(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: Part = ()
-) -> Float32[np.ndarray, "*pixels B"]:
+def read_cube(path: Path, options: SceneOptions, part: Part = ()) -> Float32[np.ndarray, "*pixels B"]:
     """Spectra in [0, 1]: divided by the scale, values above 1 clipped as a saturated sensor does, unusable pixels 0."""
-    values = _read_scaled(path, value_scale, part)
-    if invalid_pixels != "refuse":
-        values[_find_invalid(values, invalid_pixels)] = 0.0
+    values = _read_scaled(path, options, part)
+    if options.invalid_pixels != "refuse":
+        values[_find_invalid(values, options)] = 0.0
     return np.clip(values, 0.0, 1.0, out=values)
 
 
-def read_invalid(
-    path: Path, value_scale: float | None, invalid_pixels: InvalidPixels, part: Part = ()
-) -> Bool[np.ndarray, "*pixels"]:
+def read_invalid(path: Path, options: SceneOptions, part: Part = ()) -> Bool[np.ndarray, "*pixels"]:
     """Pixels that `read_cube` sets to 0."""
     parts = [part] if part else [(rows,) for rows in _row_blocks(map_array(path))]
-    return np.concatenate(
-        [_find_invalid(_read_scaled(path, value_scale, one), invalid_pixels) for one in parts]
-    )
+    return np.concatenate([_find_invalid(_read_scaled(path, options, one), options) for one in parts])
 
 
-def _read_scaled(path: Path, value_scale: float | None, part: Part) -> Float32[np.ndarray, "*pixels B"]:
+def _read_scaled(path: Path, options: SceneOptions, part: Part) -> Float32[np.ndarray, "*pixels B"]:
     with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is infinite, hence invalid as NaN is
         values = np.array(map_array(path)[part], dtype=np.float32, order="C")
-    return values if value_scale is None else np.divide(values, np.float32(value_scale), out=values)
+    scale = options.value_scale
+    return values if scale is None else np.divide(values, np.float32(scale), out=values)
 
 
-def _find_invalid(values: np.ndarray, invalid_pixels: InvalidPixels) -> Bool[np.ndarray, "*pixels"]:
+def _find_invalid(values: np.ndarray, options: SceneOptions) -> Bool[np.ndarray, "*pixels"]:
     """Pixels of (..., B) values, already divided, that can't be used: NaN, infinite or (unless they are clipped)
     negative in some band."""
     sound = np.isfinite(values)
-    return ~np.all(sound if invalid_pixels == "clip" else sound & (values >= 0.0), axis=-1)
+    return ~np.all(sound if options.invalid_pixels == "clip" else sound & (values >= 0.0), axis=-1)
 
 
 def _propose_scale(cubes: Sequence[_CubeValues]) -> float:
@@ -250,8 +241,7 @@ def _propose_scale(cubes: Sequence[_CubeValues]) -> float:
 def check_cubes(
     frames: Sequence[FrameEntry],
     operators: Sequence[np.ndarray | None],
-    value_scale: float | None,
-    invalid_pixels: InvalidPixels,
+    options: SceneOptions,
     faults: Faults,
 ) -> tuple[list[Size | None], list[_CubeValues | None]]:
     """Check shapes and types against sizes and sensors (operators of (channels, B)), then every value; gives the sizes
@@ -278,31 +268,28 @@ def check_cubes(
             faults.add(where, f"the cube has {shape[2]} bands; expected {len(operator)}, as {listed}")
         sizes.append(None if expected is None else expected[0])
         sound.append(None if shape is None else path)
-    return sizes, _check_values(frames, sound, value_scale, invalid_pixels, faults)
+    return sizes, _check_values(frames, sound, options, faults)
 
 
 def _check_values(
-    frames: Sequence[FrameEntry],
-    paths: Sequence[Path | None],
-    value_scale: float | None,
-    invalid_pixels: InvalidPixels,
-    faults: Faults,
+    frames: Sequence[FrameEntry], paths: Sequence[Path | None], options: SceneOptions, faults: Faults
 ) -> list[_CubeValues | None]:
     """Read and check every value of the cubes that have a path."""
 
     def measure(frame: FrameEntry, path: Path | None) -> _CubeValues | None:
-        if path is None:
-            return None
-        return _measure_cube(path, value_scale, invalid_pixels, frame.name_of(CUBE_KEY))
+        return None if path is None else _measure_cube(path, options, frame.name_of(CUBE_KEY))
 
     with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
         measured = list(readers.map(measure, frames, paths))
     cubes = [cube for cube in measured if cube is not None]
-    unscaled = [cube for cube in cubes if cube.is_integer and value_scale is None]
-    judged = [cube for cube in cubes if not (cube.is_integer and value_scale is None)]
-    _note_invalid(judged, invalid_pixels, faults)
+    has_scale = [options.value_scale is not None or not cube.is_integer for cube in cubes]
+    scaled, unscaled = (
+        [cube for cube, has in zip(cubes, has_scale, strict=True) if has == wanted]
+        for wanted in (True, False)
+    )
+    _note_invalid(scaled, options.invalid_pixels, faults)
     _note_integers(unscaled, faults)
-    _note_far_off(judged, value_scale, faults)
+    _note_far_off(scaled, options.value_scale, faults)
     return measured
 
 
@@ -356,7 +343,7 @@ def check_abundances(
             faults.add(where, "has abundances outside [0, 1] or NaN; expected fractions")
 
 
-def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: InvalidPixels, faults: Faults) -> None:
+def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Faults) -> None:
     """Unusable pixels; counts are summed over the frames, so that one message serves them all."""
     refused = []
     for cube in cubes:

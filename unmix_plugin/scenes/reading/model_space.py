@@ -136,7 +136,7 @@ def find_model_space(
     alike = commonest([view.sensor for view in views])
 
     def read_view(row: int, part: tuple[slice, ...]) -> Float32[np.ndarray, "H W B"]:
-        return read_cube(views[alike[row]].cube, options.value_scale, options.invalid_pixels, part)
+        return read_cube(views[alike[row]].cube, options, part)
 
     def read_valid(row: int) -> Bool[np.ndarray, "H W"]:
         view = views[alike[row]]
@@ -145,11 +145,10 @@ def find_model_space(
     compared = Views(cameras[alike], read_view, read_valid)
     before = box = points = None
     if foreground is None and options.world == "auto" and len(alike) == len(train):
-        sizes = [cameras.size(row) for row in alike]
-        before = find_before_backdrop(sizes, read_view, [view.unknown for view in views])
+        before = find_before_backdrop(compared)
     if before is not None and before.shows_matter:
         try:
-            box = find_bounds(root, cameras, before.masks())
+            box = find_bounds(cameras, before.masks())
         except SceneError:  # poses contradict it
             before = None
     has_masks = box is not None or foreground is not None
@@ -157,10 +156,10 @@ def find_model_space(
         points = find_matched_points(compared)
         points = None if points is None else replace(points, pairs=torch.tensor(alike)[points.pairs])
     try:
-        box = box or find_bounds(root, cameras, foreground, points)
+        box = box or find_bounds(cameras, foreground, points)
     except SceneError as error:
         hint = describe(compare_conventions(poses[alike], compared))
-        raise SceneError(f"{error}\n{hint}" if hint else str(error)) from error
+        raise SceneError(f"{root}: {error}" + (f"\n{hint}" if hint else "")) from error
     is_unbounded, reason = options.world == "unbounded", None
     if options.world == "auto" and not has_masks and not (points and points.are_equally_far):
         evidence = find_world_evidence(box, compared)

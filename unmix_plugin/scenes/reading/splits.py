@@ -12,7 +12,7 @@ from typing import Literal
 
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
-from unmix_plugin.scenes.reading.transforms_json import SceneEntry
+from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry
 
 _SPLIT_NAMES = ("train", "eval", "val", "test")
 _SPLIT_NAME = re.compile(
@@ -43,46 +43,36 @@ def split_frames(
         split = _by_name(entry, faults)
     else:
         split = _by_interval(entry, interval, faults)
+    how = "split chosen by itself" if method == "auto" else f"split by {method}"
     if entry.frames and not split.train:
-        advice = "name some in 'train_filenames'"
-        faults.add(FILE_NAME, f"no frame is left to train on ({_how(method)}); {advice}")
+        faults.add(FILE_NAME, f"no frame is left to train on ({how}); name some in 'train_filenames'")
     if entry.frames and not split.evaluation:
         advice = "name some in 'test_filenames' or use --eval-split interval"
-        faults.add(FILE_NAME, f"no frame is left to evaluate ({_how(method)}); {advice}")
+        faults.add(FILE_NAME, f"no frame is left to evaluate ({how}); {advice}")
     return split
-
-
-def _how(method: str) -> str:
-    return "split chosen by itself" if method == "auto" else f"split by {method}"
 
 
 def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
     owners: dict[str, set[int]] = {}  # several frames may share a picture, such as those of a rig's cubes
     for index, frame in enumerate(entry.frames):
-        for key in ("hyperspectral_file_path", "file_path"):
+        for key in (CUBE_KEY, "file_path"):
             if key in frame.paths:
                 owners.setdefault(_plain(frame.paths[key]), set()).add(index)
     chosen: dict[str, set[int]] = {}
     for name, paths in entry.split_lists.items():
-        chosen[name] = set()
         for path in paths:
             if _plain(path) not in owners:
                 faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
-            chosen[name] |= owners.get(_plain(path), set())
+        chosen[name] = {index for path in paths for index in owners.get(_plain(path), ())}
     everything = set(range(len(entry.frames)))
+    train = chosen.get("train", everything - chosen.get("val", set()) - chosen.get("test", set()))
     evaluation = chosen.get("test") or chosen.get("val")
     if evaluation is None:
         evaluation = everything - chosen["train"] if "train" in chosen else set()
-    held_out = chosen.get("val", set()) | chosen.get("test", set())
-    train = chosen.get("train", everything - held_out)
-    _refuse_overlap(entry, train & evaluation, faults)
-    return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
-
-
-def _refuse_overlap(entry: SceneEntry, both: set[int], faults: Faults) -> None:
-    for index in sorted(both):
+    for index in sorted(train & evaluation):
         message = "is listed for training and for evaluation; a frame trained on cannot judge the result"
         faults.add(entry.frames[index].where, message)
+    return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
 
 
 def _plain(path: str) -> str:
@@ -91,11 +81,10 @@ def _plain(path: str) -> str:
 
 def _name_split(paths: dict[str, str]) -> str | None:
     """The split that the parent folder or the name of a frame's picture or cube starts with."""
-    for key in ("file_path", "hyperspectral_file_path"):
+    for key in ("file_path", CUBE_KEY):
         path = PurePosixPath(paths.get(key, ""))
         for word in (path.name, path.parent.name):
-            match = _SPLIT_NAME.match(word)
-            if match:
+            if match := _SPLIT_NAME.match(word):
                 return next(name for name in _SPLIT_NAMES if match.group(1).lower().startswith(name))
     return None
 
