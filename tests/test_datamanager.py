@@ -181,20 +181,6 @@ def test_rays_a_pixel_grow_after_the_first_part_of_training_at_the_same_number_o
     assert pixels == [64, 64, 16, 16]
 
 
-def test_poses_of_another_convention_are_warned_of_when_a_run_starts(tmp_path):
-    def turn(content):
-        without_pictures(content)
-        for frame in content["frames"]:
-            pose = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
-            frame["transform_matrix"] = pose.tolist()
-
-    make_demo_scene(tmp_path / "demo", size=48, bands=6, views=12)
-    (warning,) = make(edit_scene(tmp_path / "demo", turn)).warnings()
-    assert "the poses look like camera to world, OpenCV axes" in warning
-    bare = make_scene(tmp_path / "bare", alpha=False)
-    assert not any("poses" in said for said in make(bare.root).warnings())
-
-
 def scene_record(manager: HyperspectralDataManager) -> SceneRecord:
     values = json.loads(json.dumps(scene_record_to_json(manager)))
     return SceneRecord(

@@ -35,8 +35,7 @@ from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, mask_warni
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning
-from unmix_plugin.scenes.geometry.views import Views
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning, training_views
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
@@ -321,7 +320,7 @@ class HyperspectralDataManager(DataManager):
 
     def _judge_matched(self) -> Literal["fixed", "per-view"]:
         """Of views without alpha: whether matched places say that they differ in exposure."""
-        views = Views.of(self.scene)
+        views = training_views(self.scene)
         points = find_matched_points(views)
         if points is None:
             return "fixed"

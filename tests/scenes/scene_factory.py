@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -74,6 +76,21 @@ def ring_poses(count: int, distance: float = 4.0) -> list[np.ndarray]:
         position = distance * np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         poses.append(look_at(position, np.zeros(3)))
     return poses
+
+
+def cameras_of(
+    poses: list[np.ndarray], width: int, height: int, focal: float, distortion: tuple[float, ...] = (0.0,) * 4
+) -> Cameras:
+    """Cameras with these poses and one lens."""
+    count = len(poses)
+    return Cameras(
+        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
+        focal_px=torch.full((count, 2), focal),
+        center_px=torch.tensor([[width / 2, height / 2]]).repeat(count, 1),
+        distortion=torch.tensor([distortion]).repeat(count, 1),
+        width=width,
+        height=height,
+    )
 
 
 def ball_alpha(pose: np.ndarray, radius: float, width: int, height: int, focal: float) -> np.ndarray:

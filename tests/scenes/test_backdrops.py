@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.scenes.scene_factory import cameras_of
 from unmix_plugin.scenes.backdrops import Backdrop, find_before_backdrop, judge_backdrop
+from unmix_plugin.scenes.geometry.views import Views
 
 HEIGHT, WIDTH, BANDS, VIEWS = 90, 120, 6, 5
 ROWS, COLUMNS = np.mgrid[:HEIGHT, :WIDTH]
@@ -186,7 +188,8 @@ def test_a_backdrop_of_large_views_is_kept_thinned_out():
     views = [np.full((450, 500, 4), 0.3, np.float32) for _ in range(5)]
     for shift, view in enumerate(views):
         view[100 : 300 + 10 * shift, 150:350] = np.linspace(0.05, 0.9, 200)[:, None]
-    found = find_before_backdrop([(500, 450)] * 5, lambda view, part: views[view][part], [None] * 5)
+    cameras = cameras_of([np.eye(4)] * 5, 500, 450, 1.0)
+    found = find_before_backdrop(Views(cameras, lambda view, part: views[view][part]))
     assert found is not None
     assert sum(mask.size for mask in found.thinned) == 5 * 150 * 167
     for mask, view in zip(found.masks(), views, strict=True):

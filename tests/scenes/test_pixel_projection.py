@@ -105,15 +105,3 @@ def test_a_given_number_is_taken_and_its_residual_said_or_that_it_does_not_make_
     assert ignored.startswith("target-components 2 has no effect: ")
     [automatic] = PixelTable(scene, CPU, VIEWS, memory_gb=1e-6, components="auto").notes
     assert "no effect" not in automatic
-
-
-def test_bad_values_are_replaced_before_pixels_are_projected(tmp_path):
-    def spike(cube: np.ndarray) -> None:
-        cube[8, 10, 40] = 0.0
-
-    scene, clean = make(tmp_path / "bad", spike), make(tmp_path / "clean")
-    table = PixelTable(scene, CPU, VIEWS, components=5, mends=True)
-    assert len(table.notes) == 1
-    assert table.bad_share == pytest.approx(1 / (5 * 320 * BANDS))
-    found = table.blocks[0].spectra(torch.tensor([3 * 320 + 8 * 20 + 10]))[0]
-    torch.testing.assert_close(found, torch.from_numpy(clean.cube(3)[8, 10]), atol=0.01, rtol=0)

@@ -27,7 +27,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.light.lamp import Lamp, LampFrame, MovingLamp, Triple
 from unmix_plugin.scenes.geometry.carving import Cells
-from unmix_plugin.scenes.geometry.lighting import Places, coarse_hull, seen_places
+from unmix_plugin.scenes.geometry.lighting import Pictures, Places, Seen, coarse_hull, seen_places
 
 LEAST_SHARE = 0.15
 """Of the changes of brightness within places, that a lamp must explain to be accepted."""
@@ -69,9 +69,7 @@ class _LampEvidence:
     box: SceneBox
 
     @staticmethod
-    def of(
-        cameras: Cameras, places: Places, seen: Float[Tensor, "P N"], hull: Cells, box: SceneBox
-    ) -> _LampEvidence:
+    def of(cameras: Cameras, places: Places, seen: Seen, hull: Cells, box: SceneBox) -> _LampEvidence:
         """Of places that enough views see; arguments as `seen_places` gives and takes them."""
         known = seen.isfinite() & (seen.isfinite().sum(dim=1, keepdim=True) >= FEWEST_VIEWS)
         place, view = known.nonzero().unbind(-1)
@@ -113,9 +111,7 @@ class _LampEvidence:
         return torch.exp(-(counts / DARK_CELLS).square())
 
 
-def find_lamp(
-    cameras: Cameras, log_shading: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
-) -> Lamp | None:
+def find_lamp(cameras: Cameras, log_shading: Pictures, hull: Cells, box: SceneBox) -> Lamp | None:
     """The lamp that explains most of the changes of brightness, given as of `seen_places` and as far as they are not
     those of a pixel's colour; None where none explains enough, its shadows explain nothing, or halves of the places
     find different lamps."""

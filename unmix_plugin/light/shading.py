@@ -30,10 +30,15 @@ from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.light.lamp import MovingLamp
 from unmix_plugin.operators.marching import rays_in_box
 
+Vectors = Float[Tensor, "S 3"]
+Values = Float[Tensor, "S"]
+Column = Float[Tensor, "S 1"]
+Skips = UInt8[Tensor, "X Y Z"]
+
 NUM_DIRECTION_FEATURES = 15
 
 
-def direction_features(directions: Float[Tensor, "S 3"]) -> Float[Tensor, "S 15"]:
+def direction_features(directions: Vectors) -> Float[Tensor, "S 15"]:
     """Real spherical harmonics of degrees 1 to 3 of unit directions (the constant carries nothing), up to scale."""
     x, y, z = directions.t().contiguous()  # rows: arithmetic on columns takes twice as long
     xx, yy, zz = x * x, y * y, z * z
@@ -139,9 +144,9 @@ _FIRST_NORMAL = 0.1
 class Lamplight:
     """What of a lamp's light reaches samples."""
 
-    visible: Float[Tensor, "S"]
+    visible: Values
     """The part that nothing stands in the way of, in [0, 1]."""
-    towards: Float[Tensor, "S 3"]
+    towards: Vectors
     """Unit directions to the lamp."""
 
 
@@ -149,7 +154,7 @@ class Lamplight:
 class LitSurface:
     """How samples look in a lamp's light."""
 
-    brightness: Float[Tensor, "S 1"]
+    brightness: Column
     """Of a matt surface, in [0, 1]: 1 where the lamp shines on it squarely."""
     lobes: Float[Tensor, "S 4"]
     """How well each of `LOBES` mirrors the lamp to the eye."""
@@ -166,14 +171,12 @@ class LampShading(nn.Module):
         self.register_buffer("first_normal", _FIRST_NORMAL * upwards, persistent=False)
         self.network = bias_free_network(num_features, width, 4)
 
-    def surface(self, features: Float[Tensor, "S G"]) -> tuple[Float[Tensor, "S 3"], Float[Tensor, "S 1"]]:
+    def surface(self, features: Float[Tensor, "S G"]) -> tuple[Vectors, Column]:
         """Unit normals in model space, and r."""
         raw = self.network(features)
         return normalize(raw[:, :3] + self.first_normal, dim=1), torch.sigmoid(raw[:, 3:])
 
-    def forward(
-        self, features: Float[Tensor, "S G"], directions: Float[Tensor, "S 3"], light: Lamplight
-    ) -> LitSurface:
+    def forward(self, features: Float[Tensor, "S G"], directions: Vectors, light: Lamplight) -> LitSurface:
         """How samples look along unit directions."""
         normals, around = self.surface(features)
         cosine = _bounded_below((normals * light.towards).sum(dim=1, keepdim=True))
@@ -184,7 +187,7 @@ class LampShading(nn.Module):
         return LitSurface(around + (1 - around) * visible * cosine, lobes)
 
 
-def _bounded_below(cosine: Float[Tensor, "S 1"]) -> Float[Tensor, "S 1"]:
+def _bounded_below(cosine: Column) -> Column:
     """max(0, cosine) in value only: a surface that is wrongly turned away from the lamp can still turn back."""
     return cosine + (cosine.clamp(min=0) - cosine).detach()
 
@@ -216,10 +219,10 @@ _PITCH_DARK = 64
 
 def lamplight(
     lamp: MovingLamp,
-    origins: Float[Tensor, "S 3"],
-    positions: Float[Tensor, "S 3"],
+    origins: Vectors,
+    positions: Vectors,
     box: SceneBox,
-    skips: UInt8[Tensor, "X Y Z"],
+    skips: Skips,
     detail: ShadowDetail = FINEST,
     generator: torch.Generator | None = None,
 ) -> Lamplight:
@@ -249,12 +252,8 @@ def lamplight(
 
 @torch.no_grad()
 def _visible_part(
-    positions: Float[Tensor, "S 3"],
-    lamps: Float[Tensor, "S 3"],
-    box: SceneBox,
-    skips: UInt8[Tensor, "X Y Z"],
-    detail: ShadowDetail = FINEST,
-) -> Float[Tensor, "S"]:
+    positions: Vectors, lamps: Vectors, box: SceneBox, skips: Skips, detail: ShadowDetail = FINEST
+) -> Values:
     """Part of the light from points outside the box that the box lets through to each position."""
     towards = normalize(lamps - positions, dim=-1)
     cell = float((box.size / torch.tensor(skips.shape, device=box.size.device)).max())

@@ -9,7 +9,7 @@ Notation: `H x W` pixels, `B` bands, `k` features of a spectrum; values in [0, 1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,13 +21,16 @@ from unmix_plugin.scenes.border_surfaces import (
     FIRST_TOLERANCE,
     HOLE_SHARE,
     TURNS,
+    Features,
     FittedView,
     LookedAt,
+    Mask,
     border_of,
     fit_surfaces,
     norm,
     parts_of,
 )
+from unmix_plugin.scenes.geometry.views import Views
 
 _NUM_FEATURES = 4
 """Coordinates of spectra along which those of the capture differ most."""
@@ -74,7 +77,7 @@ class Backdrop:
         """Features of the pixels of some rows, without stripes."""
         return np.clip(values, 0.0, 1.0) @ self.basis - self.stripes
 
-    def find(self, features: Float32[np.ndarray, "H W k"], known: Bool[np.ndarray, "H W"]) -> LookedAt | None:
+    def find(self, features: Features, known: Mask) -> LookedAt | None:
         """The backdrop in a view, given all its pixels and which of them have a measurement; None where it shows
         none."""
         return self._look(fit_surfaces(features, known, self.brightest))
@@ -133,26 +136,18 @@ class BeforeBackdrop:
         ]
 
 
-def find_before_backdrop(
-    sizes: Sequence[tuple[int, int]],
-    read_view: Callable[[int, tuple[slice, ...]], np.ndarray],
-    unknown: Sequence[Bool[np.ndarray, "_ _"] | None],
-) -> BeforeBackdrop | None:
-    """Where something may stand before a backdrop that all views share; None if there is none.
-
-    Args:
-        sizes: Width and height of each view.
-        read_view: From a view, and the rows, columns and bands wanted, to its picture.
-        unknown: Of each view, pixels before which anything may stand.
-    """
+def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
+    """Where something may stand before a backdrop that all views share; None if there is none. Anything may stand
+    before pixels that don't count."""
+    sizes = [views.cameras.size(view) for view in range(len(views.cameras))]
     stride = -(-max(max(size) for size in sizes) // _LONGEST_SIDE_PX)
-    bands = read_view(0, (slice(1), slice(1))).shape[2]
+    bands = views.read(0, (slice(1), slice(1))).shape[2]
     part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // _MOST_BANDS)))
     chosen = np.linspace(0, len(sizes) - 1, min(len(sizes), _LOOKED_AT)).round().astype(int)
 
     def read(view: int) -> tuple[np.ndarray, np.ndarray]:
-        image, missing = read_view(view, part), unknown[view]
-        return image, np.ones(image.shape[:2], bool) if missing is None else ~missing[part[:2]]
+        image = views.read(view, part)
+        return image, np.ones(image.shape[:2], bool) if views.valid is None else views.valid(view)[part[:2]]
 
     images, known = zip(*(read(view) for view in np.unique(chosen).tolist()), strict=True)
     sample = [image[::4, ::4][mask[::4, ::4]] for image, mask in zip(images, known, strict=True)]
@@ -166,7 +161,7 @@ def find_before_backdrop(
     return BeforeBackdrop(tuple(masks), stride, tuple(sizes))
 
 
-def _without_specks(matter: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+def _without_specks(matter: Mask) -> Mask:
     """Matter without parts that are smaller than a hole may be, wider by a pixel."""
     from scipy import ndimage
 

@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
+Features = Float32[np.ndarray, "H W k"]
+Mask = Bool[np.ndarray, "H W"]
+Distances = Float32[np.ndarray, "H W"]
 BORDER_SHARE = 0.02
 """Width of the border, as a share of the view's."""
 _MOST_SURFACES = 2
@@ -61,11 +64,11 @@ class _Surface:
 class FittedView:
     """A view and the surfaces at its border."""
 
-    features: Float32[np.ndarray, "H W k"]
+    features: Features
     surfaces: list[_Surface]
     farthest: float
     """Distance beyond which no pixel belongs to any."""
-    known: Bool[np.ndarray, "H W"]
+    known: Mask
 
     def look(self) -> LookedAt:
         """Which pixels show the surfaces, and what they look like at each.
@@ -87,9 +90,7 @@ class FittedView:
             shown = self._hangs_together(np.where(weight > _LEAST_AROUND, distance, np.inf), values)
         return LookedAt(self.features, behind + around, shown, self.known)
 
-    def _hangs_together(
-        self, distance: Float32[np.ndarray, "H W"], values: list[Float32[np.ndarray, "H W k"]]
-    ) -> Bool[np.ndarray, "H W"]:
+    def _hangs_together(self, distance: Distances, values: list[Features]) -> Mask:
         """Of pixels that are alike (distances up to 1), those that hang together with the border, and large holes.
 
         Args:
@@ -106,9 +107,7 @@ class FittedView:
         kept[0] = False
         return kept[parts]
 
-    def _seam(
-        self, first: Float32[np.ndarray, "H W k"], second: Float32[np.ndarray, "H W k"]
-    ) -> Bool[np.ndarray, "H W"]:
+    def _seam(self, first: Features, second: Features) -> Mask:
         """Pixels between two surfaces that are mixtures of both."""
         from scipy import ndimage
 
@@ -122,9 +121,7 @@ class FittedView:
         return np.logical_and(near[0], near[1]) & self.known & (away <= most)
 
 
-def _means_around(
-    values: Float32[np.ndarray, "H W k"], chosen: Bool[np.ndarray, "H W"], window: int
-) -> tuple[Float32[np.ndarray, "H W k"], Float32[np.ndarray, "H W"]]:
+def _means_around(values: Features, chosen: Mask, window: int) -> tuple[Features, Distances]:
     """Means over the chosen pixels in a window around each pixel, and the share of it that is chosen."""
     from scipy import ndimage
 
@@ -138,16 +135,16 @@ def _means_around(
 class LookedAt:
     """The backdrop of one view, pixel by pixel."""
 
-    features: Float32[np.ndarray, "H W k"]
+    features: Features
     """Of what is seen."""
-    behind: Float32[np.ndarray, "H W k"]
+    behind: Features
     """Of the backdrop, also where matter hides it."""
-    shown: Bool[np.ndarray, "H W"]
+    shown: Mask
     """Pixels that show the backdrop."""
-    known: Bool[np.ndarray, "H W"]
+    known: Mask
     """Pixels with a measurement."""
 
-    def opacity(self, matter: Bool[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
+    def opacity(self, matter: Mask) -> Distances:
         """How much of each pixel matter covers, [0, 1]: less than 1 only in the rim of `matter`."""
         from scipy import ndimage
 
@@ -162,9 +159,7 @@ class LookedAt:
         return opacity
 
 
-def fit_surfaces(
-    features: Float32[np.ndarray, "H W k"], known: Bool[np.ndarray, "H W"], brightest: float
-) -> FittedView:
+def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedView:
     """Up to two smooth surfaces that explain most of a view's border, grown inwards from there."""
     stride = max(1, round((known.size / _MOST_FITTED) ** 0.5))
     thin = (slice(None, None, stride),) * 2
@@ -237,7 +232,7 @@ def _border_surfaces(
     return surfaces
 
 
-def parts_of(mask: Bool[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
+def parts_of(mask: Mask) -> Int32[np.ndarray, "H W"]:
     """Numbers, from 1, of the parts of a mask that are connected by edges; 0 outside."""
     from scipy import ndimage
 
@@ -265,7 +260,7 @@ def _terms(shape: tuple[int, int]) -> Float32[np.ndarray, "P t"]:
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, *cubic], axis=-1)
 
 
-def border_of(shape: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+def border_of(shape: tuple[int, int]) -> Mask:
     border = np.ones(shape, bool)
     rows, columns = (max(1, round(BORDER_SHARE * side)) for side in shape)
     border[rows:-rows, columns:-columns] = False

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from unmix_plugin.scenes.geometry.carving import Cells, Masks
-from unmix_plugin.scenes.geometry.lighting import local_log_brightness
+from unmix_plugin.scenes.geometry.lighting import Pictures, local_log_brightness
+from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.pixel_block import DrawnPixels, PixelBlock
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.sensors import lonely_sensors
@@ -71,13 +72,13 @@ class AlphaEvidence:
                 found[camera] = picture.numpy()
         return [found[camera] for camera in sorted(found)]
 
-    def log_brightness(self) -> tuple[list[int], list[Float[np.ndarray, "H W"]]]:
+    def log_brightness(self) -> tuple[list[int], Pictures]:
         """The views of the sensor that took most, and of each the logarithm of its brightness; NaN where a pixel is not
         opaque, not valid or saturated."""
         block = self._largest_block
         return list(block.cameras), [local_log_brightness(seen) for seen in block.pictures(_clear_brightness)]
 
-    def log_shading(self) -> list[Float[np.ndarray, "H W"]]:
+    def log_shading(self) -> Pictures:
         """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
         block = self._largest_block
         return [local_log_brightness(seen) for seen in block.pictures(_ColourGroups.of(block).shading)]
@@ -211,23 +212,11 @@ def _overlaps(scene: Scene, sensors: list[int], reachable: Cells) -> list[tuple[
     cells = cells[:: max(1, -(-len(cells) // _MOST_POINTS))]
     unit = torch.from_numpy((cells + 0.5) / np.array(reachable.shape)).float()
     points = scene.scene_box.aabb[0] + unit * scene.scene_box.size
-    seen = {sensor: _seen(scene, sensor, points) for sensor in sensors}
+    seen = {sensor: np.zeros(len(points), bool) for sensor in sensors}
+    for view in scene.train_indices:
+        seen[scene.frames[view].sensor] |= look_up(scene.cameras, view, points)[1].numpy()
     found = []
     for sensor, own in seen.items() if len(sensors) > 1 else ():
         others = np.any([seen[other] for other in sensors if other != sensor], axis=0)
         found.append((scene.sensors[sensor].name, float((own & others).sum() / max(own.sum(), 1))))
     return found
-
-
-def _seen(scene: Scene, sensor: int, points: Float[torch.Tensor, "P 3"]) -> Bool[np.ndarray, " P"]:
-    """Points that lie within some training picture of a sensor."""
-    seen = torch.zeros(len(points), dtype=torch.bool)
-    for view in scene.train_indices:
-        if scene.frames[view].sensor == sensor:
-            coords, depths = scene.cameras.project(points, view)
-            seen |= (
-                (depths > 0)
-                & (coords >= 0).all(dim=-1)
-                & (coords < torch.tensor(scene.cameras.size(view))).all(dim=-1)
-            )
-    return seen.numpy()

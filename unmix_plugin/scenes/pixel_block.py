@@ -19,7 +19,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.pixel_pool import PixelPool
-from unmix_plugin.scenes.pixel_projection import ProjectedPixels, Projection
+from unmix_plugin.scenes.pixel_projection import Pixels, ProjectedPixels, Projection, Spectra
 from unmix_plugin.scenes.reading.cubes import Part
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bad_values import REACH_PX, repaired
@@ -37,13 +37,13 @@ class DrawnPixels:
 
     sensor: int
     """Which of the scene's."""
-    numbers: Int[Tensor, " R"]
+    numbers: Pixels
     """Of the pixels in the table, each its own."""
-    cameras: Int[Tensor, " R"]
+    cameras: Pixels
     """Which of the table's views each is of."""
     corners: Int[Tensor, "R 2"]
     """Column and row."""
-    spectra: Float[Tensor, "R b"]
+    spectra: Spectra
     """What the sensor measured, [0, 1]."""
     alpha: Float[Tensor, " R"]
     """Opacity in [0, 1]; 1 where the scene has no alpha."""
@@ -177,7 +177,7 @@ class PixelBlock:
         step = max(_FEWEST_ROWS, _CHUNK_VALUES // (self._width * self.num_channels))
         return [(top, min(top + step, self._height)) for top in range(0, self._height, step)]
 
-    def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
+    def spectra(self, pixels: Pixels) -> Spectra:
         """Spectra of some pixels in [0, 1], the numbers of `Scene.cube`; only of valid ones."""
         if self._projected is not None:
             return self._projected.spectra(pixels)
@@ -185,7 +185,7 @@ class PixelBlock:
             return self._scaled(self._values[pixels])
         return self._scaled(self._gathered(pixels.cpu())).to(self.alpha.device)
 
-    def _neighbours(self, first: int, last: int) -> Float[Tensor, "R b"]:
+    def _neighbours(self, first: int, last: int) -> Spectra:
         """The same of pixels that follow each other."""
         if self._projected is not None:
             return self._projected.spectra(torch.arange(first, last, device=self.alpha.device))
@@ -193,7 +193,7 @@ class PixelBlock:
             self._read_range(first, last) if self._values is None else self._values[first:last]
         )
 
-    def _scaled(self, values: Tensor) -> Float[Tensor, "R b"]:
+    def _scaled(self, values: Tensor) -> Spectra:
         if not self._is_compact:
             return values
         values = (values.view(torch.uint16) if self._is_unsigned else values).float()
@@ -220,7 +220,7 @@ class PixelBlock:
                 parts.append(of(spectra, self.alpha[start:end].cpu(), self.valid[start:end]))
             yield torch.cat(parts).view(self._height, self._width)
 
-    def take(self, pixels: Int[Tensor, " R"], first: int, stored: Tensor | None = None) -> DrawnPixels:
+    def take(self, pixels: Pixels, first: int, stored: Tensor | None = None) -> DrawnPixels:
         """Some pixels by their index in the block, whose first pixel has the number `first`, on any device; `stored`
         are their values as they are stored, where they were read already."""
         pixels = pixels.to(self.alpha.device)
@@ -257,7 +257,7 @@ class PixelBlock:
             parts.append(rows[start - top * width : end - top * width])
         return torch.cat(parts)
 
-    def _gathered(self, pixels: Int[Tensor, " R"]) -> Tensor:
+    def _gathered(self, pixels: Pixels) -> Tensor:
         """Values of any pixels of the block, from disk."""
         rows = pixels // self._size
         found = torch.from_numpy(np.empty((len(pixels), self.num_channels), self._kept))

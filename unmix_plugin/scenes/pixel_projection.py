@@ -16,6 +16,8 @@ from torch import Tensor
 
 from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
 
+Pixels = Int[Tensor, " R"]
+Spectra = Float[Tensor, "R b"]
 FEWEST_CHANNELS = 100
 """Of a sensor whose pixels are projected without being asked for."""
 _LARGEST_SHARE = 0.25
@@ -91,7 +93,7 @@ class ProjectedPixels:
         held = (self._components, self._whole, self._room[: len(self._whole)])
         return sum(values.numel() * values.element_size() for values in held)
 
-    def put(self, first: int, spectra: Float[Tensor, "R b"]) -> None:
+    def put(self, first: int, spectra: Spectra) -> None:
         """Keep pixels that follow each other, the first of which has the number `first`; later ones later."""
         spectra = spectra.to(self._components.device)
         components = self._subspace.components(spectra).half()
@@ -105,7 +107,7 @@ class ProjectedPixels:
             self._room = room
         self._room[before : len(self._whole)] = spectra[whole].half()
 
-    def spectra(self, pixels: Int[Tensor, " R"]) -> Float[Tensor, "R b"]:
+    def spectra(self, pixels: Pixels) -> Spectra:
         """Spectra of some pixels in [0, 1]."""
         found = self._subspace.spectra(self._components[pixels].float()).clamp_(0, _UNSATURATED)
         if len(self._whole):
@@ -115,5 +117,5 @@ class ProjectedPixels:
         return found
 
 
-def _must_stay_whole(spectra: Float[Tensor, "R b"], residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
+def _must_stay_whole(spectra: Spectra, residuals: Float[Tensor, " R"]) -> Bool[Tensor, " R"]:
     return (residuals > _LARGEST_RESIDUAL) | (spectra.amax(dim=-1) > _UNSATURATED)

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from tests.scenes.scene_factory import ball_alpha, ring_poses
+from tests.scenes.scene_factory import ball_alpha, cameras_of, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.geometry.carving import carve_box
@@ -14,15 +14,7 @@ SIDE, FOCAL = 40, 60.0
 
 
 def make_cameras(poses: list[np.ndarray], distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> Cameras:
-    count = len(poses)
-    return Cameras(
-        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
-        focal_px=torch.full((count, 2), FOCAL),
-        center_px=torch.full((count, 2), SIDE / 2),
-        distortion=torch.tensor([distortion]).repeat(count, 1),
-        width=SIDE,
-        height=SIDE,
-    )
+    return cameras_of(poses, SIDE, SIDE, FOCAL, distortion)
 
 
 def ball_matter(poses: list[np.ndarray], radius: float) -> list[np.ndarray]:

@@ -5,6 +5,7 @@ import torch
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from tests.scenes.scene_factory import cameras_of
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses
 
@@ -26,15 +27,7 @@ def flight_poses(count: int = 5, spacing: float = 0.35, sway: float = 0.05) -> l
 
 
 def flight_cameras(poses: list[np.ndarray]) -> Cameras:
-    count = len(poses)
-    return Cameras(
-        camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
-        focal_px=torch.full((count, 2), FOCAL),
-        center_px=torch.tensor([[WIDTH / 2, HEIGHT / 2]]).repeat(count, 1),
-        distortion=torch.zeros(count, 4),
-        width=WIDTH,
-        height=HEIGHT,
-    )
+    return cameras_of(poses, WIDTH, HEIGHT, FOCAL)
 
 
 def strip_cameras(count: int = 3) -> Cameras:

@@ -109,10 +109,10 @@ def test_exposures_that_differ_are_told_by_matched_places(spread, light):
 
 
 @pytest.mark.parametrize("count", [5, 12])
-def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen(tmp_path, count):
+def test_the_box_of_a_flight_lies_on_the_ground_and_holds_all_of_it_that_is_seen(count):
     cameras = flight_cameras(flight_poses(count))
     points = find_matched_points(views_of(cameras))
-    box = find_bounds(tmp_path, cameras, None, points)
+    box = find_bounds(cameras, None, points)
     for index in range(len(cameras)):
         rays = cameras.image_rays(index)
         heights = rays.origins[:, 2] - SLOPE * rays.origins[:, 0]

@@ -14,8 +14,6 @@ Notation: poses are camera to world, OpenGL axes, float64; `N` training cameras.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from jaxtyping import Float64, Int64
@@ -61,13 +59,10 @@ _SEEN_CELLS = 32
 """Cells along an edge when the region that cameras share is sought."""
 
 
-def find_bounds(
-    root: Path, cameras: Cameras, foreground: Masks | None, points: MatchedPoints | None = None
-) -> SceneBox:
+def find_bounds(cameras: Cameras, foreground: Masks | None, points: MatchedPoints | None = None) -> SceneBox:
     """The box that the training views show, in their cameras' space, which has coordinates of order 1.
 
     Args:
-        root: Scene folder, for messages.
         foreground: For each view True where it may show something; None where there is no alpha.
         points: By the numbers of these cameras, places that views agree on, for cameras that do not look at one place.
     Raises:
@@ -88,7 +83,7 @@ def find_bounds(
     explained = share_through(rays, box, hull & (count >= _HULL_SHARES[0] * count.max()))
     if explained < _MIN_CONSISTENT:
         raise SceneError(
-            f"{root}: alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
+            f"alpha and poses contradict: only {explained:.0%} of the pixels that are not transparent have "
             "a place behind them that no other training view looks through; check that 'transform_matrix' is camera "
             "to world with OpenGL axes (+y up, looking along -z), and that each picture has its own pose"
         )

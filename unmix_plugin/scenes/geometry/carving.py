@@ -29,6 +29,10 @@ Cells = Bool[np.ndarray, "R R R"]
 """Cells of a box that may be occupied."""
 Masks = list[Bool[np.ndarray, "_ _"]]
 """For each view True on pixels that may show something."""
+_Centres = Float32[np.ndarray, "3 M"]
+_Bounds = Float32[np.ndarray, "2 M"]
+_Judged = tuple[Bool[np.ndarray, " M"], Bool[np.ndarray, " M"] | None]
+"""Cells of which a part may be seen, beyond the near plane, and those that are looked through, if known."""
 _MAX_RAYS = 20_000
 """Pixels that are asked for whether a hull explains them."""
 MIN_EXPLAINED = 0.999
@@ -154,7 +158,7 @@ def carve_box(
 
 
 def _may_be_occupied(
-    centres: Float32[np.ndarray, "3 M"],
+    centres: _Centres,
     half: Float32[np.ndarray, "3"],
     near: float,
     views: list[_View | _LineView],
@@ -186,9 +190,7 @@ class _Covered:
         np.cumsum(np.cumsum(foreground, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
         self._sums, self._columns = sums.reshape(-1), width + 1
 
-    def is_empty(
-        self, low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"]
-    ) -> Bool[np.ndarray, " M"]:
+    def is_empty(self, low: _Bounds, high: _Bounds) -> Bool[np.ndarray, " M"]:
         """Whether rectangles within the view, rounded outwards, hold no foreground."""
         (x0, y0), (x1, y1) = low.astype(np.int32), high.astype(np.int32) + 1
         # One array of row-major corner numbers and `take` cost a third of two-dimensional indexing.
@@ -211,9 +213,7 @@ class _View:
         self._low, self._high = self._ideal_bounds()
         self.covered = None if foreground is None else _Covered(foreground)
 
-    def judge(
-        self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"], near: float
-    ) -> tuple[Bool[np.ndarray, " M"], Bool[np.ndarray, " M"] | None]:
+    def judge(self, centres: _Centres, half: Float32[np.ndarray, "3"], near: float) -> _Judged:
         """Cells of which a part may be seen, beyond the near plane, and those that are looked through, if known."""
         local = self._axes @ (centres - self._position[:, None])
         reach = np.abs(self._axes) @ half
@@ -252,9 +252,7 @@ class _View:
         return ideal.min(axis=0)[:, None], ideal.max(axis=0)[:, None]
 
 
-def _bend(
-    low: Float32[np.ndarray, "2 M"], high: Float32[np.ndarray, "2 M"], distortion: Float[Tensor, " D"]
-) -> tuple[Float32[np.ndarray, "2 M"], Float32[np.ndarray, "2 M"]]:
+def _bend(low: _Bounds, high: _Bounds, distortion: Float[Tensor, " D"]) -> tuple[_Bounds, _Bounds]:
     """Bounds of distorted rectangles, from their corners, the middles of their edges and their centres.
 
     A bulge between these points is of second order in a cell's size and stays within `_PIXEL_MARGIN`.
@@ -282,9 +280,7 @@ class _LineView:
         self._shift = ((places[:-1] - places[1:]) * up).sum(dim=1)
         self._turn = (back * up).sum(dim=1)
 
-    def judge(
-        self, centres: Float32[np.ndarray, "3 M"], half: Float32[np.ndarray, "3"], near: float
-    ) -> tuple[Bool[np.ndarray, " M"], Bool[np.ndarray, " M"] | None]:
+    def judge(self, centres: _Centres, half: Float32[np.ndarray, "3"], near: float) -> _Judged:
         points, radius = torch.from_numpy(np.ascontiguousarray(centres.T)), float(np.linalg.norm(half))
         middle, depths = self._camera.project(points, 0)
         rows = middle[:, 1].long().clamp(0, self._rows - 1)

@@ -29,7 +29,11 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.scenes.geometry.carving import Cells
+from unmix_plugin.scenes.geometry.views import look_up
 
+Pictures = list[Float[np.ndarray, "H W"]]
+Seen = Float[Tensor, "P N"]
+"""Logarithm of the brightness of places in views; NaN where one is not seen."""
 _NUM_PLACES = 2000
 """Places that are followed."""
 _LARGEST_HULL = 64
@@ -79,8 +83,8 @@ def _hull_places(hull: Cells, box: SceneBox) -> Places:
 
 
 def seen_places(
-    cameras: Cameras, log_brightness: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
-) -> tuple[Places, Float[Tensor, "P N"]]:
+    cameras: Cameras, log_brightness: Pictures, hull: Cells, box: SceneBox
+) -> tuple[Places, Seen]:
     """Places on a hull in a box, and the logarithm of their brightness in each view; NaN where a view does not see one,
     or its picture is NaN: background, saturated pixels."""
     hull = coarse_hull(hull)
@@ -115,14 +119,11 @@ def _looked_up(
     cameras: Cameras, index: int, image: Float[np.ndarray, "H W"], places: Places, hull: Cells, box: SceneBox
 ) -> Float[Tensor, " P"]:
     """What a view shows of the places, NaN where it does not see them."""
-    coords, depths = cameras.project(places.positions, index)
-    pixels = coords.floor().long()
-    inside = (depths > 0) & (pixels >= 0).all(dim=-1)
-    inside &= (pixels < torch.tensor(cameras.size(index))).all(dim=-1)
+    coords, inside = look_up(cameras, index, places.positions)
     towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
     inside &= (towards * places.normals).sum(dim=-1) > _LEAST_FACING
     inside &= ~_is_hidden(places.positions, towards, hull, box)
-    columns, rows = torch.where(inside[:, None], pixels, 0).unbind(-1)
+    columns, rows = torch.where(inside[:, None], coords, 0.0).long().unbind(-1)
     return torch.where(inside, torch.from_numpy(image).float()[rows, columns], torch.nan)
 
 
@@ -144,9 +145,7 @@ def _is_hidden(
 _FoundLight = Literal["fixed", "camera", "per-view"]
 
 
-def judge_light(
-    cameras: Cameras, log_brightness: list[Float[np.ndarray, "H W"]], hull: Cells, box: SceneBox
-) -> _FoundLight:
+def judge_light(cameras: Cameras, log_brightness: Pictures, hull: Cells, box: SceneBox) -> _FoundLight:
     """Which light the views were taken in; fixed where too little is seen to tell. Arguments as of `seen_places`."""
     places, seen = seen_places(cameras, log_brightness, hull, box)
     if _foretold_share(cameras, places, seen) > _MOVING_SHARE:
@@ -156,7 +155,7 @@ def judge_light(
 
 
 def judge_exposure(
-    cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Float[Tensor, "P N"]
+    cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen
 ) -> Literal["fixed", "per-view"]:
     """Whether views differ in exposure; fixed where too little is seen to tell.
 
@@ -167,7 +166,7 @@ def judge_exposure(
     return "per-view" if _gain_spread(cameras, positions, seen) > _LEAST_GAIN_SPREAD else "fixed"
 
 
-def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]) -> float:
+def _foretold_share(cameras: Cameras, places: Places, seen: Seen) -> float:
     """Least share of the changes of brightness that the other half of the views predicts; 0 if too little is seen."""
     if len(places.positions) == 0:
         return 0.0
@@ -181,7 +180,7 @@ def _foretold_share(cameras: Cameras, places: Places, seen: Float[Tensor, "P N"]
     return _least_share(seen, turned, (along > along.median(dim=0).values).T)
 
 
-def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Float[Tensor, "P N"]) -> float:
+def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Seen) -> float:
     """Standard deviation of the views' log gains, as far as two halves of the places agree on them.
 
     The least of the ways to halve the places along an axis so that enough views see both; 0 if there is none. Gains
@@ -208,7 +207,7 @@ def _gain_spread(cameras: Cameras, positions: Float[Tensor, "P 3"], seen: Float[
     return max(min(shared, default=0.0), 0.0) ** 0.5
 
 
-def _view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
+def _view_gains(seen: Seen) -> Float[Tensor, " N"]:
     """Logarithms of the views' gains, of mean 0, by which places look most alike; NaN where a view sees none.
 
     Least absolute differences of what a place looks like, gains taken off, from its mean over views; by repeated least
@@ -228,9 +227,7 @@ def _view_gains(seen: Float[Tensor, "P N"]) -> Float[Tensor, " N"]:
     return torch.where(known.any(dim=0), gains, torch.nan).float()
 
 
-def _least_share(
-    values: Float[Tensor, "P N"], functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "2 N"]
-) -> float:
+def _least_share(values: Seen, functions: Float[Tensor, "P N F"], halves: Bool[Tensor, "2 N"]) -> float:
     """Least share of the variance within places, seen by a half of the views, that a fit to the other predicts."""
     shares: list[float] = []
     for half in halves:
@@ -247,7 +244,7 @@ def _least_share(
 
 
 def _changes(
-    values: Float[Tensor, "P N"], functions: Float[Tensor, "P N F"]
+    values: Seen, functions: Float[Tensor, "P N F"]
 ) -> tuple[Float[Tensor, "V F"], Float[Tensor, " V"]]:
     """Functions and values without their means over the views of each place, of places that enough views see."""
     known = values.isfinite()

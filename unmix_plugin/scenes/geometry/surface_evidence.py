@@ -24,12 +24,15 @@ from torch import Tensor
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes.geometry.carving import Cells, refined, unit_centres
+from unmix_plugin.scenes.geometry.view_agreement import training_views
 from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
+    Differences,
     ThinnedViews,
     Views,
     best_agreement,
     choose_neighbours,
+    look_up,
     view_differences,
     view_features,
 )
@@ -172,7 +175,7 @@ def _planes(box: SceneBox, origin: Float[Tensor, "3"], axis: Float[Tensor, "3"])
     return torch.tensor(found)
 
 
-def _patch_means(differences: Float[Tensor, "P D"], own: Float[Tensor, "h w F"]) -> Float[Tensor, "P D"]:
+def _patch_means(differences: Differences, own: Float[Tensor, "H W F"]) -> Differences:
     """Means over 3 x 3 pixels on the same plane; inf where most of them are not seen."""
     height, width = own.shape[:2]
     is_seen = torch.isfinite(differences)
@@ -202,9 +205,7 @@ def _looked_up(
     cameras: Cameras, view: int, points: Float[Tensor, "P 3"], distances: Float[Tensor, "h w"], stride: int
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
     """Of the pixel that a point falls on: the least distance of those around it, its own, and the point's."""
-    pixels, depths = cameras.project(points, view)
-    limits = torch.tensor([cameras.width, cameras.height])
-    is_seen = (depths > 0.0) & ((pixels >= 0.0) & (pixels < limits)).all(dim=-1)
+    pixels, is_seen = look_up(cameras, view, points)
     least = -torch.nn.functional.max_pool2d(-distances[None], 3, stride=1, padding=1)[0]
     columns, rows = (pixels / stride).nan_to_num(0.0).clamp(0.0, 1e6).long().unbind(-1)
     rows, columns = rows.clamp(max=len(distances) - 1), columns.clamp(max=distances.shape[1] - 1)
@@ -222,7 +223,7 @@ class SurfaceEvidence:
         Args:
             device: Of the pixels that will be asked for.
         """
-        views = Views.of(scene)
+        views = training_views(scene)
         self._cameras, self._box = views.cameras, scene.scene_box
         is_compared = scene.is_unbounded and not scene.is_rig and views.cameras.key_poses is None
         self._depths = _sweep_depths(views, scene.scene_box) if is_compared else None

@@ -24,10 +24,13 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
 from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
+    Differences,
+    Image,
     ThinnedViews,
     Views,
     best_agreement,
     choose_neighbours,
+    commonest,
     view_differences,
     view_features,
 )
@@ -66,20 +69,34 @@ _LEAST_EXPLAINED = 0.6
 
 _GIVEN = "camera to world, OpenGL axes"
 _FLIP = np.diag([1.0, -1.0, -1.0])
-_REMEDIES = {
-    "camera to world, OpenCV axes": "multiply each from the right by diag(1, -1, -1, 1)",
-    "world to camera, OpenGL axes": "invert each",
+_CONVENTIONS = {
+    "camera to world, OpenCV axes": (False, True, "multiply each from the right by diag(1, -1, -1, 1)"),
+    "world to camera, OpenGL axes": (True, False, "invert each"),
     "world to camera, OpenCV axes (as COLMAP writes them)": (
-        "invert each, then multiply it from the right by diag(1, -1, -1, 1)"
+        True,
+        True,
+        "invert each, then multiply it from the right by diag(1, -1, -1, 1)",
     ),
 }
-
+"""What a matrix may be other than `_GIVEN`: whether inverted, whether with flipped axes, and what to do with it."""
 _Poses = Float64[np.ndarray, "N 3 4"]
+
+
+def training_views(scene: Scene, with_lines: bool = True) -> Views:
+    """Those of the sensor that took most, if asked for without those of line cameras."""
+    sensors = [scene.frames[view].sensor for view in scene.train_indices]
+    chosen = [scene.train_indices[row] for row in commonest(sensors)]
+    chosen = [view for view in chosen if with_lines or not scene.cameras.is_line_camera(view)]
+    return Views(
+        scene.cameras[chosen],
+        lambda row, part: scene.cube(chosen[row], part),
+        lambda row: scene.valid_mask(chosen[row]),
+    )
 
 
 def check_scene_poses(scene: Scene) -> str | None:
     """A warning if the training views agree much better under another convention than the one expected."""
-    views = Views.of(scene)
+    views = training_views(scene, with_lines=False)  # of which no single pose tells what they saw
     poses = views.cameras.camera_to_world.double().numpy()
     placement = scene.placement  # conventions are those of the matrices in transforms.json
     rotations = placement.rotation @ scene.normalisation.rotation.T @ poses[:, :, :3]
@@ -90,7 +107,7 @@ def check_scene_poses(scene: Scene) -> str | None:
 def compare_conventions(poses: _Poses, views: Views) -> dict[str, float]:
     """How little the views agree under each convention, against unrelated pixels (1); inf where they share nothing.
 
-    Of line cameras nothing is said: no single pose tells what one saw. Poses are those given, not the cameras'.
+    Of line cameras nothing is said. Poses are those given, not the cameras'.
     """
     found = None if views.cameras.key_poses is not None else _compare(poses, views, _busy_pixels)
     if found is None:
@@ -116,7 +133,7 @@ class _Comparison:
     """Pixels of some views and what these and their neighbours show, in few pixels."""
 
     neighbours: dict[int, list[int]]
-    features: dict[int, Float[Tensor, "h w F"]]
+    features: dict[int, Image]
     pixels: dict[int, Int[Tensor, " P"]]
     """Row-major numbers."""
     cameras: Cameras
@@ -130,21 +147,18 @@ class _Comparison:
         coords = torch.stack([pixels % cameras.width, pixels // cameras.width], dim=-1).float() + 0.5
         return cameras.generate_rays(torch.full((len(pixels),), view), coords)
 
-    def disagreements(self, view: int, depths: Float[Tensor, " D"], cameras: Cameras) -> Float[Tensor, "P D"]:
+    def disagreements(self, view: int, depths: Float[Tensor, " D"], cameras: Cameras) -> Differences:
         """Of a view's pixels with its neighbours, along rays."""
         rays, own = self.rays(view, cameras), self.features[view].flatten(0, 1)[self.pixels[view]]
-        return best_agreement(
-            [
-                view_differences(rays, depths, own, self.features[other], cameras, other)
-                for other in self.neighbours[view]
-            ]
-        )
+        others = [
+            view_differences(rays, depths, own, self.features[other], cameras, other)
+            for other in self.neighbours[view]
+        ]
+        return best_agreement(others)
 
 
 def _compare(
-    poses: _Poses,
-    views: Views,
-    choose: Callable[[Float[Tensor, "h w F"], torch.Generator], Int[Tensor, " P"]],
+    poses: _Poses, views: Views, choose: Callable[[Image, torch.Generator], Int[Tensor, " P"]]
 ) -> _Comparison | None:
     """None if there are too few views, or nothing in them changes."""
     if len(poses) < NUM_AGREEING + 1:
@@ -175,7 +189,7 @@ def describe(disagreements: dict[str, float]) -> str | None:
     return (
         f"the poses look like {best}: read so, the training views differ by {disagreements[best]:.2f} of what "
         f"unrelated pixels do; read as {_GIVEN}, as expected, {given}. If so, take each 'transform_matrix' of "
-        f"transforms.json: {_REMEDIES[best]}"
+        f"transforms.json: {_CONVENTIONS[best][2]}"
     )
 
 
@@ -183,17 +197,14 @@ def _meanings(poses: _Poses) -> dict[str, _Poses]:
     """What the given matrices are as camera to world with OpenGL axes, under each convention."""
     rotations, positions = poses[:, :, :3], poses[:, :, 3:]
     inverse = rotations.transpose(0, 2, 1)
-    origins = -(inverse @ positions)
-    opencv, world_to_camera, colmap = _REMEDIES
-    return {
-        _GIVEN: poses,
-        opencv: np.concatenate([rotations @ _FLIP, positions], axis=-1),
-        world_to_camera: np.concatenate([inverse, origins], axis=-1),
-        colmap: np.concatenate([inverse @ _FLIP, origins], axis=-1),
-    }
+    found = {_GIVEN: poses}
+    for name, (is_inverted, is_flipped, _) in _CONVENTIONS.items():
+        axes, places = (inverse, -(inverse @ positions)) if is_inverted else (rotations, positions)
+        found[name] = np.concatenate([axes @ _FLIP if is_flipped else axes, places], axis=-1)
+    return found
 
 
-def _busy_pixels(image: Float[Tensor, "h w F"], generator: torch.Generator) -> Int[Tensor, " P"]:
+def _busy_pixels(image: Image, generator: torch.Generator) -> Int[Tensor, " P"]:
     """Random pixels among those where the image changes most, row-major numbers."""
     change = _local_change(image)
     order = change.flatten().argsort(descending=True)
@@ -201,7 +212,7 @@ def _busy_pixels(image: Float[Tensor, "h w F"], generator: torch.Generator) -> I
     return busy[torch.randperm(len(busy), generator=generator)[:_NUM_PIXELS]]
 
 
-def _local_change(image: Float[Tensor, "h w F"]) -> Float[Tensor, "h w"]:
+def _local_change(image: Image) -> Float[Tensor, "h w"]:
     """How much an image changes around each pixel, along its rows and columns; 0 on its border."""
     change = torch.zeros(image.shape[:2])
     across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
@@ -245,31 +256,31 @@ class _WorldEvidence:
         return replace(self, num_places=len(places), num_outside=int(outside.sum()))
 
     @property
-    def _shows_more(self) -> bool:
-        return self.num_behind > _MOST_BEHIND * (self.num_behind + self.num_inside)
-
-    @property
-    def _is_unexplained(self) -> bool:
-        return self.num_explained < _LEAST_EXPLAINED * self.num_pixels
-
-    @property
     def goes_on(self) -> bool:
         """Whether the views show more than a closed box would."""
-        is_outside = self.num_outside > _MOST_BEHIND * self.num_places
-        return self._shows_more or self._is_unexplained or is_outside
+        return any(tells for tells, _ in self._reasons)
 
     def in_words(self) -> str:
         """Which it is and why, and how to say otherwise."""
-        behind = (
-            f"{self.num_behind} of {self.num_behind + self.num_inside} pixels that tell show places behind it"
-        )
+        if self.goes_on:
+            why = next(text for tells, text in self._reasons if tells)
+            return f"the world is taken to go on behind the scene box: {why} (--world bounded if not)"
+        known = ", ".join(text for _, text in self._reasons)
+        return f"the scene is taken to end with its box: {known} (--world unbounded if not)"
+
+    @property
+    def _reasons(self) -> list[tuple[bool, str]]:
+        """What was asked, whether it tells of a world behind the box, and the answer in words."""
+        telling = self.num_behind + self.num_inside
+        behind = f"{self.num_behind} of {telling} pixels that tell show places behind it"
         explained = f"its inside explains {self.num_explained} of {self.num_pixels} pixels"
         outside = f"{self.num_outside} of {self.num_places} places matched between views lie outside it"
-        if not self.goes_on:
-            known = [explained, behind] + ([outside] if self.num_places else [])
-            return f"the scene is taken to end with its box: {', '.join(known)} (--world unbounded if not)"
-        why = behind if self._shows_more else explained if self._is_unexplained else outside
-        return f"the world is taken to go on behind the scene box: {why} (--world bounded if not)"
+        reasons = [
+            (self.num_behind > _MOST_BEHIND * telling, behind),
+            (self.num_explained < _LEAST_EXPLAINED * self.num_pixels, explained),
+            (self.num_outside > _MOST_BEHIND * self.num_places, outside),
+        ]
+        return reasons if self.num_places else reasons[:2]
 
 
 def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
@@ -300,7 +311,7 @@ def find_world_evidence(box: SceneBox, views: Views) -> _WorldEvidence:
     )
 
 
-def _spread_pixels(image: Float[Tensor, "h w F"], _: torch.Generator) -> Int[Tensor, " P"]:
+def _spread_pixels(image: Image, _: torch.Generator) -> Int[Tensor, " P"]:
     """Of each of `_TILES` x `_TILES` parts of an image, or as many as it has pixels along an edge, the pixel where it
     changes most; row-major numbers."""
     change = _local_change(image)

@@ -19,8 +19,11 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
-from unmix_plugin.scenes.scene import Scene
 
+Image = Float[Tensor, "h w F"]
+"""Features of a view thinned out."""
+Differences = Float[Tensor, "P D"]
+"""Between pixels and what another view shows of points along their rays; inf where it does not see them."""
 _MOST_BANDS = 32
 """Of what is compared."""
 _MOST_POOLED = 4
@@ -43,17 +46,6 @@ class Views:
     """From a view, and the rows, columns and bands wanted, to its picture."""
     valid: Callable[[int], Bool[np.ndarray, "H W"]] | None = None
     """From a view to its pixels that count: the others show what is no part of the scene. None where all count."""
-
-    @staticmethod
-    def of(scene: Scene) -> Views:
-        """Training views of the sensor that took most."""
-        sensors = [scene.frames[view].sensor for view in scene.train_indices]
-        chosen = [scene.train_indices[row] for row in commonest(sensors)]
-        return Views(
-            scene.cameras[chosen],
-            lambda row, part: scene.cube(chosen[row], part),
-            lambda row: scene.valid_mask(chosen[row]),
-        )
 
 
 def commonest(sensors: list[int]) -> list[int]:
@@ -105,6 +97,15 @@ class ThinnedViews:
         )
 
 
+def look_up(
+    cameras: Cameras, view: int, points: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, "P 2"], Bool[Tensor, " P"]]:
+    """Where points are in a view, pixels, and whether they lie within it and before its camera."""
+    coords, depths = cameras.project(points, view)
+    size = torch.tensor(cameras.size(view))
+    return coords, (depths > 0) & ((coords >= 0) & (coords < size)).all(dim=-1)
+
+
 def choose_neighbours(
     poses: Float64[np.ndarray, "N 3 4"], num_references: int, num_neighbours: int
 ) -> dict[int, list[int]]:
@@ -121,9 +122,7 @@ def choose_neighbours(
     return {int(view): np.argsort(ranks[view])[:count].tolist() for view in chosen}
 
 
-def view_features(
-    views: list[Float[Tensor, "h w B"]], generator: torch.Generator
-) -> list[Float[Tensor, "h w F"]]:
+def view_features(views: list[Float[Tensor, "h w B"]], generator: torch.Generator) -> list[Image]:
     """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little."""
     spectra = torch.cat([view.flatten(0, 1) for view in views])
     some = spectra[torch.randperm(len(spectra), generator=generator)[:_PIXELS_OF_FEATURES]]
@@ -139,10 +138,10 @@ def view_differences(
     rays: RayBundle,
     distances: Float[Tensor, "*P D"],
     own: Float[Tensor, "P F"],
-    image: Float[Tensor, "h w F"],
+    image: Image,
     cameras: Cameras,
     view: int,
-) -> Float[Tensor, "P D"]:
+) -> Differences:
     """Between pixels and what another view shows of points along their rays; inf where that does not see them."""
     points = rays.origins[:, None] + rays.directions[:, None] * distances[..., None]
     coords, depths = cameras.project(points.flatten(0, 1), view)
@@ -156,6 +155,6 @@ def view_differences(
     return differences.masked_fill(~is_seen.reshape(differences.shape), torch.inf)
 
 
-def best_agreement(differences: list[Float[Tensor, "P D"]]) -> Float[Tensor, "P D"]:
+def best_agreement(differences: list[Differences]) -> Differences:
     """Mean over those neighbours that agree best; inf where too few see a point."""
     return torch.stack(differences, dim=-1).sort(dim=-1).values[..., :NUM_AGREEING].mean(dim=-1)
