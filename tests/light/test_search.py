@@ -18,7 +18,7 @@ from unmix_plugin.scenes.geometry.lighting import local_log_brightness, seen_pla
 @pytest.mark.parametrize("noise", [0.0, 0.3])
 def test_the_brightness_of_a_turned_ball_tells_the_direction_of_its_lamp(noise):
     cameras, images, hull, box = ball_views(True, noise)
-    evidence = _LampEvidence.of(cameras, *seen_places(cameras, images, hull, box), hull, box)
+    evidence = _LampEvidence(cameras, *seen_places(cameras, images, hull, box), hull, box)
     share, lamp = _best_lamp(evidence, cameras)
     place = np.array(lamp.place) / np.linalg.norm(lamp.place)
     assert share > 0.15
@@ -52,7 +52,7 @@ def test_things_on_a_table_tell_in_which_frame_the_lamp_stands():
         matter.append(view.alpha > 0)
     box = SceneBox(torch.tensor([[-1.4, -1.4, -0.15], [1.4, 1.4, 1.2]]))
     hull = carve_box(cameras, matter, box, 64)
-    evidence = _LampEvidence.of(cameras, *seen_places(cameras, shading, hull, box), hull, box)
+    evidence = _LampEvidence(cameras, *seen_places(cameras, shading, hull, box), hull, box)
     found = _best_lamp(evidence, cameras)[1]
     true = np.array([_LAMP_POSITION[1], _LAMP_POSITION[2] - _LOOK_AT[2], _LAMP_POSITION[0]])
     cosine = np.dot(found.place, true) / np.linalg.norm(found.place) / np.linalg.norm(true)

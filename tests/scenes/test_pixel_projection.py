@@ -11,7 +11,6 @@ from unmix_plugin.scenes.pixel_projection import ProjectedPixels, Projection
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
-from unmix_plugin.spectral.subspace import find_subspace
 
 CPU = torch.device("cpu")
 BANDS = 48
@@ -48,16 +47,16 @@ def test_odd_and_saturated_pixels_are_kept_whole():
     nm = torch.linspace(0, 1, BANDS)
     smooth = torch.stack([torch.exp(-(((nm - centre) / 0.3) ** 2)) for centre in (0.1, 0.5, 0.9)])
     pixels = torch.rand(2000, 3, generator=generator) @ smooth / 3
-    subspace = find_subspace(pixels[:1000], 3)
+    projection = Projection(pixels, 3)
     pixels[700], pixels[1700, 4:7] = torch.rand(BANDS, generator=generator), 1.0
-    held = ProjectedPixels(Projection(subspace, 0.0, 0.0), 2000, CPU)
+    held = ProjectedPixels(projection, 2000, CPU)
     for first in (0, 1000):
         held.put(first, pixels[first : first + 1000])
     assert torch.equal(held.spectra(torch.tensor([1700, 3, 700]))[[0, 2]], pixels[[1700, 700]].half().float())
     others = torch.tensor([index for index in range(2000) if index not in (700, 1700)])
     torch.testing.assert_close(held.spectra(others), pixels[others], atol=1e-3, rtol=0)
     assert held.num_bytes == 2000 * 3 * 2 + 2 * (8 + 2 * BANDS)
-    assert Projection.of(pixels, 3).whole_share == pytest.approx(0.002)
+    assert Projection(pixels, 3).whole_share == pytest.approx(0.002)
 
 
 def test_pixels_that_do_not_fit_are_projected_and_drawn_as_if_they_were_held(tmp_path, monkeypatch):

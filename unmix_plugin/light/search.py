@@ -14,11 +14,11 @@ Notation: `P` places, `N` views, `R` cells along an edge, `S` pairs of a place a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -53,35 +53,19 @@ Candidate = tuple[float, Lamp]
 """Share of the changes that a lamp explains, and the lamp."""
 
 
-@dataclass(frozen=True)
 class _LampEvidence:
-    """Places of a hull, and how bright views show them."""
+    """Places of a hull that enough views see, and how bright these show them."""
 
-    positions: Float[Tensor, "S 3"]
-    normals: Float[Tensor, "S 3"]
-    origins: Float[Tensor, "S 3"]
-    """Of the camera."""
-    place: Int[Tensor, " S"]
-    """Which place it is."""
-    changes: Float[Tensor, " S"]
-    """Of log brightness, from its mean over the views of the place."""
-    hull: Bool[Tensor, "R R R"]
-    box: SceneBox
-
-    @staticmethod
-    def of(cameras: Cameras, places: Places, seen: Seen, hull: Cells, box: SceneBox) -> _LampEvidence:
-        """Of places that enough views see; arguments as `seen_places` gives and takes them."""
+    def __init__(self, cameras: Cameras, places: Places, seen: Seen, hull: Cells, box: SceneBox) -> None:
+        """Arguments as `seen_places` gives and takes them."""
         known = seen.isfinite() & (seen.isfinite().sum(dim=1, keepdim=True) >= FEWEST_VIEWS)
-        place, view = known.nonzero().unbind(-1)
-        return _LampEvidence(
-            places.positions[place],
-            places.normals[place],
-            cameras.camera_to_world[view, :, 3],
-            place,
-            _within(seen[known], place),
-            torch.from_numpy(coarse_hull(hull)),
-            box,
-        )
+        self.place, view = known.nonzero().unbind(-1)
+        """Of each pair of a place and a view that sees it."""
+        self.positions, self.normals = places.positions[self.place], places.normals[self.place]
+        self.origins = cameras.camera_to_world[view, :, 3]
+        self.changes = _within(seen[known], self.place)
+        """Of log brightness, from its mean over the views of the place."""
+        self.hull, self.box = torch.from_numpy(coarse_hull(hull)), box
 
     def share(self, lamp: Lamp, with_shadows: bool = True) -> float:
         """Part of the squared changes that the light of a lamp explains."""
@@ -121,7 +105,7 @@ def find_lamp(cameras: Cameras, log_shading: Pictures, hull: Cells, box: SceneBo
     by_shadows = 0.0
     for half in (is_even, ~is_even):
         part = Places(places.positions[half], places.normals[half])
-        evidence = _LampEvidence.of(cameras, part, seen[half], hull, box)
+        evidence = _LampEvidence(cameras, part, seen[half], hull, box)
         if len(evidence.place.unique()) < FEWEST_PLACES:
             return None
         share, lamp = _best_lamp(evidence, cameras)

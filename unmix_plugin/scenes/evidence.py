@@ -8,8 +8,6 @@ Notation: `B` bands of the scene, `G` groups, `P` points, `R` pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -81,46 +79,40 @@ class AlphaEvidence:
     def log_shading(self) -> Pictures:
         """The same without the brightness of what pixels show, by groups of pixels of like spectra."""
         block = self._largest_block
-        return [local_log_brightness(seen) for seen in block.pictures(_ColourGroups.of(block).shading)]
+        return [local_log_brightness(seen) for seen in block.pictures(_ColourGroups(block).shading)]
 
     @property
     def _largest_block(self) -> PixelBlock:
         return max(self._blocks, key=lambda block: len(block.cameras))
 
 
-@dataclass(frozen=True)
 class _ColourGroups:
     """Groups of pixels whose spectra are multiples of each other, more or less."""
 
-    middles: Float[Tensor, "G B"]
-    """Spectra of length 1."""
-    brightest: Float[Tensor, " G"]
-    """Brightness of those of each group that are lit best."""
-
-    @staticmethod
-    def of(block: PixelBlock) -> _ColourGroups:
-        """From some of a block's opaque pixels."""
+    def __init__(self, block: PixelBlock) -> None:
+        """From some of a block's opaque pixels; none if these are too few."""
         from scipy.cluster.vq import kmeans2  # slow to import
 
         chosen = torch.arange(0, len(block), max(1, len(block) // _PIXELS_TO_GROUP))
         valid, chosen = block.valid[chosen].to(block.alpha.device), chosen.to(block.alpha.device)
         spectra = block.spectra(chosen)
         spectra = spectra[_is_clear(spectra, block.alpha[chosen], valid)]
+        self._middles: Float[Tensor, "G B"] = spectra[:0]
         if len(spectra) < _COLOUR_GROUPS:
-            return _ColourGroups(spectra.new_zeros(0, spectra.shape[1]), spectra.new_zeros(0))
+            return
         directions, rng = normalize(spectra, dim=-1).cpu().numpy(), np.random.default_rng(0)
         middles, group = kmeans2(directions, _COLOUR_GROUPS, minit="++", rng=rng)
         bright, groups = brightness(spectra), torch.from_numpy(group).to(spectra.device)
         own = [bright[groups == k] for k in range(_COLOUR_GROUPS)]
         best = [torch.quantile(each, _LIT_BEST) if len(each) else 1.0 for each in own]
-        return _ColourGroups(torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra))
+        self._middles, self._brightest = torch.from_numpy(middles).to(spectra), torch.tensor(best).to(spectra)
 
     def shading(self, spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:
         """Brightness in that of the best lit pixels of the same group; 0 for pixels that say nothing."""
-        if len(self.middles) == 0:
+        if len(self._middles) == 0:
             return torch.zeros_like(alpha)
-        group = torch.cdist(normalize(spectra, dim=-1), self.middles).argmin(dim=-1)
-        return _clear_brightness(spectra, alpha, valid) / self.brightest[group].clamp(min=1e-6)
+        group = torch.cdist(normalize(spectra, dim=-1), self._middles).argmin(dim=-1)
+        return _clear_brightness(spectra, alpha, valid) / self._brightest[group].clamp(min=1e-6)
 
 
 def _is_clear(spectra: Tensor, alpha: Tensor, valid: Tensor) -> Tensor:

@@ -8,13 +8,11 @@ Notation: `R` pixels, `b` channels of the sensor.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from unmix_plugin.spectral.subspace import SpectralSubspace, find_subspace
+from unmix_plugin.spectral.subspace import find_subspace
 
 Pixels = Int[Tensor, " R"]
 Spectra = Float[Tensor, "R b"]
@@ -30,27 +28,21 @@ _WHOLE_RESERVE = 1.2
 """Room for pixels that are kept whole, in multiples of what some pixels let expect."""
 
 
-@dataclass(frozen=True)
 class Projection:
     """How pixels are projected, and what that leaves."""
 
-    subspace: SpectralSubspace
-    residual: float
-    """Root mean square over some pixels that are not kept whole, in multiples of the noise."""
-    whole_share: float
-    """Of the pixels, that are kept whole."""
-
-    @staticmethod
-    def of(pixels: Float[Tensor, "N b"], num_components: int | None) -> Projection:
-        """Judged by the even ones of some pixels, of a subspace that the odd ones are in; None finds how many
-        components are needed. Raises SpectrumError: too few pixels, or too many components."""
-        subspace = find_subspace(pixels[1::2], num_components)
+    def __init__(self, pixels: Float[Tensor, "N b"], num_components: int | None) -> None:
+        """Judged by the even ones of some pixels, of a subspace that the odd ones are in; None finds how many numbers
+        are needed. Raises SpectrumError: too few pixels, or too many components."""
+        self.subspace = find_subspace(pixels[1::2], num_components)
         seen = pixels[::2]
-        residuals = subspace.residuals(seen, subspace.components(seen))
+        residuals = self.subspace.residuals(seen, self.subspace.components(seen))
         is_whole = _must_stay_whole(seen, residuals)
         kept = residuals[~is_whole]
-        residual = float(kept.square().mean().sqrt()) if len(kept) else float("inf")
-        return Projection(subspace, residual, float(is_whole.float().mean()))
+        self.residual = float(kept.square().mean().sqrt()) if len(kept) else float("inf")
+        """Root mean square over some pixels that are not kept whole, in multiples of the noise."""
+        self.whole_share = float(is_whole.float().mean())
+        """Of the pixels, that are kept whole."""
 
     @property
     def num_channels(self) -> int:

@@ -164,7 +164,7 @@ class PixelTable:
                 pixels = pixels[(deviations(pixels).abs() <= limits).all(dim=1)]
             if number is None and len(pixels) < 2 * (block.num_channels + 1):
                 continue
-            projection = Projection.of(pixels, number)
+            projection = Projection(pixels, number)
             if number is not None or projection.pays(block.pixel_bytes):
                 found[block.sensor] = projection
         return found
