@@ -73,7 +73,11 @@ class HyperspectralDataManager(DataManager):
         """
         super().__init__(config, data=data, device=device, seed=seed)
         self.options = config
-        self.scene = load_scene(_scene_folder(data), config.scene)
+        if data == DEMO:
+            from unmix_plugin.scenes.demo.scene import demo_scene_path
+
+            data = demo_scene_path()
+        self.scene = load_scene(data, config.scene)
         self.scene_box = self.scene.scene_box
         self.train_cameras = self.scene.cameras[list(self.scene.train_indices)]
         self.eval_cameras = self.scene.cameras[list(self.scene.eval_indices)]
@@ -325,11 +329,3 @@ class HyperspectralDataManager(DataManager):
         if points is None:
             return "fixed"
         return judge_exposure(views.cameras, points.places, points.seen_by(len(views.cameras)))
-
-
-def _scene_folder(data: Path) -> Path:
-    if data == DEMO:
-        from unmix_plugin.scenes.demo.scene import demo_scene_path
-
-        return demo_scene_path()
-    return data

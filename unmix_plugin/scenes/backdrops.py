@@ -120,8 +120,8 @@ class BeforeBackdrop:
     thinned: tuple[Bool[np.ndarray, "_ _"], ...]
     """Of every `stride`-th row and column."""
     stride: int
-    sizes: tuple[tuple[int, int], ...]
-    """Width and height of each view."""
+    size: tuple[int, int]
+    """Width and height of a view."""
 
     @property
     def shows_matter(self) -> bool:
@@ -130,20 +130,18 @@ class BeforeBackdrop:
 
     def masks(self) -> list[Bool[np.ndarray, "_ _"]]:
         """Of whole views, which are much larger than what is kept."""
-        return [
-            mask.repeat(self.stride, axis=0).repeat(self.stride, axis=1)[:height, :width]
-            for mask, (width, height) in zip(self.thinned, self.sizes, strict=True)
-        ]
+        repeated = (mask.repeat(self.stride, axis=0).repeat(self.stride, axis=1) for mask in self.thinned)
+        return [mask[: self.size[1], : self.size[0]] for mask in repeated]
 
 
 def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
     """Where something may stand before a backdrop that all views share; None if there is none. Anything may stand
     before pixels that don't count."""
-    sizes = [views.cameras.size(view) for view in range(len(views.cameras))]
-    stride = -(-max(max(size) for size in sizes) // _LONGEST_SIDE_PX)
+    size, count = views.cameras.size(0), len(views.cameras)
+    stride = -(-max(size) // _LONGEST_SIDE_PX)
     bands = views.read(0, (slice(1), slice(1))).shape[2]
     part = (slice(None, None, stride), slice(None, None, stride), slice(None, None, -(-bands // _MOST_BANDS)))
-    chosen = np.linspace(0, len(sizes) - 1, min(len(sizes), _LOOKED_AT)).round().astype(int)
+    chosen = np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int)
 
     def read(view: int) -> tuple[np.ndarray, np.ndarray]:
         image = views.read(view, part)
@@ -155,10 +153,10 @@ def find_before_backdrop(views: Views) -> BeforeBackdrop | None:
     if backdrop is None:
         return None
     masks = []
-    for image, mask in (read(view) for view in range(len(sizes))):
+    for image, mask in (read(view) for view in range(count)):
         seen = backdrop.find(backdrop.features(image), mask)
         masks.append(np.ones_like(mask) if seen is None else _without_specks(~seen.shown) | ~mask)
-    return BeforeBackdrop(tuple(masks), stride, tuple(sizes))
+    return BeforeBackdrop(tuple(masks), stride, size)
 
 
 def _without_specks(matter: Mask) -> Mask:

@@ -41,7 +41,6 @@ class SensorViews(nn.Module):
         """
         super().__init__()
         self.sensor_names = [str(values["name"]) for values in sensors]
-        self._names = [f"matrix_{index}" for index in range(len(sensors))]
         for index, values in enumerate(sensors):
             sensor = SceneSensor.from_json(values, len(rgb_weights))
             matrix = torch.from_numpy(sensor.matrix).float()
@@ -52,11 +51,11 @@ class SensorViews(nn.Module):
         self.register_buffer("plain_colours", rgb_weights.clone(), persistent=False)
 
     def __bool__(self) -> bool:
-        return bool(self._names)
+        return bool(self.sensor_names)
 
     def matrix(self, sensor: SupportsInt) -> Float[Tensor, "b B"]:
         """Operator of a sensor."""
-        return self.get_buffer(self._names[int(sensor)])
+        return self.get_buffer(f"matrix_{int(sensor)}")
 
     def num_channels(self, sensor: int) -> int:
         """b."""
@@ -78,7 +77,7 @@ class SensorViews(nn.Module):
 
     def warnings(self, num_endmembers: int) -> list[str]:
         """Sensors with too few channels to tell so many endmembers apart, and what that means."""
-        counts = [self.num_channels(sensor) for sensor in range(len(self._names))]
+        counts = [self.num_channels(sensor) for sensor in range(len(self.sensor_names))]
         few = [s for s in range(len(counts)) if not self.tells_materials(s, num_endmembers)]
         if not few:
             return []

@@ -291,7 +291,7 @@ def _read_truth(
     faults, key, table = Faults(root), "'endmembers_path'", None
     path = resolve_path(root, entry.endmembers_path, None, key, faults)
     if path is not None:
-        table = read_endmembers(path, bands.centers_nm, entry.materials, key, faults)
+        table = read_endmembers(path, bands.centers_nm, entry.materials, faults)
     named = [(frame.paths.get("abundance_file_path"), frame.where) for frame in entry.frames]
     files = tuple(
         None if file is None else resolve_path(root, file, None, where, faults) for file, where in named

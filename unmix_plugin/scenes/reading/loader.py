@@ -18,7 +18,7 @@ from unmix_plugin.scenes.reading.checks import CheckedFiles, check_files, locate
 from unmix_plugin.scenes.reading.faults import Faults, resolve_path, sha256_of
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 from unmix_plugin.scenes.reading.model_space import find_model_space, make_cameras, without_far_off
-from unmix_plugin.scenes.reading.sensors import check_coverage
+from unmix_plugin.scenes.reading.sensors import unseen_bands
 from unmix_plugin.scenes.reading.splits import Split, split_frames
 from unmix_plugin.scenes.reading.transforms_json import CUBE_KEY, SceneEntry, at_sizes, read_transforms
 from unmix_plugin.scenes.scene import Frame, Scene
@@ -63,9 +63,11 @@ def load_scene(root: Path, options: SceneOptions | None = None) -> Scene:
     split = split_frames(entry, options.eval_split, options.eval_interval, faults)
     if checked is not None and split.train and entry.wavelengths_nm is not None:
         train, far_off = without_far_off(entry, split.train)
-        used, noted = {checked.frames[index].sensor for index in train}, faults.noted
-        check_coverage(checked.sensors, used, entry.wavelengths_nm, faults)
-        if far_off is not None and faults.noted > noted:
+        used = {checked.frames[index].sensor for index in train}
+        unseen = unseen_bands(checked.sensors, used, entry.wavelengths_nm)
+        if unseen is not None:
+            faults.add("'wavelengths'", unseen)
+        if unseen is not None and far_off is not None:
             faults.add(FILE_NAME, far_off)
         split = replace(split, train=train)
         entry = replace(entry, warnings=(*entry.warnings, *checked.warnings, *([far_off] if far_off else [])))
@@ -106,28 +108,24 @@ def _read_truth(root: Path, entry: SceneEntry, options: SceneOptions, faults: Fa
         except SpectrumError as error:
             faults.add("'illuminant_path'", str(error))
     if materials_path is not None and bands is not None:
-        table = read_endmembers(materials_path, bands, names, "'endmembers_path'", faults)
+        table = read_endmembers(materials_path, bands, names, faults)
         names, endmembers = (names, None) if table is None else (table.names, table.spectra)
     return _Truth(names, illuminant, endmembers, light_path, materials_path)
 
 
 def read_endmembers(
-    path: Path,
-    wavelengths_nm: Float64[np.ndarray, " B"],
-    materials: tuple[str, ...] | None,
-    where: str,
-    faults: Faults,
+    path: Path, wavelengths_nm: Float64[np.ndarray, " B"], materials: tuple[str, ...] | None, faults: Faults
 ) -> SpectraTable | None:
     """True endmembers in the order of `materials`, matched by name; None and a noted fault if they do not fit."""
     try:
         table = read_spectra_csv(path).resampled(Bands(wavelengths_nm))
     except SpectrumError as error:
-        return faults.add(where, str(error))
+        return faults.add("'endmembers_path'", str(error))
     if materials is None:
         return table
     if sorted(materials) != sorted(table.names):
         found = f"{path} names {list(table.names)}"
-        return faults.add(where, f"{found}; expected the 'materials' {list(materials)}")
+        return faults.add("'endmembers_path'", f"{found}; expected the 'materials' {list(materials)}")
     order = [table.names.index(name) for name in materials]
     return SpectraTable(table.bands, materials, table.spectra[order])
 

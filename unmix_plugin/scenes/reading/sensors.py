@@ -74,17 +74,13 @@ def group_by_sensor(
     return tuple(sensors), tuple(indices)
 
 
-def check_coverage(
-    sensors: tuple[SceneSensor, ...],
-    train_sensors: set[int],
-    wavelengths_nm: Float64[np.ndarray, " B"],
-    faults: Faults,
-) -> None:
-    """Refuse bands of the scene that no training frame sees: nothing could be learnt of them."""
+def unseen_bands(
+    sensors: tuple[SceneSensor, ...], train_sensors: set[int], wavelengths_nm: Float64[np.ndarray, " B"]
+) -> str | None:
+    """A fault of bands of the scene that no training frame sees: nothing could be learnt of them."""
     seen = np.any([sensors[index].seen_bands for index in sorted(train_sensors)], axis=0)
-    if not seen.all():
-        missing = ", ".join(f"{nm:g}" for nm in wavelengths_nm[~seen])
-        faults.add("'wavelengths'", f"no training frame sees the bands at {missing} nm; leave them out")
+    missing = ", ".join(f"{nm:g}" for nm in wavelengths_nm[~seen])
+    return f"no training frame sees the bands at {missing} nm; leave them out" if missing else None
 
 
 def lonely_sensors(sensors: tuple[SceneSensor, ...], train_sensors: set[int]) -> list[str]:
