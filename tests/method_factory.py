@@ -44,7 +44,12 @@ CONFIG = UnmixModelConfig(
 
 
 def make_model(
-    seed: int = 0, has_alpha: bool = True, light: list[float] | None = None, **settings: Any
+    seed: int = 0,
+    has_alpha: bool = True,
+    light: list[float] | None = None,
+    more_metadata: dict[str, Any] | None = None,
+    more_data: dict[str, np.ndarray] | None = None,
+    **settings: Any,
 ) -> UnmixModel:
     """A model with random parameters of some size, so that its picture isn't uniform."""
     torch.manual_seed(seed)
@@ -56,10 +61,11 @@ def make_model(
         "subpixels": 2,
         "num_train_views": 3,
         "pixel_size": 0.087,
+        **(more_metadata or {}),
     }
     model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
     with torch.no_grad():
-        model.initialise(initial_data(), torch.Generator().manual_seed(seed))
+        model.initialise({**initial_data(), **(more_data or {})}, torch.Generator().manual_seed(seed))
         model.field.get_parameter("table").normal_(std=0.5)
     return model.eval()
 

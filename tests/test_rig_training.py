@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX, CONFIG, NUM_BANDS, WAVELENGTHS_NM, initial_data, make_rays
+from tests import method_factory
+from tests.method_factory import NUM_BANDS, initial_data, make_rays
 from tests.scenes.rig_factory import make_rig
 from unmix_plugin.datamanager import HyperspectralDataManager
 from unmix_plugin.engine.geometry.space import RayBundle
@@ -21,24 +22,9 @@ PIXELS, RAYS = (6, 3), (1, 4)
 
 
 def make_model(**settings) -> UnmixModel:
-    metadata = {
-        "wavelengths_nm": WAVELENGTHS_NM,
-        "illuminant": None,
-        "has_alpha": True,
-        "grid_resolution": 8,
-        "subpixels": 2,
-        "pixel_size": 0.087,
-        "sensors": SENSORS,
-    }
-    torch.manual_seed(0)
-    model: UnmixModel = replace(CONFIG, **settings).setup(scene_box=BOX, metadata=metadata)
-    data = initial_data()
-    typical = data["pixels"].mean(axis=0)
-    seen = {**data, "pixels": data["pixels"][:, BANDS], "sensor": np.array(0), "typical": typical}
-    with torch.no_grad():
-        model.initialise(seen, torch.Generator().manual_seed(0))
-        model.field.get_parameter("table").normal_(std=0.5)
-    return model
+    pixels = initial_data()["pixels"]
+    seen = {"pixels": pixels[:, BANDS], "sensor": np.array(0), "typical": pixels.mean(axis=0)}
+    return method_factory.make_model(more_metadata={"sensors": SENSORS}, more_data=seen, **settings).train()
 
 
 def make_batch() -> tuple[RayBundle, list[MeasuredPixels]]:

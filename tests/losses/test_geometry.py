@@ -5,13 +5,13 @@ import torch
 from torch import nn
 
 from tests.light.test_lamp import model_with_lamp
-from tests.method_factory import CONFIG, NUM_BANDS, losses_of, make_model, make_rays
-from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
+from tests.method_factory import BOX, NUM_BANDS, losses_of, make_model, make_rays
+from unmix_plugin.engine.geometry.space import UnitSpace
 from unmix_plugin.light.shading import LampShading
 from unmix_plugin.losses.geometry import normals_error, stray_light
 from unmix_plugin.model import UnmixModel
 
-SPACE = UnitSpace(SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])), is_unbounded=True)
+SPACE = UnitSpace(BOX, is_unbounded=True)
 CELL = 1 / 64
 NAN = float("nan")
 
@@ -46,10 +46,7 @@ def test_it_draws_light_to_the_surface_alone():
 
 
 def test_it_fades_out_and_needs_pixels_with_known_surfaces():
-    box = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
-    model = CONFIG.setup(
-        scene_box=box, metadata={**make_model(has_alpha=False).metadata, "is_unbounded": True}
-    )
+    model = make_model(has_alpha=False, more_metadata={"is_unbounded": True})
     batch = {"spectra": torch.zeros(2, NUM_BANDS), "alpha": torch.ones(2)}
     guided = {**batch, "surfaces": torch.tensor([[0.1, 0.2, 0.3], [NAN, NAN, NAN]])}
     begin_step = model.get_training_callbacks()[0].func

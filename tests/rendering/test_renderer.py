@@ -11,7 +11,8 @@ import torch
 from torch import nn
 from torch.testing import assert_close
 
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from tests.method_factory import BOX
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import volume_weights
@@ -28,7 +29,6 @@ from unmix_plugin.rendering.renderer import (
 )
 from unmix_plugin.settings import RendererConfig, UnmixFieldConfig
 
-BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 PIXEL = 0.1
 
 

@@ -8,10 +8,9 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.method_factory import BOX as SMALL_BOX
-from tests.method_factory import CONFIG, initial_data, make_model, make_rays
+from tests.method_factory import BOX, make_model, make_rays
 from unmix_plugin.editing.edited_field import EditedField
-from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import UnmixField
 from unmix_plugin.operators.compositing import scale_gradient
@@ -19,8 +18,6 @@ from unmix_plugin.operators.occupancy import OccupancyGrid, skip_distances
 from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.settings import UnmixFieldConfig
-
-BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
 
 def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
@@ -105,10 +102,8 @@ def test_what_is_near_a_camera_learns_more_slowly_but_looks_the_same():
 
 def test_training_tells_the_grid_what_rays_meet_unless_alpha_carves_it():
     carved, boxed = make_model().train(), make_model(has_alpha=False).train()
-    metadata = {**boxed.metadata, "is_unbounded": True}
-    world = CONFIG.setup(scene_box=SMALL_BOX, metadata=metadata).train()
-    with torch.no_grad():
-        world.initialise(initial_data(), torch.Generator().manual_seed(0))
+    world = make_model(has_alpha=False, more_metadata={"is_unbounded": True}).train()
+    torch.nn.init.zeros_(world.field.get_parameter("table"))
     rays = make_rays(200)
     batch = {"spectra": torch.rand(200, 5), "alpha": torch.ones(200), "pixels": torch.arange(200)}
     for model in (carved, boxed, world):
