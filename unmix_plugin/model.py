@@ -41,7 +41,7 @@ from unmix_plugin.operators.occupancy import OccupancyGrid
 from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.poses.training import CorrectedRays, PoseTraining
 from unmix_plugin.presets import choose, preset_for
-from unmix_plugin.rendering.grid_upkeep import is_due, record_seen, update_grid
+from unmix_plugin.rendering.grid_upkeep import GRID_INTERVAL, update_grid
 from unmix_plugin.rendering.published_field import PublishedField
 from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
 from unmix_plugin.sensors.batches import MeasuredPixels, from_batch
@@ -269,12 +269,14 @@ class UnmixModel(Model):
 
     def learn_from(self, step: TrainingBatch) -> None:
         """Note which cells the views see, and how far margins of abundances are from those of measured spectra."""
+        rendered, views = step.rendered, step.corrected.rays.camera_indices
         visible_weight = choose(self.config.renderer.visible_weight, self.preset.visible_weight)
-        record_seen(
-            self.grid, step.rendered, step.corrected.rays.camera_indices, visible_weight, self.processes
-        )
+        if visible_weight < 1:
+            own, is_seen = views.index_select(0, rendered.ray_indices), rendered.weights > visible_weight
+            num_rays = len(views) * self.processes.count
+            self.grid.visibility.record(rendered.positions, own, is_seen, num_rays)
         if self.grid.observed is not None:
-            positions, densities = map(step.rendered.visible.all_of, ("positions", "densities"))
+            positions, densities = map(rendered.visible.all_of, ("positions", "densities"))
             self.grid.record_observed(self.renderer.space.to_unit(positions.detach()), densities)
         self.comparison.observe(step.compared)
         self._pose_training.observe(step.compared, step.corrected)
@@ -395,7 +397,7 @@ class UnmixModel(Model):
     def _begin_step(self, step: int, progress: float) -> None:
         self._progress = progress
         self._pose_training.begin_step(step, progress, self.field)
-        if is_due(step):
+        if step % GRID_INTERVAL == 0:
             update_grid(
                 self.grid,
                 self.field,

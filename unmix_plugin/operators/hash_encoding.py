@@ -130,12 +130,7 @@ class _HashEncode(torch.autograd.Function):
         encoded = positions.new_empty(num_samples, num_levels * ctx.width)
         point, features = vector_type(3, positions.dtype), vector_type(ctx.width, table.dtype)
         rows = encoded.view(num_samples, num_levels, ctx.width)
-        arrays = [
-            as_warp(positions, point),
-            as_warp(table, features),
-            levels,
-            as_warp(rows, features),
-        ]
+        arrays = [as_warp(positions, point), as_warp(table, features), levels, as_warp(rows, features)]
         launch(_encode_kernel, num_samples * num_levels, arrays, positions.device)
         return encoded
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
 from unmix_plugin.operators.occupancy import OccupancyGrid
-from unmix_plugin.rendering.renderer import RenderedRays, VolumeRenderer
+from unmix_plugin.rendering.renderer import VolumeRenderer
 
-_GRID_INTERVAL = 16
+GRID_INTERVAL = 16
 """Steps between updates of the occupancy grid."""
 _PROBED_CELLS = 32_768
 """Cells of the grid that an update probes."""
@@ -34,11 +32,6 @@ _FIRST_CELLS_UNTIL = 0.5
 _SHARE_OF_PIXELS = 0.07
 """Of the pixels of the training views, that must be cast before it is decided anew what is visible. In large pictures
 a cell has many pixels: fewer rays would by chance miss what few views see, and it would be left out for good."""
-
-
-def is_due(step: int) -> bool:
-    """Whether the grid is updated before this training step."""
-    return step % _GRID_INTERVAL == 0
 
 
 def update_grid(
@@ -78,17 +71,3 @@ def _occupied_density(renderer: VolumeRenderer, num_cells: int) -> float:
     by_sample = -math.log1p(-_OCCUPIED_OPACITY) / renderer.step
     across = -math.log1p(-_OPACITY_ACROSS) / (float(renderer.space.shortest_edge) / num_cells)
     return min(by_sample, across)
-
-
-def record_seen(
-    grid: OccupancyGrid,
-    rendered: RenderedRays,
-    views: Int[Tensor, "N"],
-    visible_weight: float,
-    processes: Processes,
-) -> None:
-    """Note which cells the rays of a batch saw, each of a view; nothing where all cells stay visible."""
-    if visible_weight >= 1:
-        return
-    own, is_seen = views.index_select(0, rendered.ray_indices), rendered.weights > visible_weight
-    grid.visibility.record(rendered.positions, own, is_seen, len(views) * processes.count)

@@ -184,7 +184,9 @@ class VolumeRenderer:
         light = self.lamplight(field, origins, positions, generator)
         outputs = field.get_outputs(positions, along, features, light)
         if self.is_unbounded:
-            near = self._near_cameras(kept.t)
+            # What is near a camera fills more of its pixels than what is far, so it would learn faster, and from one
+            # view alone. Source: Philip and Deschaintre 2023, Floaters No More.
+            near = (kept.t / self.space.half_edge).square().clamp(max=1.0)
             densities = scale_gradient(densities, near)
             outputs = {name: scale_gradient(values, near[:, None]) for name, values in outputs.items()}
         depths = densities * self.step
@@ -263,14 +265,6 @@ class VolumeRenderer:
     def space(self) -> UnitSpace:
         """Where the cells of the grid lie."""
         return UnitSpace(self.box, self.is_unbounded)
-
-    def _near_cameras(self, t: Float[Tensor, "S"]) -> Float[Tensor, "S"]:
-        """Factor on gradients: what is near a camera fills more of its pixels than what is far, so it would learn
-        faster, and from one view alone.
-
-        Source: Philip and Deschaintre 2023, Floaters No More.
-        """
-        return (t / self.space.half_edge).square().clamp(max=1.0)
 
     def lamplight(
         self,
