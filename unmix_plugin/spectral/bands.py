@@ -28,7 +28,6 @@ _LONE_BAND_WIDTH_NM = 10.0
 _LEAST_GAP = 2.5
 """A step so many times the spacing beside it is a gap. Two bands missing from an even sampling leave one; a single one,
 or the uneven steps of a multispectral camera, do not."""
-
 _NM_PER_UNIT = {
     **dict.fromkeys(("nm", "nanometer", "nanometers", "nanometre", "nanometres"), 1.0),
     **dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e3),

@@ -26,7 +26,6 @@ from unmix_plugin.spectral.segmentation import material_ids, material_scores
 
 _WHITE = 1e-3
 """Power of every band differs from 1 by no more where radiance is reflectance."""
-
 OCCUPIED_ACCUMULATION = 0.5
 """A ray shows a material only where at least this much of it ends on something."""
 

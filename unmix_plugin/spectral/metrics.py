@@ -22,7 +22,6 @@ from unmix_plugin.spectral.evidence import over_background
 from unmix_plugin.spectral.unmixing.endmembers import DARK_RMS
 
 SSIM_WINDOW_PX = 7
-
 _VALUES_AT_ONCE = 1 << 20
 
 

@@ -123,10 +123,8 @@ def as_numpy(values: Tensor) -> np.ndarray:
 
 _OPAQUE_ALPHA = 0.99
 """Opacity from which an unlabelled pixel counts for the spectral angle."""
-
 _HALF_COVERED = 0.5
 """Opacity from which a pixel's abundances count."""
-
 _VIEW_FIGURES = (
     *("psnr", "psnr_matter", "psnr_unsaturated", "psnr_matter_unsaturated", "psnr_white"),
     *("rmse", "ssim", "sam", "rgb_psnr", "abundance_rmse"),

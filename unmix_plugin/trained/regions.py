@@ -19,7 +19,6 @@ from unmix_plugin.formats.files import NOT_PORTABLE, safe_name
 
 MOST_REGIONS = 256
 """That are kept with a run."""
-
 _LONGEST_NAME = 64
 _MOST_PIXELS = 1 << 26
 

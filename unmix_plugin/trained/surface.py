@@ -34,10 +34,8 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _SOLID_ACCUMULATION = 0.9
 """Rays of which at least this much ends on something give points."""
-
 _TOLERANCE_PX = 2.0
 """Difference of distances, in pixels as large as they are at the point, that still counts as the same surface."""
-
 _SCALE_BOUNDS = (1 / 16, 4.0)
 _SIDE_PX = 24
 """Least side of an image that surfaces are looked for in."""

@@ -27,7 +27,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _END_QUANTILE = 0.07
 """Rays end inside what they hit: this part of them where the density is still lower than at the surface."""
-
 _MOST_MOVED = 3.0
 """Pixels that a vertex is moved at most: deeper, a ray from above went through a hole."""
 _RINGS, _AREA_RINGS = 3, 4

@@ -42,7 +42,6 @@ _CRI_NAMES = (
 
 _LEFT_OUT = ("skin", "caucasian", "oriental", "south asian", "african", "pork", "smurf")
 """Of the built-in charts: skin, meat and figures of comics are no materials of scenes."""
-
 _HUES = (
     *("red", "orange", "yellow", "yellow green", "green"),
     *("bluish green", "blue", "purplish blue", "purple", "magenta"),

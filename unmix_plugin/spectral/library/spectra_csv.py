@@ -23,7 +23,6 @@ from unmix_plugin.spectral.bands import Bands, require_nanometres
 
 _MOST_BYTES = 1 << 26
 """Of a table; two thousand spectra in as many bands have 40 MB."""
-
 TOLERANCE_NM = 1e-3
 """What tables lose of wavelengths by rounding them: centres that differ by no more are the same, and a reach beyond the
 data by no more is not extrapolation."""

@@ -29,7 +29,6 @@ from unmix_plugin.spectral.bands import Bands
 
 _MAX_LENGTH = 500
 """Characters of a formula."""
-
 _ALLOWED = (
     "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs of one value, "
     "min max of several"

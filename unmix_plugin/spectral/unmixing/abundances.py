@@ -27,7 +27,6 @@ from unmix_plugin.errors import SpectrumError
 
 _PIXELS_AT_A_TIME = 65_536
 """Pixels solved together, so that memory stays small: each needs K x K numbers."""
-
 _SUM_WEIGHT = 1e3
 """How much heavier than a spectrum of the endmembers' length the sum-to-one row of `fcls` weighs."""
 _MOST_MATERIALS, _SETS_KEPT = 3, 6
