@@ -153,25 +153,20 @@ _DESCRIPTIONS = (
         "reflectance",
         "spectra",
         "reflectance",
-        "radiance over the scene's light, 1 = as bright as white, shading included; NaN where nothing is",
+        "radiance over the scene's light, 1 = as bright as white, shading included",
     ),
     Output(
         "continuum",
         "spectra",
         "continuum removed",
-        "reflectance over its continuum, the upper convex hull, at most 1; NaN where nothing is",
+        "reflectance over its continuum, the upper convex hull, at most 1",
     ),
-    Output(
-        "derivative",
-        "spectra",
-        "derivative",
-        "derivative of the reflectance by wavelength, 1/nm; NaN where nothing is",
-    ),
+    Output("derivative", "spectra", "derivative", "derivative of the reflectance by wavelength, 1/nm"),
     Output(
         "second_derivative",
         "spectra",
         "second derivative",
-        "second derivative of the reflectance by wavelength, 1/nm^2; NaN where nothing is",
+        "second derivative of the reflectance by wavelength, 1/nm^2",
     ),
     Output("abundances", "shares", "all abundances", "abundances, summing to the opacity", _UNIT),
     Output("segmentation", "labels", "segmentation", "index of the material, 255 where nothing is"),
@@ -373,4 +368,5 @@ def _told(output: MaterialOutput, materials: Materials) -> MaterialOutput:
     if output.name.endswith("derivative"):
         lit_nm = materials.bands.centers_nm[materials.is_lit.cpu().numpy()]
         derivative_matrix(lit_nm[:FEWEST_BANDS])  # which refuses fewer
-    return replace(output, what=output.what + ("" if materials.is_light_known else _OF_RADIANCE))
+    caveat = "" if materials.is_light_known else _OF_RADIANCE
+    return replace(output, what=f"{output.what}; NaN where nothing is{caveat}")
