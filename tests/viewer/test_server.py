@@ -264,7 +264,9 @@ def test_what_a_page_sends_is_checked_before_anything_of_it_is_kept(kind):
 
 
 def test_what_no_control_of_the_viewer_needs_is_not_listened_to():
+    upload = {"source_component_uuid": "a", "transfer_uuid": "b"}
     kinds = [("ShareUrlRequest", {}), ("GuiFormDirtyMessage", {"uuid": "a"})]
+    kinds += [(f"FileTransfer{name}", upload) for name in ("StartUpload", "Part")]
     kinds += [("GuiUpdateMessage", {"uuid": "a", "updates": updates}) for updates in ({"update_cb": 1}, {})]
     for kind, values in kinds:
         assert not _is_heard(msgspec.msgpack.encode({"type": kind, **values}))
@@ -279,30 +281,6 @@ def test_a_fault_is_said_in_one_short_line_and_once():
     loop.close()
     assert len(said) <= connections._MOST_FAULTS
     assert all(len(line) < 400 for line in said)
-
-
-def test_what_a_page_uploads_is_not_kept(viewer):
-    with page_of(viewer) as page:
-        page.look_from(0.3)
-        page.wait_until(lambda: has_control(page, "formula"))
-        upload = {"source_component_uuid": page.control("formula"), "transfer_uuid": "some"}
-        start = {"filename": "a", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2000}
-        page.send("FileTransferStartUpload", **upload, **start)
-        page.send("FileTransferPart", **upload, part_index=0, content=bytes(1000))
-        show_layer(page, "depth")
-        apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
-        assert len(apis) >= 2
-        assert all(not api._current_file_upload_states for api in apis)
-
-
-@pytest.mark.slow
-def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
-    tunnels = []
-    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *words, **_: tunnels.append(words))
-    with opened(viewer) as page:
-        page.send("ShareUrlRequest")
-        show_layer(page, "depth")
-    assert tunnels == []
 
 
 def test_the_private_parts_are_those_of_the_version_that_they_were_taken_from(viewer):

@@ -242,18 +242,14 @@ def test_where_nothing_is_the_background_shows(frame, aids, layer):
         assert_close(picture, torch.full_like(picture, value), atol=1e-5, rtol=0)
 
 
-def test_principal_components_keep_their_colours_when_the_camera_moves(frame, aids):
-    whole, _ = painted(frame, aids, "pca")
-    cropped, _ = painted(frame.map(lambda packed: packed[4:12, 6:18]), aids, "pca")
+@pytest.mark.parametrize("layer", ["band", "index", "pca"])
+def test_colours_mean_the_same_when_the_camera_moves(source, frame, aids, layer):
+    whole, _ = painted(frame, aids, layer, index="1+r650")
+    cropped, _ = painted(frame.map(lambda packed: packed[4:12, 6:18]), aids, layer, index="1+r650")
     assert_close(cropped, whole[4:12, 6:18], atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("layer", ["band", "index"])
-def test_scales_stay_the_same_when_the_camera_moves(source, aids, layer):
     frames = [make_frame(source, source.record.train_cameras[index]) for index in range(3)]
-    legends = [painted(frame, aids, layer, index="1+r650")[1] for frame in frames]
-    assert len({(legend.low, legend.high) for legend in legends}) == 1
-    assert legends[0].high > legends[0].low
+    legends = [painted(one, aids, layer, index="1+r650")[1] for one in frames]
+    assert len({str(legend) for legend in legends}) == 1
 
 
 def test_an_error_is_painted_where_it_is_known(frame, aids):

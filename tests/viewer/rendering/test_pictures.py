@@ -57,15 +57,6 @@ def test_what_training_changes_later_does_not_change_a_frame(source, model):
     assert not frame.materials.endmembers.requires_grad
 
 
-def test_a_render_leaves_the_model_in_the_mode_it_was_in(source, model):
-    model.train()
-    with source.borrowed() as scene:
-        assert not scene.field.training
-        scene.look(source.record.train_cameras[0])
-    assert model.training
-    assert model.field.training
-
-
 speeds = st.floats(1e3, 1e8)
 
 
