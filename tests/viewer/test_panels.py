@@ -363,8 +363,8 @@ def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it
         page.set("replace by the known material")
         page.wait_until(lambda: any(title == one and said in text for one, text in page.notices))
         offered = page.props("light")["options"]
-        assert 3 < len(offered) < len(illuminant_names())
-        for name in offered[1::8]:
+        assert 1 < len(offered) <= len(illuminant_names())
+        for name in offered[1:]:
             edited = viewer.services.maker.edited(Edit(Recipe(illuminant=Light(name))))
             assert edited.light_power is not None
 

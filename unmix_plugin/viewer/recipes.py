@@ -37,37 +37,37 @@ class RecipeHistory:
     """The recipe in force, those before it, and those that were undone."""
 
     def __init__(self, present: Recipe | None = None, clock: Callable[[], float] = time.monotonic) -> None:
-        self._past: list[Recipe] = []
-        self._future: list[Recipe] = []
+        self._recipes, self._index = [present or Recipe()], 0
         self._clock = clock
         self._last_change: tuple[Hashable, float] = (None, 0.0)
-        self.present = present or Recipe()
+
+    @property
+    def present(self) -> Recipe:
+        """The one in force."""
+        return self._recipes[self._index]
 
     def take(self, recipe: Recipe, subject: Hashable = None) -> None:
         """Put another recipe in force; `subject` is what is changed, None for a change that is undone by itself."""
         if recipe == self.present:
             return
         now, (last_subject, changed_at) = self._clock(), self._last_change
-        if subject is None or subject != last_subject or now - changed_at > _ONE_EDIT_S:
-            self._past = [*self._past, self.present][-_MOST_UNDONE:]
-        self._last_change = (subject, now)
-        self._future.clear()
-        self.present = recipe
+        goes_on = subject is not None and subject == last_subject and now - changed_at <= _ONE_EDIT_S
+        before = self._recipes[: self._index if goes_on else self._index + 1]
+        self._recipes = [*before[-_MOST_UNDONE:], recipe]
+        self._index, self._last_change = len(self._recipes) - 1, (subject, now)
 
     def undone(self) -> Recipe | None:
         """Go back by one; None at the beginning."""
-        return self._step(self._past, self._future)
+        return self._step(-1)
 
     def redone(self) -> Recipe | None:
         """Go forward again by one; None at the end."""
-        return self._step(self._future, self._past)
+        return self._step(1)
 
-    def _step(self, source: list[Recipe], target: list[Recipe]) -> Recipe | None:
-        if not source:
+    def _step(self, by: int) -> Recipe | None:
+        if not 0 <= self._index + by < len(self._recipes):
             return None
-        self._last_change = (None, 0.0)
-        target.append(self.present)
-        self.present = source.pop()
+        self._index, self._last_change = self._index + by, (None, 0.0)
         return self.present
 
 

@@ -29,6 +29,7 @@ from unmix_plugin.formats.files import write_file
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
 from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.materials import Materials
+from unmix_plugin.viewer import recipes
 from unmix_plugin.viewer.page import (
     Chart,
     Debounced,
@@ -41,15 +42,6 @@ from unmix_plugin.viewer.page import (
     swatches,
     table,
     text,
-)
-from unmix_plugin.viewer.recipes import (
-    change_of,
-    is_shown,
-    named_by,
-    numbered,
-    with_change,
-    with_swap,
-    with_visible,
 )
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.session import Session
@@ -182,7 +174,7 @@ class MaterialsPanel:
             raise ConfigError("choose one of the recipes saved in the run folder")
         services = self._session.services
         recipe = read_recipe(services.recipes_folder / str(self._saved.value))
-        self._change_recipe(numbered(recipe, services.maker.edited(Edit()).materials.names))
+        self._change_recipe(recipes.numbered(recipe, services.maker.edited(Edit()).materials.names))
 
     def _files(self) -> tuple[str, ...]:
         folder = self._session.services.recipes_folder
@@ -195,7 +187,7 @@ class MaterialsPanel:
         return index_in(self._chosen)
 
     def _change(self, change: Replace | Retint | Scale | Rename | Gloss) -> None:
-        self._change_recipe(with_change(self._recipe, change), (type(change), change.endmember))
+        self._change_recipe(recipes.with_change(self._recipe, change), (type(change), change.endmember))
 
     def _change_light(self) -> None:
         name, recipe = str(self._light.value), self._recipe
@@ -204,14 +196,14 @@ class MaterialsPanel:
         self._change_recipe(replace(recipe, illuminant=None if name == _OWN_LIGHT else Light(name)))
 
     def _change_visible(self) -> None:
-        hidden, index = named_by(self._recipe, Remove), {self._index}
+        hidden, index = recipes.named_by(self._recipe, Remove), {self._index}
         hidden = hidden - index if self._is_visible.value is True else hidden | index
-        self._change_recipe(with_visible(self._recipe, hidden))
+        self._change_recipe(recipes.with_visible(self._recipe, hidden))
 
     def _change_alone(self) -> None:
-        hidden = named_by(self._recipe, Remove) - {self._index}
+        hidden = recipes.named_by(self._recipe, Remove) - {self._index}
         alone = self._index if self._is_alone.value is True else None
-        self._change_recipe(with_visible(self._recipe, hidden, alone))
+        self._change_recipe(recipes.with_visible(self._recipe, hidden, alone))
 
     def _change_gloss(self) -> None:
         is_white = tuple(self._gloss_colour.value[:3]) == _WHITE
@@ -229,7 +221,7 @@ class MaterialsPanel:
             self._change(Rename(self._named, name))
 
     def _swap(self) -> None:
-        self._change_recipe(with_swap(self._recipe, Swap(self._index, index_in(self._other))))
+        self._change_recipe(recipes.with_swap(self._recipe, Swap(self._index, index_in(self._other))))
 
     def _chosen_known(self) -> LibraryMaterial | None:
         name = text(self._known.value)
@@ -269,7 +261,7 @@ class MaterialsPanel:
         self._chart.draw(materials.bands.centers_nm, lines, materials.quantity)
         entries = []
         for index, like in enumerate(_likenesses(self._library, spectra[:_LONGEST_LIST], materials, 1)):
-            hidden = "" if is_shown(self._recipe, index) else " (hidden)"
+            hidden = "" if recipes.is_shown(self._recipe, index) else " (hidden)"
             said = "".join(f", like {one}" for one in like)
             entries.append((f"{materials.names[index]}{hidden}{said}", colours[index]))
         self._listing.content = swatches(entries)
@@ -279,10 +271,10 @@ class MaterialsPanel:
         """Let the controls say what the recipe does to the endmember chosen."""
         with self._session.filling():
             index, recipe = self._index, self._recipe
-            scale, gloss = change_of(recipe, Scale, index), change_of(recipe, Gloss, index)
-            retint = change_of(recipe, Retint, index)
-            self._is_visible.value = is_shown(recipe, index)
-            self._is_alone.value = index in named_by(recipe, Isolate)
+            scale, gloss = recipes.change_of(recipe, Scale, index), recipes.change_of(recipe, Gloss, index)
+            retint = recipes.change_of(recipe, Retint, index)
+            self._is_visible.value = recipes.is_shown(recipe, index)
+            self._is_alone.value = index in recipes.named_by(recipe, Isolate)
             self._factor.value = scale.factor if scale else 1.0
             self._gloss.value = gloss.scale if gloss else 1.0
             self._gloss_colour.value = _bytes(gloss.colour) if gloss and gloss.colour else _WHITE
