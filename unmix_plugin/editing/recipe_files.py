@@ -43,10 +43,8 @@ _MOST_EDITS = 1000
 _MOST_ENDMEMBERS = 255
 """That one edit may name; no run has more."""
 _LONGEST_NUMBER, _LONGEST_QUOTE = 40, 60
-_PLAIN_TAGS = frozenset(
-    f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "timestamp")
-)
-_NUMBER_TAGS = frozenset(f"tag:yaml.org,2002:{kind}" for kind in ("int", "float"))
+_TAG = "tag:yaml.org,2002:"
+_PLAIN = ("str", "int", "float", "bool", "null", "timestamp")
 _KINDS = {kind.kind: kind for kind in OPERATIONS}
 _T = TypeVar("_T")
 
@@ -167,7 +165,7 @@ def _read_edit(node: yaml.Node, folder: Path) -> Operation:
 def _read_light(node: yaml.Node, folder: Path) -> Light:
     """A light by name or file alone, or as a mapping."""
     if not isinstance(node, yaml.MappingNode):
-        node = yaml.MappingNode(node.tag, [(yaml.ScalarNode("tag:yaml.org,2002:str", "light"), node)])
+        node = yaml.MappingNode(node.tag, [(yaml.ScalarNode(f"{_TAG}str", "light"), node)])
     return _read_fields(node, Light, "illuminant", folder)
 
 
@@ -241,16 +239,17 @@ def _scalar(node: yaml.Node) -> Any:
     """A word, number, true, false, date or None; None, too, for lists and mappings."""
     if not isinstance(node, yaml.ScalarNode):
         return None
-    if node.tag not in _PLAIN_TAGS:
+    kind = node.tag.removeprefix(_TAG)
+    if kind not in _PLAIN:
         tag = node.tag[:_LONGEST_QUOTE]
         raise _NodeError(node, f"only plain data is read; found a value with the tag {tag}")
     # YAML 1.1 takes 1:30 for a number in base 60, which nobody means.
-    if node.tag in _NUMBER_TAGS and (len(node.value) > _LONGEST_NUMBER or ":" in node.value):
+    if kind in ("int", "float") and (len(node.value) > _LONGEST_NUMBER or ":" in node.value):
         raise _NodeError(node, f"can't read {_describe(node)} as a number; put it in quotes if it is text")
     try:
         return yaml.constructor.SafeConstructor().construct_object(node)
     except (yaml.YAMLError, ValueError, KeyError, IndexError, OverflowError) as error:
-        raise _NodeError(node, f"can't read {_describe(node)} as {node.tag.rpartition(':')[2]}") from error
+        raise _NodeError(node, f"can't read {_describe(node)} as {kind}") from error
 
 
 def _plain(node: yaml.Node, what: str, kinds: tuple[type, ...], expected: str) -> Any:
