@@ -13,6 +13,7 @@ from tests.formats.video_reading import read_video
 from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.view import ViewOptions, prepared, view
 from unmix_plugin.viewer.access import ViewerOptions
+from unmix_plugin.viewer.rendering.scene import MeasuredViews
 
 
 @pytest.mark.parametrize(
@@ -74,7 +75,7 @@ def wait_for_control(page, label):
 def test_what_was_measured_is_shown_where_the_scene_is_at_hand(trained):
     with served(trained.run) as (viewer, page):
         viewer.services._reader.join(START_S)
-        assert viewer.services.maker.aids.measured is not None
+        assert isinstance(viewer.services.maker.aids.measured, MeasuredViews)
         page.set("layer", "error against a training view")
         page.wait_until(lambda: "mean absolute error of the bands against training view" in page.texts)
         page.set("cameras", True)

@@ -140,15 +140,17 @@ class Services:
         """Read the scene; without it the viewer only lacks what was measured."""
         if self.has_materials:
             _ = self.usable_lights  # takes a second, which the first page need not wait for
-        aids, missing = self.maker.aids, "the scene is not at hand: "
-        with failures_said(
-            "the scene could not be read", lambda reason: aids.set_measured(None, missing + reason)
-        ):
+        aids = self.maker.aids
+
+        def give_up(reason: str) -> None:
+            aids.measured = f"the scene is not at hand: {reason}"
+
+        with failures_said("the scene could not be read", give_up):
             scene = self.scene = self._read_scene()
             if self.has_materials and usable_views(scene):
-                aids.set_measured(MeasuredViews(scene, self.source))
-            elif self.has_materials:
-                aids.set_measured(None, "no training view has all bands")
+                aids.measured = MeasuredViews(scene, self.source)
+            else:
+                aids.measured = "no training view has all bands"
 
 
 @dataclass(frozen=True)

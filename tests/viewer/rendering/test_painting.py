@@ -30,6 +30,7 @@ from unmix_plugin.viewer.rendering.painting import (
     _paint_values,
     _to_display,
 )
+from unmix_plugin.viewer.rendering.scene import MeasuredViews
 from unmix_plugin.viewer.rendering.settings import (
     BACKGROUNDS,
     COLOUR_MAPS,
@@ -252,11 +253,12 @@ def test_colours_mean_the_same_when_the_camera_moves(source, frame, aids, layer)
     assert len({str(legend) for legend in legends}) == 1
 
 
-def test_an_error_is_painted_where_it_is_known(frame, aids):
+def test_an_error_is_painted_where_it_is_known(frame, aids, monkeypatch):
     values = torch.full_like(frame.coefficients.accumulation, 0.05)
     is_known = torch.zeros_like(values, dtype=torch.bool)
     is_known[3, 4] = True
-    known = replace(aids, error_of=lambda _: (values, is_known, "train_007"))
+    monkeypatch.setattr(MeasuredViews, "error", lambda *_: (values, is_known, "train_007"))
+    known = replace(aids, measured=object.__new__(MeasuredViews))
     picture, legend = painted(frame, known, "error", value_range=(0.0, 0.1), background="white")
     assert_close(picture[3, 4], _colour_table("viridis")[512], atol=0.01, rtol=0)
     assert_close(picture[0, 0], torch.ones(3))

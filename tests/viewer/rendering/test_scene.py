@@ -249,7 +249,7 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_
     camera = scene.cameras[scene.train_indices[1]]
     ball = replace(source, take=lambda: ball_of(camera).scene)
     maker = PictureMaker(ball)
-    maker.aids.set_measured(views)
+    maker.aids.measured = views
     turns, turn = [], source.device.guest_turn
     monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
     taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1)
@@ -267,10 +267,10 @@ def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_ren
     aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene), has_materials=True)
 
     def slowly(*arguments):
-        aids.set_measured(views)
+        aids.measured = views
         return render(*arguments)
 
     monkeypatch.setattr(aids_module, "render_reference", slowly)
     found = aids.for_layers()
     assert found is not None
-    assert found.error_of == views.error
+    assert found.measured is views

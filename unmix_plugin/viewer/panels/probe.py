@@ -23,7 +23,7 @@ from unmix_plugin.trained.protocol import Probe, RenderableScene
 from unmix_plugin.viewer.page import Chart, Line, bars, new_file, number, paragraph, table
 from unmix_plugin.viewer.panels.materials import likeness_rows
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
-from unmix_plugin.viewer.rendering.scene import Edit
+from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews
 from unmix_plugin.viewer.session import Session
 from unmix_plugin.viewer.view_cameras import camera_of
 
@@ -90,7 +90,9 @@ def _take_probe(
     with maker.edit_turn(edit) as (scene, shown):
         seen = surface_at(shown, camera, place)
         measured, point = maker.aids.measured, torch.from_numpy(seen[1]).float()
-        found = measured and measured.measurement(point, camera, shown.light_power, scene)
+        found = None
+        if isinstance(measured, MeasuredViews):
+            found = measured.measurement(point, camera, shown.light_power, scene)
     if found is None:
         return _ProbedPoint(number, *seen, shown.materials)
     view, spectrum = found

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.editing import sample_seen
@@ -47,9 +47,6 @@ def render_reference(scene: TrainedScene, cameras: Cameras) -> tuple[Coefficient
 
 _MOST_REMEMBERED = 32
 
-_ErrorOf = Callable[[MaterialView], tuple[Float[Tensor, "H W"], Bool[Tensor, "H W"], str]]
-"""A view's error against the nearest training view, where it is known, and that view's name."""
-
 
 @dataclass(frozen=True)
 class LayerAids:
@@ -61,8 +58,8 @@ class LayerAids:
     reference_points: Float[Tensor, "N 3"]
     """Where the rays end, model space."""
     scene_box: SceneBox
-    error_of: _ErrorOf | None = None
-    why_no_error: str = "the scene is not at hand"
+    measured: MeasuredViews | str = "the scene is not at hand"
+    """What the training views measured, or why that is unknown."""
     _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
 
     def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
@@ -104,15 +101,10 @@ class SceneAids:
     """What layers and edits need of the scene beside the view itself: made again as training goes on."""
 
     def __init__(self, source: SceneSource, has_materials: bool) -> None:
-        self.measured: MeasuredViews | None = None
-        """What the training views measured, once the scene is read."""
-        self._why_not_measured = "the scene is still being read"
+        self.measured: MeasuredViews | str = "the scene is still being read"
+        """What the training views measured, or why that is unknown: noted by another thread at any moment."""
         self._source, self._has_materials = source, has_materials
         self._for_layers, self._seen = Renewed(1), Renewed(2)
-
-    def set_measured(self, measured: MeasuredViews | None, why_not: str = "") -> None:
-        """Note what was measured, or why that is unknown."""
-        self.measured, self._why_not_measured = measured, why_not
 
     def for_layers(self) -> LayerAids | None:
         """What layers need; None without materials. Must not be called while the scene is lent."""
@@ -126,9 +118,7 @@ class SceneAids:
 
         # What a training has ended with is looked at for long.
         aids = self._for_layers.get(None, self._source.version, make, STEPS_KEPT if is_training else 1)
-        # Noted by another thread at any moment, also while the reference was rendered.
-        error_of = None if self.measured is None else self.measured.error
-        return replace(aids, error_of=error_of, why_no_error=self._why_not_measured)
+        return replace(aids, measured=self.measured)
 
     def see(self, scene: TrainedScene) -> Coefficients:
         """What the training cameras see of the scene, or of what edits leave of it, not long ago; called while it is

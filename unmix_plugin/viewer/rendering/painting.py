@@ -337,9 +337,9 @@ def _paint_depth(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
 
 
 def _paint_error(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -> tuple[_Picture, Legend]:
-    if aids.error_of is None:
-        raise ConfigError(f"no error to show: {aids.why_no_error}")
-    values, is_known, view = aids.error_of(frame)
+    if isinstance(aids.measured, str):
+        raise ConfigError(f"no error to show: {aids.measured}")
+    values, is_known, view = aids.measured.error(frame)
     label = f"mean absolute error of the bands against training view {view}, where it sees the same"
     return _paint_scaled(values, is_known.to(values), settings, (0.0, 0.1), label)
 
