@@ -108,6 +108,9 @@ def test_foreign_pages_take_no_place_and_their_site_is_said_once(ask):
     assert ask(gate, OPENING) is None
 
 
+MINE = socket.gethostname()
+
+
 @pytest.mark.parametrize(
     ("origin", "host", "is_own"),
     [
@@ -135,30 +138,22 @@ def test_pages_of_other_sites_are_told_by_their_origin_and_host(origin, host, is
 
 
 @pytest.mark.parametrize(
-    ("origin", "host", "is_own"),
+    ("origin", "host", "listens_at", "has_token", "is_own"),
     [
-        ("https://lab.example", {"host": "lab.example"}, True),
-        ("https://lab.example", {**HERE, "x-forwarded-host": "lab.example"}, True),
-        ("https://lab.example", HERE, False),
-        ("http://127.0.0.1:8000", HERE, False),
-        ("null", HERE, False),
+        ("https://lab.example", {"host": "lab.example"}, "127.0.0.1", True, True),
+        ("https://lab.example", {**HERE, "x-forwarded-host": "lab.example"}, "127.0.0.1", True, True),
+        ("https://lab.example", HERE, "127.0.0.1", True, False),
+        ("http://127.0.0.1:8000", HERE, "127.0.0.1", True, False),
+        ("null", HERE, "127.0.0.1", True, False),
+        ("http://lab.example:7007", {"host": "lab.example:7007"}, "lab.example", False, True),
+        ("http://lab.example:7007", {"host": "lab.example:7007"}, "0.0.0.0", False, False),
+        (f"http://{MINE}:7007", {"host": f"{MINE}:7007"}, "0.0.0.0", False, True),
     ],
 )
-def test_with_the_token_a_page_may_come_through_a_proxy_but_not_from_elsewhere(origin, host, is_own):
-    assert _is_own_page({"origin": origin, **host}, "127.0.0.1", has_token=True) is is_own
-
-
-@pytest.mark.parametrize(
-    ("name", "listens_at", "is_own"),
-    [
-        ("lab.example", "lab.example", True),
-        ("lab.example", "0.0.0.0", False),
-        (socket.gethostname(), "0.0.0.0", True),
-    ],
-)
-def test_a_name_is_own_if_the_viewer_listens_there_or_everywhere_on_that_machine(name, listens_at, is_own):
-    page = {"origin": f"http://{name}:7007", "host": f"{name}:7007"}
-    assert _is_own_page(page, listens_at) is is_own
+def test_with_the_token_a_page_may_come_through_a_proxy_and_without_it_under_a_name_of_the_viewers(
+    origin, host, listens_at, has_token, is_own
+):
+    assert _is_own_page({"origin": origin, **host}, listens_at, has_token) is is_own
 
 
 def test_a_malformed_cookie_of_another_program_does_not_hide_ours_and_malformed_words_are_wrong_ones(ask):

@@ -177,15 +177,6 @@ def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, s
     assert not bool((is_known & ~hits).any())
 
 
-def test_views_stand_where_training_corrected_them(views, scene, ball_of):
-    index = scene.train_indices[2]
-    shift = lambda camera: replace(camera, center_px=camera.center_px + 2.0)  # noqa: E731
-    frame = ball_of(shift(scene.cameras[index]))
-    corrected = tuple(replace(one, camera=shift(one.camera)) for one in frame.scene.views)
-    errors, is_known, _ = views.error(replace(frame, scene=replace(frame.scene, views=corrected)))
-    assert_close(errors[is_known], difference(scene, index)[is_known], atol=1e-6, rtol=0)
-
-
 def test_a_point_is_measured_by_the_view_nearest_to_the_camera_and_one_inside_by_none(views, scene, ball_of):
     index = scene.train_indices[1]
     camera = scene.cameras[index]
@@ -218,31 +209,35 @@ def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_
     assert float(found[1].min()) > 0
 
 
-def test_what_was_measured_is_compared_in_the_light_that_the_scene_is_shown_in(views, scene, ball_of):
-    index = scene.train_indices[2]
-    camera, frame = scene.cameras[index], ball_of(scene.cameras[index])
-    light = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
-    materials = replace(frame.materials, endmembers=frame.materials.endmembers * light, light=light)
-    relit_frame = replace(frame, scene=replace(frame.scene, materials=materials))
-    errors, is_known, _ = views.error(relit_frame)
-    assert_close(errors[is_known], difference(scene, index, light=light)[is_known], atol=1e-6, rtol=0)
-    lights = (None, light.double().numpy())
-    plain, relit = (views.measurement(on_ball(camera), camera, shown, frame.scene) for shown in lights)
-    assert_close(relit[1], plain[1] * light)
+LIGHT = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
+GAIN = torch.linspace(0.5, 2.0, 6)
 
 
-def test_what_was_measured_is_compared_as_exposed_as_the_scene(views, scene, ball_of):
-    number = 2
-    index = scene.train_indices[number]
-    camera, frame = scene.cameras[index], ball_of(scene.cameras[index])
+@pytest.mark.parametrize(
+    ("shift_px", "light", "gain"), [(2.0, None, None), (0.0, LIGHT, None), (0.0, None, GAIN)]
+)
+def test_what_was_measured_is_compared_from_where_as_lit_and_as_exposed_as_the_scene(
+    views, scene, ball_of, shift_px, light, gain
+):
+    index, shift = (
+        scene.train_indices[2],
+        lambda camera: replace(camera, center_px=camera.center_px + shift_px),
+    )
+    camera = shift(scene.cameras[index])
+    frame = ball_of(camera)
     gains = torch.ones(len(scene.train_indices), 6)
-    gains[number] = torch.linspace(0.5, 2.0, 6)
-    fitted = replace(frame.scene, view_gains=gains)
-    errors, is_known, _ = views.error(replace(frame, scene=fitted))
-    assert_close(errors[is_known], difference(scene, index, gains[number])[is_known], atol=1e-6, rtol=0)
-    scenes = (frame.scene, fitted)
-    plain, alike = (views.measurement(on_ball(camera), camera, None, shown) for shown in scenes)
-    assert_close(alike[1], plain[1] / gains[number])
+    gains[2] = 1.0 if gain is None else gain
+    materials = frame.materials
+    if light is not None:
+        materials = replace(materials, endmembers=materials.endmembers * light, light=light)
+    corrected = tuple(replace(one, camera=shift(one.camera)) for one in frame.scene.views)
+    shown = replace(frame.scene, views=corrected, view_gains=gains, materials=materials)
+    errors, is_known, _ = views.error(replace(frame, scene=shown))
+    expected = difference(scene, index, gains[2], 1.0 if light is None else light)
+    assert_close(errors[is_known], expected[is_known], atol=1e-6, rtol=0)
+    plain = views.measurement(on_ball(camera), camera, None, replace(frame.scene, views=corrected))
+    alike = views.measurement(on_ball(camera), camera, shown.light_power, shown)
+    assert_close(alike[1], plain[1] / gains[2] * (1.0 if light is None else light))
 
 
 def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_of, source, monkeypatch):
