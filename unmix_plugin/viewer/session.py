@@ -217,12 +217,12 @@ class Session:
         self._legend = client.gui.add_html("")
 
     def _first_state(self) -> PageState:
-        services = self.services
-        history = RecipeHistory(services.first_recipe)
-        if services.has_materials:
-            settings = first_settings(services.maker.edited(Edit(history.present)).materials.bands)
-        else:
-            settings = LayerSettings(layer=next(iter(services.maker.layers), "rgb"))
+        maker, history = self.services.maker, RecipeHistory(self.services.first_recipe)
+        settings = LayerSettings()
+        if self.services.has_materials:
+            settings = first_settings(maker.edited(Edit(history.present)).materials.bands)
+        elif settings.layer not in maker.layers:
+            settings = LayerSettings(layer=next(iter(maker.layers), settings.layer))
         rows = number(self.client.camera.image_height, DEFAULT_HEIGHT, HEIGHT_BOUNDS[1], DEFAULT_HEIGHT)
         return PageState(settings, history, int(rows) // 16 * 16)
 

@@ -101,7 +101,7 @@ class RenderLoop:
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
         with self._capturing:
-            pass
+            pass  # a thread in native code when the interpreter ends takes the process down with it
 
     def add(self, view: View) -> None:
         """Serve a view."""
