@@ -60,7 +60,7 @@ class LayerAids:
     scene_box: SceneBox
     measured: MeasuredViews | str = "the scene is not at hand"
     """What the training views measured, or why that is unknown."""
-    _kept: dict[tuple[str, bytes], Any] = field(default_factory=dict, repr=False, compare=False)
+    _kept: Renewed = field(default_factory=lambda: Renewed(_MOST_REMEMBERED), repr=False, compare=False)
 
     def reference_spectra(self, materials: Materials) -> Float[Tensor, "N B"]:
         """What the rays show with the given materials, as if each ended fully on what it ended on."""
@@ -85,12 +85,7 @@ class LayerAids:
         """What `make` gives, kept for the materials that clients look at."""
         spectra = torch.cat([materials.endmembers, materials.specular_spectra])
         key = (what, spectra.cpu().numpy().tobytes())
-        found = self._kept.get(key)  # looked up once: another thread may clear what is kept at any moment
-        if found is None:
-            if len(self._kept) >= _MOST_REMEMBERED:
-                self._kept.clear()
-            found = self._kept[key] = make(materials)
-        return found
+        return self._kept.get(key, 0, lambda: make(materials))
 
 
 def _colours(materials: Materials) -> Float[Tensor, "K 3"]:
