@@ -17,7 +17,7 @@ from unmix_plugin.trained.regions import InView, Region, check_name, polygon_mas
 from unmix_plugin.viewer.page import Chart, Line, bars, failures_said, paragraph, table, text
 from unmix_plugin.viewer.panels.probe import add_click_switch
 from unmix_plugin.viewer.session import Session
-from unmix_plugin.viewer.view_cameras import ViewPose
+from unmix_plugin.viewer.view_cameras import pose_of
 
 _OUTLINE, _PART = "/outline", "/region"
 _COLOUR = (230, 30, 90)
@@ -38,7 +38,6 @@ class RegionsPanel:
         self._session = session
         self._camera: Cameras | None = None
         """From which the corners were clicked."""
-        self._pose: ViewPose | None = None
         self._corners: list[tuple[float, float]] = []
         """Column and row in its picture."""
         self._is_busy = False
@@ -66,11 +65,11 @@ class RegionsPanel:
         return [(left, top), (right, top), (right, bottom), (left, bottom)]
 
     def _take(self, camera: Cameras, place: tuple[float, float]) -> None:
-        pose = self._session.pose()
-        has_moved = bool(self._corners) and pose != self._pose
+        before = self._camera
+        has_moved = before is not None and pose_of(before) != pose_of(camera)
         if has_moved or (self._shape.value == _SHAPES[0] and len(self._corners) == 2):
             self._corners = []
-        self._camera, self._pose = camera, pose
+        self._camera = camera
         self._corners.append(place)
         self._draw()
         begun = "The view has changed, so the outline begins here. " if has_moved else ""
