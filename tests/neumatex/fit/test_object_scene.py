@@ -298,6 +298,11 @@ def _mixed_pictures(folder: Path) -> None:
     _change_frames(folder, 3, file_path="images/png.png")
 
 
+def _other_light(folder: Path, **keys: Any) -> None:
+    write_cubes(folder / DIM, 2, 0.5, **keys)
+
+
+BANDS_AS_COLOURS = {f"S0.{nm},0nm": 1.0 for nm in (450, 550, 650)}
 FAULTS = {
     "truth of another size": (
         partial(_truth, size=12, names="RGB"),
@@ -308,12 +313,12 @@ FAULTS = {
         lambda folder: write_views(folder / DIM, ".png", COLOUR, count=2),
         "is camera, a response that is learnt from .* but those are linear; expected linear, srgb or agx",
     ),
-    "bands under a held-out light": (
-        lambda folder: write_cubes(folder / DIM, 2, 0.5, wavelengths=None),
-        "dim: pictures of 5 bands; the object has 3 colours: give the same",
+    "held-out bands": (
+        partial(_other_light, wavelengths=None),
+        "dim: pictures of 5 bands; the object has 3 colours",
     ),
     "bands that are no colours": (
-        partial(_pictures, channels={f"S0.{nm},0nm": 1.0 for nm in (450, 550, 650)}),
+        partial(_pictures, channels=BANDS_AS_COLOURS),
         "light's spectrum is not known",
     ),
     "mesh elsewhere": (
@@ -326,7 +331,7 @@ FAULTS = {
     ),
     "alpha of nothing": (
         partial(_pictures, channels=dict.fromkeys("RGBA", 0.0)),
-        "no pixel shows the object; write alpha",
+        "no pixel shows the object",
     ),
     "mesh without area": (partial(_reshape, factor=0.0), "has an area"),
     "no mesh": (lambda folder: (folder / "mesh.ply").unlink(), r"has no mesh; put mesh.glb or .* there"),
@@ -471,7 +476,7 @@ def test_bands_of_frames_that_are_all_in_order_change_nothing(spectral_folder):
         ({"materials": ["blue"]}, "endmembers_path"),
         (
             partial(_bands_per_frame, bands=[4, 3, 2, 1, 0]),
-            "'bands' does not list all 5 bands of its picture in order",
+            "'bands' does not list all 5 bands of its picture",
         ),
         (partial(_bands_per_frame, bands=[0, 1, 2]), "5 'wavelengths' for pictures of 3 bands"),
         (_own_responses, "has 'responses_path', which is not followed here"),
@@ -481,15 +486,15 @@ def test_bands_of_frames_that_are_all_in_order_change_nothing(spectral_folder):
             r"has shape \(12, 12, 2\); expected \(24, 24, 2\): .* and 2 materials",
         ),
         (
-            lambda folder: _change(folder / DIM, tone_mapping="srgb"),
-            "pictures of 5 bands with 'tone_mapping' srgb; expected linear light",
+            partial(_other_light, tone_mapping="srgb"),
+            "of 5 bands with 'tone_mapping' srgb; expected linear light",
         ),
         (_store_integers, "holds uint16; expected floats, or 'value_scale'"),
         (
             lambda folder: _change_arrays(folder / DIM / "cubes", lambda cube: cube[..., :4]),
             "pictures of 4 bands; the object has 5 bands",
         ),
-        (lambda folder: write_cubes(folder / DIM, 2, 1.0, wavelengths=[1, 2]), "wavelengths"),
+        (partial(_other_light, wavelengths=[1, 2]), "wavelengths"),
     ],
 )
 def test_light_that_is_not_known_in_every_band_is_refused(spectral_folder, spoil, expected):

@@ -80,17 +80,6 @@ def test_our_own_gltf_comes_back_as_it_was_in_the_world(tmp_path, up, extras):
     assert_close(mesh.normals, torch.from_numpy(normals))
 
 
-def test_normals_of_the_file_are_kept(tmp_path):
-    sphere = trimesh.creation.icosphere(subdivisions=1)
-    tilted = np.add(sphere.vertices, (0.3, 0, 0))
-    normals = tilted / np.linalg.norm(tilted, axis=1, keepdims=True)
-    trimesh.Trimesh(sphere.vertices, sphere.faces, vertex_normals=normals, process=False).export(
-        tmp_path / "m.glb", include_normals=True
-    )
-    mesh = read_mesh(tmp_path / "m.glb")
-    assert_close(mesh.normals, torch.tensor(normals, dtype=torch.float32), atol=1e-5, rtol=0)
-
-
 @pytest.mark.parametrize("has_normals", [False, True])
 def test_each_piece_is_turned_so_that_its_front_is_seen(tmp_path, has_normals):
     inward, outward = (trimesh.creation.icosphere(subdivisions=2) for _ in range(2))

@@ -103,7 +103,7 @@ class Pattern:
     second: Float[Tensor, " P"]
     sharpness: float
     """Small is smooth, large is two-coloured."""
-    stripes: float
+    stripes: float = 0.0
     """Stripes a unit of the noise; 0 for patches."""
 
     def parameters(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N P"]:
@@ -169,7 +169,6 @@ def _car_paint(rng: np.random.Generator) -> Pattern:
         layered_parameters(base | coat, colour),
         layered_parameters(second | coat, colour * rng.uniform(0.55, 0.8)),
         sharpness=1.5,
-        stripes=0.0,
     )
 
 
@@ -185,8 +184,7 @@ def _velvet(rng: np.random.Generator) -> Pattern:
         Noise.draw(rng, rng.uniform(4, 8)),
         layered_parameters(fuzz | cloth, first),
         layered_parameters(fuzz | cloth, second),
-        9.0,
-        0.0,
+        sharpness=9.0,
     )
 
 

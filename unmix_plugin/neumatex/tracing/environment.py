@@ -75,9 +75,8 @@ class Environment:
 
     def mean_radiance(self) -> Float[Tensor, " C"]:
         """Mean radiance over the sphere, a colour."""
-        return (self._scaled_image.double() * self._solid_angles[:, None, None]).sum(dim=(0, 1)).float() / (
-            4 * math.pi
-        )
+        power = (self._scaled_image.double() * self._solid_angles[:, None, None]).sum(dim=(0, 1))
+        return power.float() / (4 * math.pi)
 
     def _picture_coordinates(self, directions: Tensor) -> tuple[Tensor, Tensor]:
         """u and v in [0, 1]."""

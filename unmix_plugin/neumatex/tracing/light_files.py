@@ -178,10 +178,7 @@ def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
     width = len(row)
     coded = _NEW_RUNS[0] <= width <= _NEW_RUNS[1] and data[start : start + 2] == b"\x02\x02"
     if not coded:
-        row[:] = np.frombuffer(data, np.uint8, 4 * width, start).reshape(width, 4)
-        if (row[:, :3] == 1).all(axis=1).any():  # no brightness is written so
-            raise ValueError("runs as they were written before 1991")
-        return start + 4 * width
+        return _read_old_row(data, start, row)
     if data[start + 2] << 8 | data[start + 3] != width:
         raise ValueError("length of the row")
     start += 4
@@ -198,6 +195,21 @@ def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
                 raise ValueError("run")
             row[column : column + count, channel] = values
             column, start = column + count, start + used
+    return start
+
+
+def _read_old_row(data: bytes, start: int, row: np.ndarray) -> int:
+    """A row of plain pixels, in which (1, 1, 1, n) repeats the pixel before it."""
+    column, shift = 0, 0
+    while column < len(row):
+        pixel, count, start = np.frombuffer(data, np.uint8, 4, start), 1, start + 4
+        is_run = tuple(pixel[:3]) == (1, 1, 1)
+        if is_run:
+            pixel, count = row[column - 1], int(pixel[3]) << shift
+            if column == 0 or column + count > len(row):
+                raise ValueError("run")
+        row[column : column + count] = pixel
+        column, shift = column + count, shift + 8 if is_run else 0
     return start
 
 
