@@ -12,9 +12,7 @@ import trimesh
 from torch import Tensor
 
 from tests.viewer.view_factory import BOX, ring
-from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.runs.scene_record import SceneRecord
-from unmix_plugin.neumatex.demo.objects import viewpoints
 from unmix_plugin.neumatex.fit.tone import tone_curve
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.environment import Environment
@@ -156,11 +154,6 @@ def ball(subdivisions: int = 3) -> Mesh:
 def knot() -> Mesh:
     """A torus in [-1, 1]^3."""
     return mesh_from(trimesh.creation.torus(0.7, 0.3, major_sections=48, minor_sections=24))
-
-
-def ring_cameras(count: int, size: int) -> Cameras:
-    """Cameras that look at the origin from several sides."""
-    return viewpoints(count, size, 1.0)
 
 
 CAMERAS = ring()

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from torch.testing import assert_close
 
-from tests.neumatex.surfaces import ball, generator, mesh_from, ring_cameras, unit
+from tests.neumatex.surfaces import ball, generator, mesh_from, unit
 from tools.prior_objects import (
     TrainingObjects,
     random_environment,
@@ -29,6 +29,7 @@ from tools.train_prior import (
     write_small_prior,
 )
 from unmix_plugin.errors import RunError, SceneError
+from unmix_plugin.neumatex.demo.objects import viewpoints
 from unmix_plugin.neumatex.prior.observations import (
     NUM_LOBES,
     PosedViews,
@@ -301,7 +302,7 @@ def posed_views(alpha: float = 1.0) -> PosedViews:
     """In which pixels are coloured by where they are in the picture."""
     ramp = ((torch.arange(32) + 0.5) / 32).expand(32, 32)
     picture = torch.stack([ramp, ramp.T, torch.full((32, 32), 0.5)], dim=-1)
-    return PosedViews(ring_cameras(5, 32), [picture] * 5, [torch.full((32, 32), alpha)] * 5)
+    return PosedViews(viewpoints(5, 32, 1.0), [picture] * 5, [torch.full((32, 32), alpha)] * 5)
 
 
 @pytest.fixture(scope="module")

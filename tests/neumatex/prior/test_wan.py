@@ -14,6 +14,7 @@ from torch.testing import assert_close
 from tests.neumatex.surfaces import generator
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.neumatex.prior.wan import WanPrior, read_wan_prior
+from unmix_plugin.neumatex.tracing.surface import Triplane
 
 WAN_1_3B: dict[str, Any] = {
     "num_layers": 30, "num_attention_heads": 12, "attention_head_dim": 128, "ffn_dim": 8960, "patch_size": (1, 2, 2),
@@ -66,7 +67,7 @@ def test_the_real_size_turns_views_into_planes_of_their_resolution(real_size):
 def test_a_tiny_prior_gives_a_triplane_that_can_be_optimised():
     prior = WanPrior(*tiny_models(), num_parameters=9, generator=generator())
     planes = prior(*views(32))
-    triplane = prior.triplane(planes[0])
+    triplane = Triplane.filled(prior.readers, planes[0], 32)
     assert_close(triplane.planes.detach(), planes[0].detach())
     assert triplane.parameters_at(torch.zeros(5, 3)).shape == (5, 9)
     planes.square().mean().backward()

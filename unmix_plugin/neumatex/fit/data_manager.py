@@ -144,11 +144,9 @@ class ObjectDataManager(DataManager):
         return self._names[index]
 
     def get_train_rays_per_batch(self) -> int:
-        """Pixels of the next training batch."""
         return self._num_rays
 
     def set_train_rays_per_batch(self, num_rays: int) -> None:
-        """Let the next training batches have `num_rays` pixels."""
         self._num_rays = num_rays
 
     def get_training_callbacks(self) -> list[TrainingCallback]:

@@ -21,7 +21,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from unmix_plugin.errors import ConfigError, install_hint
-from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS, Readers, Triplane
+from unmix_plugin.neumatex.tracing.surface import NUM_CHANNELS, Readers
 
 if TYPE_CHECKING:
     from diffusers.models.autoencoders.autoencoder_kl_wan import AutoencoderKLWan
@@ -76,7 +76,7 @@ class WanPrior(nn.Module):
     def forward(
         self, orbit: Float[Tensor, "B 3 17 S S"], canonical: Float[Tensor, "B 3 6 S S"]
     ) -> Float[Tensor, "B 3 12 S S"]:
-        """Planes XY, YZ, XZ of objects.
+        """Planes XY, YZ, XZ of objects; `Triplane.filled` makes of one's planes and `readers` what a fit starts from.
 
         Args:
             orbit, canonical: Tone-mapped views, [-1, 1]: in order around the object; along +x, -x, +y, -y, +z, -z.
@@ -106,10 +106,6 @@ class WanPrior(nn.Module):
         alone = (latents * self.latents_std + self.latents_mean).transpose(1, 2).flatten(0, 1)[:, :, None]
         planes = self.autoencoder.decoder(self.autoencoder.post_quant_conv(alone))
         return planes[:, :, 0].unflatten(0, (-1, 3))
-
-    def triplane(self, planes: Float[Tensor, "3 12 S S"]) -> Triplane:
-        """One object's planes with copies of the networks that read them."""
-        return Triplane.filled(self.readers, planes, planes.shape[-1])
 
 
 def _widened(autoencoder: AutoencoderKLWan) -> AutoencoderKLWan:
