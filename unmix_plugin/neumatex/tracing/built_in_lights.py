@@ -16,6 +16,7 @@ from unmix_plugin.neumatex.tracing.environment import Environment, directions_of
 
 _Directions = Float64[np.ndarray, "*pixels 3"]
 _Radiance = Float64[np.ndarray, "*pixels 3"]
+_Number = float | int
 
 _MEAN_RADIANCE = 0.8
 """Of every built-in environment, over the sphere and the colours."""
@@ -33,28 +34,28 @@ def built_in_environment(name: str, seed: int = 0, height: int = 128) -> Environ
     return Environment(environment.image * gain)
 
 
-def _towards(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
+def _towards(azimuth_deg: _Number, elevation_deg: _Number) -> np.ndarray:
     """Unit vector of an azimuth (from +x to +y) and an elevation."""
     azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
     flat = np.cos(elevation)
     return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
-def _colour(*values: float) -> np.ndarray:
+def _colour(*values: _Number) -> np.ndarray:
     return np.array(values, dtype=np.float64)
 
 
-def _tint(rng: np.random.Generator, strength: float) -> np.ndarray:
+def _tint(rng: np.random.Generator, strength: _Number) -> np.ndarray:
     return 1.0 + strength * rng.uniform(-1, 1, 3)
 
 
-def _step(values: np.ndarray, at: float, width: float) -> np.ndarray:
+def _step(values: np.ndarray, at: _Number, width: _Number) -> np.ndarray:
     """From 0 below `at` to 1 above, smooth over `width`."""
     t = np.clip((values - at) / width + 0.5, 0, 1)
     return t * t * (3 - 2 * t)
 
 
-def _disc(d: _Directions, centre: np.ndarray, radius_deg: float, soft: float = 0.15) -> np.ndarray:
+def _disc(d: _Directions, centre: np.ndarray, radius_deg: _Number, soft: _Number = 0.15) -> np.ndarray:
     """1 inside a round light, 0 outside, with an edge of `soft` radii."""
     angle = np.arccos(np.clip(d @ centre, -1, 1))
     radius = np.deg2rad(radius_deg)
@@ -62,7 +63,7 @@ def _disc(d: _Directions, centre: np.ndarray, radius_deg: float, soft: float = 0
 
 
 def _panel(
-    d: _Directions, azimuth_deg: float, elevation_deg: float, width_deg: float, height_deg: float
+    d: _Directions, azimuth_deg: _Number, elevation_deg: _Number, width_deg: _Number, height_deg: _Number
 ) -> np.ndarray:
     """1 on a rectangular light that faces the origin, 0 beside it."""
     forward = _towards(azimuth_deg, elevation_deg)
