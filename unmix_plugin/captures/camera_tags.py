@@ -15,7 +15,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
 from xml.etree import ElementTree
@@ -175,6 +175,19 @@ def band_of(tags: XmpTags) -> BandTable | None:
         fwhm_nm = np.array(widths) if len(widths) == len(centres) and min(widths) > 0 else None
         return BandTable(np.array(centres, dtype=np.float64), f"XMP tag {name}, nm", fwhm_nm)
     return None
+
+
+def with_camera_tags(table: BandTable, tags: XmpTags, num_bands: int) -> BandTable:
+    """The table with what a multispectral camera's XMP says of its bands, if nothing else says it."""
+    names = tag_value(tags, "BandName")
+    named = (names,) if isinstance(names, str) else tuple(names or ())
+    if table.names is None and len(named) == num_bands:
+        table = replace(table, names=named)
+    found = band_of(tags) or BandTable()
+    if table.wavelengths_nm is not None or found.wavelengths_nm is None:
+        return table
+    is_fitting = len(found.wavelengths_nm) == num_bands
+    return replace(found, names=table.names, bad=table.bad) if is_fitting else table
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import band_of, parse_xmp
+from unmix_plugin.captures.camera_tags import parse_xmp, with_camera_tags
 from unmix_plugin.captures.header_values import exposure_facts
 from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
@@ -55,9 +55,8 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     allow_decoded(path, width * height * num_bands * dtype.itemsize, CaptureError)
     alpha = mode in ("RGBA", "LA", "PA") or "transparency" in info
     xmp = parse_xmp(info.get("xmp") or b"")
-    bands = band_of(xmp)
-    if bands is None or bands.wavelengths_nm is None or len(bands.wavelengths_nm) != num_bands:
-        bands = BandTable(names=("red", "green", "blue") if num_bands == 3 else None)
+    colours = BandTable(names=("red", "green", "blue") if num_bands == 3 else None)
+    bands = with_camera_tags(colours, xmp, num_bands)
     metadata: dict[str, Any] = {"xmp": xmp} if xmp else {}
     if num_bands == 3 and dtype.itemsize == 1 and bands.wavelengths_nm is None:
         metadata["encoding"] = "sRGB"

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unmix_plugin.captures.camera_tags import band_of, camera_tags, tag_value
+from unmix_plugin.captures.camera_tags import camera_tags, with_camera_tags
 from unmix_plugin.captures.header_values import StatedBands, check_bands, exposure_facts, state_bands
 from unmix_plugin.captures.readers.arrays import choose_axes, image_shape
 from unmix_plugin.captures.readers.gdal import gdal_entries, gdal_items, gdal_linear, gdal_number
@@ -30,7 +30,6 @@ from unmix_plugin.captures.spectral_file import (
     COLOURS_AS_STORED,
     Axes,
     BandIndex,
-    BandTable,
     ReadOptions,
     SpectralFile,
     import_extra,
@@ -130,7 +129,7 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         shape=shape,
         dtype=stack.dtype,
         read_part=lambda rows, wanted: _read_part(path, stack, axes, rows, wanted),
-        bands=_with_camera_tags(bands, tags["xmp"], shape[2]),
+        bands=with_camera_tags(bands, tags["xmp"], shape[2]),
         interleave=interleave,
         linear=linear,
         no_data=stack.no_data,
@@ -210,7 +209,6 @@ def _find_stack(path: Path, file: TiffFile, warnings: list[str]) -> _Stack:
     first, size = like[0], path.stat().st_size
     for page in like:
         _check_page(path, page, size)
-        _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
     compressed = [page for page in like if not _is_mappable(page)]
     of_strip = max((math.prod(page.chunks) * page.dtype.itemsize for page in compressed), default=0)  # type: ignore[union-attr]
     allow_decoded(path, max(of_strip, sum(page.nbytes for page in compressed)), CaptureError)
@@ -269,11 +267,14 @@ def _image_pages(file: TiffFile) -> list[TiffPage]:
     """Pages that are no previews or masks, with those that lie below a page (SubIFDs); of several positions or times of
     an OME-TIFF those of the first."""
     in_file: Any = file.pages
-    listed: list[Any] = list(in_file)
+    listed = list(in_file)  # before the series, which take pages for more of the first one
     if file.is_ome and len(file.series) > 1 and len({series.shape for series in file.series}) == 1:
         listed = [page for page in file.series[0].pages if page is not None]
-    below = [sub for page in listed for sub in (page.pages or ())]
-    return [page for page in [*listed, *below] if not (page.is_reduced or page.is_mask)]
+    return [page for page in _with_below(listed) if not (page.is_reduced or page.is_mask)]
+
+
+def _with_below(pages: Any) -> list[Any]:
+    return [*pages, *(sub for page in pages for sub in (page.pages or ()))]
 
 
 def _mask_pages(path: Path, file: TiffFile, image: TiffPage) -> list[TiffPage]:
@@ -281,15 +282,12 @@ def _mask_pages(path: Path, file: TiffFile, image: TiffPage) -> list[TiffPage]:
 
     Source: TIFF 6.0, NewSubfileType 4 and PhotometricInterpretation 4; GDAL, GTiff driver, internal masks.
     """
-    in_file: Any = file.pages
-    below = [sub for page in in_file for sub in (page.pages or ())]
     # Pages that tifffile takes for more of the first one (OME) have no marks of their own.
-    marked = [page for page in [*in_file, *below] if getattr(page, "is_mask", False)]
+    marked = [page for page in _with_below(file.pages) if getattr(page, "is_mask", False)]
     found = [page for page in marked if not page.is_reduced]
     masks = [page for page in found if page.shaped[2:] == (*image.shaped[2:4], 1) and page.shaped[0] == 1]
     for page in masks:
         _check_page(path, page, path.stat().st_size)
-        _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
     allow_decoded(path, sum(page.nbytes for page in masks), CaptureError)
     return masks
 
@@ -325,6 +323,7 @@ def _check_page(path: Path, page: TiffPage, file_size: int) -> None:
         end = max(end, page.dataoffsets[0] + page.nbytes)
     if end > file_size:
         raise CaptureError(f"{where}: cut short: its numbers reach to byte {end} of {file_size}")
+    _ = page.decode, page.jpegtables  # read now, as the file is closed afterwards
 
 
 def _is_mappable(page: TiffPage) -> bool:
@@ -419,16 +418,3 @@ def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
         if all(0 < len(name) < 200 for name in names) and len(set(names)) == len(names):
             return StatedBands(what, names=names)
     return StatedBands("the file")
-
-
-def _with_camera_tags(table: BandTable, xmp: dict[str, Any], num_bands: int) -> BandTable:
-    """The table with what a multispectral camera's XMP says, if nothing else says it."""
-    names = tag_value(xmp, "BandName")
-    named = (names,) if isinstance(names, str) else tuple(names or ())
-    if table.names is None and len(named) == num_bands:
-        table = replace(table, names=named)
-    found = band_of(xmp) or BandTable()
-    if table.wavelengths_nm is not None or found.wavelengths_nm is None:
-        return table
-    is_fitting = len(found.wavelengths_nm) == num_bands
-    return replace(found, names=table.names, bad=table.bad) if is_fitting else table
