@@ -4,7 +4,6 @@ From the folder of each layout to a scene that loads, with the values and splits
 """
 
 import json
-import re
 import shutil
 from functools import partial
 
@@ -92,20 +91,16 @@ def test_frames_of_some_lists_are_split_as_scenes_are(tmp_path, lists, expected)
 @pytest.mark.parametrize(
     ("listed", "message"),
     [
-        (["frame_00000.png", "frame_00001.png"], r"2 of 2 .*\(frame_00000.png, frame_00001.png\)"),
-        (
-            ["./train/frame_00000.png", "train/frame_00001.jpg", None],
-            r"2 of 3 .*\(train/frame_00001.jpg, None\)",
-        ),
-        (3, r"1 of 1 .*\(3\)"),
+        (["frame_00000.png"], "lists 'frame_00000.png', which is the file_path of no frame"),
+        (["./train/frame_00000.png", "train/frame_00001.jpg"], "lists 'train/frame_00001.jpg', which"),
+        (["./train/frame_00000.png", None], "is a list of 2; expected a list of file paths"),
     ],
 )
 def test_lists_that_name_no_frame_are_refused(tmp_path, key, listed, message):
     write_unmix(tmp_path, "train", "train", **{key: listed})
     for find in (find_unmix_nerf, find_nerfstudio):
-        with pytest.raises(CaptureError, match=f"'{key}' .*such as train/frame_00000.png") as caught:
+        with pytest.raises(CaptureError, match=f"'{key}':? {message}"):
             find(tmp_path, PLAIN)
-        assert re.search(message, str(caught.value))
 
 
 def as_integers(root):

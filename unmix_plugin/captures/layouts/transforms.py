@@ -3,9 +3,8 @@ NeSpoF's captures, `nespof-real`.
 
 The frames are those of transforms.json, or of Blender's transforms_train.json and its like, whose paths have no suffix.
 
-`nerfstudio`: RGB pictures, each as a cube of three bands; an alpha channel says what is matter. Files of other kinds
-are opened as what they are, such as the ENVI headers of HSI-Nerfstudio in `datadir`. A picture has no wavelengths, only
-primaries; the user gives three numbers.
+`nerfstudio`: RGB pictures, each as a cube of three bands without wavelengths; an alpha channel says what is matter.
+Files of other kinds are opened as what they are, such as the ENVI headers of HSI-Nerfstudio in `datadir`.
 
 `unmix-nerf`, `hs-nerf`: frames have `hyperspectral_file_path`. UnMix-NeRF names .npy cubes, wavelengths and labels,
 HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are lists in the file, otherwise the folder of a frame's file:
@@ -13,21 +12,10 @@ HS-NeRF .pt tensors of 8 bits without wavelengths. Splits are lists in the file,
 them, are followed there. Keys of scene folders are followed, too: `value_scale`, `fwhm`, and `bands`, `sensor` and
 `capture` of a frame.
 
-NeSpoF has one OpenEXR file for each view and wavelength, which holds Stokes components s0 to s3.
-
-`nespof`, rendered scenes; transforms_test.json lists the frames of the other two again:
-
-    transforms_{train,val,test}.json   `camera_angle_x`, frames with `file_path` "./train/r_0" (no suffix)
-    450/train/r_0.exr ... 650/...      s0 is the radiance; maybe alpha
-    seg/r_0.png                        labels, if any
-
-`nespof-real`, captures:
-
-    poses_bounds.npy                   LLFF poses, one row a view, in the order of the names of views
-    exr/<view>/450.exr                 one folder a view
-
-NeSpoF's files have s0, s1, s2, s3 and maybe alpha, in this order; files of Mitsuba's Stokes integrator have 16 channels
-with the intensity in the fifth.
+`nespof`, `nespof-real`: one OpenEXR file for each view and wavelength, with the Stokes components s0 to s3 and maybe
+alpha, in this order; or Mitsuba's 16 channels, with the intensity in the fifth. Frames of a rendered scene are
+"./train/r_0" with the files 450/train/r_0.exr ... 650/train/r_0.exr, and maybe labels in seg/r_0.png. A capture has
+exr/<view>/450.exr, and poses_bounds.npy with one row a view, in the order of the names of views.
 """
 
 from __future__ import annotations
@@ -56,9 +44,15 @@ from unmix_plugin.captures.spectral_file import (
     SpectralFile,
     linear_values,
 )
-from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.scenes.reading.faults import Faults, read_number
-from unmix_plugin.scenes.reading.transforms_json import read_sensor_entry, read_value_scale, read_widths
+from unmix_plugin.scenes.reading.splits import split_by_lists
+from unmix_plugin.scenes.reading.transforms_json import (
+    read_sensor_entry,
+    read_split_lists,
+    read_value_scale,
+    read_widths,
+)
 
 Split: TypeAlias = Literal["train", "eval"]
 _SPLIT_OF_FILE: dict[str, Split] = {"train": "train", "val": "eval", "eval": "eval", "test": "eval"}
@@ -107,13 +101,8 @@ class _FrameList:
 
 
 def _read_frames(root: Path, key: str) -> _FrameList:
-    """Frames of transforms.json, or of transforms_train.json and its like; repeated ones are left out and noted.
-
-    Args:
-        key: Names a file in every frame.
-    Raises:
-        CaptureError: none of these is there, or one has no frames, or a frame lacks the key.
-    """
+    """Frames of transforms.json, or of transforms_train.json and its like; repeated ones are left out and noted. Raises
+    CaptureError: none of these is there, or one has no frames, or a frame lacks the key of its file."""
     whole = root / "transforms.json"
     files: dict[Path, Split | None] = {whole: None}
     if not whole.is_file():
@@ -143,34 +132,18 @@ def _read_frames(root: Path, key: str) -> _FrameList:
 
 
 def _split_by_lists(frames: tuple[_Frame, ...], top: dict[str, Any], root: Path) -> tuple[_Frame, ...]:
-    """Splits from `train_filenames` and the like: evaluation is test if there is any, otherwise validation, otherwise
-    what training leaves; without a list for training, it is what the others leave. Raises CaptureError: a list names
-    what no frame does."""
-    known = {frame.text(key) for frame in frames for key in _NAME_KEYS} - {""}
-    lists: list[set[str]] = []
-    for key in ("train_filenames", "val_filenames", "test_filenames"):
-        values = top.get(key) or []
-        listed = [path_text(str(value)) for value in (values if isinstance(values, list) else [values])]
-        if unknown := [name for name in listed if name not in known]:
-            raise CaptureError(
-                f"{root}: {len(unknown)} of {len(listed)} paths in '{key}' are those of no frame "
-                f"({name_some(unknown)}); expected them as frames have them, such as {frames[0].name}"
-            )
-        lists.append(set(listed))
-    train, val, test = lists
-    evaluation = test or val
-    if not (train or evaluation):
+    """Splits from `train_filenames` and the like, where there are some that are not empty."""
+    faults = Faults(root)
+    lists = {name: listed for name, listed in read_split_lists(top, faults).items() if listed}
+    names = [[text for key in _NAME_KEYS if (text := frame.text(key))] for frame in frames]
+    train, evaluation = split_by_lists(names, lists, faults)
+    faults.raise_if_any(CaptureError)
+    if not lists:
         return frames
-
-    def split_of(frame: _Frame) -> Split | None:
-        names = {frame.text(key) for key in _NAME_KEYS}
-        if names & evaluation:
-            return "eval"
-        if names & train or not (train or names & val):
-            return "train"
-        return None if evaluation else "eval"
-
-    return tuple(replace(frame, split=split_of(frame)) for frame in frames)
+    splits: list[Split | None] = [
+        "eval" if index in evaluation else "train" if index in train else None for index in range(len(frames))
+    ]
+    return tuple(replace(frame, split=split) for frame, split in zip(frames, splits, strict=True))
 
 
 def _make_capture(
@@ -304,10 +277,7 @@ def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[
         for message in _not_followed(frame, entry.bands, None if centres is None else len(centres)):
             faults.add(frame.where, message)
         entries.append(entry)
-    try:
-        faults.raise_if_any()
-    except SceneError as error:
-        raise CaptureError(str(error)) from error
+    faults.raise_if_any(CaptureError)
     # Frames without a name are of one sensor if their bands are the same.
     unnamed = list(dict.fromkeys(entry.bands for entry in entries if entry.name is None))
     stated = []

@@ -30,7 +30,7 @@ from unmix_plugin.captures.poses.pose_set import (
     reading,
 )
 from unmix_plugin.captures.poses.xml_cameras import find_orientations, read_metashape, read_micmac
-from unmix_plugin.errors import CaptureError, SceneError, counted, name_some
+from unmix_plugin.errors import CaptureError, counted, name_some
 from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
@@ -230,10 +230,7 @@ def read_transforms(contents: Mapping[Path, Any], sizes: Mapping[str, _Size]) ->
         placement = read_placement(top, faults, path.name)
         metres.add(read_metres_per_unit(top, faults, path.name))
         found = _read_frames(path, top, frames, sizes, faults, warned, said)
-        try:
-            faults.raise_if_any()
-        except SceneError as error:
-            raise CaptureError(str(error)) from error
+        faults.raise_if_any(CaptureError)
         if not placement.is_identity:
             said.append("applied_transform and applied_scale are undone")
         for (name, *others), matrix, lens in found:

@@ -18,7 +18,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from unmix_plugin.errors import SceneError, name_some
+from unmix_plugin.errors import SceneError, UnmixError, name_some
 from unmix_plugin.limits import MOST_TABLE_BYTES, parse_json, read_bounded
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME
 
@@ -52,19 +52,19 @@ class Faults:
         if where not in places:
             places.append(where)
 
-    def raise_if_any(self) -> None:
-        """End here if anything is wrong. Raises SceneError: one or more faults were noted; its message lists them."""
+    def raise_if_any(self, kind: type[UnmixError] = SceneError) -> None:
+        """End here if anything is wrong. Raises an error of this kind: faults were noted; its message lists them."""
         lines = [
             message if places == [str(self._root)] else f"{name_some(places)}: {message}"
             for message, places in self._places.items()
         ]
         if len(lines) == 1:
-            raise SceneError(f"{self._root}: {lines[0]}")
+            raise kind(f"{self._root}: {lines[0]}")
         listed = [f"  {number}. {line}" for number, line in enumerate(lines[:MAX_LISTED], start=1)]
         if len(lines) > MAX_LISTED:
             listed.append(f"  and {len(lines) - MAX_LISTED} more")
         if lines:
-            raise SceneError("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
+            raise kind("\n".join([f"{self._root}: {len(lines)} faults in the scene", *listed]))
 
 
 class UnreadableJsonError(ValueError):

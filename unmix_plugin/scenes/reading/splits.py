@@ -6,6 +6,7 @@ Evaluation frames are those of the test split if there are any, otherwise those 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Literal
@@ -53,26 +54,41 @@ def split_frames(
 
 
 def _by_lists(entry: SceneEntry, faults: Faults) -> Split:
-    owners: dict[str, set[int]] = {}  # several frames may share a picture, such as those of a rig's cubes
-    for index, frame in enumerate(entry.frames):
-        for key in (CUBE_KEY, "file_path"):
-            if key in frame.paths:
-                owners.setdefault(_plain(frame.paths[key]), set()).add(index)
-    chosen: dict[str, set[int]] = {}
-    for name, paths in entry.split_lists.items():
-        for path in paths:
-            if _plain(path) not in owners:
-                faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
-        chosen[name] = {index for path in paths for index in owners.get(_plain(path), ())}
-    everything = set(range(len(entry.frames)))
-    train = chosen.get("train", everything - chosen.get("val", set()) - chosen.get("test", set()))
-    evaluation = chosen.get("test") or chosen.get("val")
-    if evaluation is None:
-        evaluation = everything - chosen["train"] if "train" in chosen else set()
+    names = [
+        [frame.paths[key] for key in (CUBE_KEY, "file_path") if key in frame.paths] for frame in entry.frames
+    ]
+    train, evaluation = split_by_lists(names, entry.split_lists, faults)
     for index in sorted(train & evaluation):
         message = "is listed for training and for evaluation; a frame trained on cannot judge the result"
         faults.add(entry.frames[index].where, message)
     return Split(tuple(sorted(train)), tuple(sorted(evaluation)))
+
+
+def split_by_lists(
+    names: Sequence[Iterable[str]], lists: Mapping[str, Sequence[str]], faults: Faults
+) -> tuple[set[int], set[int]]:
+    """Indices of frames that train and that evaluate.
+
+    Args:
+        names: Paths that each frame is called by.
+        lists: Those of `train`, `val` and `test`, where there are some; a fault is noted where no frame has one.
+    """
+    owners: dict[str, set[int]] = {}  # several frames may share a picture, such as those of a rig's cubes
+    for index, paths in enumerate(names):
+        for path in paths:
+            owners.setdefault(_plain(path), set()).add(index)
+    chosen: dict[str, set[int]] = {}
+    for name, paths in lists.items():
+        for path in paths:
+            if _plain(path) not in owners:
+                faults.add(f"'{name}_filenames'", f"lists {path!r}, which is the file_path of no frame")
+        chosen[name] = {index for path in paths for index in owners.get(_plain(path), ())}
+    everything = set(range(len(names)))
+    train = chosen.get("train", everything - chosen.get("val", set()) - chosen.get("test", set()))
+    evaluation = chosen.get("test") or chosen.get("val")
+    if evaluation is None:
+        evaluation = everything - chosen["train"] if "train" in chosen else set()
+    return train, evaluation
 
 
 def _plain(path: str) -> str:

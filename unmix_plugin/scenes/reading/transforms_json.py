@@ -274,7 +274,7 @@ def read_transforms(root: Path, faults: Faults, needs_cubes: bool = True) -> Sce
         endmembers_path=_read_text(content, "endmembers_path", FILE_NAME, faults),
         value_scale=read_value_scale(content, faults),
         fwhm_nm=read_widths(content, faults),
-        split_lists=_read_split_lists(content, faults),
+        split_lists=read_split_lists(content, faults),
         frames=tuple(_read_frame(content, frame, i, faults, needs_cubes) for i, frame in enumerate(frames)),
         placement=read_placement(content, faults, FILE_NAME),
         metres_per_unit=read_metres_per_unit(content, faults, FILE_NAME),
@@ -408,7 +408,8 @@ def _read_materials(content: dict[str, Any], faults: Faults) -> tuple[str, ...] 
     return tuple(values)
 
 
-def _read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tuple[str, ...]]:
+def read_split_lists(content: dict[str, Any], faults: Faults) -> dict[str, tuple[str, ...]]:
+    """Paths of `train`, `val` and `test`, where there are lists of them; with a noted fault where one is wrong."""
     lists: dict[str, tuple[str, ...]] = {}
     for name in ("train", "val", "test"):
         values = content.get(f"{name}_filenames")
