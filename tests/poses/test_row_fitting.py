@@ -1,6 +1,5 @@
 """Rows of a line camera move until the scene looks like what they measured."""
 
-import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
@@ -10,7 +9,7 @@ from torch.testing import assert_close
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import KeyPoses, rotation_matrix
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
-from unmix_plugin.poses.row_fitting import _solve_banded, fit_rows, main_axes
+from unmix_plugin.poses.row_fitting import fit_rows, main_axes
 
 ROWS, WIDTH, FOCAL_PX, HEIGHT, SWEEP = 64, 48, 60.0, 2.0, 2.0
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -0.1], [1.0, 1.0, 0.1]]))
@@ -44,12 +43,14 @@ def look(rays: RayBundle, axes: Float[Tensor, "2 C"]) -> Float[Tensor, "R D"]:
     return torch.cat([found[:, :2] @ axes, found[:, 2:]], dim=1)
 
 
-def fitted(truth: Cameras, valid: Tensor | None = None, spoilt: slice = slice(0, 0)) -> Cameras:
-    """From the sweep without wobble, by the picture of `truth`, in which some rows are white."""
+def fitted(
+    truth: Cameras, valid: Tensor | None = None, spoilt: slice = slice(0, 0), start: Cameras | None = None
+) -> Cameras:
+    """From the sweep without wobble, or another start, by the picture of `truth`, in which some rows are white."""
     picture = seen(truth.image_rays(0)).view(ROWS, WIDTH, 3)
     picture[spoilt] = 1.0
     valid = torch.ones(ROWS, WIDTH, dtype=torch.bool) if valid is None else valid
-    return fit_rows(camera(), picture[..., :2], valid, picture[..., 2], BOX, look)
+    return fit_rows(start or camera(), picture[..., :2], valid, picture[..., 2], BOX, look)
 
 
 def off_by(found: Cameras, truth: Cameras) -> float:
@@ -83,10 +84,7 @@ def test_pixels_that_are_not_valid_do_not_pull() -> None:
 
 def test_a_line_camera_with_key_poses_of_its_own_starts_from_them() -> None:
     truth = camera(1.0)
-    picture = seen(truth.image_rays(0)).view(ROWS, WIDTH, 3)
-    valid = torch.ones(ROWS, WIDTH, dtype=torch.bool)
-    found = fit_rows(truth, picture[..., :2], valid, picture[..., 2], BOX, look)
-    assert off_by(found, truth) < 0.02
+    assert off_by(fitted(truth, start=truth), truth) < 0.02
 
 
 def test_the_channels_that_are_compared_hold_all_that_two_materials_show() -> None:
@@ -95,24 +93,3 @@ def test_the_channels_that_are_compared_hold_all_that_two_materials_show() -> No
     axes = main_axes(mixed)
     assert_close(mixed @ axes @ axes.T, mixed, atol=1e-5, rtol=0)
     assert main_axes(mixed[:0]).shape == (5, 3)
-
-
-@pytest.mark.parametrize("num_knots", [4, 5, 9])
-def test_the_banded_solution_is_the_dense_one(num_knots: int) -> None:
-    generator = np.random.default_rng(0)
-    blocks = np.zeros((4, num_knots, 6, 6))
-    dense = np.zeros((num_knots, 6, num_knots, 6))
-    for knot in range(num_knots - 3):
-        rows = generator.normal(size=(30, 24))
-        normal = (rows.T @ rows).reshape(4, 6, 4, 6)
-        dense[knot : knot + 4, :, knot : knot + 4] += normal
-        for low in range(4):
-            for high in range(low, 4):
-                blocks[high - low, knot + low] += normal[high, :, low]
-    blocks[0] += np.eye(6)
-    dense += np.einsum("ab,ij->aibj", np.eye(num_knots), np.eye(6))
-    pull = generator.normal(size=(num_knots, 6))
-    matrix = dense.reshape(6 * num_knots, -1)
-    matrix[np.diag_indices_from(matrix)] *= 1.01
-    expected = np.linalg.solve(matrix, pull.ravel()).reshape(pull.shape)
-    np.testing.assert_allclose(_solve_banded(blocks, pull, 0.01), expected, rtol=1e-8, atol=1e-12)

@@ -94,21 +94,24 @@ def test_trees_of_several_days_may_have_the_same_names_and_references_above_them
     assert any("references: white.hdr;" in note for note in find_cubes(tmp_path, PLAIN).notes)
 
 
-def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
-    write_tree(tmp_path / "tree")
+def reflectances(tmp_path: Path) -> tuple[list[np.ndarray], list[str]]:
+    """What the command makes of the tree, view by view, and what it says."""
     write_poses(tmp_path / "poses.json", NAMES)
     options = {"poses": str(tmp_path / "poses.json"), "saturation": 60000.0, "max_noise": 9.0}
-    process(tmp_path / "tree", tmp_path / "scene", **options)
-    for index, name in enumerate(NAMES):
-        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
-        np.testing.assert_allclose(stored, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
+    said = process(tmp_path / "tree", tmp_path / "scene", **options)
+    return [np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535 for name in NAMES], said
+
+
+def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
+    write_tree(tmp_path / "tree")
+    for index, values in enumerate(reflectances(tmp_path)[0]):
+        np.testing.assert_allclose(values, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
 
 
 @pytest.mark.parametrize("names", ["WHITEDARKREF_{}", "whitedark_{}", "{}_White-Dark_Reference"])
 def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, names):
     """Specim IQ writes WHITEDARKREF where the white was taken before, with another exposure."""
     write_tree(tmp_path / "tree")
-    write_poses(tmp_path / "poses.json", NAMES)
     for name in NAMES:
         folder = tmp_path / "tree" / name / "capture"
         write_cube(folder, names.format(name), counts(300, 3), header={"tint": 10})
@@ -119,14 +122,10 @@ def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, nam
     assert "4 of 4 views have a dark frame for their white reference alone" in str(
         find_cubes(tmp_path / "tree", PLAIN)
     )
-    options = {"poses": str(tmp_path / "poses.json"), "saturation": 60000.0, "max_noise": 9.0}
-    wrong = process(tmp_path / "tree", tmp_path / "scene", **options)
-    assert not any(
-        "dark current" in text for text in wrong
-    )  # each dark was exposed like what it is taken off
-    for index, name in enumerate(NAMES):
-        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
-        np.testing.assert_allclose(stored, (1000 + 100 * index) / (1800 + 400 * index) / 4, atol=1e-4)
+    found, wrong = reflectances(tmp_path)
+    assert not any("dark current" in text for text in wrong)  # each was exposed like what it is taken off
+    for index, values in enumerate(found):
+        np.testing.assert_allclose(values, (1000 + 100 * index) / (1800 + 400 * index) / 4, atol=1e-4)
 
 
 def test_reflectances_of_the_camera_are_taken_where_a_white_is_missing(tmp_path):
@@ -166,20 +165,16 @@ def test_views_of_several_sizes_become_sensors(tmp_path):
 
 def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_path):
     write_tree(tmp_path / "tree")
-    write_poses(tmp_path / "poses.json", NAMES)
     for path in [*tmp_path.glob("tree/*/results/*"), *tmp_path.glob("tree/214/capture/WHITEREF*")]:
         path.unlink()
-    options = {"poses": str(tmp_path / "poses.json"), "saturation": 60000.0}
     with pytest.raises(
         CaptureError, match=r"1 view \(214\) without a white reference of their own, 3 others"
     ):
-        process(tmp_path / "tree", tmp_path / "scene", **options)
+        reflectances(tmp_path)
     for path in tmp_path.glob("tree/21[35]/capture/WHITEREF*"):
         path.unlink()
-    process(tmp_path / "tree", tmp_path / "scene", **options)
-    for index, name in enumerate(NAMES):
-        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
-        np.testing.assert_allclose(stored, (1000 + 100 * index) / 2000, atol=1e-4)
+    for index, values in enumerate(reflectances(tmp_path)[0]):
+        np.testing.assert_allclose(values, (1000 + 100 * index) / 2000, atol=1e-4)
 
 
 def test_views_are_named_so_that_every_system_has_a_file_for_each():
