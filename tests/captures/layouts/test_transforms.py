@@ -194,11 +194,6 @@ def test_wavelengths_settle_which_axis_is_that_of_bands(tmp_path):
         assert view.cube.warnings == ()
 
 
-def without_cubes(root):
-    for index in range(3):
-        (root / "train" / f"frame_0000{index}.npy").unlink()
-
-
 def with_path(text):
     def spoil(root):
         np.save(root.parent / "outside.npy", cube(0))
@@ -209,24 +204,22 @@ def with_path(text):
     return spoil
 
 
-def without_key(root):
-    edit(root, lambda content: content["frames"][2].pop("hyperspectral_file_path"))
+def with_content(text):
+    return lambda root: (root / "transforms.json").write_text(text)
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (without_cubes, r"lacks 3 files .*train/frame_00000.npy.*nerfstudio"),
-        (without_key, r"frames\[2\] has no 'hyperspectral_file_path'"),
+        (lambda root: [path.unlink() for path in root.glob("train/*.npy")], r"lacks 3 files .*nerfstudio"),
+        (with_path(None), r"frames\[0\] has no 'hyperspectral_file_path'"),
         *(
             (with_path(text), r"frames\[0\].*leaves the folder")
             for text in ("../outside.npy", "/etc/passwd", "link.npy")
         ),
         (with_path("train/frame 00001.npy"), "would both be the view 'frame_00001'"),
-        *(
-            (lambda root, content=content: (root / "transforms.json").write_text(content), "transforms.json")
-            for content in ("{", '{"frames": 3}', '{"frames": [3]}', '{"no": "frames"}', "")
-        ),
+        *((with_content(text), "transforms.json") for text in ("{", '{"frames": 3}', '{"frames": [3]}', "")),
+        (with_content('{"no": "frames"}'), "transforms.json"),
     ],
 )
 def test_a_spoilt_list_of_frames_is_refused(tmp_path, spoil, message):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import (
     FLIP,
     IDEAL,
@@ -23,6 +22,7 @@ from tests.captures.poses.pose_factory import (
     transforms,
     write_json,
 )
+from unmix_plugin.captures.poses.lens import Lens
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.meshes import write_ply
@@ -62,7 +62,7 @@ def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_th
         write_json(tmp_path / f"transforms_{split}.json", content)
     found = read_poses(tmp_path, {"r_0": (512, 400)})
     assert sorted(found.cameras) == sorted(name.removeprefix("./") for name in poses)
-    lens = present(found.cameras["val/r_1"].lens)
+    lens = lens_of(found)
     assert (lens.width, lens.height, lens.center_px) == (512, 400, (256.0, 200.0))
     assert lens.focal_px == pytest.approx((256.0, 256.0))
 
@@ -72,13 +72,7 @@ def test_the_size_is_that_of_the_picture_that_a_frame_names_and_not_of_the_view(
     Image.new("RGB", (30, 20)).save(tmp_path / "view.png")
     for sizes in ({}, {"view": (15, 10)}, {"other": (15, 10)}):
         found = read(tmp_path, {"fl_x": 40.0, "frames": transforms(poses)["frames"]}, picture_sizes=sizes)
-        lens = present(found.cameras["view.png"].lens)
-        assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (
-            30,
-            20,
-            (40.0, 40.0),
-            (15.0, 10.0),
-        )
+        assert lens_of(found) == Lens(30, 20, (40.0, 40.0), (15.0, 10.0))
         assert found.warnings == ()
 
 
@@ -284,8 +278,7 @@ def test_axes_are_turned_and_names_are_those_of_the_pictures_or_go_by_order(tmp_
     for place in (path, tmp_path):
         found = read_poses(place)
         assert_same_poses(found, ring())
-    lens = present(found.cameras["images/view_0.png"].lens)
-    assert (lens.width, lens.height, lens.focal_px, lens.center_px) == (640, 480, (500, 500), (320, 240))
+    assert lens_of(found) == Lens(640, 480, (500, 500), (320, 240))
 
 
 def test_other_arrays_and_damaged_files_are_refused(tmp_path):
