@@ -68,13 +68,8 @@ def check_pose_options(options: ProcessOptions, capture: Capture) -> None:
 
 
 def marked_poses(plan: Plan, options: ProcessOptions) -> PoseSet:
-    """Poses by printed markers.
-
-    Returns:
-        Poses by view, with lenses of the whole images as the capture has them.
-    Raises:
-        CaptureError: there are too few markers, or they contradict each other.
-    """
+    """Poses by printed markers, by view, with lenses of the whole images as the capture has them. Raises CaptureError:
+    there are too few markers, or they contradict each other."""
     sightings, notes = _sightings(plan, options)
     lenses: dict[str, Lens | tuple[int, int]] = {}
     for view in plan.views:
@@ -99,13 +94,10 @@ def poses_of_written_views(
     """Poses by structure from motion, or of a turntable, on all views.
 
     Args:
-        plan: Of the scene.
-        records: Of its views, which are all written.
-        scene: Folder that they are in.
+        records: Of the views, which are all written, in the folder `scene`.
         work: Folder for files of the estimation.
     Returns:
-        Poses by view, with lenses of the whole images as the capture has them; metric and upright where markers of a
-        known size are in view.
+        Poses as `marked_poses` has them; metric and upright where markers of a known size are in view.
     Raises:
         CaptureError: a library is not installed, or the pictures do not tell.
     """

@@ -262,12 +262,8 @@ def _square(pose: Float64[np.ndarray, "3 4"]) -> _Pose:
 
 
 def _place_poses(poses: PoseSet, is_flight: bool = False) -> tuple[PoseSet, Placement, tuple[str, ...]]:
-    """Poses in the scene's world, the way there from the source's, and how up axis, middle and scale were found.
-
-    The up axis is the source's where it has one, otherwise the direction across which the cameras' horizontal axes lie,
-    or the mean of their up vectors. The middle is where the cameras look, or that of the sparse points. In a flight,
-    cameras that all look one way look down.
-    """
+    """Poses in the scene's world, the way there from the source's, and how up axis, middle and scale were found. In a
+    flight, cameras that all look one way look down."""
     stacked = np.stack([camera.camera_to_world for camera in poses.cameras.values()])
     up, how_up = _find_up(stacked, poses.up, is_flight)
     middle, how_middle = _find_middle(stacked, poses.points)

@@ -64,7 +64,6 @@ def spline_weights(
     Args:
         place: Among the knots of a view, [0, count - 1].
         count: Knots of that view: at least 4, or 1 of a frame camera, which stands alone.
-
     Returns:
         The first of four knots in a row, and their weights.
     """
@@ -89,12 +88,8 @@ def spline_weights(
 def on_spline(
     values: Float[Tensor, "M C"], first: Int[Tensor, " R"], weights: Float[Tensor, "R 4"]
 ) -> Float[Tensor, "R C"]:
-    """What values at knots make of places between them.
-
-    Args:
-        values: Of all knots.
-        first, weights: Of each place, as `spline_weights` has them; `first` among all knots.
-    """
+    """What values at all knots make of places between them, with the weights that `spline_weights` gives; `first`
+    counts among all knots."""
     # Behind the last knot weights are 0: only a frame camera reaches so far.
     knots = (first[:, None] + torch.arange(_FEWEST_KNOTS, device=first.device)).clamp(max=len(values) - 1)
     own = values.index_select(0, knots.flatten()).unflatten(0, knots.shape)
@@ -116,10 +111,8 @@ def row_waves(count: int) -> Float[Tensor, "n n"]:
 def similarities(
     offsets: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], scale: Float[Tensor, " M"]
 ) -> Float[Tensor, "6*M 7"]:
-    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle.
-
-    A step turns by `scale` and moves by `scale` times `reach`.
-    """
+    """Orthonormal steps that turn, move or scale the world as seen from cameras at these offsets from its middle; a
+    step turns by `scale` and moves by `scale` times `reach`."""
     axes = torch.eye(3, dtype=torch.float64)
     places, lengths = offsets.double().cpu(), reach.double().cpu()[:, None]
     zero = torch.zeros_like(places)

@@ -258,11 +258,7 @@ class PoseRefinement(nn.Module):
 
     @torch.no_grad()
     def undo_runaways(self, is_final: bool = True) -> None:
-        """Give views that went too far their poses back; where most did, all.
-
-        Args:
-            is_final: Whether they keep them; else they may try again.
-        """
+        """Give views that went too far their poses back, where most did, all; they keep them if it is final."""
         sizes = self._sizes(self.free_steps()).amax(dim=1) / self.bound
         views = torch.arange(len(self.is_free), device=sizes.device).repeat_interleave(self.counts)
         # In the mean over its knots: a line camera may wobble farther in a few rows and still be on its way.

@@ -251,13 +251,8 @@ def _smooth_prior(num_knots: int, pixel: float) -> csr_matrix:
 def _solve_banded(
     blocks: Float64[np.ndarray, "4 n 6 6"], pull: Float64[np.ndarray, "n 6"], damping: float
 ) -> Float64[np.ndarray, "n 6"]:
-    """Solution of normal equations whose diagonal is larger by a share (Levenberg-Marquardt).
-
-    Args:
-        blocks: Lower half: row numbers of block (d, a) are those of knot a + d, columns those of knot a.
-        pull: Right-hand side.
-        damping: The share.
-    """
+    """Solution of normal equations whose diagonal is larger by the share `damping` (Levenberg-Marquardt). `blocks` are
+    the lower half: rows of block (d, a) are numbers of knot a + d, columns those of knot a."""
     from scipy.linalg import solveh_banded
 
     num_knots, bandwidth = blocks.shape[1], 4 * _NUMBERS - 1

@@ -185,10 +185,8 @@ def _sensor_names(bands: Sequence[_BandFile]) -> list[str]:
 
 
 def _release_names(bands: Sequence[_BandFile], where: str) -> list[str]:
-    """Names of the releases: the name up to the band of the first file of each, with its folder where names repeat.
-
-    Identifiers count where they join files; cameras that write another one into every file are grouped by name.
-    """
+    """Names up to the band of the first file of each release, with its folder where names repeat. Identifiers count
+    where they join files; cameras that write another one into every file are grouped by name."""
     identifiers = [tag_text(item.tags, *_UNIQUE_TAGS) or "" for item in bands]
     counts = Counter(identifier for identifier in identifiers if identifier)
     keys = [
@@ -260,10 +258,8 @@ def _pix4d_lens(file: SpectralFile, tags: XmpTags, exif: dict[str, Any]) -> Lens
 
 
 def _dji_lens(file: SpectralFile, tags: XmpTags) -> Lens:
-    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre.
-
-    Where `DewarpFlag` is not 0, the camera has taken the distortion out of its picture already.
-    """
+    """`DewarpData`: a date; fx, fy, cx, cy, k1, k2, p1, p2, k3, where cx, cy count from the optical centre. Where
+    `DewarpFlag` is not 0, the camera has taken the distortion out of its picture already."""
     height, width = file.shape[:2]
     text = (tag_text(tags, "DewarpData") or "").rpartition(";")[2]
     numbers = tag_numbers({"DewarpData": text}, "DewarpData") or []
@@ -285,10 +281,8 @@ def _fit_fisheye(
     matrix: tuple[float, ...],
     centre: tuple[float, float],
 ) -> Lens:
-    """Radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F.
-
-    Remembered, as all files of a lens have the same.
-    """
+    """Radius p0 + p1 t + p2 t^2 + p3 t^3 with t = 2/pi times the angle, then the matrix C, D; E, F. Remembered, as all
+    files of a lens have the same."""
     affine, at_axis = np.array(matrix).reshape(2, 2), 2.0 / math.pi * polynomial[1]
 
     def project(ideal: Points) -> Points:

@@ -154,10 +154,7 @@ def _make_capture(
     notes: Iterable[str] = (),
     warnings: Iterable[str] = (),
 ) -> Capture:
-    """Views, one a frame, with the poses of these, in the order of their names.
-
-    Poses that can't be used are noted, as the user may give others.
-    """
+    """Views, one a frame, in the order of their names; poses that can't be used are noted, as others may be given."""
     posed = dict(zip((frame.name for frame in listed.frames), views, strict=True))
     sizes = {name: (view.cube.shape[1], view.cube.shape[0]) for name, view in posed.items()}
     poses, said = None, [*listed.notes, *notes]
@@ -237,11 +234,7 @@ find_hs_nerf = partial(_find_cubes, "hs-nerf")
 
 
 def _in_eval(text: str) -> str:
-    """The path with a folder `val` replaced by `eval`.
-
-    >>> _in_eval("val/cubes/a.npy")
-    'eval/cubes/a.npy'
-    """
+    """The path with a folder `val` replaced by `eval`."""
     path = PurePosixPath(text)
     return str(PurePosixPath(*("eval" if part == "val" else part for part in path.parent.parts), path.name))
 
@@ -259,10 +252,8 @@ class _StatedCube:
 
 
 def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[list[_StatedCube], list[str]]:
-    """What is said of each frame's cube, and warnings.
-
-    Raises CaptureError: a key of a scene folder is wrong, or can't be followed here.
-    """
+    """What is said of each frame's cube, and warnings. Raises CaptureError: a key of a scene folder is wrong, or can't
+    be followed here."""
     values, faults, warnings = listed.top.get("wavelengths"), Faults(root), []
     numbers = [read_number(value) for value in values] if isinstance(values, list) else []
     is_known = bool(numbers) and None not in numbers and options.wavelengths_nm is None
@@ -452,11 +443,7 @@ def _open_opacity(path: Path) -> SpectralFile | None:
 
 
 def _opacity_channel(names: list[str]) -> str | None:
-    """The alpha channel: by its name, otherwise the fifth of five.
-
-    >>> _opacity_channel(["s0", "s1", "s2", "s3", "w"])
-    'w'
-    """
+    """The alpha channel: by its name, otherwise the fifth of five."""
     named = [name for name in names if name.lower().split(".")[-1] in ("a", "alpha")]
     if named:
         return named[0]

@@ -227,10 +227,8 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
 
 
 def _text_images(path: Path) -> list[_Image]:
-    """Images with their poses; lines of the points that were seen are told by their form.
-
-    COLMAP writes one below every image, which is blank where nothing was seen; other programs leave blank ones out.
-    """
+    """Images with their poses. COLMAP writes a line of the points that were seen below every image, blank where nothing
+    was; other programs leave blank ones out. So such lines are told by their form."""
 
     def parse(line: str) -> _Image | None:
         if _is_observations(line):
@@ -243,11 +241,7 @@ def _text_images(path: Path) -> list[_Image]:
 
 
 def _is_observations(line: str) -> bool:
-    """Whether a line lists points that an image saw: x, y and the number of the point, again and again.
-
-    >>> _is_observations("10.5 11.5 1 20 21 -1"), _is_observations("1 1 0 0 0 0 0 3 1 17.png")
-    (True, False)
-    """
+    """Whether a line lists points that an image saw: x, y and the number of the point, again and again."""
     words = line.split()
     try:
         _ = [float(word) for word in words], [int(word) for word in words[2::3]]

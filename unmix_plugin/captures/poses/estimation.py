@@ -93,8 +93,7 @@ def estimate_poses(
         masks: True on matter; features are found there, but not on its rim.
         threads: None takes those of the machine, at most 8; with 1 the same pictures give the same poses to the bit.
     Returns:
-        Poses by the name of the view, in an arbitrary world (`has_world` is False); `notes` say how many views were
-        registered and the reprojection error.
+        Poses by the name of the view, in an arbitrary world (`has_world` is False).
     Raises:
         CaptureError: pycolmap is not installed, or fewer than half of the views, or than 3, could be registered.
     """
@@ -256,12 +255,12 @@ def contrast_picture(
 
 
 def _reconstruct(path: Path) -> None:
-    """Reconstruct, and write `found.json`: folder, registered images and reprojection error of each model; and
-    features and matches of each image. Those of an earlier try of the same pictures are gone on with.
+    """Write `found.json`: folder, registered images and reprojection error of each model, and `_matches_of_views`.
+    Files of an earlier try of the same pictures are gone on with.
 
-    The settings: `folder`, which holds `images` (and `masks`: IMAGE.png, black where no features are wanted, where
-    `has_masks`); `sensors`, names of image files with one lens each; whether to match neighbours in the order of names
-    alone (`sequential`); `threads`; and the digest of all pictures.
+    The settings: `folder`, with `images` and, where `has_masks`, `masks` (IMAGE.png, black where no features are
+    wanted); `sensors`, names of image files with one lens each; `sequential`, whether to match neighbours in the order
+    of names alone; `threads`; and the digest of all `pictures`.
     """
     import pycolmap
 

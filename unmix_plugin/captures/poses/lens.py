@@ -129,16 +129,13 @@ _CALIBRATE = "calibrate the camera again, or undistort the images and give poses
 
 @np.errstate(all="ignore")  # whatever comes of it is judged by where pixels fall
 def fit_lens(project: Project, start: Lens, model: str, where: str) -> Lens:
-    """The OPENCV lens that stands for one of another model, and says so.
+    """The OPENCV lens that stands for one of another model, and says so: the nearest; if it is not near enough, pixels
+    are to be resampled into it; and of a lens too wide for it, a pinhole that shows its middle.
 
     Args:
-        project: The other model.
         start: Size of the image and a first guess of focal length and centre.
         model: What the other model is called.
         where: The file, for messages.
-    Returns:
-        The nearest lens; if it is not near enough, pixels are to be resampled into it. Of a lens too wide for it, a
-        pinhole that shows its middle.
     Raises:
         CaptureError: the model is not to be followed even in the middle of the image, or its numbers are impossible.
     """
@@ -305,12 +302,8 @@ def bend_agisoft(
     growth: Sequence[float],
     is_fisheye: bool,
 ) -> Points:
-    """Metashape's frame and fisheye cameras; up to version 1.5 the tangential terms grow with 1 + p3 r^2 + p4 r^4.
-
-    Args:
-        tangential: In OpenCV's order.
-        growth: p3 and p4.
-    """
+    """Metashape's frame and fisheye cameras, p1 and p2 in OpenCV's order; up to version 1.5 the tangential terms grow
+    with 1 + p3 r^2 + p4 r^4."""
     points = _equidistant(ideal) if is_fisheye else ideal
     grown = _series((points**2).sum(axis=1), growth)[:, None]
     return bend_brown(points, radial) + _tangential(points, tangential) * grown
@@ -324,10 +317,8 @@ def bend_thin_prism(ideal: Points, k1: float, k2: float, p1: float, p2: float, *
 
 
 def bend_fisheye_624(ideal: Points, *terms: float) -> Points:
-    """Project Aria's fisheye: six radial terms, two tangential and four of a thin prism, which act on bent points.
-
-    FISHEYE624 of nerfstudio, RAD_TAN_THIN_PRISM_FISHEYE of COLMAP.
-    """
+    """Project Aria's fisheye (nerfstudio's FISHEYE624, COLMAP's RAD_TAN_THIN_PRISM_FISHEYE): six radial terms, two
+    tangential and four of a thin prism, which act on bent points."""
     bent = bend_fisheye(ideal, *terms[:6])
     return bent + _tangential(bent, (terms[7], terms[6])) + _prism(bent, terms[8:])
 
@@ -366,10 +357,8 @@ def bend_dual(ideal: Points, transition: float, *radial: float) -> Points:
 
 def bend_ftheta(ideal: Points, reach_px: float, *terms: float) -> Points:
     """instant-ngp's ftheta: the angle from the axis is a polynomial of the distance from the centre in pixels, radians
-    over pixels to the power of their number. The focal length is 1 / p1 pixels.
-
-    Distances are looked for up to `reach_px`; beyond, and where the polynomial falls, NaN.
-    """
+    over pixels to the power of their number. The focal length is 1 / p1 pixels. Beyond `reach_px`, and where the
+    polynomial falls, NaN."""
     polyval, slopes = np.polynomial.polynomial.polyval, np.polynomial.polynomial.polyder(terms)
     distances = np.linspace(0.0, reach_px, 4096)
     angles = polyval(distances, terms)

@@ -45,10 +45,7 @@ _LEAST_STEP = 0.3
 
 
 def parse_family(name: str | None) -> str | None:
-    """OpenCV's name of a family, as a user writes it.
-
-    Raises:
-        ConfigError: there is no such family.
+    """OpenCV's name of a family, as a user writes it. Raises ConfigError: there is no such family.
 
     >>> parse_family("apriltag_36h11")
     'DICT_APRILTAG_36H11'
@@ -78,10 +75,8 @@ def require_opencv() -> Any:
 def count_markers(
     pictures: Sequence[Float32[np.ndarray, "H W"]], family: str | None = None
 ) -> dict[str, int]:
-    """How many markers of each family are in pictures; with a family given, of that one alone.
-
-    Of families whose codes are short, some are found in any texture: a number counts that is in two pictures.
-    """
+    """How many markers of each family, or of a given one, are in pictures. Of families whose codes are short, some are
+    found in any texture: a number counts that is in two pictures."""
     cv2 = require_opencv()
     families = _TRIED if family is None else (family,)
     detector = _detector(cv2, families)
@@ -99,13 +94,8 @@ def count_markers(
 def find_markers(
     pictures: Mapping[str, Float32[np.ndarray, "H W"]], family: str
 ) -> tuple[Sightings, list[str]]:
-    """The markers of a family in every picture.
-
-    Args:
-        pictures: Light of each view, linear, in any unit.
-    Returns:
-        Those of each view, and a sentence on markers that were left out because a picture shows two of a number.
-    """
+    """The markers of a family in the light of each view (linear, in any unit); and a sentence on those that were left
+    out because a picture shows two of a number."""
     cv2 = require_opencv()
     detector = _detector(cv2, [family])
     cells = detector.getDictionary().markerSize + 2
@@ -150,11 +140,8 @@ def _stretched(cv2: Any, picture: Float32[np.ndarray, "H W"]) -> tuple[UInt8[np.
 
 
 def _refine(picture: Float32[np.ndarray, "H W"], first: Corners, cells: int) -> Corners | None:
-    """The corners where lines along the sides meet; None where no side is to be followed.
-
-    Args:
-        cells: Along a side, with the black border.
-    """
+    """The corners where lines along the sides meet; None where no side is to be followed. `cells` are those along a
+    side, with the black border."""
     corners = first
     for _ in range(4):
         lines = list(_side_lines(picture, corners, cells))

@@ -74,11 +74,9 @@ def solve(
     steps: int = 60,
     bent: bool = False,
 ) -> MarkerMap:
-    """Least squares over the views and markers of the sightings, and over lenses that are free.
-
-    Columns are 6 for each view and 7 for each marker (a rotation vector, a shift, the logarithm of the size) and 3 for
-    each lens (the logarithm of the focal length, k1, k2); what is fixed has no column.
-    """
+    """Least squares over the views and markers of the sightings, and over lenses that are free: 6 columns for each view
+    and 7 for each marker (a rotation vector, a shift, the logarithm of the size), 3 for each lens (the logarithm of the
+    focal length, k1, k2); what is fixed has none."""
     from scipy.optimize import least_squares
     from scipy.sparse import csr_matrix
     from scipy.spatial.transform import Rotation

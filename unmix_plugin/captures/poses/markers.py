@@ -376,11 +376,8 @@ def _how_large(marker_size: float | None) -> str:
 def _stand_on_markers(
     corners: Float64[np.ndarray, "M 4 3"], marker_size: float
 ) -> tuple[Placement, Float64[np.ndarray, "3"] | None, str]:
-    """The way to the world that stands on the markers, in which their sides have a length.
-
-    Returns:
-        The way; up in that world, None where no two markers lie in a plane; and how up was found.
-    """
+    """The way to the world that stands on the markers, in which their sides have a length; up in that world, None where
+    no two markers lie in a plane; and how up was found."""
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     normals = np.cross(corners[:, 1] - corners[:, 2], corners[:, 0] - corners[:, 1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -139,7 +139,7 @@ def make_pose_set(
         where: The file, for messages.
         up: Against gravity, in the source's coordinates.
     Raises:
-        CaptureError: a name twice with different poses, or a matrix is not a pose, or a lens is none.
+        CaptureError: a name twice with different poses, a matrix that is no pose, or a lens that is none.
     """
     unique, repeated = _unique(cameras, where)
     rigid, scales = _rigid(unique, where)

@@ -52,14 +52,11 @@ _Size: TypeAlias = tuple[int, int]
 
 
 def read_poses(path: Path, picture_sizes: Mapping[str, _Size] | None = None) -> PoseSet:
-    """Poses of a file or folder, whichever program wrote it.
+    """Poses of a file or folder, whichever program wrote it. Raises CaptureError: nothing known is there, or what is
+    there is damaged or can't be represented.
 
     Args:
-        path: A file, or a folder that holds the files.
-        picture_sizes: Width and height of views by name, file name or stem, for sources that have no sizes and no
-            pictures.
-    Raises:
-        CaptureError: nothing known is there, or what is there is damaged or can't be represented.
+        picture_sizes: Of views by name, file name or stem, for sources that have no sizes and no pictures.
     """
     if not path.exists():
         raise CaptureError(f"{path} is not there; give a file or folder with poses: {_KNOWN}")
@@ -142,10 +139,8 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def _read_llff(path: Path) -> PoseSet:
-    """poses_bounds.npy, (N, 17): a 3 x 5 matrix [R | t | h, w, f] (axes down, right, back), near, far.
-
-    Cameras have the names of the pictures beside it, where there are as many.
-    """
+    """poses_bounds.npy, (N, 17): a 3 x 5 matrix [R | t | h, w, f] (axes down, right, back), near, far. Cameras have the
+    names of the pictures beside it, where there are as many."""
     try:
         with reading(path):
             read_array_header(path)

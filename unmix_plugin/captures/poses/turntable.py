@@ -138,12 +138,8 @@ class _Numbers:
     def errors(
         self, evidence: Evidence, ahead: float = 0.0, rims: bool = True
     ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, "Q 4"]]:
-        """Distances of matched points from epipolar lines, and of outlines from tangents, pixels.
-
-        Args:
-            ahead: By how much further the first view of each pair was turned.
-            rims: Whether what comes of masks that are too wide or too narrow is taken off.
-        """
+        """Distances of matched points from epipolar lines, and of outlines from tangents, pixels; with the first view
+        of each pair turned `ahead` by so much. `rims`: less what comes of masks that are too wide or too narrow."""
         second = self.poses(evidence)
         first = replace(self, slack=self.slack + ahead).poses(evidence) if ahead else second
         return (
