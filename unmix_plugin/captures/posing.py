@@ -112,13 +112,13 @@ def pose_views(
             f"{poses.source}: {len(posed)} of {len(views)} views has a pose; a scene needs {_LEAST_VIEWS} or more. "
             + "; ".join(said)
         )
+    given = {view.name: cameras[view.name].lens or view.lens for view in posed}
     fitted = {
-        view.name: replace(cameras[view.name], lens=lens_of_view(cameras[view.name].lens or view.lens, view))
-        for view in posed
+        view.name: replace(cameras[view.name], lens=lens_of_view(given[view.name], view)) for view in posed
     }
     has_many_lenses = len({view.sensor for view in posed if view.release}) > 1
-    own = {view.sensor: view.lens for view in posed if cameras[view.name].lens in (None, view.lens)}
-    of_views = [f"lens {sensor}: {lens.said}" for sensor, lens in own.items() if lens and lens.said]
+    own = {view.sensor: view.lens for view in posed if view.lens and view.lens == given[view.name]}
+    of_views = [f"lens {sensor}: {lens.said}" for sensor, lens in own.items() if lens.said]
     placed, way, how = _place_poses(replace(poses, cameras=fitted), is_flight=has_many_lenses)
     metres, keys = poses.metres_per_unit, way.to_json() if poses.has_world else {}
     if known is not None:
@@ -130,28 +130,25 @@ def pose_views(
             keys, metres = Placement(scale=1.0 / metres).to_json(), 1.0
     if metres is not None and keys:
         keys[METRES_KEY] = metres
-    cut, scaled = _other_sizes(posed, cameras)
+    cut, scaled = _other_sizes(posed, given)
     notes = (*poses.notes, *matched, *completed, *of_views, *scaled, *how)
     findings = [*doubts, *cut]
     missing = [view.name for view in views if view not in posed]
     if len(missing) > _MOST_UNPOSED * len(views):  # so many that the source itself is suspect
-        left_out = (
-            f"{len(missing)} of {len(views)} views have no pose and are left out ({name_some(missing)})"
-        )
-        findings.insert(
-            0, f"{left_out}: is {poses.source} the whole model, and are the names in it those of the files?"
-        )
+        left_out = f"views have no pose and are left out ({name_some(missing)})"
+        whole = f"is {poses.source} the whole model, and are the names in it those of the files?"
+        findings.insert(0, f"{len(missing)} of {len(views)} {left_out}: {whole}")
     return PosedViews(posed, placed, tuple(findings), keys, notes)
 
 
 def _other_sizes(
-    posed: Sequence[CaptureView], cameras: Mapping[str, PosedCamera]
+    posed: Sequence[CaptureView], lenses: Mapping[str, Lens | None]
 ) -> tuple[list[str], list[str]]:
     """Lenses given for pictures of another size: a finding where it is no whole multiple, so that they were cut,
     perhaps, and not scaled; and notes of the others."""
     findings, notes = [], []
     for view in posed:
-        lens, (height, width, _) = cameras[view.name].lens or view.lens, view.cube.shape
+        lens, (height, width, _) = lenses[view.name], view.cube.shape
         if lens is None or lens.width == width:
             continue
         given, ratio = f"{lens.width} x {lens.height} pixels", max(width / lens.width, lens.width / width)

@@ -213,7 +213,6 @@ def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
     ("factor", "message"),
     [
         (0.0, "all zeros"),
-        (np.nan, "not finite"),
         ([[-1.0, 1.0, 1.0, 1.0]], "mirror image"),
         ([[1.0, 2.0, 1.0, 1.0]], "sheared"),
     ],
@@ -231,6 +230,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"frames": []}, "has no camera; expected one for each view"),
         ({"frames": [1]}, r"frames\[0\] is 1"),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
+        ({"frames": [{"transform_matrix": [math.nan] * 12}]}, r"frames\[0\]: .* list of 12; .*finite"),
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
         ({"w": 0.5}, "'w' is 0.5; expected a whole number"),

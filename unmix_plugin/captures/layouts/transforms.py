@@ -45,7 +45,7 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
 )
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.faults import Faults, read_number
+from unmix_plugin.scenes.reading.faults import Faults, read_numbers
 from unmix_plugin.scenes.reading.splits import split_by_lists
 from unmix_plugin.scenes.reading.transforms_json import (
     read_sensor_entry,
@@ -254,10 +254,9 @@ class _StatedCube:
 def _state_cubes(root: Path, listed: _FrameList, options: ReadOptions) -> tuple[list[_StatedCube], list[str]]:
     """What is said of each frame's cube, and warnings. Raises CaptureError: a key of a scene folder is wrong, or can't
     be followed here."""
-    values, faults, warnings = listed.top.get("wavelengths"), Faults(root), []
-    numbers = [read_number(value) for value in values] if isinstance(values, list) else []
-    is_known = bool(numbers) and None not in numbers and options.wavelengths_nm is None
-    centres = np.array(numbers, dtype=np.float64) if is_known else None
+    values, faults, warnings, centres = listed.top.get("wavelengths"), Faults(root), [], None
+    if isinstance(values, list) and values and options.wavelengths_nm is None:
+        centres = read_numbers(values, len(values))
     scale, widths = read_value_scale(listed.top, faults), read_widths(listed.top, faults)
     if widths is not None and (unknown := int(np.isnan(widths).sum())):
         counts = f"{unknown} of {len(widths)} bands"

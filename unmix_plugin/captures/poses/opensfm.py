@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from unmix_plugin.captures.poses import lens
 from unmix_plugin.captures.poses.pose_set import FLIP, PosedCamera, PoseSet, SparsePoints, make_pose_set
 from unmix_plugin.errors import CaptureError, name_some
-from unmix_plugin.scenes.reading.faults import describe, read_number
+from unmix_plugin.scenes.reading.faults import describe, read_number, read_numbers
 
 _PLAIN = ("perspective", "simple_radial", "radial", "brown")
 _SIX_TERMS = "k1 k2 k3 k4 k5 k6 p1 p2 s0 s1 s2 s3"
@@ -90,7 +90,7 @@ def _world_to_camera(
 def _pose(values: dict[str, Any], where: str) -> Float64[np.ndarray, "3 4"]:
     from scipy.spatial.transform import Rotation
 
-    turn, shift = _vector(values.get("rotation")), _vector(values.get("translation"))
+    turn, shift = read_numbers(values.get("rotation"), 3), read_numbers(values.get("translation"), 3)
     if turn is None or shift is None:
         raise CaptureError(
             f"{where}: 'rotation' and 'translation', its own or its rig's, have to be 3 finite numbers each"
@@ -127,12 +127,14 @@ def _lens_opensfm(values: dict[str, Any], where: str) -> lens.Lens:
 
 def _points(content: dict[str, Any], where: str) -> SparsePoints | None:
     points = list(_object(content, "points").values())
-    positions = [_vector(point.get("coordinates")) if isinstance(point, dict) else None for point in points]
+    positions = [
+        read_numbers(point.get("coordinates"), 3) if isinstance(point, dict) else None for point in points
+    ]
     if not points:
         return None
     if any(position is None for position in positions):
         raise CaptureError(f"{where}: a point has no 3 finite 'coordinates'; the file is damaged")
-    colours = [_vector(point.get("color")) for point in points]
+    colours = [read_numbers(point.get("color"), 3) for point in points]
     known = [np.zeros(3) if colour is None else np.clip(colour, 0, 255) for colour in colours]
     return np.array(positions), np.array(known).round().astype(np.uint8)
 
@@ -141,8 +143,3 @@ def _object(content: dict[str, Any], key: Any) -> dict[str, Any]:
     """The object below a key; an empty one without it."""
     value = content.get(key) if isinstance(key, str) else None
     return value if isinstance(value, dict) else {}
-
-
-def _vector(value: Any) -> Float64[np.ndarray, "3"] | None:
-    numbers = [read_number(number) for number in value] if isinstance(value, list) else []
-    return None if len(numbers) != 3 or None in numbers else np.array(numbers, dtype=np.float64)

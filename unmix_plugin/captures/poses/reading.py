@@ -35,7 +35,7 @@ from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
-from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number
+from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_numbers
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, keys_to_say
 from unmix_plugin.scenes.reading.images import FORMATS
 from unmix_plugin.scenes.reading.lenses import Intrinsics, read_lens
@@ -337,13 +337,12 @@ def _terms_of_other_models(values: dict[str, Any], where: str) -> tuple[str | No
         listed = values.get("distortion_params")
     else:
         return None, ()
-    numbers = [read_number(value) for value in listed] if isinstance(listed, list) else []
-    terms = tuple(number for number in numbers if number is not None)
-    if len(numbers) != count or len(terms) != count:
+    terms = read_numbers(listed, count)
+    if terms is None:
         raise CaptureError(f"{where}: {what} are {describe(listed)}; expected {count} numbers")
     if model == "ftheta" and not terms[1] > 0:
         raise CaptureError(f"{where}: 'ftheta_p1' is {terms[1]:g}; expected pixels per radian above 0")
-    return model, terms
+    return model, tuple(terms.tolist())
 
 
 def _make_lens(
@@ -375,20 +374,19 @@ def _make_lens(
 
 
 def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:
-    """A matrix of 3 or 4 rows, or 12 or 16 numbers row by row; NaN is kept for the check that names all such frames."""
-    rows = value
-    if isinstance(value, list) and len(value) in (12, 16) and not any(isinstance(row, list) for row in value):
-        rows = [value[start : start + 4] for start in range(0, len(value), 4)]
-    is_matrix = isinstance(rows, list) and len(rows) in (3, 4)
-    if not is_matrix or not all(isinstance(row, list) and len(row) == 4 for row in rows):
+    """A matrix of 3 or 4 rows, or 12 or 16 numbers row by row."""
+    tried = [read_numbers(value, *shape) for shape in ((4, 4), (3, 4), (16,), (12,))]
+    numbers = next((found for found in tried if found is not None), None)
+    if numbers is None:
         found = "absent" if value is None else describe(value)
         raise CaptureError(
-            f"{where}: 'transform_matrix' is {found}; expected 4 (or 3) rows of 4 numbers, camera to world"
+            f"{where}: 'transform_matrix' is {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world"
         )
-    numbers = [[read_number(number) for number in row] for row in rows]
-    matrix = np.array([[math.nan if number is None else number for number in row] for row in numbers])
+    matrix = numbers.reshape(-1, 4)
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6 and matrix[3].any():
-        raise CaptureError(f"{where}: the last row of 'transform_matrix' is {rows[3]}; expected 0, 0, 0, 1")
+        raise CaptureError(
+            f"{where}: the last row of 'transform_matrix' is {matrix[3].tolist()}; expected 0, 0, 0, 1"
+        )
     return matrix[:3]
 
 
