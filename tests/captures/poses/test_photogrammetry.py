@@ -194,7 +194,7 @@ def test_damaged_documents_are_refused(tmp_path, spoil, message):
         read_poses(path)
 
 
-def write_micmac(tmp_path, distortion="<ModNoDist/>", orientation=None, calibration=None):
+def write_micmac(tmp_path, distortion="<ModNoDist/>", orientation=("", ""), calibration=("", "")):
     """With one text of the orientations, or of the calibration, in place of another."""
     folder = tmp_path / "Ori-All"
     folder.mkdir(exist_ok=True)
@@ -202,9 +202,9 @@ def write_micmac(tmp_path, distortion="<ModNoDist/>", orientation=None, calibrat
         rows = dict(zip(("l1", "l2", "l3"), map(text_of, pose[:, :3] @ FLIP), strict=True))
         text = ORIENTATION.format(center=text_of(pose[:, 3]), convention="eConvApero_DistM2C", **rows)
         path = folder / f"Orientation-{name.split('/')[-1]}.xml"
-        path.write_text(text.replace(*orientation or ("", "", 0)))
+        path.write_text(text.replace(*orientation))
     text = CALIBRATION.format(distortion=distortion)
-    (folder / "AutoCal.xml").write_text(text.replace(*calibration or ("", "", 0)))
+    (folder / "AutoCal.xml").write_text(text.replace(*calibration))
     return folder
 
 
