@@ -69,17 +69,6 @@ def test_words_work_right_after_the_method_and_common_settings_have_short_names(
         assert four == replace(plain, num_endmembers=4)
 
 
-def test_help_shows_the_common_options_and_help_all_the_others_too():
-    common, everything = (run(train, "unmix-nerf", flag) for flag in ("--help", "--help-all"))
-    assert common.status == everything.status == 0
-    for flag in ("--data", "--max-seconds", "--endmembers", "--value-scale", "--help-all"):
-        assert flag in common.out
-    for flag in ("--checkpoints-kept", "--pipeline.model.field", "--viewer.port", "--steps-per-save"):
-        assert flag not in common.out
-        assert flag in everything.out
-    assert len(common.out.splitlines()) < 80
-
-
 @pytest.mark.parametrize(
     ("words", "iterations", "seconds"),
     [

@@ -31,14 +31,14 @@ def demo(arguments: list[str]) -> None:
     from unmix_plugin.commands.train import train
     from unmix_plugin.engine.runs.run_folder import newest_run
 
-    where = ["--output-dir", str(options.output_dir), "--device", options.device]
-    train(
-        ["unmix-nerf", "--data", "demo", "--max-seconds", str(options.seconds), "--endmembers", "6", *where]
-    )
+    device = ["--device", options.device]
+    demo_words = ["--data", "demo", "--max-seconds", str(options.seconds), "--endmembers", "6"]
+    train(["unmix-nerf", *demo_words, "--output-dir", str(options.output_dir), *device])
     run = newest_run(options.output_dir)
-    evaluate(["--run", str(run.path), "--device", options.device])
-    export(["abundances", "--run", str(run.path), "--device", options.device])
-    export(["page", "--run", str(run.path), "--device", options.device, "--resolution", "160"])
+    words = ["--run", str(run.path), *device]
+    evaluate(words)
+    export(["abundances", *words])
+    export(["page", *words, "--resolution", "160"])
     print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
     print(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
     print(f"look around in it: unmix-view --run {run.path}")

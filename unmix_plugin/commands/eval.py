@@ -42,15 +42,7 @@ class _EvalOptions(SharedViews, RunOptions):
 
 
 def evaluate(argv: list[str]) -> None:
-    """Parse the arguments, render and measure each view, write and say what was found.
-
-    Raises:
-        RunError: the run is unusable, or its folder can't be written.
-        SceneError: the scene is missing or malformed.
-        ConfigError: the method does not unmix spectra, the recipe is wrong or does not fit the run, or the device is
-            not there.
-        SpectrumError: there is no such light.
-    """
+    """Parse the arguments, render and measure each view, write and say what was found."""
     options = tyro.cli(_EvalOptions, prog="unmix-eval", args=argv)
 
     from unmix_plugin.engine.processes import joined, start_together

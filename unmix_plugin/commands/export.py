@@ -58,15 +58,7 @@ _IN_THE_RUNS_BANDS = ("metamerism", "report", "spectrum")
 
 
 def export(argv: list[str]) -> None:
-    """Parse the arguments, write the product, list its files.
-
-    Raises:
-        RunError: the run is unusable, or the folder can't be written.
-        ConfigError: files would be overwritten, options that don't fit the run or each other, the method does not unmix
-            spectra, or the device is not there.
-        SpectrumError: a spectrum or a light that is unknown or does not cover the bands, or a sensor that sees nothing
-            in them.
-    """
+    """Parse the arguments, write the product, list its files."""
     own, broken = _own_products({product.name for product in PRODUCTS})
     for plugin in broken:
         print(plugin, file=sys.stderr)

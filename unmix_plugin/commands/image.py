@@ -48,15 +48,7 @@ class _ImageOptions(ReadingOptions):
 
 
 def image(argv: list[str]) -> None:
-    """Parse the arguments, unmix, write, and say what was found.
-
-    Raises:
-        CaptureError: the file can't be read.
-        ConfigError: results are there already.
-        SpectrumError: the image can't be unmixed so, has no minimum noise fractions, or shares too few bands with a
-            library.
-        RunError: the results can't be written.
-    """
+    """Parse the arguments, unmix, write, and say what was found."""
     options = tyro.cli(_ImageOptions, prog="unmix-image", args=argv)
 
     from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean, stated_values

@@ -9,14 +9,7 @@ from functools import partial
 
 
 def process(arguments: list[str]) -> None:
-    """Parse the arguments, make the scene, say where it is.
-
-    Raises:
-        CaptureError: files are missing, damaged or don't fit each other.
-        ConfigError: an option is wrong or does not fit the files.
-        RunError: the folder can't be written.
-        SystemExit: files were to be inspected, and one was refused.
-    """
+    """Parse the arguments, make the scene, say where it is."""
     if arguments[:1] == ["inspect"]:
         from unmix_plugin.commands.process_inspect import inspect_command
 

@@ -48,13 +48,7 @@ class _InspectOptions(ReadingOptions):
 
 
 def inspect_command(arguments: list[str]) -> int:
-    """Parse the arguments and print what each file holds.
-
-    Returns:
-        Exit status: 0, or 2 if a file was refused.
-    Raises:
-        ConfigError: no file is named.
-    """
+    """Parse the arguments and print what each file holds; the exit status is 0, or 2 if a file was refused."""
     options = tyro.cli(_InspectOptions, prog="unmix-process inspect", args=arguments)
     if not options.files:
         raise ConfigError("no file is named; expected unmix-process inspect FILE...")

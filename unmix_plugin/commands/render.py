@@ -23,16 +23,7 @@ if TYPE_CHECKING:
 
 
 def render(argv: list[str]) -> None:
-    """Parse the arguments, render each view, list the files.
-
-    Raises:
-        RunError: the run is unusable, or a file can't be written.
-        ConfigError: cameras, outputs or formats that are not there or don't fit each other, a recipe that is wrong or
-            does not fit the run, files that would be overwritten, a method that does not unmix spectra, or a device
-            that is not there.
-        SceneError: the environment map is missing, damaged or unusable.
-        SpectrumError: a wavelength outside the bands, a light that is unknown, or a sensor that sees nothing in them.
-    """
+    """Parse the arguments, render each view, list the files."""
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
 
     from unmix_plugin.engine.processes import joined, start_together

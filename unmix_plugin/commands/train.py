@@ -51,12 +51,7 @@ def parse(argv: Sequence[str]) -> tuple[TrainerConfig, TrainingViewerOptions]:
     """All settings: the method's defaults, or those of the run to go on with, changed by the arguments.
 
     A limit given alone is the only one: with `--max-seconds` the method's number of iterations does not end training,
-    with `--max-num-iterations` no time that a resumed run was given does.
-
-    Raises:
-        ConfigError: no or an unknown method, not that of the run to go on with, or impossible settings.
-        RunError: the run to go on with is unusable.
-        SystemExit: help was asked for (0), or arguments do not parse (2).
+    with `--max-num-iterations` no time that a resumed run was given does. Help, and arguments that do not parse, exit.
     """
     if not argv or argv[0].startswith("-"):
         installed = ", ".join(sorted(discover_methods()[0]))
@@ -119,12 +114,7 @@ def _shown_only(config: Any, is_shown: Callable[[Collection[Any]], bool]) -> Any
 
 
 def train(argv: list[str]) -> None:
-    """Parse the arguments, train, say where the run is.
-
-    Raises:
-        ConfigError: no or an unknown method, or impossible settings.
-        SystemExit: help was asked for (0), arguments that do not parse (2), or a stop on request (130).
-    """
+    """Parse the arguments, train, say where the run is."""
     methods, broken = discover_methods()
     for plugin in broken:
         print(f"warning: {plugin}", file=sys.stderr)

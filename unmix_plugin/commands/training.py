@@ -72,12 +72,7 @@ def train(
 
 
 def first_config(method: MethodSpecification, load_run: Path | None) -> TrainerConfig:
-    """The method's defaults, or the settings of the run to go on with.
-
-    Raises:
-        ConfigError: the run is of another method.
-        RunError: it is unusable.
-    """
+    """The method's defaults, or the settings of the run to go on with, which must be of this method."""
     if load_run is None:
         return method.config
     from unmix_plugin.engine.runs.load_run import load_config
@@ -101,11 +96,7 @@ def with_limits_given(config: TrainerConfig, *, steps: bool, seconds: bool) -> T
 
 
 def _with_settings(config: TrainerConfig, settings: Mapping[str, Any]) -> TrainerConfig:
-    """The settings changed by name, as the command line names them; hyphens and underscores are alike.
-
-    Raises:
-        ConfigError: an unknown name, one setting by two names, or a value that doesn't fit.
-    """
+    """The settings changed by name, as the command line names them; hyphens and underscores are alike."""
     from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
 
     known, tree, given = dict(_names(config)), {}, {}

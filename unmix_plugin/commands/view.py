@@ -37,12 +37,7 @@ class ViewOptions(RunOptions):
 
 
 def view(argv: list[str]) -> None:
-    """Parse the arguments, serve until Ctrl-C or until the process is asked to end.
-
-    Raises:
-        RunError: the run is unusable.
-        ConfigError: the method does not unmix spectra, the device is not there, or nothing can listen at the address.
-    """
+    """Parse the arguments, serve until Ctrl-C or until the process is asked to end."""
     options = tyro.cli(ViewOptions, prog="unmix-view", args=argv)
     viewer = prepared(options)
     viewer.start()
@@ -56,13 +51,7 @@ def view(argv: list[str]) -> None:
 
 
 def prepared(options: ViewOptions) -> Viewer:
-    """The viewer of a run, not yet listening.
-
-    Raises:
-        RunError: the run is unusable.
-        ConfigError: the method does not unmix spectra, the device is not there, or the recipe does not fit the run.
-        SpectrumError: there is no such light, or a library that can't be read or compared.
-    """
+    """The viewer of a run, not yet listening."""
     from unmix_plugin.commands.reporting import CommandConsole, chosen_run, working
     from unmix_plugin.editing.apply import assumption_of_light
     from unmix_plugin.editing.edited_run import requested_recipe

@@ -115,14 +115,7 @@ def draw_panels(
     scale: ColourScale | None = None,
     legend: Sequence[tuple[str, Colour]] = (),
 ) -> bytes:
-    """A grid of panels as a PNG.
-
-    Args:
-        rows: Panels, all of one picture size.
-        heading: Line above all.
-        scale: Drawn as a colour bar on the right.
-        legend: Names and their colours, listed below.
-    """
+    """A grid of panels, all of one picture size, as a PNG: heading above, colour bar on the right, legend below."""
     from matplotlib.ticker import MaxNLocator
 
     height_px, width_px, _ = rows[0][0].image.shape

@@ -1,1 +1,4 @@
-"""Products of a run: one file each, with its options as fields, its help as docstring, and `write`."""
+"""Products of a run, with their options as fields, their help as docstring, and `write`.
+
+Writers raise a RunError where the disk is full or refuses.
+"""

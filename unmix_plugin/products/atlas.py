@@ -43,7 +43,9 @@ def _chart_labels(
     positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The chart of each triangle, counted from 0, and the axis (0 to 5) that each triangle is seen along."""
-    normals, links = _normals(positions, faces), _links(faces)
+    a, b, c = positions[faces].swapaxes(0, 1)
+    across, links = np.cross(b - a, c - a), _links(faces)
+    normals = across / np.linalg.norm(across, axis=1, keepdims=True).clip(1e-30)
     smooth = normals
     for _ in range(_ROUNDS):
         summed = smooth + links @ smooth
@@ -74,12 +76,6 @@ def _best(scores: np.ndarray, normals: np.ndarray, otherwise: np.ndarray | None 
     allowed = (cosines > _LEAST_COSINE) & ((scores > 0) if otherwise is not None else True)
     chosen = np.where(allowed, scores, -np.inf).argmax(axis=1)
     return np.where(allowed.any(axis=1), chosen, cosines.argmax(axis=1) if otherwise is None else otherwise)
-
-
-def _normals(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = positions[faces].swapaxes(0, 1)
-    across = np.cross(b - a, c - a)
-    return across / np.linalg.norm(across, axis=1, keepdims=True).clip(1e-30)
 
 
 def _links(faces: np.ndarray) -> Any:
@@ -124,11 +120,8 @@ class Atlas:
 
 
 def unwrap(positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], texture_size: int) -> Atlas:
-    """Cut a mesh into charts and pack them.
+    """Cut a mesh into charts and pack them into textures so many texels wide and high.
 
-    Args:
-        positions, faces: Of any mesh.
-        texture_size: Width and height of the textures, texels.
     Raises:
         ConfigError: xatlas is not installed, or the charts don't fit into a texture of this size.
     Source:
@@ -155,11 +148,7 @@ def unwrap(positions: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], t
 
 
 def _packed(flat: np.ndarray, cut: np.ndarray, charts: np.ndarray, texture_size: int) -> Any:
-    """The packed charts; xatlas only estimates how large they may be, so that what it finds is scaled to fit.
-
-    Raises:
-        ConfigError: the space between the charts leaves no room for them.
-    """
+    """The packed charts; xatlas only estimates how large they may be, so that what it finds is scaled to fit."""
     import xatlas
 
     packing = xatlas.PackOptions()
@@ -222,12 +211,8 @@ def texels_of(atlas: Atlas, size: int) -> Texels:
 def _inside(
     corners: Float[np.ndarray, "F 3 2"], size: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Places, triangles and weights of the texels in each triangle, some triangles at a time.
-
-    Args:
-        corners: Column and row of each corner, in texels, where a centre has whole numbers.
-        size: Width and height.
-    """
+    """Places, triangles and weights of the texels in each triangle, some triangles at a time; the corners are column
+    and row in texels, where a centre has whole numbers."""
     low = np.clip(np.floor(corners.min(axis=1)).astype(np.int64), 0, size - 1)
     extent = np.clip(np.ceil(corners.max(axis=1)).astype(np.int64), 0, size - 1) - low + 1
     counts = extent.prod(axis=1)

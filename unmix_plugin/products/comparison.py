@@ -67,7 +67,6 @@ def compare_runs(runs: Sequence[ComparedRun], folder: Path) -> Comparison:
 
     Raises:
         ConfigError: methods that measure differently, or nothing that the runs share.
-        RunError: the disk is full or refuses.
     """
     labels, remarks = _labels([run.path for run in runs]), []
     blank = {name for run in runs for name, errors in run.bands.items() if not errors.num_pixels}
@@ -177,11 +176,7 @@ def _without_blank(run: ComparedRun) -> ComparedRun:
 
 
 def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
-    """Names of the views that show the same in all runs; what is said of the others goes to the remarks.
-
-    Raises:
-        ConfigError: methods that measure differently, no shared band, or no such view.
-    """
+    """Names of the views that show the same in all runs; what is said of the others goes to the remarks."""
     first = runs[0]
     for other in runs[1:]:
         if bool(other.bands) != bool(first.bands):

@@ -26,11 +26,7 @@ _LEGEND_ROWS = 16
 
 
 def export(job: Job, asked: Endmembers) -> list[Path]:
-    """Write table, library and plot, and in the run's own bands the angles to all known spectra.
-
-    Raises:
-        ConfigError: a library to compare with what another sensor sees.
-    """
+    """Write table, library and plot, and in the run's own bands the angles to all known spectra."""
     materials, paths = job.materials, _endmember_paths(job.folder)
     if materials.sensor is not None:
         if asked.library:
@@ -97,12 +93,8 @@ def draw_spectra(
     colours: Float[np.ndarray, "K 3"],
     labels: tuple[str, str],
 ) -> bytes:
-    """Endmembers as lines, as a PNG; from the ninth on, dashes tell near colours apart too.
-
-    Args:
-        x: Wavelengths or numbers of the bands.
-        labels: Of both axes.
-    """
+    """Endmembers as lines over wavelengths or numbers of bands, as a PNG; from the ninth on, dashes tell near colours
+    apart too. `labels` are those of both axes."""
     from matplotlib.figure import Figure
 
     legend_columns = -(-len(colours) // _LEGEND_ROWS)

@@ -92,11 +92,7 @@ class Evaluated:
 
 
 def evaluate_images(pipeline: Pipeline, folder: Path, follow: _Follow) -> Evaluated:
-    """What a model says of its own images, and its pictures of each: KIND/NAME.png in the folder.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """What a model says of its own images, and its pictures of each: KIND/NAME.png in the folder."""
     images, found, num_pictures = pipeline.evaluate_images(), [], 0
     for _ in follow("evaluating images", range(pipeline.datamanager.num_eval_images)):
         name, metrics, pictures = next(images)
@@ -126,11 +122,8 @@ def evaluate_scene(
         measured: With all truth that is known.
         light_factors: What measured radiance is multiplied with; None: nothing.
         folder: Where pictures go: rgb, segmentation and abundances.
-        processes: That share the views.
     Returns:
         What was found; None in all processes but the first.
-    Raises:
-        RunError, Follower: the disk is full or refuses, or another process failed.
     """
     truth = scene_truth(measured).in_light(light_factors)
     evaluation = Evaluation(truth, scene.materials.endmembers, scene.materials.names)

@@ -116,11 +116,7 @@ class _Textures:
 
 
 def _textures(scene: TrainedScene, mesh: TriangleMesh, size: int | None) -> _Textures:
-    """Unwrap the mesh and look at the surface from straight above each texel.
-
-    Raises:
-        ConfigError: xatlas is not installed, or the charts don't fit into a texture of the size asked for.
-    """
+    """Unwrap the mesh and look at the surface from straight above each texel."""
     low, high = 16, 8192
     if size is not None and not low <= size <= high:
         raise ConfigError(f"--texture-size is {size}; choose {low} to {high} texels, or 0 for no textures")

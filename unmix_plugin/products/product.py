@@ -77,13 +77,7 @@ class RunWork(RunOptions, ABC):
 
     @abstractmethod
     def write(self, job: Job) -> list[Path]:
-        """Write the product.
-
-        Returns:
-            Its files.
-        Raises:
-            UnmixError: something that a user can fix.
-        """
+        """Write the product, and return its files; an UnmixError is something that a user can fix."""
 
 
 @dataclass(frozen=True)
@@ -135,16 +129,12 @@ class Job:
 
     @property
     def scene(self) -> TrainedScene:
-        """The trained scene.
-
-        Raises:
-            ConfigError: its method does not unmix spectra.
-        """
+        """The trained scene; a ConfigError if its method does not unmix spectra."""
         return self.loaded.materials_scene
 
     @property
     def materials(self) -> Materials:
-        """Its endmembers and the light that they are seen in; raises as `scene` does."""
+        """Its endmembers and the light that they are seen in; an error as `scene` has it."""
         return self.scene.materials
 
     @property
@@ -153,11 +143,7 @@ class Job:
         return self.loaded.scene.frame
 
     def claim(self, paths: Collection[Path]) -> None:
-        """Refuse to overwrite files, before anything is computed.
-
-        Raises:
-            ConfigError: one of them exists, and overwriting was not asked for.
-        """
+        """Refuse to overwrite files, before anything is computed, unless that was asked for."""
         from unmix_plugin.formats.files import refuse_to_overwrite
 
         refuse_to_overwrite(paths, self.overwrite)
@@ -190,13 +176,8 @@ class Job:
         paths: Callable[[str], list[Path]],
         write: Callable[[str, MaterialView], None],
     ) -> list[Path]:
-        """Render views, one after the other, each at its own size, and write each; several processes share them.
-
-        Args:
-            choice: Of the run's views.
-            paths: Files of a view, from its name.
-            write: Writes them.
-        """
+        """Render views, one after the other, each at its own size, and write each to the paths of its name; several
+        processes share them."""
         views, processes = self.views(choice), self.processes
         files = [path for view in views for path in paths(view.name)]
         with processes.together():

@@ -124,14 +124,13 @@ def _measured(
         return None
     index = _with_all_bands(scene).get(view.name)
     if index is None:
-        job.say(f"{view.name} was taken by a sensor without all bands: no measured spectrum")
-        return None
-    if not _counts(scene, index, *pixel):
-        job.say(
-            f"{view.name} has no valid value in that pixel, or its mask leaves it out: no measured spectrum"
-        )
-        return None
-    return _read_pixel(job, scene, index, *pixel)
+        why = "was taken by a sensor without all bands"
+    elif not _counts(scene, index, *pixel):
+        why = "has no valid value in that pixel, or its mask leaves it out"
+    else:
+        return _read_pixel(job, scene, index, *pixel)
+    job.say(f"{view.name} {why}: no measured spectrum")
+    return None
 
 
 def _counts(scene: Scene, index: int, column: int, row: int) -> bool:
@@ -145,9 +144,8 @@ def _read_pixel(job: Job, scene: Scene, index: int, column: int, row: int) -> Fl
     if gains is not None and index in scene.train_indices:
         spectrum = spectrum / gains[scene.train_indices.index(index)].numpy()
     elif gains is not None:
-        job.say(
-            f"no exposure was fitted to {scene.frames[index].name}: what it measured is as it was exposed"
-        )
+        name = scene.frames[index].name
+        job.say(f"no exposure was fitted to {name}: what it measured is as it was exposed")
     return relit(spectrum, job.loaded.record.summary.get("illuminant"), job.scene.light_power)
 
 
@@ -171,9 +169,9 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray
             continue
         seen = job.scene.probe(camera, column, row)
         near = _SAME_PLACE_PX * float(depths[0] / camera.focal_px[0].min())
-        if seen.position is None or seen.opacity < OCCUPIED_ACCUMULATION:
+        if seen.position is None or np.linalg.norm(seen.position - probe.position) > near:
             continue
-        if np.linalg.norm(seen.position - probe.position) > near or not _counts(scene, index, column, row):
+        if seen.opacity < OCCUPIED_ACCUMULATION or not _counts(scene, index, column, row):
             continue
         alpha = scene.alpha(index)
         if alpha is None or alpha[row, column] >= _WHOLE:

@@ -53,8 +53,6 @@ def write_unmixed_image(
         on_map: Where the image lies, as entries of an ENVI header.
         library: Known spectra to which angles are written, where wavelengths are known.
         fractions: Minimum noise fractions, if asked for.
-    Raises:
-        RunError: the disk is full or refuses.
     """
     make_folder(folder)
     names = [f"material {number}" for number in range(1, len(found.endmembers) + 1)]

@@ -88,12 +88,7 @@ class PageContent:
 
 
 def export(job: Job, asked: Page) -> list[Path]:
-    """Find the surface, look at every vertex, and write `page.html`, with as many triangles as fit.
-
-    Raises:
-        ConfigError: a library for an object without bands, or too large a one.
-        SpectrumError: a library that can't be read or compared.
-    """
+    """Find the surface, look at every vertex, and write `page.html`, with as many triangles as fit."""
     path = job.folder / "page.html"
     job.claim([path])
     # A scene without mixed materials may say itself what a page shows of it, with about so many cells along an edge.
@@ -231,12 +226,8 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
 
 
 def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | None) -> dict[str, Any]:
-    """Spectra, lights and names, as page.js reads them; empty where there are no bands.
-
-    Args:
-        materials: As they are lit.
-        recorded: Light that the scene was recorded in, relative power; None where it is unknown.
-    """
+    """Spectra, lights and names, as page.js reads them; empty where there are no bands. `recorded` is the power of the
+    light that the scene was recorded in; None where it is unknown."""
     if materials is None:
         names = "wavelengths_nm ranges_nm names colours endmembers specular rgb indices is_lit".split()  # noqa: SIM905
         empty: dict[str, Any] = {name: [] for name in names}

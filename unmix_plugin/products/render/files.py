@@ -123,9 +123,7 @@ def choose_formats(
     Args:
         outputs: Names, or `all`, every output that takes no argument; none: those that are usually wanted, as far as
             the scene has them.
-        formats: Of `_FORMATS`; none: what suits each output best.
-        scene: It says what outputs there are.
-        is_path: Whether views follow each other.
+        formats: Of `_FORMATS`; none: what suits each output best, whether views follow each other or not.
     Raises:
         ConfigError: an unknown output or format, a format that suits no output, or an output that no format suits.
         SpectrumError: a wavelength outside the bands.
@@ -256,11 +254,7 @@ def video_path(folder: Path, formatted: FormattedOutput) -> Path:
 
 
 def still(path: Path, formatted: FormattedOutput, setting: RenderSetting) -> AbstractContextManager[RowsSink]:
-    """Context that gives a sink for the rows of one view; at its end the file is there; of ENVI's two, the header.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Context that gives a sink for the rows of one view; at its end the file is there; of ENVI's two, the header."""
     files = {"npy": _npy, "envi": _envi, "exr": _exr, "png": _png, "mp4": _sweep, "tif": _tif}
     return files[formatted.format](formatted.output, path, setting)
 

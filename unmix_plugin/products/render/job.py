@@ -164,14 +164,7 @@ class RenderJob:
         folder: Path,
         processes: Processes = ALONE,
     ) -> None:
-        """
-        Args:
-            scene, cameras: Of any method, and where to render it from.
-            outputs: What to write.
-            survey: Of these cameras and outputs.
-            folder: Where to write.
-            processes: That share the views, each with a job like this one.
-        """
+        """Of a scene of any method; `survey` is of these cameras and outputs, and each process has a job like this."""
         self._scene, self._cameras, self._survey, self._processes = scene, cameras, survey, processes
         asked = [one.output for one in outputs]
         setting = setting_for(scene, cameras.views[0].camera, asked, survey, folder)

@@ -140,12 +140,9 @@ def map_camera(
     """An orthographic camera that has all of the scene box in its image, and where its map lies.
 
     Args:
-        scene: Of any method.
-        scale: Of its world.
+        scene, scale: Of any method, and of its world.
         direction: From where one looks: one of `_DIRECTIONS`, or x,y,z of the world.
         pixel_size: Edge of a pixel, metres or units of the world; None: that of the scene's own views.
-    Raises:
-        ConfigError: an unknown direction, or a size that is not above 0 or makes too many pixels.
     """
     axes, frame = _axes(direction), scene.frame
     metres = 1.0 if scale is None else scale.metres_per_unit

@@ -54,10 +54,6 @@ class Palette:
             return Palette((), id_colours(), surveyed)
         return Palette(materials.names, endmember_colours(materials), surveyed)
 
-    def _entries(self, output: Output) -> list[tuple[str, Colour]]:
-        """Names and colours of the output's ids or shares; none where they have no names."""
-        return list(output.classes) or list(zip(self.names, self.colours, strict=False))
-
     def by_id(self, output: Output) -> Float64[np.ndarray, "256 3"]:
         """Colour of each id, neutral grey for those that stand for nothing."""
         own = [colour for _, colour in output.classes] if output.classes else self.colours
@@ -172,7 +168,8 @@ def legend_csv(classes: Iterable[tuple[str, Colour]], nothing: Colour | None = N
 def draw_legend(output: Output, palette: Palette) -> bytes:
     """The legend of an output as a PNG."""
     scale, width = palette.scale(output), _WIDTH - 2 * _MARGIN
-    shown = palette._entries(output) if output.kind in ("labels", "shares") else []
+    shown = output.classes or zip(palette.names, palette.colours, strict=False)
+    shown = shown if output.kind in ("labels", "shares") else ()
     names = [(name[:_LONGEST_NAME], colour) for name, colour in shown]
     names_height = legend_height(names, width) if names else 0.0
     height = 2 * _MARGIN + (0.0 if scale is None else _BAR_ROW) + names_height

@@ -74,12 +74,7 @@ class ReportViews:
     def __init__(
         self, materials: Materials, evaluation: Evaluation | None, with_shares: Collection[str]
     ) -> None:
-        """
-        Args:
-            materials: The scene's materials.
-            evaluation: Collects the figures of merit; None without measured views.
-            with_shares: Names of the views whose abundances are shown.
-        """
+        """No evaluation without measured views; `with_shares` are the names of views whose abundances are shown."""
         self.materials = materials
         self.evaluation = evaluation
         self.shown: list[_ShownView] = []
@@ -258,12 +253,7 @@ def material_cards(
 ) -> list[dict[str, Any]]:
     """A card for each endmember; its `matches` are what it resembles: line, angle in radians, bands compared.
 
-    Args:
-        materials: The scene's materials.
-        proportions: Part of all that is seen that each is.
-        light: In which the spectra are seen; None where it is unknown.
-        library: Known materials.
-        truth: True materials, where they are known.
+    `proportions` are parts of all that is seen; spectra are seen in `light`, None where it is unknown.
     """
     spectra, nm = materials.endmembers.detach().cpu().double().numpy(), materials.bands.centers_nm
     colours = endmember_colours(materials)
