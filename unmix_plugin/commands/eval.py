@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import tyro
 
@@ -153,46 +153,19 @@ def _evaluate_run(
 
 
 def _report(console: Console, run: ComparedRun, found: Evaluated, is_edited: bool, is_relit: bool) -> None:
-    for what, how in _ALIGNED.items():
-        if what in found.more.get("aligned", ()):
-            print(f"each evaluation view was aligned first: {how}")
-    of = ", edited, against the scene as measured" if is_edited else ""
-    of += " (in the same light)" if is_relit else ""
-    _show(console, run.figures, f"{run.path.name}: {counted(run.figures['views'], 'evaluation view')}", of)
-    print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
-    if found.num_pictures:
-        kinds = ": rgb/, segmentation/ and abundances/, truth beside prediction"
-        drawn = counted(found.num_pictures, "picture")
-        print(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
-
-
-_ALIGNED = {
-    "gain": "exposure and smooth white balance fitted to the measured view",
-    "pose": "its pose fitted to the measured view with the field as it is",
-}
-
-
-def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | None:
-    """The scene of mixed materials that the run's method makes; None where its model measures its images itself."""
-    from unmix_plugin.commands.reporting import spectral_scene
-    from unmix_plugin.engine.registry import find_method
-    from unmix_plugin.trained.open_run import require_materials
-    from unmix_plugin.trained.trained_scene import TrainedScene
-
-    name = loaded.config.method_name
-    make, has_spectra = find_method(name).scene, spectral_scene(loaded.pipeline.datamanager) is not None
-    scene = None if make is None or not has_spectra else make(loaded.pipeline.model, loaded.scene, None)
-    return require_materials(scene, name) if is_edited or isinstance(scene, TrainedScene) else None
-
-
-def _show(console: Console, figures: dict[str, Any], title: str, of: str) -> None:
-    """The figures as a table; what they are beside those that are everybody's."""
+    """Figures as a table, with what they are beside those that are everybody's; and where everything is."""
     from rich.table import Table
 
     from unmix_plugin.trained.evaluation import DEFINITIONS
 
+    for what, how in _ALIGNED.items():
+        if what in found.more.get("aligned", ()):
+            print(f"each evaluation view was aligned first: {how}")
+    figures, title = run.figures, f"{run.path.name}: {counted(run.figures['views'], 'evaluation view')}"
     if "bands" in figures:
-        title = f"{title}, {counted(figures['bands'], 'band')}{of}"
+        title += f", {counted(figures['bands'], 'band')}"
+        title += ", edited, against the scene as measured" if is_edited else ""
+        title += " (in the same light)" if is_relit else ""
     table = Table(title=title, title_justify="left")
     table.add_column("figure", no_wrap=True)
     table.add_column("value", justify="right", no_wrap=True)
@@ -206,9 +179,31 @@ def _show(console: Console, figures: dict[str, Any], title: str, of: str) -> Non
     unknown = [name for name, value in figures.items() if value is None]
     if unknown:
         print(f"not measured, since the scene does not have the truth for it: {', '.join(unknown)}")
+    print(f"{run.pictures / 'metrics.json'}  these figures, and those of each view")
+    if found.num_pictures:
+        kinds = ": rgb/, segmentation/ and abundances/, truth beside prediction"
+        drawn = counted(found.num_pictures, "picture")
+        print(f"{run.pictures}  {drawn}{kinds if found.has_materials else ''}")
 
 
+_ALIGNED = {
+    "gain": "exposure and smooth white balance fitted to the measured view",
+    "pose": "its pose fitted to the measured view with the field as it is",
+}
 _UNITS = {"psnr": " dB", "sam": " rad", "angle": " rad", "seconds": " s"}
+
+
+def _materials_scene(loaded: LoadedPipeline, is_edited: bool) -> TrainedScene | None:
+    """The scene of mixed materials that the run's method makes; None where its model measures its images itself."""
+    from unmix_plugin.commands.reporting import spectral_scene
+    from unmix_plugin.engine.registry import find_method
+    from unmix_plugin.trained.open_run import require_materials
+    from unmix_plugin.trained.trained_scene import TrainedScene
+
+    name = loaded.config.method_name
+    make, has_spectra = find_method(name).scene, spectral_scene(loaded.pipeline.datamanager) is not None
+    scene = None if make is None or not has_spectra else make(loaded.pipeline.model, loaded.scene, None)
+    return require_materials(scene, name) if is_edited or isinstance(scene, TrainedScene) else None
 
 
 if __name__ == "__main__":  # of one of several processes

@@ -130,6 +130,7 @@ def train(argv: list[str]) -> None:
     from unmix_plugin.engine.processes import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole
     from unmix_plugin.engine.training.steps import follow_training, joined_training
+    from unmix_plugin.engine.training.training_control import Interrupted
 
     start_together("unmix_plugin.commands.train", argv, config.machine.num_devices)
     with joined_training(config) as processes:
@@ -139,23 +140,16 @@ def train(argv: list[str]) -> None:
         console = ProgressConsole()
         trainer = prepare(config, console, processes)
         with _shown(trainer, viewing, console):
-            _run(trainer, console)
+            try:
+                finish(trainer, console)
+            except Interrupted as stop:
+                print(stop, file=sys.stderr)
+                if stop.step is not None:
+                    resume = shlex.join([_PROGRAM, config.method_name, "--load-run", str(stop.run)])
+                    print(f"go on with: {resume}", file=sys.stderr)
+                print(f"run: {stop.run}", flush=True)
+                sys.exit(INTERRUPTED)
         print(f"run: {trainer.run.path}", flush=True)
-
-
-def _run(trainer: Trainer, console: Console) -> None:
-    """Train, and write what the model has found; exits with 130 after a stop on request."""
-    from unmix_plugin.engine.training.training_control import Interrupted
-
-    try:
-        finish(trainer, console)
-    except Interrupted as stop:
-        print(stop, file=sys.stderr)
-        if stop.step is not None:
-            resume = shlex.join([_PROGRAM, trainer.config.method_name, "--load-run", str(stop.run)])
-            print(f"go on with: {resume}", file=sys.stderr)
-        print(f"run: {stop.run}", flush=True)
-        sys.exit(INTERRUPTED)
 
 
 @contextmanager

@@ -87,10 +87,11 @@ class RunProduct(WriteOptions, RunWork):
 
 @dataclass(frozen=True)
 class Product(EditOptions, RunProduct):
-    """A product of a scene of mixed materials, which can be edited before; named for its class."""
+    """A product of a scene of mixed materials, which can be edited before; named for its class if it has no name."""
 
     def __init_subclass__(cls) -> None:
-        cls.name = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", cls.__name__).lower()
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<=[a-z])(?=[A-Z])", "-", cls.__name__).lower()
 
     def write(self, job: Job) -> list[Path]:
         """Write the product by `export` of the module of its name, which is imported for it alone."""

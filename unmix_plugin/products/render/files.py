@@ -320,7 +320,8 @@ def _whole(output: Output, setting: RenderSetting) -> tuple[RowsSink, np.ndarray
     def add(rows: Rows) -> None:
         values = rows.values[output.name].reshape(-1, width, count)
         place = slice(rows.first, rows.first + len(values))
-        planes[:, place], filled[place] = np.moveaxis(values, -1, 0), rows._filled_by(output)
+        planes[:, place] = np.moveaxis(values, -1, 0)
+        filled[place] = rows._filled_by(output)
 
     return add, planes, filled
 
