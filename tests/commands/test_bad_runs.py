@@ -30,13 +30,17 @@ def cut_off(name):
     return lambda path: (path / name).write_bytes((path / name).read_bytes()[:40])
 
 
-def in_scene(part, **changes):
+def in_json(name, part=None, **changes):
     def change(path):
-        values = json.loads((path / "scene.json").read_text())
-        values[part].update(changes)
-        (path / "scene.json").write_text(json.dumps(values))
+        values = json.loads((path / name).read_text())
+        (values if part is None else values[part]).update(changes)
+        (path / name).write_text(json.dumps(values))
 
     return change
+
+
+def in_scene(part, **changes):
+    return in_json("scene.json", part, **changes)
 
 
 def spoilt_tensors(value):
@@ -50,9 +54,7 @@ def spoilt_tensors(value):
                 tensor.view(-1)[:1] = value
         data = safetensors.torch.save(tensors)
         tensors_path.write_bytes(data)
-        record = tensors_path.with_suffix(".json")
-        values = json.loads(record.read_text())
-        record.write_text(json.dumps({**values, "sha256": hashlib.sha256(data).hexdigest()}))
+        in_json("checkpoints/step-000020.json", sha256=hashlib.sha256(data).hexdigest())(path)
 
     return change
 
@@ -69,19 +71,11 @@ def piped(name):
     return change
 
 
-def circle(path):
-    (path / "notes").symlink_to("notes")
-
-
-def as_before_format_6(path):
-    values = json.loads((path / "config.json").read_text())
-    values["format_version"] = 5
-    values["config"]["pipeline"]["datamanager"]["grid_resolution"] = "auto"
-    (path / "config.json").write_text(json.dumps(values))
-
-
 SPOILT = {
-    "settings of an older version": (as_before_format_6, "format 5, written by an older version"),
+    "settings of an older version": (
+        in_json("config.json", format_version=5),
+        "format 5, written by an older",
+    ),
     "tensors of NaN": (spoilt_tensors(float("nan")), "has values that are not finite"),
     "tensors of infinity": (spoilt_tensors(float("inf")), "has values that are not finite"),
     "tensors cut off": (cut_off("checkpoints/step-000020.safetensors"), "damaged or cut short"),
@@ -90,7 +84,7 @@ SPOILT = {
     "piped tensors": (piped("checkpoints/step-000020.safetensors"), "is no regular file"),
     "light beyond numbers": (in_scene("metadata", illuminant=[1e308] * 8), "the number 1e+308"),
     "world of no size": (in_scene("metadata", pixel_size=1e-300), "a pixel_size above 0"),
-    "circle of links": (circle, "can't open the run folder"),
+    "circle of links": (lambda path: (path / "notes").symlink_to("notes"), "can't open the run folder"),
     "scene.json cut off": (cut_off("scene.json"), "can't read"),
     "views outside": (in_scene("summary", frames=[f"../{i}" for i in range(8)]), "the name of a frame"),
     "grid of gigabytes": (in_scene("metadata", grid_resolution=1290), "a grid_resolution of 8 to 512"),

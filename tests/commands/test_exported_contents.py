@@ -208,12 +208,21 @@ def test_a_report_keeps_what_it_is_about_with_the_run(solid_copy):
     assert "report.json is damaged" in refused(export, *words("report", "--run", solid_copy, "--overwrite"))
 
 
-def test_a_report_shows_the_regions_that_are_kept_and_says_which_it_cannot(solid_copy):
+def test_regions_that_are_kept_are_written_and_a_report_shows_them_and_says_which_it_cannot(solid_copy):
     names = load_run(solid_copy, "cpu").materials_scene.materials.names
     far = Box((90.0, 90.0, 90.0), (91.0, 91.0, 91.0))
     everything = Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0))
     for name, region in (("all of it", everything), ("far away", far)):
         keep_region(RunFolder(solid_copy), name, region)
+    done(export, *words("regions", "--run", solid_copy))
+    done(export, "spectrum", "--region", "all of it", "--run", solid_copy, "--device", "cpu")
+    quantity = load_run(solid_copy, "cpu").materials_scene.materials.quantity
+    for file, about in (
+        ("regions/regions.hdr", "mean spectra of regions"),
+        ("spectrum/region_all of it.hdr", "mean spectrum"),
+    ):
+        header = read_header(solid_copy / "exports" / file)
+        assert header["description"].strip() == f"{about}: {quantity}, 1 = full scale"
     done(export, *words("report", "--run", solid_copy))
     page = (solid_copy / "exports" / "report" / "report.html").read_text()
     assert_self_contained(page)
@@ -224,19 +233,6 @@ def test_a_report_shows_the_regions_that_are_kept_and_says_which_it_cannot(solid
     assert (len(shares), sum(shares)) == (len(names), pytest.approx(1, abs=0.01))
     assert "Not shown: the region far away has nothing of the surface in it" in page
     assert "far away" not in section
-
-
-def test_libraries_of_regions_say_what_their_spectra_are(solid_copy):
-    keep_region(RunFolder(solid_copy), "all of it", Box((-90.0, -90.0, -90.0), (90.0, 90.0, 90.0)))
-    done(export, *words("regions", "--run", solid_copy))
-    done(export, "spectrum", "--region", "all of it", "--run", solid_copy, "--device", "cpu")
-    quantity = load_run(solid_copy, "cpu").materials_scene.materials.quantity
-    for file, about in (
-        ("regions/regions.hdr", "mean spectra of regions"),
-        ("spectrum/region_all of it.hdr", "mean spectrum"),
-    ):
-        header = read_header(solid_copy / "exports" / file)
-        assert header["description"].strip() == f"{about}: {quantity}, 1 = full scale"
 
 
 def test_a_report_quotes_the_figures_that_eval_found_and_links_to_the_page(solid_copy, tmp_path, monkeypatch):

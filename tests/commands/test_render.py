@@ -61,21 +61,17 @@ def test_a_map_without_coordinates_is_said_to_have_none(trained, tmp_path):
 def test_renders_go_into_the_run_by_default_and_need_nothing_else(trained, run_copy, tmp_path):
     shutil.move(trained.scene, tmp_path / "elsewhere")
     try:
-        ended = run(render, "--run", run_copy, "--outputs", "rgb")
+        done(render, "--run", run_copy, "--outputs", "rgb")
     finally:
         shutil.move(tmp_path / "elsewhere", trained.scene)
-    assert ended.status == 0, ended.err
     assert (run_copy / "exports" / "render" / "rgb" / "eval_006.png").is_file()
 
 
 def test_chosen_outputs_formats_views_and_size(trained, tmp_path):
     words = ["--outputs", "spectral", "band:550nm", "--formats", "exr", "--view", "1", "--size", "24x12"]
     done(render, "--run", trained.run, "--output", tmp_path, *words)
-    assert files(tmp_path) == [
-        "band-550nm/eval_006.exr",
-        "cameras-dataset-eval.json",
-        "spectral/eval_006.exr",
-    ]
+    written = ["band-550nm/eval_006.exr", "cameras-dataset-eval.json", "spectral/eval_006.exr"]
+    assert files(tmp_path) == written
     channels = read_exr(tmp_path / "spectral" / "eval_006.exr")
     assert {pixels.shape for pixels in channels.values()} == {(12, 24)}
     assert sum(name.startswith("S0.") for name in channels) == 8

@@ -22,16 +22,13 @@ def view(mse, nm=NM, mean=(0.1, 0.2, 0.3)):
 def compared(
     folder: Path, name: str, psnr: float, views: dict[str, BandErrors], setting: int = 4
 ) -> ComparedRun:
+    pictures = folder / name / "eval"
+    (pictures / "rgb").mkdir(parents=True, exist_ok=True)
     for one in views:
-        (folder / name / "eval" / "rgb").mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (30, 20), "red").save(folder / name / "eval" / "rgb" / f"{one}.png")
-    figures = {"psnr": psnr, "miou": None}
+        Image.new("RGB", (30, 20), "red").save(pictures / "rgb" / f"{one}.png")
     per_view = {one: {"name": one, "psnr": psnr} for one in views}
-    settings = {"endmembers": setting, "seed": 42}
-    cameras = np.zeros((len(views), 3, 4))
-    return ComparedRun(
-        folder / name, "unmix-nerf", figures, per_view, views, cameras, folder / name / "eval", settings
-    )
+    found = ({"psnr": psnr, "miou": None}, per_view, views, np.zeros((len(views), 3, 4)))
+    return ComparedRun(folder / name, "unmix-nerf", *found, pictures, {"endmembers": setting, "seed": 42})
 
 
 def rows_of(path: Path) -> list[list[str]]:

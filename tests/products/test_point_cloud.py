@@ -188,36 +188,29 @@ def test_each_point_has_material_abundances_and_the_colour_of_its_diffuse_spectr
     np.testing.assert_allclose(columns(ply, ("red", "green", "blue"))[top], expected, atol=1)
 
 
-def test_indices_and_targets_are_written_for_each_point(points, tmp_path):
+def test_indices_targets_and_nearest_spectra_are_written_for_each_point(points, tmp_path):
     spectra = SCENE.materials.endmembers.detach().double().numpy()
     write_spectra_csv(tmp_path / "top.csv", SpectraTable(SCENE.bands, ("top",), spectra[:1]))
+    write_spectra_csv(tmp_path / "two.csv", SpectraTable(SCENE.bands, ("moss", "red clay"), spectra[[1, 0]]))
     asked = ["index:r650/r500", "index:pri", f"target:{tmp_path / 'top.csv'}<0.1"]
+    asked += [f"library:{tmp_path / 'two.csv'}<0.1"]
     scores = _require_point_scores(asked, SCENE.bands)
     path = tmp_path / "points.ply"
     count = _write_point_cloud(path, points, 300, SCENE, FRAME, scores)
     ply = PlyData.read(path)
-    written = [ply["vertex"].properties[index].name for index in (-3, -2, -1)]
-    assert written == ["index_1", "index_pri", "target_1"]
+    written = [one.name for one in ply["vertex"].properties[-4:]]
+    assert written == ["index_1", "index_pri", "target_1", "library_1"]
     found = columns(ply, written)
     assert found.dtype == np.float32
-    assert found.shape == (count, 3)
+    assert found.shape == (count, 4)
     shares = columns(ply, [f"abundance_endmember_{index}" for index in range(3)])
     seen = shares @ spectra
     np.testing.assert_allclose(found[:, 0], seen[:, 4] / seen[:, 1], rtol=1e-4)
     material = np.asarray(ply["vertex"]["material"])
     pure = shares.max(axis=1) > 0.999
     np.testing.assert_array_equal(found[pure, 2], material[pure] == 0)
-    assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-3]
-    assert ply.comments[-3].endswith("of radiance, since the scene's light is unknown")
-
-
-def test_a_file_says_which_spectrum_a_number_of_a_library_is(points, tmp_path):
-    spectra = SCENE.materials.endmembers.detach().double().numpy()
-    write_spectra_csv(tmp_path / "two.csv", SpectraTable(SCENE.bands, ("moss", "red clay"), spectra[[1, 0]]))
-    scores = _require_point_scores([f"library:{tmp_path / 'two.csv'}<0.1"], SCENE.bands)
-    _write_point_cloud(tmp_path / "points.ply", points, 300, SCENE, FRAME, scores)
-    ply = PlyData.read(tmp_path / "points.ply")
+    known = pure & (material < 2)
+    np.testing.assert_array_equal(found[known, 3], 1 - material[known])
+    assert "index_1: index:r650/r500, formula r650/r500" in ply.comments[-6]
+    assert ply.comments[-6].endswith("of radiance, since the scene's light is unknown")
     assert ply.comments[-2:] == ["library_1 0: moss", "library_1 1: red clay"]
-    numbers, material = np.asarray(ply["vertex"]["library_1"]), np.asarray(ply["vertex"]["material"])
-    pure = columns(ply, [f"abundance_endmember_{index}" for index in range(3)]).max(axis=1) > 0.999
-    np.testing.assert_array_equal(numbers[pure & (material < 2)], 1 - material[pure & (material < 2)])

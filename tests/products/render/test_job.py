@@ -128,6 +128,15 @@ def test_a_block_is_never_more_than_so_many_pixels_but_always_a_row(tmp_path):
     assert all(block.camera.width * block.camera.height <= 1 << 16 for block in job.blocks())
 
 
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Pictures of three views, what they share, and what the scene itself renders of each."""
+    folder, cameras = tmp_path_factory.mktemp("pictures"), views(3)
+    outputs = ["rgb", "band:550nm", "depth", "segmentation", "abundances"]
+    _, survey, job = render(folder, outputs, ["png"], cameras)
+    return folder, survey, job, [(f"view.{index}", truth(cameras, index, survey)) for index in range(3)]
+
+
 def over_black(rgba):
     """Linear light that an RGBA picture adds to black."""
     encoded = rgba[..., :3] / 255
@@ -135,42 +144,31 @@ def over_black(rgba):
     return linear * (rgba[..., 3:] / 255)
 
 
-def test_pictures_have_straight_colours_and_the_models_opacity(tmp_path):
-    cameras = views()
-    _, survey, _ = render(tmp_path, ["rgb", "band:550nm"], ["png"], cameras)
-    for index in range(2):
-        expected = truth(cameras, index, survey)
-        rgba = iio.imread(tmp_path / "rgb" / f"view.{index}.png")
-        assert np.abs(rgba[..., 3] - 255 * expected["accumulation"]).max() <= 0.5001
-        assert (expected["accumulation"] < 0.9).any(), "the test needs transparent pixels"
-        np.testing.assert_allclose(over_black(rgba), expected["linear_rgb"], atol=0.006)
-        grey = over_black(iio.imread(tmp_path / "band-550nm" / f"view.{index}.png"))
-        np.testing.assert_allclose(grey[..., 1], expected["band:550nm"], atol=0.006)
+def test_pictures_have_straight_colours_and_the_models_opacity(pictures):
+    folder, _, _, expected = pictures
+    for name, values in expected:
+        rgba = iio.imread(folder / "rgb" / f"{name}.png")
+        assert np.abs(rgba[..., 3] - 255 * values["accumulation"]).max() <= 0.5001
+        assert (values["accumulation"] < 0.9).any(), "the test needs transparent pixels"
+        np.testing.assert_allclose(over_black(rgba), values["linear_rgb"], atol=0.006)
+        grey = over_black(iio.imread(folder / "band-550nm" / f"{name}.png"))
+        np.testing.assert_allclose(grey[..., 1], values["band:550nm"], atol=0.006)
 
 
-def test_maps_have_one_known_range_in_all_views(tmp_path):
-    cameras = views(3)
-    _, survey, _ = render(tmp_path, ["depth"], ["png"], cameras)
+def test_maps_have_one_known_range_and_ids_their_colours_in_all_views(pictures):
+    folder, survey, job, expected = pictures
     scale = survey.scales["depth"]
     assert 0 < scale.low < scale.high
-    for index in range(3):
-        values = truth(cameras, index, survey)
-        path = tmp_path / "depth" / f"view.{index}.png"
-        rgba = iio.imread(path)
+    for name, values in expected:
+        with Image.open(folder / "depth" / f"{name}.png") as picture:
+            assert f"viridis from {scale.low:.6g} to {scale.high:.6g}" in picture.info["Description"]
+            rgba = np.asarray(picture)
         fraction = np.clip((values["depth"] - scale.low) / (scale.high - scale.low), 0, 1)
         shown = rgba[..., 3] > 0
         colours = np.round(255 * colormaps["viridis"](fraction)[..., :3])
         np.testing.assert_allclose(rgba[shown][:, :3], colours[shown], atol=1)  # a half is rounded either way
-        with Image.open(path) as picture:
-            assert f"viridis from {scale.low:.6g} to {scale.high:.6g}" in picture.info["Description"]
-
-
-def test_ids_keep_their_colours_in_all_views(tmp_path):
-    cameras = views(3)
-    _, survey, job = render(tmp_path, ["segmentation"], ["png"], cameras)
-    for index in range(3):
-        ids = truth(cameras, index, survey)["segmentation"]
-        with Image.open(tmp_path / "segmentation" / f"view.{index}.png") as picture:
+        ids = values["segmentation"]
+        with Image.open(folder / "segmentation" / f"{name}.png") as picture:
             np.testing.assert_array_equal(np.asarray(picture), ids)
             rgba = np.asarray(picture.convert("RGBA"))
         seen = ids != 255
@@ -178,14 +176,12 @@ def test_ids_keep_their_colours_in_all_views(tmp_path):
         assert not rgba[~seen][:, 3].any()
 
 
-def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(tmp_path):
-    cameras = views(1)
-    _, survey, job = render(tmp_path, ["abundances"], ["png"], cameras)
-    rgba = iio.imread(tmp_path / "abundances" / "view.0.png")
+def test_one_tile_for_each_endmember_stands_in_a_picture_of_abundances(pictures):
+    folder, _, job, [(name, values), *_] = pictures
+    rgba = iio.imread(folder / "abundances" / f"{name}.png")
     layout = CanvasLayout.of((14, 11), job.palette.names)
     assert rgba.shape[1::-1] == layout.size
-    expected = truth(cameras, 0, survey)
-    shares = expected["abundances"] / np.maximum(expected["accumulation"], 1e-6)[..., None]
+    shares = values["abundances"] / np.maximum(values["accumulation"], 1e-6)[..., None]
     for index in range(3):
         left = layout.corner(index)[1]
         tile = rgba[-11:, left : left + 14]
