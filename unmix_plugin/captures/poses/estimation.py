@@ -66,7 +66,6 @@ _TEXTURE = (
 )
 _STILL = "mask a background that stands still while the object turns (--mask black, white or files)"
 _OTHER_POSES = "give poses of another program with --poses FILE"
-_WHAT_TO_DO = f"{_SMALLER_STEPS}; {_TEXTURE}; {_STILL}; {_OTHER_POSES}"
 
 
 def require_pycolmap() -> None:
@@ -102,7 +101,7 @@ def estimate_poses(
 
     require_pycolmap()
     if len(pictures) < _LEAST_VIEWS:
-        raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_WHAT_TO_DO}")
+        raise CaptureError(f"{len(pictures)} views; at least {_LEAST_VIEWS} are needed: {_SMALLER_STEPS}")
     ordered = sorted(pictures, key=natural_order)
     files = {name: f"{index:06d}.png" for index, name in enumerate(ordered)}
     shown = {"images": {files[name]: picture for name, picture in pictures.items()}}

@@ -170,7 +170,7 @@ class _Chain:
         for index in np.unique(seen.sensor[seen.view]).tolist():
             own = seen.sensor[seen.view] == index
             ideal = lenses[index].ideal_of(seen.corners[own].reshape(-1, 2))
-            assert ideal is not None  # `_followed` leaves out what a lens can't follow
+            assert ideal is not None  # `_gather` leaves out what a lens can't follow
             self._ideal[own] = ideal.reshape(-1, 4, 2)
         self._squares = np.stack([_square_poses(corners) for corners in self._ideal])
         """Both poses of each sighting, camera from marker."""

@@ -400,11 +400,9 @@ def _refuse_unexplained(fitted: _Numbers, evidence: Evidence) -> None:
     limit = _MOST_OFF * float(np.hypot(*evidence.size))
     if off <= limit or fits >= max(_ENOUGH_MATCHES, _ENOUGH_FIT * len(matched)):
         return
-    limits = (
-        f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
-    )
+    told = f"a quarter of the outlines are off by more than {off:.2g} px (at most {limit:.2g} is expected), "
     raise CaptureError(
-        f"the angles do not explain the pictures: {limits if np.isfinite(off) else ''}{fits} of {len(matched)} matched "
+        f"the angles do not explain the pictures: {told * bool(len(compared))}{fits} of {len(matched)} matched "
         "points fit; expected the object alone to turn before a camera and a background that stand still: check "
         "--angles, and that --mask cuts out the object"
     )
