@@ -35,6 +35,8 @@ def board(columns: int = 4, rows: int = 3) -> dict[int, np.ndarray]:
 
 
 BOARD = board()
+BIGGER = BOARD | {7: BOARD[7].mean(axis=0) + 1.5 * SQUARE}
+MOVED = {number: points + np.array([0.02, 0.01, 0.0]) * (number > 5) for number, points in BOARD.items()}
 
 
 def cameras(count: int = 8, lens: Lens = LENS, corners: dict[int, np.ndarray] = BOARD) -> PoseSet:
@@ -195,19 +197,18 @@ def test_a_board_in_one_view_only_is_refused():
 
 
 @pytest.mark.slow
-def test_markers_of_two_sizes_are_refused_by_number():
-    truth, corners = cameras(), BOARD | {7: BOARD[7].mean(axis=0) + 1.5 * SQUARE}
-    with pytest.raises(CaptureError, match=r"several sizes: over the usual one, 7 \(1\.[45]"):
-        solved(seen(truth, corners))
-
-
-@pytest.mark.slow
-def test_boards_that_moved_against_each_other_are_refused():
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        (BIGGER, BIGGER, r"several sizes: over the usual one, 7 \(1\.[45]"),
+        (BOARD, MOVED, "markers did not keep their places"),
+    ],
+)
+def test_markers_of_two_sizes_and_boards_that_moved_are_refused(before, after, message):
     truth = cameras()
-    moved = {number: points + np.array([0.02, 0.01, 0.0]) * (number > 5) for number, points in BOARD.items()}
-    before, after = seen(truth), seen(truth, moved)
-    sightings = {name: (before if index < 4 else after)[name] for index, name in enumerate(truth.cameras)}
-    with pytest.raises(CaptureError, match="markers did not keep their places"):
+    first, later = seen(truth, before), seen(truth, after)
+    sightings = {name: (first if index < 4 else later)[name] for index, name in enumerate(truth.cameras)}
+    with pytest.raises(CaptureError, match=message):
         solved(sightings)
 
 
