@@ -80,7 +80,7 @@ class PixelBlock:
         self._projected: ProjectedPixels | None = None
         self._values: Tensor | None = None
         ones = torch.ones(1, device=device)
-        self.alpha = ones.repeat(len(self)) if scene.has_alpha else ones.expand(len(self))  # takes no memory
+        self.alpha = ones.repeat(len(self)) if scene.has_alpha else ones.expand(len(self))  # without memory
         self.valid = torch.empty(len(self), dtype=torch.bool)
         for row, view in enumerate(views):
             part = slice(row * self._size, (row + 1) * self._size)

@@ -282,11 +282,8 @@ def _check_values(
     with ThreadPoolExecutor(min(_MOST_READERS, os.cpu_count() or 1)) as readers:
         measured = list(readers.map(measure, frames, paths))
     cubes = [cube for cube in measured if cube is not None]
-    has_scale = [options.value_scale is not None or not cube.is_integer for cube in cubes]
-    scaled, unscaled = (
-        [cube for cube, has in zip(cubes, has_scale, strict=True) if has == wanted]
-        for wanted in (True, False)
-    )
+    unscaled = [cube for cube in cubes if cube.is_integer and options.value_scale is None]
+    scaled = [cube for cube in cubes if not cube.is_integer or options.value_scale is not None]
     _note_invalid(scaled, options.invalid_pixels, faults)
     _note_integers(unscaled, faults)
     _note_far_off(scaled, options.value_scale, faults)
@@ -298,9 +295,7 @@ def say_clipped(cubes: Sequence[_CubeValues], value_scale: float | None) -> tupl
     clipped = [cube for cube in cubes if cube.share_above_one > _EXCESS_SHARE]
     if value_scale is None or not clipped:
         return ()
-    share, greatest = (
-        max(getattr(cube, name) for cube in clipped) for name in ("share_above_one", "greatest")
-    )
+    share, greatest = max(cube.share_above_one for cube in clipped), max(cube.greatest for cube in clipped)
     found = f"up to {share:.0%} of the values are above 1 after division by the value scale {value_scale:g}"
     stored_as = f"and count as 1 (up to {greatest:g} as stored)"
     advice = f"if they are no highlights, give --value-scale {_propose_scale(clipped):g}"
@@ -350,9 +345,8 @@ def _note_invalid(cubes: Sequence[_CubeValues], invalid_pixels: str, faults: Fau
         if invalid_pixels == "refuse" and cube.num_invalid_pixels:
             refused.append(cube)
         elif invalid_pixels != "refuse" and cube.num_invalid_pixels == cube.num_pixels:
-            faults.add(
-                cube.where, "every pixel of the cube has a NaN, infinite or negative value; drop the frame"
-            )
+            found = "every pixel of the cube has a NaN, infinite or negative value"
+            faults.add(cube.where, f"{found}; drop the frame")
         elif invalid_pixels == "clip" and not cube.is_noise:
             found = f"the cube has {cube.num_far_negative} values far below 0"
             faults.add(cube.where, f"{found}, which is not noise; check its dark frame")
@@ -378,12 +372,11 @@ def _note_integers(cubes: Sequence[_CubeValues], faults: Faults) -> None:
     if not cubes:
         return
     greatest, scale = max(cube.greatest for cube in cubes), _propose_scale(cubes)
+    found = f"the cube holds integers (up to {greatest:g} in this scene)"
     meaning = f" ({_INTEGER_SCALES[scale]})" if scale in _INTEGER_SCALES else ""
-    holds = f"the cube holds integers (up to {greatest:g} in this scene)"
+    advice = f"give --value-scale {scale:g}, the number that stands for 1{meaning}"
     for cube in cubes:
-        faults.add(
-            cube.where, f"{holds}; give --value-scale {scale:g}, the number that stands for 1{meaning}"
-        )
+        faults.add(cube.where, f"{found}; {advice}")
 
 
 def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Faults) -> None:
@@ -393,11 +386,12 @@ def _note_far_off(cubes: Sequence[_CubeValues], scale: float | None, faults: Fau
     far = [cube for cube in cubes if cube.share_above_one > most_share or cube.greatest > most]
     if not far:
         return
-    given = "" if scale is None else f" after division by --value-scale {scale:g}"
-    advice = (
-        f"give --value-scale {_propose_scale(far):g}{', or to 1 to clip highlights at 1' * (scale is None)}"
-    )
     greatest = max(cube.greatest for cube in far)
+    given, advice = "", f"give --value-scale {_propose_scale(far):g}"
+    if scale is None:
+        advice += ", or to 1 to clip highlights at 1"
+    else:
+        given = f" after division by --value-scale {scale:g}"
     found = f"the cube's values are far outside [0, 1]{given} (up to {greatest:g} as stored in this scene)"
     for cube in far:
         faults.add(cube.where, f"{found}; {advice}")

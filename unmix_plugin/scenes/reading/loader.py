@@ -136,25 +136,19 @@ def _assemble(
     space = find_model_space(root, entry, checked, split.train, options)
     before, fwhm_nm, warnings = space.before_backdrop, entry.fwhm_nm, entry.warnings
     if fwhm_nm is not None and (unknown := int(np.isnan(fwhm_nm).sum())):
-        said = (
-            f"'fwhm' has 0 or null for {unknown} of {len(fwhm_nm)} bands: the widths of all count as unknown"
-        )
-        fwhm_nm, warnings = None, (*warnings, said)
+        found = f"'fwhm' has 0 or null for {unknown} of {len(fwhm_nm)} bands"
+        fwhm_nm, warnings = None, (*warnings, f"{found}: the widths of all count as unknown")
     if before is not None and not before.shows_matter:
         before, warnings = None, (*warnings, _NOTHING_TO_SEE)
-    hashes = {frame.cube: frame.sha256 for frame in checked.frames}
-    files = [(path, key in _MEASURED_KEYS) for frame in entry.frames for key, path in frame.files.items()]
-    files += [(root / FILE_NAME, True)]
-    files += [(path, True) for path in [truth.light_path] if path is not None]
-    files += [(path, False) for path in [truth.materials_path] if path is not None]
-    input_hashes, truth_hashes = (
-        {
-            _relative(path, root): hashes.get(path) or sha256_of(path)
-            for path, kind in files
-            if kind == is_input
-        }
-        for is_input in (True, False)
-    )
+    known = {frame.cube: frame.sha256 for frame in checked.frames}
+    files = [(key, path) for frame in entry.frames for key, path in frame.files.items()]
+    inputs = [path for key, path in files if key in _MEASURED_KEYS] + [root / FILE_NAME, truth.light_path]
+    truths = [path for key, path in files if key not in _MEASURED_KEYS] + [truth.materials_path]
+
+    def hashes(paths: Sequence[Path | None]) -> dict[str, str]:
+        found = [path for path in paths if path is not None]
+        return {_relative(path, root): known.get(path) or sha256_of(path) for path in found}
+
     assert entry.wavelengths_nm is not None
     evaluated = [entry.frames[index].files for index in split.evaluation]
     return Scene(
@@ -180,8 +174,8 @@ def _assemble(
         warnings=warnings,
         has_labels=all("seg_file_path" in files for files in evaluated),
         has_abundances=all("abundance_file_path" in files for files in evaluated),
-        input_hashes=input_hashes,
-        truth_hashes=truth_hashes,
+        input_hashes=hashes(inputs),
+        truth_hashes=hashes(truths),
         options=options,
     )
 
