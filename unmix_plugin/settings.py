@@ -52,7 +52,7 @@ _WHERE_LAMP = {
 }
 
 
-def _within(value: float | int | str, low: float, high: float = math.inf) -> bool:
+def _within(value: float | int | str, low: float | int, high: float | int = math.inf) -> bool:
     """Whether a setting is a word such as `auto`, or a number from `low` to `high`."""
     return isinstance(value, str) or low <= value <= high
 
