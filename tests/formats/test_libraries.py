@@ -260,7 +260,8 @@ def test_a_folder_stands_for_the_libraries_in_it_whatever_the_suffix_of_their_nu
     path, _ = written_by_spectral(tmp_path)
     (tmp_path / "image.hdr").write_text("ENVI\nfile type = ENVI Standard\n")
     assert library_of([tmp_path]).names == ("moss", "Acer rubrum", "oak", "fir tree")
-    path.with_suffix(".sli").rename(path.with_suffix(""))
+    path.with_suffix(".sli").rename(tmp_path / "bandpass_trees.dat")
+    path.rename(tmp_path / "bandpass_trees.hdr")
     assert library_of([tmp_path]).names == ("moss", "Acer rubrum", "oak", "fir tree")
     (tmp_path / "none").mkdir()
     with pytest.raises(SpectrumError, match="none: no library in this folder"):

@@ -99,8 +99,8 @@ def read_library(path: Path) -> list[LibraryMaterial]:
 def _libraries_in(folder: Path) -> list[Path]:
     """Files of spectra in a folder, without what ECOSTRESS and USGS put beside them."""
     kinds = [f".{suffix}" for suffix in LIBRARY_SUFFIXES if suffix != "hdr"]  # each .sli has its own
-    there = [path for path in sorted(folder.iterdir()) if not _BESIDE_SPECTRA.search(path.name)]
-    found = [path for path in there if path.suffix.lower() in kinds]
+    there = sorted(folder.iterdir())
+    found = [path for path in there if path.suffix.lower() in kinds and not _BESIDE_SPECTRA.search(path.name)]
     with_numbers = {path.stem for path in found if path.suffix.lower() == ".sli"}
     headers = [path for path in there if path.suffix.lower() == ".hdr" and path.stem not in with_numbers]
     found += filter(_is_library, headers)
