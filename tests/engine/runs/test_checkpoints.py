@@ -5,6 +5,8 @@ import errno
 import itertools
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.systems import needs_posix
 from unmix_plugin.engine.runs import atomic_files
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
@@ -53,18 +56,23 @@ def failing_at(number: int, error: type[BaseException]) -> Iterator[list[str]]:
         yield calls
 
 
-def failed_saves(folder: Path, error: type[BaseException], keep: int) -> Iterator[tuple[Path, str]]:
-    """Folders with step 1 to which step 2 was saved, failing at each system call in turn, and what was said."""
+def failed_saves(
+    folder: Path, error: type[BaseException], keep: int, *, is_again: bool = False
+) -> Iterator[tuple[Path, str]]:
+    """Folders with step 1 to which step 2 was saved, for the second time if `is_again`, failing at each system call in
+    turn, and what was said."""
     for number in itertools.count(1):
         place, said = folder / str(number), ""
         save_checkpoint(place, 1, tensors_of(1), {})
+        if is_again:
+            save_checkpoint(place, 2, tensors_of(2), {"seconds": 1})
         with failing_at(number, error) as calls:
             try:
                 save_checkpoint(place, 2, tensors_of(2), {}, keep=keep)
             except (Killed, RunError) as stopped:
                 said = str(stopped)
         if len(calls) < number:
-            assert number > 12
+            assert number > (6 if is_again else 12)
             return
         yield place, said
 
@@ -94,25 +102,74 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
         assert torch.equal(loaded.tensors[name], tensor.detach())
 
 
-def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path):
+@pytest.mark.parametrize("same_step", [False, True])
+def test_a_kill_at_any_system_call_leaves_a_complete_checkpoint(tmp_path: Path, same_step: bool):
     seen: set[int] = set()
-    for folder, _ in failed_saves(tmp_path, Killed, keep=1):
+    for folder, _ in failed_saves(tmp_path, Killed, keep=1 + same_step, is_again=same_step):
         found = newest_complete_checkpoint(folder)
         assert found.damaged == ()
         assert torch.equal(found.tensors["a"], tensors_of(found.step)["a"])
         seen.add(found.step)
         save_checkpoint(folder, 3, tensors_of(3), {}, keep=1)
         assert {path.name for path in folder.iterdir()} == {"step-000003.json", "step-000003.safetensors"}
-    assert seen == {1, 2}
+    assert seen == ({2} if same_step else {1, 2})
 
 
-def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Path):
-    for folder, said in failed_saves(tmp_path, OSError, keep=2):
+@pytest.mark.parametrize("same_step", [False, True])
+def test_a_full_disk_at_any_system_call_is_said_and_changes_nothing(tmp_path: Path, same_step: bool):
+    for folder, said in failed_saves(tmp_path, OSError, keep=2, is_again=same_step):
         assert "No space left on device" in said
         names = {path.name for path in folder.iterdir()}
         assert not [name for name in names if name.endswith(".tmp")]
         assert {"step-000001.json", "step-000001.safetensors"} <= names
-        assert newest_complete_checkpoint(folder).damaged == ()
+        found = newest_complete_checkpoint(folder)
+        assert found.damaged == ()
+        assert found.step == 2 or not same_step
+
+
+@pytest.mark.slow
+@needs_posix
+def test_twenty_real_kills_during_saving_leave_complete_checkpoints(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, "-c", KILLING, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    steps = [int(word) for word in done.stdout.split()]
+    assert len(steps) == 20
+    assert steps == sorted(steps)
+    assert steps[-1] > steps[0]
+
+
+KILLING = """
+import os, random, signal, sys
+from pathlib import Path
+import torch
+from unmix_plugin.engine.runs.checkpoints import newest_complete_checkpoint, save_checkpoint
+
+folder, chance = Path(sys.argv[1]), random.Random(1)
+save_checkpoint(folder, 1, {"a": torch.full((300_000,), 1.0)}, {})
+for _ in range(20):
+    start = newest_complete_checkpoint(folder).step
+    saved, tell = os.pipe()
+    child = os.fork()
+    if child == 0:
+        for step in range(start + 1, start + 10_000):
+            save_checkpoint(folder, step, {"a": torch.full((300_000,), float(step))}, {})
+            os.write(tell, b".")
+        os._exit(0)
+    for _ in range(chance.randint(1, 4)):
+        os.read(saved, 1)
+    os.kill(child, signal.SIGKILL)  # in the middle of the next save
+    os.waitpid(child, 0)
+    found = newest_complete_checkpoint(folder)
+    assert found.damaged == (), found.damaged
+    assert found.tensors["a"].unique().tolist() == [float(found.step)]
+    print(found.step)
+"""
 
 
 def test_damage_to_the_newest_falls_back_to_the_one_before(tmp_path: Path):
@@ -154,3 +211,11 @@ def test_a_checkpoint_of_a_newer_version_is_refused_not_passed_over(tmp_path: Pa
     path.write_text(json.dumps({**json.loads(path.read_text()), "format_version": RUN_FORMAT + 1}))
     with pytest.raises(RunError, match="newer version"):
         newest_complete_checkpoint(tmp_path)
+
+
+def test_saving_the_same_tensors_again_only_rewrites_the_record(tmp_path: Path):
+    save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 1})
+    before = (tmp_path / "step-000001.safetensors").stat().st_mtime_ns
+    save_checkpoint(tmp_path, 1, tensors_of(1), {"seconds": 2})
+    assert newest_complete_checkpoint(tmp_path).record["seconds"] == 2
+    assert (tmp_path / "step-000001.safetensors").stat().st_mtime_ns == before

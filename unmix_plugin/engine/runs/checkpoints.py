@@ -61,13 +61,16 @@ def save_checkpoint(
     """
     data = safetensors.torch.save(_separate(tensors))
     tensors_path, record_path = folder / f"{_stem(step)}.safetensors", folder / f"{_stem(step)}.json"
+    sha256 = hashlib.sha256(data).hexdigest()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         remove_stale_temporaries(folder)
         _remove_orphans(folder)
-        record_path.unlink(missing_ok=True)  # of a damaged one: never a record beside other tensors
-        write_file(tensors_path, data)
-        write_run_json(record_path, {**record, "step": step, "sha256": hashlib.sha256(data).hexdigest()})
+        is_there = record_path.exists() and tensors_path.exists()
+        if not is_there or hashlib.sha256(tensors_path.read_bytes()).hexdigest() != sha256:
+            record_path.unlink(missing_ok=True)  # of a damaged one: never a record beside other tensors
+            write_file(tensors_path, data)
+        write_run_json(record_path, {**record, "step": step, "sha256": sha256})
         _remove_others(folder, step, keep)
     except OSError as error:
         raise RunError(f"can't write to {folder}: {error.strerror or error}") from error
