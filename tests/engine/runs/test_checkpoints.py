@@ -27,6 +27,10 @@ def tensors_of(step: int) -> dict[str, Tensor]:
     return {"a": torch.full((40, 3), float(step)), "n": torch.tensor(step)}
 
 
+def bytes_of(tensor: Tensor) -> list[int]:
+    return tensor.detach().contiguous().reshape(-1).view(torch.uint8).tolist()
+
+
 class Killed(BaseException):
     """Stands for SIGKILL: nothing that runs after it has any effect."""
 
@@ -86,6 +90,7 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
         "scalar": torch.tensor(3.5),
         "empty": torch.zeros(0, 4),
         "half": torch.randn(4).to(torch.bfloat16),
+        "byte": torch.randn(4).to(torch.float8_e4m3fn),
         "base": base,
         "transposed": base.T,
         "row": base[1],
@@ -99,7 +104,8 @@ def test_a_checkpoint_comes_back_to_the_bit(tmp_path: Path):
     assert set(loaded.tensors) == set(tensors)
     for name, tensor in tensors.items():
         assert loaded.tensors[name].dtype == tensor.dtype
-        assert torch.equal(loaded.tensors[name], tensor.detach())
+        assert loaded.tensors[name].shape == tensor.shape
+        assert bytes_of(loaded.tensors[name]) == bytes_of(tensor)
 
 
 @pytest.mark.parametrize("same_step", [False, True])

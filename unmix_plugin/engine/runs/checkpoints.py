@@ -119,7 +119,9 @@ def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
 
 def _is_sound(name: str, tensor: Tensor) -> bool:
     """Whether a tensor holds numbers; what a model keeps beside its parameters may be infinite."""
-    is_sound = tensor.isnan().logical_not() if name.startswith(_MODEL) else tensor.isfinite()
+    is_small = tensor.is_floating_point() and tensor.element_size() == 1  # of which torch can't ask it
+    values = tensor.float() if is_small else tensor
+    is_sound = values.isnan().logical_not() if name.startswith(_MODEL) else values.isfinite()
     return bool(is_sound.all())
 
 
