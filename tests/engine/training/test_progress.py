@@ -1,5 +1,6 @@
 """When training ends, what is shown of it, and what is written down."""
 
+import errno
 import importlib.util
 import io
 import json
@@ -27,6 +28,7 @@ from unmix_plugin.engine.training.progress import (
 )
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.engine.training.training_control import Interrupted
+from unmix_plugin.errors import RunError
 
 limits = st.tuples(st.none() | st.integers(0, 10_000), st.none() | st.floats(1e-3, 1e4)).filter(any)
 steps, seconds = st.integers(0, 20_000), st.floats(0, 2e4)
@@ -104,6 +106,17 @@ def test_a_status_says_step_loss_psnr_speed_and_time_left():
     bare = replace(STATUS, psnr=None, progress=0.0, rays_per_second=2.4e6)
     assert str(bare) == "step 120    0 %  loss 0.00123  2.4M rays/s"
     assert str(replace(STATUS, seconds=7200.0)).endswith("6:00:00 left")
+
+
+def test_where_the_output_is_no_terminal_each_status_is_one_plain_line():
+    out = io.StringIO()
+    display = ProgressDisplay(Console(file=out, width=40), plain_interval_s=0.0)
+    with display:
+        assert display.is_due
+        display.show(STATUS)
+        display.message("saved [bold]x[/bold]")
+    assert out.getvalue() == f"{STATUS}\nsaved [bold]x[/bold]\n"
+    assert not ProgressDisplay(Console(file=out), plain_interval_s=100.0).is_due
 
 
 @pytest.mark.parametrize("width", [40, 60, 200])
@@ -191,3 +204,27 @@ def test_resuming_cuts_off_later_lines_odd_ones_and_a_half_written_one(tmp_path:
     path.write_bytes(b'\xef\xbb\xbf{"step": 1}\n' + odd + b'{"step": 2}\n{"step": 3}\n{"step": 4, "lo')
     MetricsWriter(RunFolder(tmp_path), resumed_step=2).write(3, 0.0, "train", {})
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == [1, 2, 3]
+
+
+def test_a_full_disk_while_saving_ends_training_with_a_clear_error_and_the_last_checkpoint(
+    short_config: TrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    trainer = Trainer(short_config)
+    saved: list[int] = []
+    original = trainer.save
+
+    def save_then_fill_the_disk() -> None:
+        original()
+        saved.append(trainer.step)
+        monkeypatch.setattr("os.write", refuse)
+
+    def refuse(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(trainer, "save", save_then_fill_the_disk)
+    with pytest.raises(RunError, match=r"No space left on device.*go on with --load-run"):
+        trainer.train()
+    assert saved == [4]
+    names = sorted(path.name for path in trainer.run.checkpoints.iterdir())
+    assert names == ["step-000004.json", "step-000004.safetensors"]
+    assert "failed at step 8: RunError" in trainer.run.log_path.read_text()
