@@ -231,7 +231,7 @@ IN_WAVENUMBERS = ECOSTRESS.replace("(micrometers)", "(cm-1)").replace("Wavelengt
         ("x.txt", "Wavelength sand grass\n400 1 1\n", "what column 3, 'grass', means is unknown"),
         ("x.txt", "nm;dry sand;wet grass\n400;0,1;0,1\n", "what column 3, 'wet grass', means is unknown"),
         ("x.txt", "400, 1,2\n500, 1,2\n", "3 numbers, and what column 3 means is unknown"),
-        ("x.txt", "400\t0.1\n500\t0,1\t2.0\n", "4 numbers, and what column 3 means is unknown"),
+        ("x.txt", "400\t0.1\n500\t0,1\t2.0\n", "column 3 means is unknown; .* or write several spectra"),
         ("x.txt", IN_WAVENUMBERS, "'X Units' is"),
         ("x.txt", ECOSTRESS.replace("Reflectance", "Transmittance"), "'Y Units' is .* expected reflectance"),
         ("x.pdf", "", r"a library is a \.csv, an ENVI spectral library"),

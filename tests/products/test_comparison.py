@@ -95,7 +95,9 @@ def test_runs_that_share_nothing_are_refused(tmp_path):
     of_objects = replace(
         compared(tmp_path, "d", 30.0, {"v0": view([0.01, 0.01, 0.01])}), bands={}, method="neumatex"
     )
-    with pytest.raises(ConfigError, match=r"is of unmix-nerf, .* of neumatex: these measure"):
+    with pytest.raises(
+        ConfigError, match=r"is of unmix-nerf, .* of neumatex: these measure .*; compare runs of"
+    ):
         compare_runs([first, of_objects], tmp_path / "out")
     moved = replace(of_objects, path=tmp_path / "e", cameras=np.ones((1, 3, 4)))
     with pytest.raises(ConfigError, match="runs of different scenes"):

@@ -96,7 +96,10 @@ def read_header(path: Path) -> dict[str, str]:
             raise
         other = next((kind for word, kind in _OTHER_HEADERS.items() if begin.startswith(word)), None)
         found = f"it is the header of {other}" if other else str(error)
-        raise ValueError(f"no ENVI header: {found}; expected 'ENVI' and then 'key = value' lines") from error
+        raise ValueError(
+            f"no ENVI header: {found}; expected 'ENVI' and then 'key = value' lines. Convert the file to ENVI or "
+            "write such a header for it"
+        ) from error
 
 
 def _decoded(data: bytes) -> str:

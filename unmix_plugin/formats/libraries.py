@@ -269,7 +269,8 @@ def _read_text(path: Path) -> _Table:
         third = "column 3" if heads is None else f"column 3, '{heads[2].strip()}',"
         if count > 3 or heads is None or not _DEVIATION.search(heads[2]):
             raise SpectrumError(
-                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value"
+                f"a line has {count} numbers, and what {third} means is unknown; leave a wavelength and a value, or "
+                "write several spectra as a .csv headed 'wavelength,NAME,...'"
             )
     kept = rows[:, 0] > 0
     wavelengths, values = rows[kept].T

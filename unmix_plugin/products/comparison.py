@@ -181,7 +181,8 @@ def _shared_views(runs: Sequence[ComparedRun], remarks: list[str]) -> list[str]:
     for other in runs[1:]:
         if bool(other.bands) != bool(first.bands):
             raise ConfigError(
-                f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure views differently"
+                f"{first.path} is of {first.method}, {other.path} of {other.method}: these measure views differently; "
+                "compare runs of methods that measure alike"
             )
     names = [name for name in first.views if all(name in run.views for run in runs)]
     others = len({name for run in runs for name in run.views}) - len(names)

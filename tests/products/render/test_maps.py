@@ -105,7 +105,7 @@ def test_units_and_a_coordinate_system_that_are_known_are_written():
     kind, *_, zone, half, datum, units = utm.envi["map info"]
     assert (kind, zone, half, datum, units) == ("UTM", 32, "North", "WGS-84", "units=Meters")
     assert national.envi["map info"][0] == "Arbitrary"
-    with pytest.raises(ConfigError, match="--epsg needs a world in metres"):
+    with pytest.raises(ConfigError, match=r"--epsg needs a world in metres, .*: leave --epsg out"):
         choose_cameras(SCENE, RenderOptions(cameras="map", epsg=32632), None)
     _, info = map_camera(SCENE, None, "top", 0.2)
     assert info.envi["map info"][-1] == "units=Unknown"

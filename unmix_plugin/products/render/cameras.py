@@ -121,7 +121,8 @@ def _require_coordinate_system(epsg: int, scale: Scale | None, direction: str) -
         raise ConfigError(f"--epsg is for maps from above; map:{direction} has no east and north")
     if scale is None or scale.metres_per_unit != 1:
         raise ConfigError(
-            "--epsg needs a world in metres, as geo-referenced poses have; this run's scale is another or unknown"
+            "--epsg needs a world in metres, as geo-referenced poses have; this run's scale is another or unknown: "
+            "leave --epsg out"
         )
 
 
