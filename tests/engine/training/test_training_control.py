@@ -16,7 +16,12 @@ from unmix_plugin.engine.runs.load_run import load_config
 from unmix_plugin.engine.runs.run_folder import checkpoint_steps
 from unmix_plugin.engine.training import training_control as device_share
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.engine.training.training_control import SHARE_BOUNDS, DeviceShare, Interrupted
+from unmix_plugin.engine.training.training_control import (
+    SHARE_BOUNDS,
+    DeviceShare,
+    Interrupted,
+    TrainingControl,
+)
 
 STEP_S = 0.004
 
@@ -174,6 +179,15 @@ def wait_for_rounds(control, number):
     for _ in range(number):
         assert seen.acquire(timeout=120)
     control.wait_while_paused = look
+
+
+def test_a_training_is_stopped_by_the_control_that_it_was_given(short_config):
+    control = TrainingControl()
+    trainer = Trainer(short_config, console=Console(file=io.StringIO()), control=control)
+    call_after_step(trainer, 3, control.request_stop)
+    with pytest.raises(Interrupted) as stopped:
+        trainer.train()
+    assert stopped.value.step == 3
 
 
 @pytest.mark.parametrize("average_decay", [None, 0.9])

@@ -56,6 +56,7 @@ class Trainer:
         config: TrainerConfig,
         *,
         console: Console | None = None,
+        control: TrainingControl | None = None,
         processes: Processes = ALONE,
     ) -> None:
         """Read the scene, make the model, then make the run folder or reopen the one in `config.load_run`.
@@ -63,6 +64,7 @@ class Trainer:
         Args:
             config: All settings; to resume, `load_config(path)`, in which limits may be changed.
             console: Where progress is shown; standard output if None.
+            control: Through which other threads watch and steer this training.
             processes: That train together, of which this is the first; the others call `follow_training`.
         Raises:
             SceneError, ConfigError: scene or settings are wrong; nothing has been written.
@@ -70,8 +72,7 @@ class Trainer:
         """
         config_to_json(config)  # settings that can't be written down are refused before anything is
         self.console = console or ProgressConsole()
-        self.control = TrainingControl()
-        """Through which other threads watch and steer this training."""
+        self.control = control or TrainingControl()
         self.processes = processes
         keep_freed_memory()
         with processes.together():
