@@ -23,8 +23,8 @@ def test_regions_that_can_not_be_shown_are_said(exported):
     facts, said, _ = exported
     assert facts["regions"] == ["cap <b>", "below"]
     for text in (
-        "The region nowhere is left out: the region nowhere has nothing of the surface in it",
-        "The region of no material is left out: the scene has no material 7; it has 3.",
+        "Not shown: the region nowhere has nothing of the surface in it",
+        "Not shown: the region of no material can't be found: the scene has no material 7; it has 3.",
     ):
         assert any(one.startswith(text) for one in said)
 

@@ -43,9 +43,10 @@ class MeasuredRegion:
     """Standard deviation over the area."""
     abundances: Float64[np.ndarray, " K"]
     """Summing to 1."""
-
     faces: Bool[np.ndarray, " F"]
     """Triangles of which more than half is in it."""
+    vertex_areas: Float64[np.ndarray, " V"]
+    """Its part of what each vertex stands for, a third of its triangles; square units of the world."""
 
     def said(self, names: Sequence[str], scale: Scale | None) -> str:
         """Area and largest shares for people."""
@@ -83,28 +84,26 @@ class MeasuredSurface:
         """Of the triangles, square units of the world."""
         return self.mesh.areas() / self.scene.frame.scale**2
 
-    def shares(self, region: Region) -> Float64[np.ndarray, "F 3"]:
+    def _shares(self, region: Region, name: str) -> Float64[np.ndarray, "F 3"]:
         """How much of each third of a triangle, that of a corner, is in a region: 0 to 1."""
         faces, names = self.mesh.faces, self.scene.materials.names
         if isinstance(region, OfMaterial):
             if region.material >= len(names):
-                raise ConfigError(f"the scene has no material {region.material}; it has {len(names)}")
+                raise ConfigError(
+                    f"the region {name} can't be found: the scene has no material {region.material}; it has "
+                    f"{len(names)}"
+                )
             return (self._materials == region.material)[faces].astype(np.float64)
         corners, weights = self.mesh.vertices[faces], np.array(_PARTS) / 6
         points = np.einsum("pc,fcx->fpx", weights, corners).reshape(-1, 3)
         inside = points_in(self.scene, region, torch.from_numpy(points).float())
         return inside.reshape(len(faces), len(_PARTS)) @ weights / weights.sum(axis=0)
 
-    def vertex_areas(self, shares: Float64[np.ndarray, "F 3"]) -> Float64[np.ndarray, " V"]:
-        """The area of a region that each vertex stands for, a third of its triangles' (square units of the world), from
-        the region's `shares`."""
-        weights = shares * (self.areas / 3)[:, None]
-        return np.bincount(self.mesh.faces.ravel(), weights.ravel(), len(self.mesh.vertices))
-
     def measure(self, region: Region, name: str) -> MeasuredRegion:
         """What a region is; a ConfigError where it has nothing of the surface, or the scene no such material."""
-        shares = self.shares(region)
-        weights = self.vertex_areas(shares)
+        shares = self._shares(region, name)
+        of_corners = shares * (self.areas / 3)[:, None]
+        weights = np.bincount(self.mesh.faces.ravel(), of_corners.ravel(), len(self.mesh.vertices))
         area = float(weights.sum())
         if area <= 0:
             world = self.scene.frame.to_world(self.mesh.vertices).round(3)
@@ -118,7 +117,7 @@ class MeasuredSurface:
         mean = share @ spectra
         spread = np.sqrt(share @ (spectra - mean) ** 2)
         abundances = share @ self._abundances.double().numpy()
-        return MeasuredRegion(area, mean, spread, abundances, shares.mean(axis=1) > 0.5)
+        return MeasuredRegion(area, mean, spread, abundances, shares.mean(axis=1) > 0.5, weights)
 
 
 def points_in(

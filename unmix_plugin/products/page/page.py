@@ -206,10 +206,9 @@ def _mixture_content(job: Job, resolution: int) -> tuple[PageContent, int]:
     kept = job.loaded.measures.regions
     names: list[str] = []
     if kept:
-        surface = MeasuredSurface(job.scene, mesh)
-        found, failed = measure_regions(surface, kept)
-        notes += [f"The region {name} is left out: {reason}." for name, reason in failed.items()]
-        inside = [surface.vertex_areas(surface.shares(kept[name])) for name in found]
+        found, failed = measure_regions(MeasuredSurface(job.scene, mesh), kept)
+        notes += [f"Not shown: {reason}." for reason in failed.values()]
+        inside = [region.vertex_areas for region in found.values()]
         names, of_vertex = list(found), np.maximum(arrays["areas"], 1e-30)
         if names:  # how much of each vertex is in each, 255 for all of it
             arrays["regions"] = np.round(255 * np.stack(inside) / of_vertex).astype(np.uint8)
