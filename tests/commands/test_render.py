@@ -11,6 +11,7 @@ from tests.formats.video_reading import read_video
 from tests.products.render.render_factory import read_envi, read_exr
 from unmix_plugin.commands.render import render
 from unmix_plugin.editing.edited_run import load_edited_run
+from unmix_plugin.engine import processes
 from unmix_plugin.trained.open_run import load_run
 
 pytestmark = pytest.mark.usefixtures("no_wait_for_the_disk")
@@ -145,7 +146,7 @@ def test_files_of_an_earlier_render_are_kept_unless_overwrite_is_given(trained, 
         (["--outputs", "spectrl"], "no output named 'spectrl' (did you mean spectral"),
         (["--formats", "tiff"], "there is no format 'tiff'"),
         (["--cameras", "orbits"], "unknown cameras 'orbits' (did you mean orbit?)"),
-        (["--size", "64"], "--size 64: expected width and height in pixels, as in 640x480"),
+        (["--size", "64x99999"], "--size: 64 x 99999 pixels"),
         (["--illuminant", "sun"], "sun"),
         (["--edits", "none.yml"], "none.yml"),
     ],
@@ -156,6 +157,12 @@ def test_what_cannot_be_rendered_exits_2_before_anything_is_written(trained, tmp
     assert said in ended.err
     assert len(ended.err.strip().splitlines()) <= 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_size_that_is_none_is_refused_before_processes_start_and_the_run_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "start_together", lambda *_: pytest.fail("processes were started"))
+    said = refused(render, "--run", tmp_path / "none", "--num-devices", 2, "--size", "64")
+    assert "--size 64: expected width and height in pixels, as in 640x480" in said
 
 
 def test_a_folder_that_cannot_be_made_exits_2_before_rendering(trained, tmp_path):

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 def render(argv: list[str]) -> None:
     """Parse the arguments, render each view, list the files."""
     options = tyro.cli(RenderOptions, prog="unmix-render", args=argv)
+    options.asked_size()  # refused before processes start and the run is read
 
     from unmix_plugin.engine.processes import joined, start_together
 

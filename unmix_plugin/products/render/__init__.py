@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.product import EditOptions, RunOptions, SharedViews, WriteOptions
 
 
@@ -49,3 +51,12 @@ class RenderOptions(SharedViews, WriteOptions, EditOptions, RunOptions):
     """Degrees by which the environment is turned about the world's +z."""
     environment_exposure: float = 0.0
     """Stops by which the environment is brighter."""
+
+    def asked_size(self) -> tuple[int, int] | None:
+        """Width and height that --size says; a ConfigError where it does not say them."""
+        if self.size is None:
+            return None
+        match = re.fullmatch(r"(\d{1,9})[xX*](\d{1,9})", self.size)
+        if match is None:
+            raise ConfigError(f"--size {self.size}: expected width and height in pixels, as in 640x480")
+        return int(match[1]), int(match[2])

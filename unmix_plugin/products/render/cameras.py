@@ -132,14 +132,11 @@ def _path(name: str, cameras: Cameras) -> RenderCameras:
 
 
 def _size(size: tuple[int, int], options: RenderOptions) -> tuple[int, int]:
-    downscale = options.downscale
-    if options.size is not None and downscale is not None:
+    downscale, asked = options.downscale, options.asked_size()
+    if asked is not None and downscale is not None:
         raise ConfigError("--size and --downscale both say how large pictures are; give one of them")
-    if options.size is not None:
-        match = re.fullmatch(r"(\d{1,9})[xX*](\d{1,9})", options.size)
-        if match is None:
-            raise ConfigError(f"--size {options.size}: expected width and height in pixels, as in 640x480")
-        return check_size(int(match[1]), int(match[2]), "--size")
+    if asked is not None:
+        return check_size(*asked, "--size")
     if downscale is None and options.cameras in _PATH_CAMERAS and size[1] < _LEAST_PATH_HEIGHT:
         return round(size[0] * _LEAST_PATH_HEIGHT / size[1]), _LEAST_PATH_HEIGHT
     if downscale is None:
