@@ -33,6 +33,8 @@ class _EvalOptions(SharedViews, RunOptions):
 
     runs: tyro.conf.Positional[tuple[Path, ...]] = ()
     """Run folders, as training printed them; none takes the newest under --output-dir."""
+    run: Path | None = None
+    """The same for one run."""
     data: Path | None = None
     """Scene folder, where it is no longer where the run was trained on it."""
     edits: Path | None = None

@@ -43,9 +43,9 @@ class WriteOptions:
     """Where files go."""
 
     output: Path | None = None
-    """Folder to write to; None: exports/ and the product's name (of a render: render), in the run folder."""
+    """Folder to write to; None: exports/ and the product's name, in the run folder."""
     overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Replace files of an earlier export."""
+    """Replace earlier files."""
 
 
 @dataclass(frozen=True)

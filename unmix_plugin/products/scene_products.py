@@ -76,6 +76,9 @@ class Metamerism(_ComparedProduct):
     """Pairs of materials that look alike in one light and differ in another, as an eye adapted to each light sees them:
     metamerism.csv, the pairs with their differences, and metamerism.png, swatches."""
 
+    library: tuple[Path, ...] = ()
+    """Known spectra to pair in place of the built-in ones: .csv files, ENVI spectral libraries, texts of ECOSTRESS or
+    USGS, or folders of them; +builtin adds the built-in ones."""
     surfaces: Literal["run", "library", "all"] = "all"
     """Pair the run's endmembers, materials of the library, or both together."""
     lights: tuple[str, ...] = ("D65", "A", "FL2", "FL11")

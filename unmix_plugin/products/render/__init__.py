@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.product import EditOptions, RunOptions, SharedViews, WriteOptions
@@ -13,6 +14,8 @@ from unmix_plugin.products.product import EditOptions, RunOptions, SharedViews, 
 class RenderOptions(SharedViews, WriteOptions, EditOptions, RunOptions):
     """Render views of a trained run: spectra, pictures, maps and videos, from the run folder alone."""
 
+    output: Path | None = None
+    """Folder to write to; None: exports/render in the run folder."""
     cameras: str = "dataset-eval"
     """dataset-eval, dataset-train, orbit (around the scene), interpolate (through the evaluation cameras), map (from
     above without perspective, north up; map:bottom, map:east, map:north, map:west, map:south or map:X,Y,Z: from there),
