@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import spectral.io.envi as envi
 import torch
@@ -24,7 +25,7 @@ from unmix_plugin.products import views
 from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
 from unmix_plugin.products.poses import _poses_json
 from unmix_plugin.products.product import Job
-from unmix_plugin.products.scene_products import Segmentation
+from unmix_plugin.products.scene_products import Abundances, Cubes, Segmentation
 from unmix_plugin.products.spectrum import _facts, _ProbedPlace, _read_pixel
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.trained.camera_files import read_camera_file
@@ -73,6 +74,21 @@ def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
     for index in np.unique(ids):
         expected = [int(rows[int(index)][name]) for name in ("red", "green", "blue")]
         assert (colours[ids == index] == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("product", "said"),
+    [
+        (Abundances(formats=("envi", "exr")), "abundances, summing to the opacity"),
+        (Cubes(formats=("envi", "exr")), "radiance on black, 1 = full scale"),
+    ],
+)
+def test_cubes_say_of_which_view_their_numbers_are(tmp_path, product, said):
+    product.write(job_of(SCENE, tmp_path))
+    name = next(view.name for view in SCENE.views if view.split == "eval")
+    image: Any = envi.open(str(tmp_path / f"{name}.hdr"))
+    assert image.metadata["description"] == f"{name}: {said}"
+    assert OpenEXR.File(str(tmp_path / f"{name}.exr")).header()["comments"] == f"{name}: {said}"
 
 
 def test_what_a_training_view_measured_is_as_exposed_as_the_trained_scene(tmp_path):

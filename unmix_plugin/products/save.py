@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from unmix_plugin.trained.run_views import RunView
 _FORMATS = {".npy": "npy", ".png": "png", ".exr": "exr", ".hdr": "envi"}
 
 
-def save(view: MaterialView, name: str, path: str | Path) -> Path:
+def save(view: MaterialView, name: str, path: str | Path, *, label: str = "") -> Path:
     """Write an output of a view; a file that is there is replaced.
 
     Args:
@@ -23,6 +24,7 @@ def save(view: MaterialView, name: str, path: str | Path) -> Path:
         name: Of the output, such as `rgb`, `abundances` or `band:650nm`.
         path: File to write. Its suffix says how: .npy (the numbers), .png (a picture), .exr (OpenEXR), or .hdr (ENVI: a
             header, and the data beside it as .img).
+        label: Of what the numbers are, such as the name of the view: .exr and .hdr say it. Empty: the output's name.
     Returns:
         The path.
     Raises:
@@ -38,7 +40,7 @@ def save(view: MaterialView, name: str, path: str | Path) -> Path:
     (formatted,) = choose_formats([name], [_FORMATS[path.suffix]], scene, is_path=False)
     outputs = [formatted.output]
     survey = take_survey(scene, [RunView(path.stem, camera)], outputs if path.suffix == ".png" else [])
-    setting = setting_for(scene, camera, outputs, survey, path.parent)
+    setting = replace(setting_for(scene, camera, outputs, survey, path.parent), label=label)
     values: dict[str, np.ndarray] = {
         "accumulation": view.opacity.cpu().numpy(),
         COVERAGE: view.coverage.cpu().numpy(),

@@ -94,7 +94,7 @@ def _paths(folder: Path, formats: Sequence[str], view: str) -> list[Path]:
 
 def _save(folder: Path, formats: Sequence[str], output: str, name: str, view: MaterialView) -> None:
     for kind in formats:
-        save(view, output, _paths(folder, [kind], name)[0])
+        save(view, output, _paths(folder, [kind], name)[0], label=name)
 
 
 def _scores_of(view: PredictedView, materials: Materials) -> Float[Tensor, "H W K"]:

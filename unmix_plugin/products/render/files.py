@@ -238,6 +238,12 @@ class RenderSetting:
     """Of sweeps; None: so that they take about six seconds."""
     map_info: MapInfo | None = None
     """Where a map lies."""
+    label: str = ""
+    """Of what the numbers are, in ENVI and EXR files; empty: the output's name."""
+
+    def described(self, output: Output) -> str:
+        """What the numbers of a file are."""
+        return f"{self.label or output.name}: {output.what}"
 
 
 def still_paths(folder: Path, formatted: FormattedOutput, view_name: str) -> list[Path]:
@@ -341,7 +347,7 @@ def _envi(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSi
     names = setting.channels.get(output.name, (output.name,))
     shape = (height, width, len(names))
     bands = setting.bands if output.kind in ("channels", "spectra") else None
-    description = f"{output.name}: {output.what}"
+    description = setting.described(output)
     more = {} if setting.map_info is None else dict(setting.map_info.envi)
     if isinstance(output, MaterialOutput) and output.centers_nm:
         # In the order of the channels, which for a false colour is seldom that of bands.
@@ -375,7 +381,7 @@ def _exr(output: Output, path: Path, setting: RenderSetting) -> Iterator[RowsSin
     # One plane a channel, as the format wants them: nothing is copied when the file is written.
     add, planes, opacity = _whole(output, setting)
     yield add
-    comments = f"{output.name}: {output.what}"
+    comments = setting.described(output)
     if output.kind == "channels" and setting.bands is not None:
         to_rgb = rgb_matrix(setting.bands).numpy()
         rows = (np.clip(row, 0, None).T @ to_rgb for row in planes.swapaxes(0, 1))
