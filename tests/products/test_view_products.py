@@ -24,7 +24,7 @@ from unmix_plugin.engine.processes import ALONE
 from unmix_plugin.products import views
 from unmix_plugin.products.endmembers import _endmember_paths, _write_endmembers
 from unmix_plugin.products.poses import _poses_json
-from unmix_plugin.products.product import Job
+from unmix_plugin.products.product import Job, Product
 from unmix_plugin.products.scene_products import Abundances, Cubes, Segmentation
 from unmix_plugin.products.spectrum import _facts, _ProbedPlace, _read_pixel
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -74,6 +74,16 @@ def test_labels_are_ids_whose_palette_and_legend_name_the_materials(tmp_path):
     for index in np.unique(ids):
         expected = [int(rows[int(index)][name]) for name in ("red", "green", "blue")]
         assert (colours[ids == index] == expected).all()
+
+
+def test_a_product_is_named_for_its_class_unless_it_has_a_name():
+    class FlatMap(Product):
+        pass
+
+    class Chart(Product):
+        name = "reflectance-chart"
+
+    assert (FlatMap.name, Chart.name) == ("flat-map", "reflectance-chart")
 
 
 @pytest.mark.parametrize(
