@@ -233,6 +233,7 @@ DESCRIBED = [
         ("", enmap(THREE, FWHMOfBand=[width, 7, 7]), {"nm": THREE, "fwhm": None})  # a width that no band has
         for width in ("0", "-7", "inf")
     ),
+    ("", enmap((0, 450, 550)), {"nm": (450, 450, 550), "bad": [0]}),  # a dead band
     ("", xml("band", DESIS), {"nm": [500, 600, 700], "fwhm": 3, "calibrated": CUBE * GAINS + OFFSETS}),
     *(  # L1B: the first bands are those of the VNIR image, the last those of the SWIR image
         (

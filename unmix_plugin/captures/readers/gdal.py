@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from unmix_plugin.captures.header_values import check_bands, plain_names, state_bands, state_linear
 from unmix_plugin.captures.spectral_file import BandTable, Linear, SpectralFile
 from unmix_plugin.errors import counted
@@ -124,7 +126,9 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
     if bands.wavelengths_nm is None and "wavelength" in of_all:
         stated = state_bands(gdal_entries(of_all) | {"wavelength_units": "nm"}, found.name)
         table = check_bands(stated, num_bands, warnings)
-        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bands.bad, bands.names)
+        marks = [bad for bad in (table.bad, bands.bad) if bad is not None]
+        bad = np.any(marks, axis=0) if marks else None
+        bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bad, bands.names)
     linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
     texts = items.get("no_data", {}).values()
     no_data = [number for number in map(gdal_number, texts) if number is not None and not math.isnan(number)]
