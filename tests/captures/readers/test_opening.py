@@ -194,6 +194,7 @@ def test_a_linear_calibration_is_known_by_whatever_name_a_format_has_for_it(tmp_
     ("attributes", "scale", "values"),
     [
         ({"Scale_Factor": 10000.0}, 10000, CUBE / 10000),
+        ({"Scale Factor": 10000.0}, 10000, CUBE / 10000),
         ({"scale_factor": 1.0, "add_offset": 0.0}, None, None),
         ({"scale_factor": 2.0, "add_offset": 0.0}, 0.5, 2 * CUBE),
         ({"scale_factor": 5.0}, 0.2, 5 * CUBE),

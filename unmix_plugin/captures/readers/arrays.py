@@ -50,7 +50,7 @@ _OFFSETS = ("add_offset", "offset", "offsets", "bias", "intercept")
 _OF_ALL = ("scale_factor", "reflectance_scale_factor", "add_offset")
 """Names that hold for all images of a file; the others mean this only beside the numbers themselves."""
 _MAY_DIVIDE = ("scale_factor", "scalefactor", "scale")
-"""Names in any case of factors that divide where they are above 1, as NEON's `Scale_Factor` does; CF's `scale_factor`
+"""Plain names of factors that divide where they are above 1, as NEON's `Scale_Factor` does; CF's `scale_factor`
 never does."""
 _QUALITY = re.compile(r"(^|_)(err|error|errors|flags?|mask|quality|qa|uncertainty|std|stddev)(_|$)")
 """What an array of three axes is called that measures nothing itself."""
@@ -329,12 +329,13 @@ def _linear(path: Path, image: FoundArray, num_bands: int, warnings: list[str]) 
     }
     named = plain_names(found)
     # An offset, 0 too, is CF's, whose factors multiply whatever they are.
-    key = next((named[name] for name in _GAINS if name in named), "")
-    if key.lower() in _MAY_DIVIDE and key != "scale_factor" and not any(name in named for name in _OFFSETS):
+    name = next((name for name in _GAINS if name in named), "")
+    key = named.get(name, "")
+    if name in _MAY_DIVIDE and key != "scale_factor" and not any(name in named for name in _OFFSETS):
         found[key] = (
             [1 / gain if gain > 1 else gain for gain in found[key]] if len(found[key]) == 1 else found[key]
         )
-    if key.lower() == "scale_factor":
+    if name == "scale_factor":
         found.pop(named.get("reflectance_scale_factor", ""), None)
     linear = state_linear(path, num_bands, found, "attribute", [(_GAINS, _OFFSETS)], warnings)
     return linear or _prisma(path, image, num_bands)
