@@ -115,7 +115,7 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
         return unit if unit is None or isinstance(unit, str) else str(listed(unit)[0])
 
     name, centres = find(_CENTRES, "", "nm", "um")
-    fwhm, good = find(_WIDTHS, "", _unit_in(name))[1], find(GOOD, "")[1]
+    fwhm, good = find(_WIDTHS, "", _unit_in(name), "nm", "um")[1], find(GOOD, "")[1]
     marks = good and [int(mark) if isinstance(mark, bool) else mark for mark in good]
     names = find(_NAMES, "", separators=",")[1]
     return StatedBands(f"{where} '{named.get(name)}'", centres, unit_of(name), fwhm, marks, names)

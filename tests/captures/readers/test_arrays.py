@@ -365,6 +365,12 @@ def test_what_was_not_measured_is_known_by_all_attributes_of_netcdf_and_by_its_f
         ({"rad": CUBE, "rgb": CUBE[..., :3], "bands": np.arange(1.0, 6)}, "rad", {"nm": None}),
         ({"cube": CUBE, "bands": [[3, 5, 8, 11, 12]]}, None, {"nm": None, "warnings": ()}),
         ({"cube": CUBE, "bands": NM / 1000}, None, {"nm": NM}),
+        ({"cube": CUBE, "wavelength": NM, "fwhm_nm": NM / 100}, None, {"nm": NM, "fwhm": NM / 100}),
+        (
+            {"cube": CUBE, "wavelength_um": NM / 1000, "fwhm_nm": NM / 100},
+            None,
+            {"nm": NM, "fwhm": None, "warning": "FWHM are left out: they would be 4500 to 6500 nm"},
+        ),
         (
             {"cube": CUBE, "wavelengths": np.arange(1, 6)},
             None,
