@@ -130,7 +130,7 @@ def counts_bands(items: Sequence[Any], unit: str | None) -> bool:
     """Whether a list called `bands` has the number or numbers of bands, and not their wavelengths."""
     try:
         numbers = np.array(items, np.float64)
-    except ValueError:
+    except (TypeError, ValueError):
         return True
     has_unit = unit is not None and nm_per_unit(unit) is not None
     return not has_unit and (len(items) < 2 or are_band_numbers(numbers, may_have_gaps=True))

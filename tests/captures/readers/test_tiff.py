@@ -147,6 +147,7 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
         (described(text), {"nm": NM, "evidence": "image description"})
         for text in (
             json.dumps({"wavelengths_nm": NM}),
+            json.dumps({"wavelengths_nm": NM, "bands": [{"name": "red"}]}),
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
             "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
             "wavelength = {400, 410, 420, 430, 440, 450}",
