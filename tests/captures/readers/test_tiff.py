@@ -148,6 +148,8 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
         for text in (
             json.dumps({"wavelengths_nm": NM}),
             json.dumps({"wavelengths_nm": NM, "bands": [{"name": "red"}]}),
+            json.dumps({"sensor": {"wavelengths": NM}, "bands": [{"name": "red"}]}),
+            json.dumps({"note": "wavelengths (nm): 400, 410, 420, 430, 440, 450"}),
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
             "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
             "wavelength = {400, 410, 420, 430, 440, 450}",

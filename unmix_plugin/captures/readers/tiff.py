@@ -399,12 +399,14 @@ def _described(page: TiffPage) -> dict[str, Any]:
         content = json.loads(text)
     except (ValueError, RecursionError):
         content = None
-    if isinstance(content, dict):
-        return {key: value for key, value in content.items() if isinstance(value, list | str)}
+    items = content.items() if isinstance(content, dict) else ()
+    entries = {key: value for key, value in items if isinstance(value, list | str)}
+    if state_bands(entries, "image description").centres:
+        return entries
     match = _LIST.search(text)
     unit = match["unit"] if match and nm_per_unit(match["unit"] or "") else ""
     found = re.findall(r"\d+(?:\.\d+)?", match["list"]) if match else []
-    return {"wavelength": found, "wavelength units": unit}
+    return {"wavelength": found, "wavelength units": unit} if found else entries
 
 
 def _from_pages(pages: list[TiffPage], imagej: dict[str, Any]) -> StatedBands:
