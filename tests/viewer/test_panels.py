@@ -223,6 +223,14 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.look_from(0.3)
         page.click(0.5, 0.5)
         page.wait_for_text("The view has changed, so the outline begins here")
+        page.click(0.75, 0.7)
+        page.wait_for_text("Corners: 2")
+        page.set("keep the region")  # once more under its name
+        page.wait_until(lambda: read_measures(source.run).regions["middle part"] != kept)
+        with source.borrowed_materials() as scene:
+            again = MeasuredSurface.of(scene).measure(read_measures(source.run).regions["middle part"], "")
+        assert again.area != pytest.approx(found.area, rel=0.01)
+        page.wait_for_text(f"{again.area:.4g} square units")
         page.set("shape", "polygon")
         page.wait_for_text("Tick the box")
         for count, place in enumerate(((0.5, 0.4), (0.6, 0.6), (0.45, 0.6)), 1):

@@ -136,19 +136,19 @@ class RegionsPanel:
         threading.Thread(target=work, name="unmix-viewer-region", daemon=True).start()
 
     def _list(self, chosen: str) -> None:
-        """Show the names of what is kept, where they are others, and what one of them is, if it is kept still."""
+        """Show the names of what is kept, and what one of them is, if it is kept still."""
         names = (*_NO_REGION, *self._session.services.regions.kept)
-        if tuple(self._chosen.options) != names:
-            self._chosen.options = names
-            self._chosen.value = chosen if chosen in names else _NO_REGION[0]
-            self._show_chosen()
+        self._chosen.options = names
+        self._chosen.value = chosen if chosen in names else _NO_REGION[0]
+        self._show_chosen()
 
     def _follow(self) -> None:
         """Other pages and commands keep and remove regions, too."""
         changed_at = self._session.services.regions.changed_at
         if changed_at != self._changed_at:
             self._changed_at = changed_at
-            self._list(str(self._chosen.value))
+            if tuple(self._chosen.options) != (*_NO_REGION, *self._session.services.regions.kept):
+                self._list(str(self._chosen.value))
 
     def _show_chosen(self) -> None:
         self._show(None)  # numbers of another region never stand under this name while it is measured
