@@ -28,6 +28,7 @@ from unmix_plugin.viewer.rendering.captures import (
     VideoQueue,
     check_size,
     differences,
+    joined_strips,
     output_of,
     render_argv,
     strip_of_spectra,
@@ -79,15 +80,16 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     frame = make_frame(source, camera)
     strips, _ = captured(services, camera, strip_of_spectra)
-    for found, expected in zip(zip(*strips, strict=True), strip_of_spectra(frame), strict=True):
-        np.testing.assert_allclose(np.concatenate(found), expected, atol=1e-5)
+    assert len(strips) > 1
+    for found, expected in zip(joined_strips(strips, 13), strip_of_spectra(frame), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("light", "quantity"), [(None, "radiance"), (torch.ones(5), "reflectance")])
 def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_path, light, quantity):
     frame = make_frame(source, sized_camera(some_pose(), 17, 13))
     materials = replace(frame.materials, light=light)
-    path = write_spectra(tmp_path / "view.exr", [strip_of_spectra(frame)], materials)
+    path = write_spectra(tmp_path / "view.exr", strip_of_spectra(frame), materials)
     file = OpenEXR.File(str(path), separate_channels=True)
     assert file.header()["comments"] == f"{quantity} on black, 1 = full scale"
     layer = "T" if quantity == "reflectance" else "S0"
@@ -105,6 +107,23 @@ def test_a_picture_that_is_cancelled_or_left_ends_and_a_strip_that_is_not_taken_
     services.stop()
     with pytest.raises(ConfigError, match="the viewer was stopped"):
         captured(services, camera)
+
+
+def test_pictures_of_two_pages_are_rendered_in_turn_and_one_that_waits_can_be_cancelled(services):
+    large, small = sized_camera(some_pose(), 1024, 1024), sized_camera(some_pose(), 16, 16)
+    cancelled, parts = threading.Event(), []
+    first = services.loop.strips(large, Edit(), 1, threading.Event(), parts.append)
+    next(first)
+    assert captured(services, small)[1][-1] == 1.0
+    assert parts[-1] < 1
+    waiting = services.loop.strips(small, Edit(), 1, cancelled, lambda _: cancelled.set())
+    services.loop._queue.append(None)  # of a page that waits longer
+    cancelled.set()
+    with pytest.raises(ConfigError, match="cancelled"):
+        next(waiting)
+    services.loop._queue.remove(None)
+    assert not services.loop._queue
+    assert services.loop._num_blocks == 0
 
 
 @pytest.mark.parametrize(
@@ -267,3 +286,8 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
     videos.stop()
     # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
     assert one.wait() == (None, "cancelled")
+    run_instead("print('rendering: 1 of 1 done')")
+    late = Ending(tmp_path)
+    videos.start(late.job)
+    assert late.wait() == (None, "cancelled")
+    assert late.parts == []

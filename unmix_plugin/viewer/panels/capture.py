@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from unmix_plugin.viewer.rendering.captures import (
     VideoJob,
     check_size,
     differences,
+    joined_strips,
     output_of,
     render_argv,
     strip_of_spectra,
@@ -37,7 +38,6 @@ _MOST_KEY_FRAMES = 100
 _PREVIEW_FPS = 12
 _LARGEST_DOWNLOAD = 1 << 26
 _NO_KEYS: tuple[str, ...] = ("none yet",)
-_StripT = TypeVar("_StripT")
 
 
 class CapturePanel:
@@ -97,20 +97,20 @@ class CapturePanel:
         path, what = self._new_file(".png"), f"{settings.layer}, {camera.width} x {camera.height} pixels"
         self._begin(
             camera,
-            lambda strip: maker.paint(strip, settings, False, False).picture,
-            lambda strips: write_file(path, rgba_png_bytes(np.concatenate(strips), what)),
+            lambda strip: (maker.paint(strip, settings, False, False).picture,),
+            lambda picture: write_file(path, rgba_png_bytes(picture[0], what)),
         )
 
     def _save_spectra(self) -> None:
         materials = self._session.materials()
         camera, path = self._camera(len(materials.bands)), self._new_file(".exr")
-        self._begin(camera, strip_of_spectra, lambda strips: write_spectra(path, strips, materials))
+        self._begin(camera, strip_of_spectra, lambda picture: write_spectra(path, picture, materials))
 
     def _begin(
         self,
         camera: Cameras,
-        read: Callable[[RenderedView], _StripT],
-        write: Callable[[list[_StripT]], Path],
+        read: Callable[[RenderedView], Sequence[np.ndarray]],
+        write: Callable[[Sequence[np.ndarray]], Path],
     ) -> None:
         """Render a picture strip by strip in a thread of its own, write what is read of them and hand it over."""
         if self._capture is not None:
@@ -123,7 +123,7 @@ class CapturePanel:
         def work() -> None:
             with failures_said("the picture failed", lambda reason: session.warn(reason, "no picture")):
                 try:
-                    found = [read(strip) for strip in strips]
+                    found = joined_strips(map(read, strips), camera.height)
                 finally:
                     self._capture = None
                     show(0.0)

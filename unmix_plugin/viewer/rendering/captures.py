@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,9 +61,22 @@ def strip_of_spectra(frame: RenderedView) -> Strip:
     return frame["spectral"].cpu().numpy(), linear_rgb.cpu().numpy(), frame.coverage.cpu().numpy()
 
 
-def write_spectra(path: Path, strips: Sequence[Strip], materials: Materials) -> Path:
-    """Write the spectra of these materials as a spectral EXR; a RunError if the disk is full or refuses."""
-    spectra, linear_rgb, coverage = (np.concatenate(parts) for parts in zip(*strips, strict=True))
+def joined_strips(strips: Iterable[Sequence[np.ndarray]], height: int) -> list[np.ndarray]:
+    """Arrays of a whole picture, filled while its strips come from top to bottom, so that it is held once."""
+    whole: list[np.ndarray] = []
+    first = 0
+    for strip in strips:
+        whole = whole or [np.empty((height, *part.shape[1:]), part.dtype) for part in strip]
+        for array, part in zip(whole, strip, strict=True):
+            array[first : first + len(part)] = part
+        first += len(strip[0])
+    return whole
+
+
+def write_spectra(path: Path, picture: Sequence[np.ndarray], materials: Materials) -> Path:
+    """Write spectra of these materials, as `strip_of_spectra` has them, as a spectral EXR; a RunError if the disk is
+    full or refuses."""
+    spectra, linear_rgb, coverage = picture
     about = f"{materials.quantity} on black, 1 = full scale"
     return write_spectral_exr(path, spectra, materials.bands, linear_rgb, coverage, about, materials.quantity)
 
@@ -97,6 +110,7 @@ class VideoQueue:
     def __init__(self) -> None:
         self._turn, self._lock = threading.Lock(), threading.Lock()
         self._jobs: list[VideoJob] = []
+        self._is_stopping = False
 
     def start(self, job: VideoJob) -> None:
         """Render a video when those before it are done."""
@@ -111,7 +125,8 @@ class VideoQueue:
                 _end(job.process)
 
     def stop(self) -> None:
-        """Drop all videos."""
+        """Drop all videos, also those that are asked for from now on."""
+        self._is_stopping = True
         for job in [*self._jobs]:
             self.cancel(job)
 
@@ -119,6 +134,7 @@ class VideoQueue:
         lines: deque[str] = deque(maxlen=_LINES_KEPT)
         with self._turn:
             with self._lock:
+                job.is_cancelled |= self._is_stopping
                 process = job.process = None if job.is_cancelled else _begin(job.argv)
             if process is not None:
                 with process:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,7 +88,10 @@ class RenderLoop:
         self._changed = threading.Condition()
         self._views: list[View] = []
         self._is_stopping = False
-        self._capturing = threading.Lock()
+        self._queue: deque[object] = deque()
+        """Pictures rendered in strips that wait for their next block."""
+        self._num_blocks = 0
+        """Of such pictures, that are rendered at this moment."""
         self._thread = threading.Thread(target=self._run, name="unmix-viewer-render", daemon=True)
 
     def start(self) -> None:
@@ -100,8 +105,10 @@ class RenderLoop:
             self._changed.notify_all()
         if self._thread.is_alive():
             self._thread.join(_JOIN_S)
-        with self._capturing:
-            pass  # a thread in native code when the interpreter ends takes the process down with it
+        with (
+            self._changed
+        ):  # a thread in native code when the interpreter ends takes the process down with it
+            self._changed.wait_for(lambda: self._num_blocks == 0, _JOIN_S)
 
     def add(self, view: View) -> None:
         """Serve a view."""
@@ -138,26 +145,40 @@ class RenderLoop:
         show: Callable[[float], None] = lambda _: None,
     ) -> Iterator[RenderedView]:
         """A picture of any size apart from any view: strips from top to bottom, each rendered in the caller's thread
-        when nothing is more urgent, one picture after another. `show` is told the part that is rendered; a ConfigError
-        once it is `cancelled` or the loop stopped, another UnmixError if the edit does not fit the run."""
+        when nothing is more urgent, in turn with other such pictures. `show` is told the part that is rendered; a
+        ConfigError once it is `cancelled` or the loop stopped, another UnmixError if the edit does not fit the run."""
         rows = max(1, _STRIP_PIXELS // camera.width)
-        with self._capturing:
-            for first in range(0, camera.height, rows):
-                part = camera.crop(0, first, camera.width, min(rows, camera.height - first))
-                render, frame = FrameRender(part, subpixels, is_finished=True), None
-                while frame is None:
-                    self._give_way()
-                    if self._is_stopping or cancelled.is_set():
-                        raise ConfigError("the viewer was stopped" if self._is_stopping else "cancelled")
+        for first in range(0, camera.height, rows):
+            part = camera.crop(0, first, camera.width, min(rows, camera.height - first))
+            render, frame = FrameRender(part, subpixels, is_finished=True), None
+            while frame is None:
+                with self._turn(cancelled):
                     frame = self._maker.advance(render, edit, self._maker.speed.block_rays, RESTING_COST)
-                    show((first + part.height * (1 - render.rays_left / render.num_rays)) / camera.height)
-                yield frame
+                show((first + part.height * (1 - render.rays_left / render.num_rays)) / camera.height)
+            yield frame
 
-    def _give_way(self) -> None:
-        """Wait until no view waits for a picture at once."""
+    @contextmanager
+    def _turn(self, cancelled: threading.Event) -> Iterator[None]:
+        """Context for a block of a picture in strips: entered when no view waits for a picture at once, and pictures
+        that have waited longer have had a block."""
+        turn = object()
         with self._changed:
-            while self._waiting and not self._is_stopping:
+            self._queue.append(turn)
+            while not (self._is_stopping or cancelled.is_set()):
+                if not self._waiting and self._queue[0] is turn:
+                    break
                 self._changed.wait(_POLL_S)
+            self._queue.remove(turn)
+            self._changed.notify_all()
+            if self._is_stopping or cancelled.is_set():
+                raise ConfigError("the viewer was stopped" if self._is_stopping else "cancelled")
+            self._num_blocks += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._num_blocks -= 1
+                self._changed.notify_all()
 
     def step(self) -> bool:
         """Do the most urgent piece of work; False if there is none at this moment."""
