@@ -102,6 +102,12 @@ def test_the_longest_and_most_nested_formula_is_read():
     assert float(value("-" * 60 + "r800")) == 0.7
 
 
+def test_numbers_may_be_large_and_have_zeros_before_them():
+    assert float(value("007*r800*00.50")) == pytest.approx(2.45)
+    assert float(value("r800/" + "9" * 26)) == pytest.approx(0.7e-26)
+    assert float(value("r800+" + "9" * 400)) != float(value("r800+" + "9" * 400))
+
+
 def test_a_caret_is_the_power_operator_case_does_not_matter_and_wavelengths_may_have_decimals():
     assert value("R800^2^2*SQRT(R670)") == value("r800**2**2*sqrt(r670)")
     assert parse_formula("r800.5/(r670+r800.5)-r450").wavelengths_nm == (450.0, 670.0, 800.5)

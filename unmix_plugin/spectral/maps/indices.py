@@ -87,7 +87,8 @@ class _Formula:
                 case ast.Name(id=name) if name in self.wavelengths:
                     found = at(self.wavelengths[name])
                 case ast.Constant(value=int() | float() as number):  # PyTorch refuses numbers beyond its type
-                    found = like.new_full((), number if number <= torch.finfo(like.dtype).max else torch.nan)
+                    is_known = number <= torch.finfo(like.dtype).max
+                    found = like.new_full((), float(number) if is_known else torch.nan)
                 case ast.UnaryOp(op=ast.USub(), operand=operand):
                     found = -value(operand)
                 case ast.BinOp(left=left, op=sign, right=right) if type(sign) in _OPERATORS:
@@ -123,14 +124,17 @@ def parse_formula(text: str) -> _Formula:
     wavelengths: dict[str, float] = {}
     expression = text
     for match in _TOKEN.finditer(text):
-        if match["nm"]:  # a name of as many characters, so that places stay
-            name = match[0].replace(".", "_")
-            wavelengths[name] = float(match["nm"])
-            expression = expression[: match.start()] + name + expression[match.end() :]
+        read = match[0]  # rewritten in as many characters, so that places stay
+        if match["nm"]:
+            read = read.replace(".", "_")
+            wavelengths[read] = float(match["nm"])
+        elif match["number"]:  # Python refuses zeros before a whole number
+            read = re.sub(r"^0+(?=[0-9])", "", read).ljust(len(read))
         elif match["other"] or (
             match["word"] and match["word"] not in {**_FUNCTIONS, **_FUNCTIONS_OF_SEVERAL}
         ):
             raise _fault(text, match.start())
+        expression = expression[: match.start()] + read + expression[match.end() :]
     try:
         formula = _Formula(text, wavelengths, ast.parse(expression, mode="eval").body)
         formula.evaluate(lambda _: torch.zeros(()), torch.zeros(()))  # which refuses what is not allowed
