@@ -215,3 +215,17 @@ def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multip
     assert len(recipe.operations) == 1000
     assert recipe.operations[-1] == Remove((7,) * 255)
     assert "not YAML" in (fault := fault_of("edits: &a [*a]")) or "an edit is one of" in fault
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Retint(1, (0.0, 0.0, 0.0), None),
+        lambda: Retint(1, None),
+        lambda: Scale(1, None),
+        lambda: Rename(1, None),
+    ],
+)
+def test_an_edit_made_in_python_without_a_value_is_refused(make):
+    with pytest.raises((ConfigError, TypeError)):  # of a checker of types, where one runs
+        make()

@@ -8,9 +8,9 @@ recipe, or by its number from 0. Colours are sRGB in [0, 1]. Fields are also the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 from unmix_plugin.errors import ConfigError
 
@@ -58,8 +58,11 @@ class Operation:
     """In the recipe's file, from 1; None if it comes from no file."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None and (fault := _fault(name, value)):
+        for own in fields(self):
+            value = getattr(self, own.name)
+            if value is None and own.default is not None:
+                raise ConfigError(f"{own.name} of an edit is missing; found None")
+            if value is not None and (fault := _fault(own.name, value)):
                 raise ConfigError(fault)
 
 
@@ -102,8 +105,8 @@ class Retint(Operation):
     kind = "retint"
     endmember: Endmember
     colour: Colour
-    match: Literal["picture", "spectrum"] = "picture"
-    """What is given the colour: the material as cameras see it, shaded, or its spectrum in full light."""
+    match: str = "picture"
+    """What is given the colour: `picture`, the material as cameras see it, shaded, or its `spectrum` in full light."""
 
 
 @dataclass(frozen=True)
