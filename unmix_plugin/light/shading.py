@@ -215,6 +215,8 @@ FINEST = ShadowDetail(clear_cells=3.0, dark_cells=2.0, spread=0.02)
 """At the end of training, and in renders."""
 _PITCH_DARK = 64
 """Opaque cells on the way of light from which on nothing passes in float32, so that more needn't be counted."""
+_SHADOWS_AT_ONCE = 1 << 16
+"""Positions whose samples towards the lamp are held together: 16 MB."""
 
 
 def lamplight(
@@ -255,6 +257,9 @@ def _visible_part(
     positions: Vectors, lamps: Vectors, box: SceneBox, skips: Skips, detail: ShadowDetail = FINEST
 ) -> Values:
     """Part of the light from points outside the box that the box lets through to each position."""
+    if len(positions) > _SHADOWS_AT_ONCE:
+        parts = zip(positions.split(_SHADOWS_AT_ONCE), lamps.split(_SHADOWS_AT_ONCE), strict=True)
+        return torch.cat([_visible_part(*part, box, skips, detail) for part in parts])
     towards = normalize(lamps - positions, dim=-1)
     cell = float((box.size / torch.tensor(skips.shape, device=box.size.device)).max())
     t_far = box.intersect(positions, towards)[1]
