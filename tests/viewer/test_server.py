@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import contextlib
 import math
 import socket
 import threading
@@ -14,6 +15,8 @@ import msgspec
 import pytest
 import viser
 import websockets
+from hypothesis import given
+from hypothesis import strategies as st
 from viser import infra
 from websockets.exceptions import InvalidStatus
 
@@ -281,6 +284,36 @@ def test_a_fault_is_said_in_one_short_line_and_once():
     loop.close()
     assert len(said) <= connections._MOST_FAULTS
     assert all(len(line) < 400 for line in said)
+
+
+@given(st.binary(max_size=100))
+def test_bytes_of_any_kind_are_a_message_or_none(data):
+    with contextlib.suppress(ValueError):
+        _is_heard(data)
+
+
+def test_what_a_page_uploads_is_not_kept(viewer):
+    with page_of(viewer) as page:
+        page.look_from(0.3)
+        page.wait_until(lambda: has_control(page, "formula"))
+        upload = {"source_component_uuid": page.control("formula"), "transfer_uuid": "some"}
+        start = {"filename": "a", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2000}
+        page.send("FileTransferStartUpload", **upload, **start)
+        page.send("FileTransferPart", **upload, part_index=0, content=bytes(1000))
+        show_layer(page, "depth")
+        apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
+        assert len(apis) >= 2
+        assert all(not api._current_file_upload_states for api in apis)
+
+
+@pytest.mark.slow
+def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
+    tunnels = []
+    monkeypatch.setattr("viser._viser.ViserTunnel", lambda *words, **_: tunnels.append(words))
+    with opened(viewer) as page:
+        page.send("ShareUrlRequest")
+        show_layer(page, "depth")
+    assert tunnels == []
 
 
 def test_the_private_parts_are_those_of_the_version_that_they_were_taken_from(viewer):
