@@ -50,7 +50,7 @@ def test_it_builds_and_has_every_command_and_every_public_name(tmp_path):
     commands = tmp_path / "html/reference/commands"
     assert "--max-seconds FLOAT" in words_of(commands / "unmix-train.html")
     assert "--unseen {drop,keep}" in words_of(commands / "unmix-export.html")
-    assert "weights in other formats are not read" in words_of(tmp_path / "html/reference/messages.html")
+    assert "has no COLMAP model" in words_of(tmp_path / "html/reference/messages.html")
     names = (tmp_path / "html/reference/python-api.html").read_text()
     assert 'id="unmix_plugin.TrainedScene.probe"' in names
 

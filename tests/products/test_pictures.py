@@ -169,7 +169,7 @@ def test_a_matched_endmember_has_the_colour_of_its_material_and_a_surplus_one_it
     given = materials(3)
     evaluation = Evaluation(_SceneTruth(given.bands, 2, torch.rand(2, 8).double()), given.endmembers)
     look = material_look(evaluation)
-    first, second, third = look.predicted(np.array([0, 1, 2], dtype=np.uint8), {0: 1, 2: 0})
+    ((first, second, third),) = look.predicted(np.array([[0, 1, 2]], dtype=np.uint8), {0: 1, 2: 0})
     np.testing.assert_array_equal(first, look.true_colours[1])
     np.testing.assert_array_equal(third, look.true_colours[0])
     assert min(np.abs(second - colour).max() for colour in look.true_colours) > 0.05

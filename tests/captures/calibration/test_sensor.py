@@ -33,7 +33,7 @@ MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
 def test_noise_is_found_beside_what_bands_share():
     level = np.full(12, 0.01)
     level[7] = 0.3
-    noisy = MIXTURES + level * GENERATOR.standard_normal(MIXTURES.shape)
+    noisy = MIXTURES + level * np.random.default_rng(5).standard_normal(MIXTURES.shape)
     expected = level / np.sqrt((noisy**2).mean(axis=0))
     found = _noise_shares(noisy.astype(np.float32))
     assert found[7] == pytest.approx(expected[7], rel=0.05)

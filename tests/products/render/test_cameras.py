@@ -40,7 +40,7 @@ def test_paths_have_as_many_frames_as_asked_for_of_at_least_512_rows_or_the_size
     assert cameras.is_path
     assert cameras.size == (683, 512)
     assert len(chosen(cameras=source).views) == 120
-    assert chosen(cameras=source, frames=2, downscale=1).size == (40, 30)
+    assert chosen(cameras=source, frames=2, downscale=1.0).size == (40, 30)
     assert chosen(cameras=source, frames=2, size="20x16").size == (20, 16)
 
 
@@ -55,13 +55,13 @@ def test_a_file_gives_the_cameras_written_in_it(tmp_path):
     found = chosen(cameras=str(path))
     assert names(found) == [f"orbit_{index:04d}" for index in range(4)]
     assert (found.is_path, found.frames_per_second) == (True, 12.0)
-    assert chosen(cameras=str(path), fps=30).frames_per_second == 30.0
+    assert chosen(cameras=str(path), fps=30.0).frames_per_second == 30.0
 
 
 def test_size_and_downscale_change_all_views():
     for request, size in (
         ({"size": "64x48"}, (64, 48)),
-        ({"downscale": 2}, (20, 15)),
+        ({"downscale": 2.0}, (20, 15)),
         ({"downscale": 0.5}, (80, 60)),
         ({}, (40, 30)),
     ):
@@ -79,13 +79,13 @@ BAD = [
     ({"cameras": "orbit", "frames": 10**9}, "--frames 1000000000"),
     ({"view": ("view_9",)}, r"no view 'view_9' \(did you mean view_8 or"),
     ({"view": ("3",)}, "no view '3'; give a number from 0 to 2, or a name such as view_6"),
-    ({"size": "4x4", "downscale": 2}, "--size and --downscale both say"),
+    ({"size": "4x4", "downscale": 2.0}, "--size and --downscale both say"),
     ({"size": "0x4"}, "--size: 0 x 4 pixels"),
     ({"size": "20000x4"}, "--size: 20000 x 4 pixels; expected whole numbers from 1 to 16384"),
     ({"downscale": 0.0}, "--downscale 0: expected 0.001 to 1000"),
     ({"downscale": float("nan")}, "--downscale nan"),
-    ({"downscale": 100}, "--downscale 100: 0 x 0 pixels"),
-    ({"fps": -1}, "--fps: -1 frames a second"),
+    ({"downscale": 100.0}, "--downscale 100: 0 x 0 pixels"),
+    ({"fps": -1.0}, "--fps: -1.0 frames a second"),
     ({"fps": float("nan")}, "--fps: nan frames a second"),
 ]
 
@@ -105,5 +105,5 @@ def test_views_of_several_sizes_are_rendered_as_large_as_the_largest():
     cameras = choose_cameras(rig, RenderOptions())
     assert [view.camera.size(0) for view in cameras.views] == [(40, 30)] * 3
     for source in ("orbit", "interpolate"):
-        path = choose_cameras(rig, RenderOptions(cameras=source, frames=2, downscale=2))
+        path = choose_cameras(rig, RenderOptions(cameras=source, frames=2, downscale=2.0))
         assert len({view.camera.size(0) for view in path.views}) == 1

@@ -248,7 +248,9 @@ def _stated_bands(files: Sequence[SpectralFile], options: ProcessOptions) -> _Ba
             f"{file.path}: the wavelengths of its {file.shape[2]} bands are unknown ({file.bands.evidence}); give them "
             "with --wavelengths"
         )
-    marks = [one.bands.bad for one in files if one.bands.bad is not None]
+    marks = [one.bands.bad for one in files if one.bands.bad is not None] or [
+        np.zeros(len(wavelengths), bool)
+    ]
     choice = _BandChoice(wavelengths, {}).without(np.any(marks, axis=0), "marked as bad in the file")
     broad = f"wider than {MOST_WIDTH:.0%} of its wavelength: too broad for one"
     choice = choice.without(file.bands.is_broad, broad).without_repeated()
