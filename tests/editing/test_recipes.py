@@ -4,6 +4,7 @@ import re
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -218,14 +219,9 @@ def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multip
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Retint(1, (0.0, 0.0, 0.0), None),
-        lambda: Retint(1, None),
-        lambda: Scale(1, None),
-        lambda: Rename(1, None),
-    ],
+    ("kind", "values"),
+    [(Retint, (1, (0.0, 0.0, 0.0), None)), (Retint, (1, None)), (Scale, (1, None)), (Rename, (1, None))],
 )
-def test_an_edit_made_in_python_without_a_value_is_refused(make):
+def test_an_edit_made_in_python_without_a_value_is_refused(kind: Any, values):
     with pytest.raises((ConfigError, TypeError)):  # of a checker of types, where one runs
-        make()
+        kind(*values)
