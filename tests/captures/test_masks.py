@@ -16,6 +16,7 @@ from unmix_plugin.captures.plan import _choose_mask as choose_mask
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import CaptureView
 from unmix_plugin.captures.writing.view_files import ViewRecipe, alpha_picture, write_view
+from unmix_plugin.captures.writing.view_files import _clean as clean
 from unmix_plugin.captures.writing.view_files import _read_labels as read_labels
 from unmix_plugin.captures.writing.view_files import _read_view_masks as read_view_masks
 from unmix_plugin.errors import CaptureError
@@ -39,6 +40,16 @@ def test_a_white_background_is_bright_in_every_band():
     leaf = np.full((1, 1, 8), 0.98, np.float32)
     leaf[..., 3] = 0.4
     assert rule.matter(leaf).all()
+
+
+def test_large_holes_and_parts_stay():
+    mask = np.zeros((200, 200), bool)
+    mask[40:160, 40:160] = True
+    mask[80:100, 80:100] = False
+    mask[10:20, 10:20] = True
+    cleaned, specks, holes = clean(mask)
+    np.testing.assert_array_equal(cleaned, mask)
+    assert (specks, holes) == (0, 0)
 
 
 @pytest.mark.parametrize("pixels", [np.zeros((4, 5, 3), np.uint8), np.full((4, 5), 300, np.uint16)])
