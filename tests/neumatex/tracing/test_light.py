@@ -238,6 +238,12 @@ def test_a_spectral_environment_is_brought_to_the_bands(tmp_path):
     assert light.rotation_deg == 10.0
 
 
+def test_colours_beside_wavelengths_light_what_is_in_colours(tmp_path):
+    channels = {name: np.full((4, 8), level, np.float32) for level, name in enumerate(["T.500nm", *"RGB"])}
+    light = read_environment(write_exr(tmp_path / "light.exr", channels, {}))
+    assert_close(light.image[0, 0], torch.tensor([1.0, 2.0, 3.0]))
+
+
 def test_environments_whose_light_is_not_known_in_every_band_are_refused(tmp_path):
     grey, two = np.ones((4, 8), np.float32), np.ones((4, 8, 2), np.float32)
     colours = write_exr(tmp_path / "rgb.exr", dict.fromkeys("RGB", grey), {})

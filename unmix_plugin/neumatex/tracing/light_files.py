@@ -112,23 +112,25 @@ def read_exr(path: Path, channel: str | None = None) -> tuple[np.ndarray, list[s
 def _light_of_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
     """Colours, or where bands are wanted and there are channels of wavelengths, spectra at them; and whether they are
     spectra."""
+    from unmix_plugin.captures.readers.exr import channel_names
+
     try:
-        values, names, nm = read_exr(path)
+        names = channel_names(path)
+        values, _, nm = (None, [], None) if bands is None else read_exr(path)
+        if bands is not None and values is not None and nm is not None:
+            order = np.argsort(nm)
+            spectra = resample_spectra(values[..., order].astype(np.float64), Bands(nm[order]), bands)
+            return spectra.astype(np.float32), True
+        colours = next((colours for colours in ("RGB", "Y") if set(colours) <= set(names)), None)
+        if colours is None:
+            raise SceneError(f"{path}: has channels {', '.join(names)}; an environment map needs R, G and B")
+        planes = [read_exr(path, colour)[0][..., 0] for colour in colours]
     except CaptureError as error:
         raise SceneError(str(error)) from error
-    if bands is not None and nm is not None:
-        order = np.argsort(nm)
-        try:
-            spectra = resample_spectra(values[..., order].astype(np.float64), Bands(nm[order]), bands)
-        except SpectrumError as error:
-            raise SceneError(
-                f"{path}: its wavelengths and those of the pictures do not match: {error}"
-            ) from error
-        return spectra.astype(np.float32), True
-    colours = next((colours for colours in ("RGB", "Y") if set(colours) <= set(names)), None)
-    if colours is None:
-        raise SceneError(f"{path}: has channels {', '.join(names)}; an environment map needs R, G and B")
-    planes = [values[..., names.index(colour)] for colour in colours]
+    except SpectrumError as error:
+        raise SceneError(
+            f"{path}: its wavelengths and those of the pictures do not match: {error}"
+        ) from error
     return np.stack(3 // len(planes) * planes, axis=-1).astype(np.float32), False
 
 
