@@ -150,9 +150,9 @@ def state_linear(
         where: What entries are, for people.
         pairs: Plain names of gains and of offsets; those of an earlier pair go before others.
     Raises:
-        CaptureError: they are no numbers, impossible, or there is a factor beside them.
+        CaptureError: they are no numbers, impossible, or there is a factor beside gains.
     """
-    named, found = plain_names(entries), []
+    named, found, has_gains = plain_names(entries), [], False
     for pair in pairs:
         keys = [next((named[name] for name in names if name in named), "") for names in pair]
         gains, offsets = (_floats(path, f"{where} '{key}'", entries.get(key, "")) for key in keys)
@@ -163,18 +163,20 @@ def state_linear(
         )
         if linear := linear_values(path, num_bands, gains, offsets, f"{where} {stated}"):
             found.append(linear)
+            has_gains |= bool(gains)
     if len(found) > 1:
         warnings.append(f"{found[0].evidence} is applied, not {found[1].evidence}")
     key = named.get(_DIVISOR, "")
     factors = _factors(key, entries.get(key, "1"), warnings)
     if set(factors) == {1.0}:
         return found[0] if found else None
-    if found:
+    if has_gains:
         raise CaptureError(
             f"{path}: has '{key}' {factors[0]:g} and other gains ({found[0].evidence}); take one out of the file, as "
             "it is unclear which the numbers need"
         )
-    return linear_values(path, num_bands, [1 / factor for factor in factors], [], f"{where} '{key}'")
+    offsets, said = (found[0].offsets.tolist(), f"{found[0].evidence} and") if found else ([], where)
+    return linear_values(path, num_bands, [1 / factor for factor in factors], offsets, f"{said} '{key}'")
 
 
 def _floats(path: Path, what: str, value: Any) -> list[float]:

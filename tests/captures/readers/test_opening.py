@@ -200,6 +200,7 @@ def test_a_linear_calibration_is_known_by_whatever_name_a_format_has_for_it(tmp_
         ({"scale_factor": 5.0}, 0.2, 5 * CUBE),
         ({"slope": 5.0}, 0.2, 5 * CUBE),
         ({"reflectance_scale_factor": 5.0}, 5, CUBE / 5),
+        ({"reflectance_scale_factor": 5.0, "add_offset": -0.25}, None, CUBE / 5 - 0.25),
         ({"scale_factor": 0.25, "add_offset": 2.0}, None, CUBE * 0.25 + 2),
     ],
 )
