@@ -323,7 +323,7 @@ _FACTS = {
 }
 """What names say. A plain gain is the whole one; the others multiply each other."""
 _OF_EXIF = ("speed", "f_number")
-"""Facts that count beside a time of EXIF or OpenEXR, and are left out where they make no sense."""
+"""Facts that count beside a time of EXIF, and are left out where they make no sense."""
 _OWNERS = ("camera", "sensor", "detector", "imager")
 """Words before a name that change nothing."""
 _SECONDS = {
@@ -378,7 +378,7 @@ def exposure_facts(entries: Mapping[str, Any], where: str, warnings: list[str]) 
             taken = {1.0: "seconds", 1e-3: "milliseconds"}[_TIMES[name]] if name in _TIMES else "a factor"
             evidence = f"{where} '{key}'" + ("" if has_unit else f", no unit: taken as {taken}")
             found[what] = numbers[0] if len(set(numbers)) == 1 else numbers, evidence
-            is_exif |= name in ("exifexposuretime", "exptime")
+            is_exif |= name == "exifexposuretime"
     return _combined({what: found[what] for what in found if is_exif or what not in _OF_EXIF}, warnings)
 
 

@@ -122,9 +122,10 @@ def test_damaged_numbers_are_reported_in_the_error_alone(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-def test_a_window_is_put_where_it_belongs_and_the_rest_is_missing(tmp_path):
+@pytest.mark.parametrize("time", [{"expTime": 0.25}, {"exposure": "250 ms"}])
+def test_a_window_is_put_where_it_belongs_and_the_rest_is_missing(tmp_path, time):
     inside = (slice(2, 7), slice(3, 11))
-    header = head(window=(3, 2, 10, 6)) | {"expTime": 0.25, "isoSpeed": 200.0, "aperture": 2.5}
+    header = head(window=(3, 2, 10, 6)) | time | {"isoSpeed": 200.0, "aperture": 2.5}
     file = opened(tmp_path / "a.exr", header, channels(CUBE[inside]))
     expected = np.full(CUBE.shape, np.nan, np.float32)
     expected[inside] = CUBE[inside]

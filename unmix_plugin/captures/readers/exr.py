@@ -46,8 +46,6 @@ _PLAIN = re.compile(rf"{_LAYER}{_NUMBER}")
 _METRES_PER_SECOND = 299_792_458.0
 _ALPHA = ("A", "alpha")
 _COLOURS = ("R", "G", "B")
-_OF_EXIF = {"isoSpeed": "EXIF ISOSpeed", "aperture": "EXIF FNumber"}
-"""Attributes of the format, by the names of the same things in EXIF."""
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
 _DAMAGED = "can't be read as OpenEXR, copy the file again"
 LAYERS = ("S0", "T", "")
@@ -117,8 +115,12 @@ def open_exr(path: Path, options: ReadOptions) -> SpectralFile:
         for name, value in header.items()
         if isinstance(value, str | int | float) and name not in _OF_ALL_FILES
     }
-    as_exif = {name: attributes[key] for key, name in _OF_EXIF.items() if key in attributes}
-    exposure = exposure_facts(attributes | as_exif, "attribute", warnings)
+    exposure = exposure_facts(attributes, "attribute", warnings)
+    speed, aperture = (attributes.get(key) for key in ("isoSpeed", "aperture"))
+    if exposure and isinstance(speed, float) and 0 < speed < np.inf:
+        exposure |= {"gain": speed / 100, "gain_evidence": "attribute 'isoSpeed'"}
+    if exposure and isinstance(aperture, float) and 0 < aperture < np.inf:
+        exposure["f_number"] = aperture
     counts = Counter(channel.part for channel in channels)
     listed = [
         {"name": title, "type": str(part.type()), "channels": counts[index]}
