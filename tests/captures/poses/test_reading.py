@@ -230,7 +230,11 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"frames": []}, "has no camera; expected one for each view"),
         ({"frames": [1]}, r"frames\[0\] is 1"),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
-        ({"frames": [{"transform_matrix": [math.nan] * 12}]}, r"frames\[0\]: .* list of 12; .*finite"),
+        ({"frames": [{"transform_matrix": [0] * 11}]}, r"frames\[0\]: .* list of 11; .*4 numbers"),
+        (
+            {"frames": [{"file_path": f"{i}.png", "transform_matrix": [math.nan] * 12} for i in range(2)]},
+            r"2 of 2 camera matrices .*: 0\.png, 1\.png: .* not finite",
+        ),
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
         ({"w": 0.5}, "'w' is 0.5; expected a whole number"),

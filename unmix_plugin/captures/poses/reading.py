@@ -35,7 +35,7 @@ from unmix_plugin.formats.meshes import read_ply_points
 from unmix_plugin.limits import open_regular
 from unmix_plugin.scenes.placement import Placement, read_metres_per_unit, read_placement
 from unmix_plugin.scenes.reading.cubes import UnreadableArrayError, map_array, read_array_header
-from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_numbers
+from unmix_plugin.scenes.reading.faults import Faults, describe, find_named, read_number, read_numbers
 from unmix_plugin.scenes.reading.foreign_keys import FILE_NAME, keys_to_say
 from unmix_plugin.scenes.reading.images import FORMATS
 from unmix_plugin.scenes.reading.lenses import Intrinsics, read_lens
@@ -374,15 +374,17 @@ def _make_lens(
 
 
 def _read_matrix(value: Any, where: str) -> Float64[np.ndarray, "3 4"]:
-    """A matrix of 3 or 4 rows, or 12 or 16 numbers row by row."""
-    tried = [read_numbers(value, *shape) for shape in ((4, 4), (3, 4), (16,), (12,))]
-    numbers = next((found for found in tried if found is not None), None)
-    if numbers is None:
+    """A matrix of 3 or 4 rows, or 12 or 16 numbers row by row; NaN is kept for the check that names all such frames."""
+    rows: list[Any] = value if isinstance(value, list) else []
+    if not any(isinstance(row, list) for row in rows):
+        rows = [rows[start : start + 4] for start in range(0, len(rows), 4)]
+    if len(rows) not in (3, 4) or not all(isinstance(row, list) and len(row) == 4 for row in rows):
         found = "absent" if value is None else describe(value)
         raise CaptureError(
-            f"{where}: 'transform_matrix' is {found}; expected 4 (or 3) rows of 4 finite numbers, camera to world"
+            f"{where}: 'transform_matrix' is {found}; expected 4 (or 3) rows of 4 numbers, camera to world"
         )
-    matrix = numbers.reshape(-1, 4)
+    numbers = [[read_number(number) for number in row] for row in rows]
+    matrix = np.array([[math.nan if number is None else number for number in row] for row in numbers])
     if len(matrix) == 4 and np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6 and matrix[3].any():
         raise CaptureError(
             f"{where}: the last row of 'transform_matrix' is {matrix[3].tolist()}; expected 0, 0, 0, 1"
