@@ -238,7 +238,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
         ({"w": 0.5}, "'w' is 0.5; expected a whole number"),
-        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO.*undistort"),
+        ({"camera_model": "ORTHOPHOTO"}, "ORTHOPHOTO.*EQUIRECTANGULAR: undistort"),
         ({"ftheta_p0": 0.0, "fl_x": 300.0}, "'ftheta_p1' is 0; expected pixels per radian"),
         ({"ftheta_p0": "steep"}, "'ftheta_p0' to 'ftheta_p5' are .*expected 6 numbers"),
         (

@@ -183,7 +183,6 @@ _BENT_MODELS: dict[str, models.Bend] = {
     "OPENCV_FISHEYE": models.bend_fisheye,
     "FISHEYE624": models.bend_fisheye_624,
     "EQUIRECTANGULAR": models.bend_equirectangular,
-    "ftheta": models.bend_ftheta,
 }
 
 
@@ -354,8 +353,8 @@ def _make_lens(
     center, focal = (width / 2 if x is None else x, height / 2 if y is None else y), given.focal_at(*size)
     model = other_model or given.model
     bend: models.Bend | None = _BENT_MODELS.get(model) if isinstance(model, str) else None
-    if model == "ftheta":
-        focal, terms = (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
+    if model == "ftheta":  # by its terms alone, never by `camera_model`
+        bend, focal, terms = models.bend_ftheta, (1.0 / terms[1], 1.0 / terms[1]), (math.hypot(*size), *terms)
     elif bend is models.bend_equirectangular:
         focal = (width / (2 * math.pi), height / math.pi)
     elif bend is models.bend_fisheye:
