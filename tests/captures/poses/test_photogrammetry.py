@@ -322,6 +322,8 @@ def test_poses_of_a_rig_are_composed(tmp_path):
         content["rig_instances"][name] = {**outer, "rig_camera_ids": {name: "left"}}
         del shot["rotation"], shot["translation"]
     assert_same_poses(read_opensfm(tmp_path, content), ring())
+    with pytest.raises(CaptureError, match="names \"left\", not in 'rig_cameras'"):
+        read_opensfm(tmp_path, content | {"rig_cameras": {}})
 
 
 @pytest.mark.parametrize(

@@ -81,8 +81,10 @@ def _world_to_camera(
     for rig in rigs:
         lens_of = _object(_object(rigs, rig), "rig_camera_ids")
         if name in lens_of:
-            outer = _pose(rigs[rig], where)
-            inner = _pose(_object(_object(content, "rig_cameras"), lens_of[name]), where)
+            in_rig = _object(_object(content, "rig_cameras"), lens_of[name])
+            if not in_rig:
+                raise CaptureError(f"{where} names {describe(lens_of[name])}, not in 'rig_cameras'")
+            outer, inner = _pose(rigs[rig], where), _pose(in_rig, where)
             return np.column_stack([inner[:, :3] @ outer[:, :3], inner[:, :3] @ outer[:, 3] + inner[:, 3]])
     return None
 
