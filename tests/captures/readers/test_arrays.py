@@ -120,7 +120,10 @@ def test_what_is_nearest_to_an_image_counts_and_units_are_those_of_their_own_lis
         file["wavelength"] = NM
         file["wavelength"].attrs["units"] = "um"
         file.attrs["scale_factor"], file["run"].attrs["Scale_Factor"] = 0.5, 4.0
-    check_file(open_spectral_file(tmp_path / "a.h5"), nm=NM + 1, scale=4, warnings=())
+        file["other/bands"] = NM / 1000
+        file["other/bands"].attrs["units"] = "um"
+    said = "'run/more/bands', no unit"
+    check_file(open_spectral_file(tmp_path / "a.h5"), nm=NM + 1, scale=4, evidence=said, warnings=())
 
 
 @pytest.mark.parametrize(

@@ -296,14 +296,15 @@ def _lists_beside(arrays: Sequence[FoundArray], image: FoundArray) -> dict[str, 
     for array in sorted(arrays, key=groups_apart):
         name, length = array.own_name, prod(array.shape)
         lengths = (1, *image.shape) if is_exposure(name) else image.shape if says_bands(name) else ()
-        if array is image or name in beside or not array.is_vector or length not in lengths:
+        known = [key.rpartition("/")[2].lower() for key in beside]
+        if array is image or name in known or not array.is_vector or length not in lengths:
             continue
         own, numbers = plain_names(array.attributes), _unpacked(array)
         unit = next((array.all_attributes[own[key]] for key in ("units", "unit") if key in own), None)
         if is_exposure(name):
             beside[name] = numbers if unit is None else [f"{number} {unit}" for number in numbers]
         elif name != "bands" or not counts_bands(numbers, unit):
-            beside |= {name: numbers} | ({} if unit is None else {f"{name} units": unit})
+            beside |= {array.name: numbers} | ({} if unit is None else {f"{name} units": unit})
     return beside
 
 
