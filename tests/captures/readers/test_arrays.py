@@ -110,7 +110,7 @@ def test_units_scale_and_groups_of_hdf5(tmp_path):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["run/cube"] = CUBE
         file["run/cube"].attrs["wavelengths"] = NM
-        file["run"].attrs["scale_factor"] = 0.5
+        file["run"].attrs["Scale Factor"] = 0.5
     check_file(open_spectral_file(tmp_path / "b.h5"), nm=NM, scale=2)
 
 

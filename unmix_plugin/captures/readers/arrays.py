@@ -323,11 +323,8 @@ def _linear(path: Path, image: FoundArray, num_bands: int, warnings: list[str]) 
     NEON's 10000 does. PRISMA's are those of its level.
     """
     found = {key: _numbers(value) for key, value in image.all_attributes.items()}
-    found = {
-        k: numbers
-        for k, numbers in found.items()
-        if numbers and (k in image.attributes or k.lower() in _OF_ALL)
-    }
+    plain = plain_names({key: numbers for key, numbers in found.items() if numbers})
+    found = {key: found[key] for name, key in plain.items() if key in image.attributes or name in _OF_ALL}
     named = plain_names(found)
     # An offset, 0 too, is CF's, whose factors multiply whatever they are.
     name = next((name for name in _GAINS if name in named), "")
