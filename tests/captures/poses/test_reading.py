@@ -282,7 +282,7 @@ def test_axes_are_turned_and_names_are_those_of_the_pictures_or_go_by_order(tmp_
     for place in (path, tmp_path):
         found = read_poses(place)
         assert_same_poses(found, ring())
-    assert lens_of(found) == Lens(640, 480, (500, 500), (320, 240))
+    assert lens_of(found) == Lens(640, 480, (500.0, 500.0), (320.0, 240.0))
 
 
 def test_other_arrays_and_damaged_files_are_refused(tmp_path):
