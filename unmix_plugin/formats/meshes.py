@@ -113,7 +113,7 @@ def read_ply_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.nd
     )
     if is_text:
         body = filter(bytes.strip, io.BytesIO(data[start:]))
-        table = np.loadtxt(body, dtype, comments=None, max_rows=max(count, 1), ndmin=1)
+        table = np.loadtxt(body, dtype, comments=None, max_rows=min(max(count, 1), len(data)), ndmin=1)
     else:
         held = min(count, (len(data) - start) // dtype.itemsize)
         table = np.frombuffer(data, dtype, max(held, 0), start)

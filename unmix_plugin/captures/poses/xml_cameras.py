@@ -18,6 +18,7 @@ centre of the first one.
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -94,7 +95,7 @@ def read_metashape(path: Path, root: _Element) -> PoseSet:
         name = camera.get("label") or f"camera {camera.get('id')}"
         raw.append((name, PosedCamera(pose, lenses.get(camera.get("sensor_id")))))
     middle = np.mean([camera.camera_to_world[:, 3] for _, camera in raw], axis=0)
-    is_geocentric = _EARTH_RADII[0] < np.linalg.norm(middle) < _EARTH_RADII[1]
+    is_geocentric = _EARTH_RADII[0] < math.hypot(*middle) < _EARTH_RADII[1]
     notes += ["coordinates are geocentric; up is away from the Earth's middle"] if is_geocentric else []
     has_world = any(np.abs(world - np.eye(4)).max() > 0 for world in worlds.values())
     up = middle if is_geocentric else np.array([0.0, 0.0, 1.0]) if has_world else None
@@ -234,7 +235,7 @@ def _calibration_metashape(sensor: _Element, where: str) -> tuple[_Element | Non
         if resolution is None:
             continue
         texts = resolution.get("width", ""), resolution.get("height", "")
-        if all(text.isdecimal() and 0 < int(text) < 1_000_000 for text in texts):
+        if all(text.isdecimal() and len(text) <= 6 and int(text) > 0 for text in texts):
             return calibration, (int(texts[0]), int(texts[1]))
     raise CaptureError(f"{where} has no resolution; expected its width and height in pixels")
 
