@@ -135,9 +135,13 @@ class RegionsPanel:
 
         threading.Thread(target=work, name="unmix-viewer-region", daemon=True).start()
 
+    @property
+    def _choices(self) -> tuple[str, ...]:
+        return (*_NO_REGION, *self._session.services.regions.kept)
+
     def _list(self, chosen: str) -> None:
         """Show the names of what is kept, and what one of them is, if it is kept still."""
-        names = (*_NO_REGION, *self._session.services.regions.kept)
+        names = self._choices
         self._chosen.options = names
         self._chosen.value = chosen if chosen in names else _NO_REGION[0]
         self._show_chosen()
@@ -147,7 +151,7 @@ class RegionsPanel:
         changed_at = self._session.services.regions.changed_at
         if changed_at != self._changed_at:
             self._changed_at = changed_at
-            if tuple(self._chosen.options) != (*_NO_REGION, *self._session.services.regions.kept):
+            if tuple(self._chosen.options) != self._choices:
                 self._list(str(self._chosen.value))
 
     def _show_chosen(self) -> None:
