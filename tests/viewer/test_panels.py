@@ -226,7 +226,12 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.click(0.75, 0.7)
         page.wait_for_text("Corners: 2")
         page.set("keep the region")  # once more under its name
-        redrawn = lambda: read_measures(source.run).regions["middle part"]  # noqa: E731
+
+        def redrawn() -> InView:
+            region = read_measures(source.run).regions["middle part"]
+            assert isinstance(region, InView)
+            return region
+
         page.wait_until(lambda: not np.array_equal(redrawn().mask(), kept.mask()))
         with source.borrowed_materials() as scene:
             again = MeasuredSurface.of(scene).measure(redrawn(), "")
