@@ -6,8 +6,9 @@ import torch
 from torch.testing import assert_close
 
 from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
+from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.products.mesh import gltf_content
-from unmix_plugin.trained.surface import SurfaceAppearance, look_from_above
+from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SCENE = ball_scene()
@@ -92,3 +93,15 @@ def test_abundances_of_names_that_are_alike_are_all_kept(names):
     for numbers in (looks.properties(), gltf_content(mesh, looks, "three points")[1]):
         columns = [column for name, column in numbers.items() if "abundance_" in name.lower()]
         np.testing.assert_array_equal(columns, np.eye(3))
+
+
+def test_a_point_beyond_the_edge_is_not_in_the_image_where_the_lens_model_folds_over():
+    bent = torch.tensor([[-0.3, 0.0, 0.0, 0.0]])
+    camera = Cameras(
+        torch.eye(4)[None, :3], torch.full((1, 2), 300.0), torch.full((1, 2), 200.0), bent, 400, 400
+    )
+    angles = torch.linspace(-1.5, 1.5, 301)
+    points = 2 * torch.stack([angles.sin(), torch.zeros(301), -angles.cos()], dim=-1)
+    edge = camera.generate_rays(torch.zeros(1, dtype=torch.int64), torch.tensor([[400.0, 200.0]]))
+    expected = angles.abs() < torch.atan2(edge.directions[0, 0], -edge.directions[0, 2])
+    assert in_image(camera, points)[0].tolist() == expected.tolist()

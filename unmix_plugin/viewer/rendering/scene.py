@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from unmix_plugin.editing import Recipe, changes_geometry, edit_scene
@@ -32,6 +32,7 @@ from unmix_plugin.trained.open_run import LoadedRun, require_materials, snapshot
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.run_materials import relit as relit_measurement
+from unmix_plugin.trained.surface import in_image
 from unmix_plugin.trained.trained_scene import TrainedScene
 
 _ValueT = TypeVar("_ValueT")
@@ -203,8 +204,7 @@ class MeasuredViews:
         if len(seen):
             rays = frame.camera.to(device).image_rays(0)
             points = (rays.origins + coefficients.ray_distance[:, None] * rays.directions)[seen]
-            rows, columns, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
-            pixels = (rows[sees].numpy(), columns[sees].numpy())
+            pixels, sees = self._pixels_of(points, index, self._camera(index, frame.scene))
             measured = self._scene.cube(self._indices[index], pixels)
             measured = self._comparable(index, measured, frame.scene, frame.scene.light_power)
             spectra = frame.materials.spectra(coefficients.map(lambda packed: packed[seen[sees]])).cpu()
@@ -227,9 +227,9 @@ class MeasuredViews:
         tried sees it. `scene` is the unedited one, which is lent."""
         for index in self._by_nearness(camera, scene)[:_VIEWS_TRIED].tolist():
             own = self._camera(index, scene)
-            rows, columns, sees = self._pixels_of(point[None], index, own, scene)
+            pixels, sees = self._pixels_of(point[None], index, own, scene)
             if bool(sees[0]):
-                measured = self._scene.cube(self._indices[index], (rows.numpy(), columns.numpy()))
+                measured = self._scene.cube(self._indices[index], pixels)
                 spectrum = self._comparable(index, measured[0], scene, light)
                 return self._scene.frames[self._indices[index]].name, spectrum
         return None
@@ -263,22 +263,22 @@ class MeasuredViews:
 
     def _pixels_of(
         self, points: Float[Tensor, "P 3"], index: int, camera: Cameras, lent: TrainedScene | None = None
-    ) -> tuple[Tensor, Tensor, Bool[Tensor, "P"]]:
-        """Row and column of each point in a training view, and whether that view sees it in a pixel that counts."""
-        camera = camera.to("cpu")
-        coords, depths = camera.project(points.cpu(), 0)
-        columns, rows = coords.nan_to_num(-1.0).clamp(-1, 1e6).floor().long().unbind(-1)
-        inside = (depths > 0) & (columns >= 0) & (rows >= 0)
-        inside &= (columns < camera.width) & (rows < camera.height)
-        rows, columns = rows.clamp(0, camera.height - 1), columns.clamp(0, camera.width - 1)
-        places = camera.poses_at(torch.zeros_like(rows), coords[:, 1].nan_to_num(0.0))[:, :, 3]
-        distance = (points.cpu() - places).norm(dim=-1)
+    ) -> tuple[tuple[Int[np.ndarray, " seen"], Int[np.ndarray, " seen"]], Bool[Tensor, "P"]]:
+        """Which points a training view sees in a pixel that counts, and the rows and columns of these."""
+        camera, points = camera.to("cpu"), points.cpu()
+        sees, coords, _ = in_image(camera, points)
+        columns, rows = coords.long().unbind(-1)
+        places = camera.poses_at(torch.zeros_like(rows), coords[:, 1])[:, :, 3]
+        distance = (points[sees] - places).norm(dim=-1)
         rendered = self._distance_of(index, camera, lent)[rows, columns]
-        sees = inside & ((distance - rendered).abs() < _TOLERANCE * distance)
-        if bool(sees.any()):
-            places = (rows[sees].numpy(), columns[sees].numpy())
-            sees[sees.clone()] = torch.from_numpy(self._scene.valid_mask(self._indices[index], places))
-        return rows, columns, sees
+        is_near = (distance - rendered).abs() < _TOLERANCE * distance
+        rows, columns = rows[is_near].numpy(), columns[is_near].numpy()
+        sees[sees.clone()] = is_near
+        if len(rows):
+            counts = self._scene.valid_mask(self._indices[index], (rows, columns))
+            rows, columns = rows[counts], columns[counts]
+            sees[sees.clone()] = torch.from_numpy(counts)
+        return (rows, columns), sees
 
     def _distance_of(self, index: int, camera: Cameras, lent: TrainedScene | None) -> Float[Tensor, "H W"]:
         """Distances along the rays of a training view as last rendered, infinite where nothing is."""
