@@ -8,6 +8,8 @@ from torch.testing import assert_close
 from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.products.mesh import gltf_content
+from unmix_plugin.spectral.materials import Coefficients
+from unmix_plugin.trained.outputs import OUTPUTS, MaterialView
 from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 
@@ -105,3 +107,13 @@ def test_a_point_beyond_the_edge_is_not_in_the_image_where_the_lens_model_folds_
     edge = camera.generate_rays(torch.zeros(1, dtype=torch.int64), torch.tensor([[400.0, 200.0]]))
     expected = angles.abs() < torch.atan2(edge.directions[0, 0], -edge.directions[0, 2])
     assert in_image(camera, points)[0].tolist() == expected.tolist()
+
+
+def test_colours_of_a_surface_are_those_of_renders_also_where_a_band_exceeds_full_scale():
+    spectra = torch.tensor([[0.3, 0.4, 0.9, 1.8, 0.2], [1.5, 0.2, 0.1, 0.3, 2.0], [0.1, 0.2, 0.3, 0.2, 0.1]])
+    scene = replace(SCENE, materials=replace(SCENE.materials, endmembers=spectra))
+    ones = torch.ones(1, 3)
+    seen = Coefficients.of(ones, ones, torch.eye(3)[None], torch.eye(3)[None], torch.zeros(1, 3, 0))
+    rendered = OUTPUTS["rgb"].compute(MaterialView(scene, scene.views[0].camera, seen))[0]
+    looks = SurfaceAppearance(scene.materials, torch.eye(3), spectra)
+    np.testing.assert_allclose(looks.srgb, rendered.numpy(), atol=1e-5)

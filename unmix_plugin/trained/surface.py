@@ -279,8 +279,9 @@ class SurfaceAppearance:
     @property
     def linear_rgb(self) -> Float32[np.ndarray, "P 3"]:
         """Linear light in sRGB primaries, [0, 1]."""
+        # Clamped after the colours are made, as in renders: in another light a band may exceed full scale.
         matrix = rgb_matrix(self.materials.bands, torch.float64)
-        return (self.diffuse.double().clamp(0, 1) @ matrix).clamp(0, 1).float().numpy()
+        return (self.diffuse.double() @ matrix).clamp(0, 1).float().numpy()
 
     @property
     def srgb(self) -> Float64[np.ndarray, "P 3"]:
