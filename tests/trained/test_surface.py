@@ -10,7 +10,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.products.mesh import gltf_content
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.outputs import OUTPUTS, MaterialView
-from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above
+from unmix_plugin.trained.surface import SurfaceAppearance, in_image, look_from_above, sample_field
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SCENE = ball_scene()
@@ -117,3 +117,13 @@ def test_colours_of_a_surface_are_those_of_renders_also_where_a_band_exceeds_ful
     rendered = OUTPUTS["rgb"].compute(MaterialView(scene, scene.views[0].camera, seen))[0]
     looks = SurfaceAppearance(scene.materials, torch.eye(3), spectra)
     np.testing.assert_allclose(looks.srgb, rendered.numpy(), atol=1e-5)
+
+
+def test_densities_are_had_without_the_work_of_abundances(monkeypatch):
+    points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 0.9]])
+    densities, abundances = sample_field(SCENE, points)
+    assert abundances.shape == (2, 3)
+    monkeypatch.setattr(type(SCENE.field), "abundances_of", None)
+    alone, nothing = sample_field(SCENE, points, with_abundances=False)
+    assert torch.equal(alone, densities)
+    assert nothing.shape == (2, 0)

@@ -251,15 +251,17 @@ class GridPoints:
 
 @torch.no_grad()
 def sample_field(
-    scene: TrainedScene, points: Float[Tensor, "*grid 3"]
+    scene: TrainedScene, points: Float[Tensor, "*grid 3"], with_abundances: bool = True
 ) -> tuple[Float[Tensor, "*grid"], Float[Tensor, "*grid K"]]:
-    """Densities per model unit, and abundances, which sum to 1; both 0 in cells that are never rendered. On the CPU."""
+    """Densities per model unit, and abundances, which sum to 1 (K is 0 without); both 0 in cells that are never
+    rendered. On the CPU."""
     flat = points.flatten(0, -2).to(scene.device)
     densities = torch.zeros(len(flat), device=scene.device)
-    abundances = torch.zeros(len(flat), len(scene.materials.names), device=scene.device)
+    abundances = torch.zeros(len(flat), with_abundances * len(scene.materials.names), device=scene.device)
     for chosen in scene.renderer.is_occupied(flat).nonzero()[:, 0].split(_CHUNK):
         densities[chosen], features = scene.field.get_density(flat[chosen])
-        abundances[chosen] = scene.field.abundances_of(features)
+        if with_abundances:
+            abundances[chosen] = scene.field.abundances_of(features)
     shape = points.shape[:-1]
     return densities.cpu().view(shape), abundances.cpu().view(*shape, abundances.shape[1])
 

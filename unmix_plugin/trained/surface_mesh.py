@@ -91,7 +91,7 @@ def vertex_areas(
 
 def _surface_density(scene: TrainedScene, ends: SurfacePoints) -> float:
     """Density per model unit at which the surface lies, from the densities where rays end."""
-    densities, _ = sample_field(scene, ends.positions)
+    densities, _ = sample_field(scene, ends.positions, with_abundances=False)
     densities = densities[densities > 0]
     if len(densities) == 0:
         raise RunError(
@@ -227,7 +227,8 @@ def surface_of(
     surface = SeenSurface(scene, _NUM_RAYS, cameras, follow)
     grid = GridPoints.over(scene.scene_box.aabb, resolution)
     slices = follow("sampling the density", range(grid.shape[0]))
-    densities = np.stack([sample_field(scene, grid.slice_points(index))[0].numpy() for index in slices])
+    parts = (grid.slice_points(index) for index in slices)
+    densities = np.stack([sample_field(scene, part, with_abundances=False)[0].numpy() for part in parts])
     with working("finding the surface"):
         found = _surface_density(scene, surface.points()) if density is None else density / scene.frame.scale
         solid = densities if keeps_unseen else _filled(densities, grid, scene, surface)
