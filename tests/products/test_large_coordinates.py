@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from tests.products.ball_model import ALL_ROUND, ball_scene, seen_surface
 from tests.products.mesh_reading import loaded_mesh
 from tests.trained.camera_scenes import FRAME, around
-from unmix_plugin.products.mesh import _write_mesh
+from unmix_plugin.products.mesh import _write_mesh, gltf_content
 from unmix_plugin.products.point_cloud import _write_point_cloud
 from unmix_plugin.products.volume import _write_volume
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.trained.camera_files import camera_file_bytes, read_camera_file
 from unmix_plugin.trained.run_views import RunView, positions_for_files
-from unmix_plugin.trained.surface import GridPoints
+from unmix_plugin.trained.surface import GridPoints, SurfaceAppearance
 from unmix_plugin.trained.surface_mesh import TriangleMesh
 
 SCENE = ball_scene()
@@ -98,3 +98,12 @@ def test_positions_take_the_type_that_keeps_them_to_a_millionth(distance, expect
     stored = positions_for_files(points)
     assert stored.dtype == expected
     assert np.abs(stored - points).max() <= 2e-6
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
+def test_gltf_keeps_positions_to_a_millionth_in_units_of_any_size(unit):
+    vertices = unit * (np.array([500_400.3, 300_700.1, 12.0]) + np.random.default_rng(0).random((50, 3)))
+    mesh = TriangleMesh(positions_for_files(vertices), np.array([[0, 1, 2]]))
+    looks = SurfaceAppearance(SCENE.materials, torch.eye(3), torch.ones(3, len(SCENE.bands)))
+    positions, _, extras = gltf_content(mesh, looks, "a surface")
+    assert np.abs(positions.astype(np.float64) + extras["offset"] - vertices).max() <= 1e-6 * unit

@@ -248,7 +248,9 @@ def gltf_content(
         extras["metres_per_unit"] = looks.scale.metres_per_unit
     vertices = mesh.vertices
     if vertices.dtype == np.float64:
-        extras["offset"] = np.round(vertices.mean(axis=0)).tolist()
+        extent = max(float(np.ptp(vertices, axis=0).max()), 1e-12)
+        # Whole units, or as many digits as leave no more than about the extent, which float32 resolves.
+        extras["offset"] = np.round(vertices.mean(axis=0), max(0, -math.floor(math.log10(extent)))).tolist()
         vertices = vertices - extras["offset"]
     return vertices.astype(np.float32), numbers, extras
 
