@@ -200,3 +200,13 @@ def test_the_gain_fitted_to_a_view_counts_in_its_pictures_and_errors():
     [shown] = views.shown
     np.testing.assert_allclose(of_bands(views), 0, atol=1e-7)
     np.testing.assert_array_equal(shown.predicted, shown.measured)
+
+
+def test_confidence_is_a_mean_over_what_has_a_material_and_haze_does_not_lower_it():
+    view, _ = striped("view")
+    haze = view.accumulation.clone()
+    haze[0] = 0.4
+    sure = torch.where(view.segmentation == 255, 0.0, 0.8)
+    views = ReportViews(MATERIALS, None, ())
+    views.add("view", replace(view, accumulation=haze, confidence=sure), None)
+    assert views.confidence == pytest.approx(0.8)

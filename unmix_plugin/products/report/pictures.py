@@ -88,8 +88,9 @@ class ReportViews:
         self._amounts += as_numpy(view.abundances).sum(axis=(0, 1))
         opacity, bands = as_numpy(view.accumulation), self.materials.bands
         if view.confidence is not None:
-            self._sure += float((as_numpy(view.confidence) * opacity).sum())
-            self._seen += float(opacity.sum())
+            is_seen = view.segmentation.numpy() != NOTHING_ID  # elsewhere nothing is said of a material
+            self._sure += float((as_numpy(view.confidence) * opacity)[is_seen].sum())
+            self._seen += float(opacity[is_seen].sum())
         maps = np.moveaxis(as_numpy(view.shares), -1, 0) if name in self._with_shares else ()
         shares = tuple(eight_bits(over_neutral(paint(one, SHARE_SCALE), opacity)) for one in maps)
         spectra = view.spectra if truth is None else truth.shown(view)
