@@ -24,6 +24,7 @@ from unmix_plugin.scenes.geometry.carving import (
     MIN_EXPLAINED,
     _needed_witnesses,
     carve_box,
+    count_views,
     foreground_rays,
     mask_warning,
     share_through,
@@ -253,3 +254,11 @@ def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_a
     warning = mask_warning(turned(demo, turn), [alpha > 0 for alpha in alphas if alpha is not None])
     assert (warning is not None) == is_told
     assert warning is None or ("contradict each other" in warning and "--poses refine" in warning)
+
+
+def test_a_point_on_the_right_or_lower_edge_of_an_image_is_outside_as_everywhere():
+    camera = Cameras(
+        torch.eye(4)[None, :3], torch.full((1, 2), 8.0), torch.full((1, 2), 4.0), torch.zeros(1, 4), 8, 8
+    )
+    edges = torch.tensor([[-0.5, 0.0, -1.0], [0.0, 0.5, -1.0], [0.5, 0.0, -1.0], [0.0, -0.5, -1.0]])
+    assert count_views(camera, edges).tolist() == [1, 1, 0, 0]

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras, distort, undistort
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox, UnitSpace
+from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.scene import Scene
 
 Cells = Bool[np.ndarray, "R R R"]
@@ -364,9 +365,7 @@ def count_views(cameras: Cameras, points: Float[Tensor, "P 3"]) -> Int64[Tensor,
     """How many cameras see each point."""
     count = torch.zeros(len(points), dtype=torch.int64)
     for index in range(len(cameras)):
-        pixels, depths = cameras.project(points, index)
-        limits = torch.tensor(cameras.size(index), dtype=torch.float32)
-        count += ((pixels >= 0.0) & (pixels <= limits)).all(dim=-1) & (depths > 0.0)
+        count += look_up(cameras, index, points)[1]
     return count
 
 
