@@ -9,9 +9,11 @@ import torch
 
 from tests.products.ball_page import SCENE, export
 from unmix_plugin.editing import Light, Recipe, edit_scene
+from unmix_plugin.editing.apply import with_sensor
 from unmix_plugin.errors import ConfigError, SpectrumError
 from unmix_plugin.products.page import page
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
+from unmix_plugin.spectral.sensor import Sensor
 
 
 @pytest.fixture(scope="module")
@@ -117,3 +119,14 @@ def test_a_page_that_can_not_be_small_enough_is_said_to_be_large(tmp_path, monke
     monkeypatch.setattr(page, "MOST_BYTES", 1000)
     _, said, path = export(tmp_path, regions={})
     assert f"the page has {path.stat().st_size / 1e6:.1f} MB, more than a mail takes" in said
+
+
+def test_through_a_sensor_no_known_spectra_and_no_other_lights_are_offered(tmp_path):
+    """They would be taken at the centres of its channels, which see the mean of what is around."""
+    responses = np.array([[1.0, 1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 0.5, 1.0, 1.0]])
+    sensor = Sensor("camera", SpectraTable(SCENE.bands, ("short", "long"), responses))
+    materials = with_sensor(SCENE, sensor).materials
+    assert page._known_spectra(materials, ()).sources == []
+    assert [one["name"] for one in page._spectral_facts(materials, None)["lights"]] == ["the scene's own"]
+    with pytest.raises(ConfigError, match=r"known in channels of --sensor, .*: leave out --library"):
+        page._known_spectra(materials, (tmp_path,))

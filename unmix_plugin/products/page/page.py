@@ -142,9 +142,10 @@ class _KnownSpectra(NamedTuple):
 
 
 def _known_spectra(materials: Materials | None, library: Sequence[Path]) -> _KnownSpectra:
-    if materials is None:
+    if materials is None or materials.sensor is not None:
         if library:
-            raise ConfigError("the object is known in colours, not in bands: leave out --library")
+            own = "colours, not in bands" if materials is None else "channels of --sensor, not in its bands"
+            raise ConfigError(f"the object is known in {own}: leave out --library")
         return _KnownSpectra([], np.zeros((0, 0), np.uint16))
     light = _light_of(materials)
     known = library_of(library, materials.bands, light)
@@ -241,7 +242,7 @@ def _spectral_facts(materials: Materials | None, recorded: Sequence[float] | Non
         back = relit(np.ones(len(bands)), power.tolist(), before)
         notes = [f"black where {shown} does not reach"] if not materials.is_lit.all() else []
         lights.append({"name": own, "factors": rounded(back), "notes": notes})
-    for light in _LIGHTS:
+    for light in _LIGHTS if materials.sensor is None else ():  # a light is lit before a sensor looks
         if light == shown:
             continue
         try:
