@@ -129,8 +129,9 @@ class Services:
         self.curve = curve  # another one each time: panels read it meanwhile
 
     def stop(self) -> None:
-        """End rendering; waits for the scene if it is still being read."""
+        """End rendering and measuring; waits for the scene if it is still being read."""
         self.videos.stop()
+        self.regions.stop()
         self.loop.stop()
         if self._reader.is_alive():
             # Not left behind: a thread in native code when the interpreter ends takes the process down with it.

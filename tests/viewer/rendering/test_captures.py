@@ -283,7 +283,9 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
     videos, one = VideoQueue(), Ending(tmp_path)
     videos.start(one.job)
     assert one.begun.wait(120)
+    [thread] = videos._jobs.values()
     videos.stop()
+    assert not thread.is_alive()
     # Its output is read to the end, which comes only once the encoder, which shares it, has ended.
     assert one.wait() == (None, "cancelled")
     run_instead("print('rendering: 1 of 1 done')")

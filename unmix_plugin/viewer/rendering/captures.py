@@ -109,13 +109,14 @@ class VideoQueue:
 
     def __init__(self) -> None:
         self._turn, self._lock = threading.Lock(), threading.Lock()
-        self._jobs: list[VideoJob] = []
+        self._jobs: dict[VideoJob, threading.Thread] = {}
         self._is_stopping = False
 
     def start(self, job: VideoJob) -> None:
         """Render a video when those before it are done."""
-        self._jobs.append(job)
-        threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True).start()
+        thread = threading.Thread(target=self._run, args=(job,), name="unmix-viewer-video", daemon=True)
+        self._jobs[job] = thread
+        thread.start()
 
     def cancel(self, job: VideoJob) -> None:
         """Drop a video, even one that is being rendered."""
@@ -125,10 +126,13 @@ class VideoQueue:
                 _end(job.process)
 
     def stop(self) -> None:
-        """Drop all videos, also those that are asked for from now on."""
+        """Drop all videos, also those that are asked for from now on, and wait until they are told so."""
         self._is_stopping = True
-        for job in [*self._jobs]:
+        jobs = self._jobs.copy()
+        for job in jobs:
             self.cancel(job)
+        for thread in jobs.values():
+            thread.join(_WAIT_S)
 
     def _run(self, job: VideoJob) -> None:
         lines: deque[str] = deque(maxlen=_LINES_KEPT)
@@ -144,13 +148,13 @@ class VideoQueue:
                             job.progress(int(found[1]) / int(found[2]))
             with self._lock:
                 job.process = None
-                self._jobs.remove(job)
         if process is not None and process.returncode == 0:
             job.done(next(job.folder.rglob("*.mp4"), None), "no video was written")
         elif job.is_cancelled:
             job.done(None, "cancelled")
         else:
             job.done(None, f"rendering the video failed: {''.join(lines).strip()[-_LONGEST_MESSAGE:]}")
+        del self._jobs[job]
 
 
 def _begin(argv: list[str]) -> subprocess.Popen[str]:

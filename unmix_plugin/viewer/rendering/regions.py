@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.measured_surface import MeasuredRegion, MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, measures_path, read_measures
 from unmix_plugin.trained.regions import Region, region_to_json
@@ -18,6 +19,8 @@ from unmix_plugin.viewer.rendering.scene import Edit
 
 _PAUSE_S = 0.002
 """Between two turns on the device, so that pages which wait for it come in between."""
+_STOP_S = 20.0
+"""How long a turn under way is waited for."""
 
 
 class RunRegions:
@@ -27,6 +30,7 @@ class RunRegions:
         self._maker, self._source = maker, maker.source
         self._measuring, self._keeping = threading.Lock(), threading.Lock()
         """Apart, since finding the surface takes minutes, in which regions are kept and removed all the same."""
+        self._is_stopping = False
         self._surface: MeasuredSurface | None = None
         self._measured: dict[str, tuple[MeasuredRegion, MeasuredSurface]] = {}
         """By what a region is, as JSON: names may be given anew."""
@@ -64,6 +68,12 @@ class RunRegions:
         with self._keeping:
             keep_region(self._source.run, name, region)
 
+    def stop(self) -> None:
+        """End what is measured, and refuse to measure from now on."""
+        self._is_stopping = True
+        if self._measuring.acquire(timeout=_STOP_S):
+            self._measuring.release()
+
     def _find_surface(self, show: Callable[[str], None]) -> MeasuredSurface:
         """The surface, found in many short turns on the device, between which pages are drawn."""
         with self._turn() as scene:
@@ -85,7 +95,9 @@ class RunRegions:
 
     @contextmanager
     def _turn(self) -> Iterator[TrainedScene]:
-        """The device and the unedited scene, after pages that wait."""
+        """The device and the unedited scene, after pages that wait; a ConfigError once stopped."""
         time.sleep(_PAUSE_S)
+        if self._is_stopping:
+            raise ConfigError("the viewer was stopped")
         with self._maker.edit_turn(Edit()) as (scene, _):
             yield scene
