@@ -22,8 +22,9 @@ from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import illuminant_names
+from unmix_plugin.spectral.colour.conversion import illuminant_names, linear_to_srgb, rgb_matrix
 from unmix_plugin.trained.camera_files import read_camera_file
 from unmix_plugin.trained.measured_surface import MeasuredSurface
 from unmix_plugin.trained.measures import keep_region, read_measures
@@ -122,6 +123,13 @@ def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, 
         recipe = page.props("recipe")
         page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
         (points, colours), (same, relit) = clouds
+        aids, materials = (
+            viewer.services.maker.aids.for_layers(),
+            viewer.services.maker.edited(Edit()).materials,
+        )
+        assert aids is not None
+        linear = (aids.reference_spectra(materials) @ rgb_matrix(materials.bands)).clamp(0, 1)
+        assert np.array_equal(colours, eight_bits(linear_to_srgb(linear).numpy()))
         assert np.array_equal(points, same)
         assert relit[:, 2].mean() < colours[:, 2].mean() - 5
         page.set("visible", False)

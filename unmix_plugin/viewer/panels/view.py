@@ -11,6 +11,7 @@ import torch
 from jaxtyping import UInt8
 
 from unmix_plugin.errors import ConfigError
+from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import linear_to_srgb, rgb_matrix
@@ -314,7 +315,7 @@ class ScenePanel:
         main = aids.reference.abundances.argmax(dim=-1).cpu().numpy()
         spectra, kept = aids.reference_spectra(materials), are_shown[main]
         linear = (spectra @ rgb_matrix(materials.bands).to(spectra)).clamp(0, 1)
-        colours = (linear_to_srgb(linear) * 255).byte().cpu().numpy()[kept]
+        colours = eight_bits(linear_to_srgb(linear).cpu().numpy())[kept]
         points = aids.reference_points.cpu().numpy()[kept]
         step = max(1, -(-len(points) // _MOST_POINTS))
         scene = self._session.client.scene
