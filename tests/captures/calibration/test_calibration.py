@@ -95,6 +95,31 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     np.testing.assert_allclose(found.values[:, 4], (counts[:, 4] - 50.0) / 2950, rtol=1e-5)
 
 
+@pytest.mark.parametrize("is_image", [False, True])
+@pytest.mark.parametrize("is_in_view", [True, False])
+def test_a_white_of_one_value_leaves_no_trace_of_the_dark_of_columns_or_pixels(is_image, is_in_view):
+    """What the panel is above the dark behind it is the same for all pixels, whatever these have of their own."""
+    generator = np.random.default_rng(0)
+    dark_levels = np.rint(900.0 + 120.0 * generator.standard_normal((LINES if is_image else 1, SAMPLES, NUM)))
+    if is_image:
+        dark_levels += 500.0 * (np.arange(LINES)[:, None, None] >= LINES // 2)
+    truth = generator.choice([0.25, 0.5], (LINES, SAMPLES, 1)) + np.zeros(NUM)
+    truth[2:8, 3:9] = 1.0
+    cube = file_of((8000 * truth + dark_levels).astype(np.uint16))
+    stored = np.broadcast_to(dark_levels, (LINES, SAMPLES, NUM)).astype(np.uint16)
+    dark = open_reference(file_of(stored), "dark frame", cube)
+    assert dark.is_per_pixel == is_image
+    if is_in_view:
+        white = panel_reference(cube, (2, 3, 6, 6), "a view")
+    else:  # wider than the cubes, of which the mean dark is all that is known
+        level = 8000.0 + dark_levels.mean(axis=(0, 1)) + np.zeros((3, SAMPLES + 7, 1))
+        white = open_reference(file_of(level.astype(np.float32)), "white reference", cube)
+    white = replace(white, dark=dark, reflectance=np.ones(NUM))
+    np.testing.assert_allclose(white.signal, 8000, rtol=1e-6)
+    calibration = Calibration(Raster.of(LINES, SAMPLES, None, 1), ALL_BANDS, dark=dark, white=white)
+    np.testing.assert_allclose(calibration.rows(cube, 0, LINES).values, truth, rtol=1e-5)
+
+
 def test_a_reference_has_gains_where_the_cubes_have_them():
     stored = np.full((4, 3, 2), 100, np.uint16)
     gains, offsets = np.array([0.5, 2.0]), np.array([1.0, -1.0])

@@ -185,9 +185,7 @@ class Calibration:
             factor = ratio if len(ratio) == 1 else ratio[bands]
         if white is not None:
             assert white.reflectance is not None
-            light = white.rows(rows, columns, bands)
-            if white.dark is not None:
-                light = light - white.dark.rows(rows, columns, bands)
+            light = white.light(rows, columns, bands)
             # NaN where the white is not above the dark.
             light = np.where(light > 0, light, np.float32(np.nan))
             factor = factor * (white.reflectance[bands].astype(np.float32) / light)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
@@ -135,11 +136,23 @@ class Reference:
         mean = self.mean[:, :, bands]
         return mean if mean.shape[1] == 1 else mean[:, columns]
 
-    @property
+    def light(self, rows: slice, columns: slice, bands: np.ndarray) -> Float32[np.ndarray, "h columns b"]:
+        """The same of a white panel, above its dark: a mean over columns less the mean of the dark over these."""
+        if not self.is_per_pixel and self.mean.shape[1] == 1:
+            return self.signal[None, None, bands].astype(np.float32)
+        light = self.rows(rows, columns, bands)
+        return light if self.dark is None else light - self.dark.rows(rows, columns, bands)
+
+    @cached_property
     def signal(self) -> Float64[np.ndarray, " B"]:
         """Mean counts above its dark at each band of the file."""
         own = self.mean.astype(np.float64).mean(axis=(0, 1))
-        return own if self.dark is None else own - self.dark.signal
+        if self.dark is None or self.rectangle is None:
+            return own if self.dark is None else own - self.dark.signal
+        top, left, height, width = self.rectangle
+        lines, columns = slice(top, top + height), slice(left, left + width)
+        behind = self.dark.rows(lines, columns, np.arange(len(own)))
+        return own - np.nanmean(behind, axis=(0, 1), dtype=np.float64)
 
 
 def _open_reference(file: SpectralFile, what: str, cube: SpectralFile) -> Reference:
