@@ -37,7 +37,7 @@ _PARTS = r"[,;\s]"
 _DIVISOR = "reflectance_scale_factor"
 """Stored number of full reflectance, under the same name everywhere."""
 _LEAST_WIDTH_NM = 0.05
-"""Widths below this are in another unit than the wavelengths, as are those wider than these."""
+"""Widths below this are in another unit, as are those wider than their wavelengths."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
 _ASK = "give the wavelengths yourself (--wavelengths)"
 
@@ -81,6 +81,8 @@ class StatedBands:
     centres: Sequence[object] | None = None
     unit: str | None = None
     fwhm: Sequence[object] | None = None
+    fwhm_unit: str | None = None
+    """None where it is that of the centres."""
     good: Sequence[object] | None = None
     """0 for a bad band."""
     names: Sequence[str] | None = None
@@ -107,18 +109,20 @@ def state_bands(entries: Mapping[str, Any], where: str) -> StatedBands:
                 return longest, found[longest] or None
         return "", None
 
-    def unit_of(name: str) -> str | None:
+    def unit_of(name: str, is_of_all: bool = True) -> str | None:
         # Those of a list called `wavelength`, or of all bands.
-        of_all = () if _unit_in(name) or "wavelength" in named else ("wavelength_units", "wavelength_unit")
+        is_of_all &= not _unit_in(name) and "wavelength" not in named
+        of_all = ("wavelength_units", "wavelength_unit") if is_of_all else ()
         keys = [named[key] for key in (f"{name}_units", f"{name}_unit", *of_all) if key in named]
         unit = entries[keys[0]] if keys else _unit_in(name) or None
         return unit if unit is None or isinstance(unit, str) else str(listed(unit)[0])
 
     name, centres = find(_CENTRES, "", "nm", "um")
-    fwhm, good = find(_WIDTHS, "", _unit_in(name), "nm", "um")[1], find(GOOD, "")[1]
+    width, fwhm = find(_WIDTHS, "", _unit_in(name), "nm", "um")
+    good = find(GOOD, "")[1]
     marks = good and [int(mark) if isinstance(mark, bool) else mark for mark in good]
-    names = find(_NAMES, "", separators=",")[1]
-    return StatedBands(f"{where} '{named.get(name)}'", centres, unit_of(name), fwhm, marks, names)
+    names, where = find(_NAMES, "", separators=",")[1], f"{where} '{named.get(name)}'"
+    return StatedBands(where, centres, unit_of(name), fwhm, unit_of(width, is_of_all=False), marks, names)
 
 
 def _unit_in(name: str) -> str:
@@ -231,18 +235,33 @@ def check_bands(stated: StatedBands, num_bands: int, warnings: list[str]) -> Ban
     if centres is not None and (np.diff(centres[~unused]) == 0).any():
         warnings.append("two bands beside each other have the same wavelength")
     fwhm = _numbers("FWHM", stated.fwhm, num_bands, warnings)
-    if fwhm is not None and factor is not None and (fwhm[~unused] > 0).all():
-        fwhm = np.where(unused, fwhm[~unused].mean(), fwhm) * factor
-        if centres is not None and ((fwhm > centres) | (fwhm < _LEAST_WIDTH_NM)).any():
-            unit = f"{fwhm.min():g} to {fwhm.max():g} nm, as they have the unit of the wavelengths"
-            warnings.append(f"FWHM are left out: they would be {unit}")
-            fwhm = None
+    if fwhm is not None and factor is not None and centres is not None and (fwhm[~unused] > 0).all():
+        fwhm = np.where(unused, fwhm[~unused].mean(), fwhm)
+        fwhm = _widths_nm(fwhm, (stated.fwhm_unit or "").strip(), factor, centres, warnings)
     else:
         fwhm = named_fwhm
     good = _numbers("marks of bad bands", stated.good, num_bands, warnings)
     bad = unused if good is None else (good == 0) | unused
     marks = None if good is None and not unused.any() else bad
     return BandTable(centres, evidence, fwhm, marks, None if names is None else tuple(map(str, names)))
+
+
+def _widths_nm(
+    widths: np.ndarray, unit: str, factor: float, centres: np.ndarray, warnings: list[str]
+) -> np.ndarray | None:
+    """Widths by their own unit, otherwise by that of the wavelengths, of which one is `factor` nm, or by nm or
+    micrometres where that can't be; None with a warning where nothing fits."""
+    tried = (factor, 1.0, 1e3) if unit.lower() in ("", "unknown") else (nm_per_unit(unit) or np.nan,)
+    fitting = [one for one in tried if ((widths * one <= centres) & (widths * one >= _LEAST_WIDTH_NM)).all()]
+    low, high = widths.min(), widths.max()
+    if not fitting:
+        said = f"{low * tried[0]:g} to {high * tried[0]:g} nm" if tried[0] > 0 else f"in {unit!r}"
+        warnings.append(f"FWHM are left out: they would be {said}")
+        return None
+    if fitting[0] != tried[0]:
+        taken = f"{low:g} to {high:g} taken as {'nm' if fitting[0] == 1.0 else 'micrometres'}"
+        warnings.append(f"FWHM: {taken}, as they can't be in the unit of the wavelengths")
+    return widths * fitting[0]
 
 
 def _fitting(

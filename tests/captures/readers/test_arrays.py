@@ -169,6 +169,20 @@ def test_wavelengths_and_widths_may_be_packed_and_no_data_has_many_names(tmp_pat
     check_file(file, nm=NM, fwhm=NM / 100, no_data=(-3, -1, -2))
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("nm", 1.0), ("micrometers", 1e-3), ("parsec", None)])
+@pytest.mark.parametrize("wavelength_unit", ["nm", "um"])
+def test_widths_have_a_unit_of_their_own(tmp_path, unit, factor, wavelength_unit):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"] = CUBE
+        file["wavelength"] = NM * (1.0 if wavelength_unit == "nm" else 1e-3)
+        file["wavelength"].attrs["units"] = wavelength_unit
+        file["fwhm"] = 150.0 * np.ones(5) * (factor or 1.0)
+        file["fwhm"].attrs["units"] = unit
+    file = open_spectral_file(tmp_path / "a.h5")
+    said = () if factor else ("FWHM are left out: they would be in 'parsec'",)
+    check_file(file, nm=NM, fwhm=150 if factor else None, warnings=said)
+
+
 def test_axes_by_the_names_of_netcdf4(tmp_path):
     square = CUBE[:5, :5]
     with h5py.File(tmp_path / "a.nc", "w") as opened:
@@ -369,11 +383,7 @@ def test_what_was_not_measured_is_known_by_all_attributes_of_netcdf_and_by_its_f
         ({"cube": CUBE, "bands": [[3, 5, 8, 11, 12]]}, None, {"nm": None, "warnings": ()}),
         ({"cube": CUBE, "bands": NM / 1000}, None, {"nm": NM}),
         ({"cube": CUBE, "wavelength": NM, "fwhm_nm": NM / 100}, None, {"nm": NM, "fwhm": NM / 100}),
-        (
-            {"cube": CUBE, "wavelength_um": NM / 1000, "fwhm_nm": NM / 100},
-            None,
-            {"nm": NM, "fwhm": None, "warning": "FWHM are left out: they would be 4500 to 6500 nm"},
-        ),
+        ({"cube": CUBE, "wavelength_um": NM / 1000, "fwhm_nm": NM / 100}, None, {"nm": NM, "fwhm": NM / 100}),
         (
             {"cube": CUBE, "wavelengths": np.arange(1, 6)},
             None,

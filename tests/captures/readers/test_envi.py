@@ -126,10 +126,13 @@ LEFT_OUT = {
     f"{UNIT}Micrometers\nwavelength = {{400, 500, 600, 700}}": "can't be in Micrometers",
     f"{UNIT}nm\nwavelength = {{.4, .5, .6, .7}}": "can't be in nm",
 }
-WIDTHS = "FWHM are left out: they would be"
+WIDTHS = {
+    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.0055, .0055, .0055, .0055}}": "taken as micrometres",
+    f"{UNIT}Micrometers\nwavelength = {{.5, .51, .52, .53}}\nfwhm = {{5.5, 5.5, 5.5, 5.5}}": "5.5 to 5.5 taken as nm",
+}
 NO_WIDTHS = {
-    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.0055, .0055, .0055, .0055}}": WIDTHS,
-    f"{UNIT}Micrometers\nwavelength = {{.5, .51, .52, .53}}\nfwhm = {{5.5, 5.5, 5.5, 5.5}}": WIDTHS,
+    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{900, 5.5, 5.5, 5.5}}": "would be 5.5 to 900 nm",
+    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.00005, 5.5, 5.5, 5.5}}": "would be 5e-05 to 5.5 nm",
 }
 
 
@@ -138,7 +141,11 @@ NO_WIDTHS = {
     [
         *SAID.items(),
         *((text, {"nm": None, "warning": said}) for text, said in LEFT_OUT.items()),
-        *((text, {"fwhm": None, "warning": "FWHM are left out: they would be"}) for text in NO_WIDTHS),
+        *((text, {"fwhm": 5.5, "warning": said}) for text, said in WIDTHS.items()),
+        *(
+            (text, {"fwhm": None, "warning": f"FWHM are left out: they {said}"})
+            for text, said in NO_WIDTHS.items()
+        ),
     ],
 )
 def test_what_a_header_says_of_bands_is_used_or_left_out_with_a_reason(tmp_path, entries, expected):
