@@ -17,6 +17,7 @@ from tests.captures.file_factory import (
     write_envi,
 )
 from tests.fuzz.capture_samples import SAMPLES
+from unmix_plugin.captures.calibration.references import finished_by, stated_reflectance
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
 from unmix_plugin.commands.process import process
 from unmix_plugin.commands.process_inspect import inspect_command
@@ -267,6 +268,26 @@ def test_every_xml_beside_an_image_is_read_or_said_not_to_describe_its_bands(
     name = f"a-SPECTRAL_IMAGE{detector}.TIF"
     image = write_tiff(tmp_path, name=name, xml=text, aux=pam({"NoDataValue": 7}))
     check_file(open_spectral_file(image), no_data=(7,), **expected)
+
+
+@pytest.mark.parametrize(
+    ("product", "level", "quantity"),
+    [
+        ("ENMAP01-____L2A-DT0000001867_20220724T104526Z_008_V010302_20230628T165614Z", None, "reflectance"),
+        ("ENMAP01-____L1C-DT0000001867_20220724T104526Z_008_V010302_20230628T165614Z", "L1C", "radiance"),
+        ("DESIS-HSI-L2A-DT0485529167_001-20220712T223540-V0220", None, "reflectance"),
+        ("renamed", "L2A", "reflectance"),
+        ("renamed", None, None),
+    ],
+)
+def test_the_level_of_enmap_and_desis_says_what_gains_make_of_numbers(tmp_path, product, level, quantity):
+    said = f"<base><level>{level}</level></base>" if level else ""
+    text = enmap(THREE, GainOfBand=[1e-4] * 3, OffsetOfBand=[0] * 3).replace("<x>", f"<x>{said}")
+    image = write_tiff(tmp_path, name=f"{product}-SPECTRAL_IMAGE.TIF")
+    (tmp_path / f"{product}-METADATA.XML").write_text(text)
+    file = open_spectral_file(image)
+    assert (stated_reflectance(file) is not None) == (quantity == "reflectance")
+    assert (finished_by(file) is not None) == (quantity is not None)
 
 
 @pytest.mark.parametrize("name", [name for name in SAMPLES if name != "cube.hdr"])

@@ -27,6 +27,9 @@ _NAMES_BY_ROLE = {"scale": "scale", "offset": "offset", "description": "band_nam
 """What entries are that GDAL itself marks with a role."""
 _IMAGE_NAME = re.compile(r"SPECTRAL_IMAGE(_VNIR|_SWIR)?$")
 """End of the name of an image of EnMAP or DESIS; those of EnMAP's level L1B have the bands of one detector."""
+_QUANTITIES = {"L1B": "radiance", "L1C": "radiance", "L2A": "reflectance"}
+_LEVEL = re.compile(rf"(?<![A-Z])({'|'.join(_QUANTITIES)})(?![A-Z0-9])")
+"""Of EnMAP and DESIS, as their XML or their names say it: ENMAP01-____L2A-..., DESIS-HSI-L2A-..."""
 _OF_BANDS = {
     "scale": ("Scale", "GainOfBand", "gainOfBand"),
     "offset": ("Offset", "OffsetOfBand", "offsetOfBand"),
@@ -88,7 +91,10 @@ def with_xml_beside(file: SpectralFile) -> SpectralFile:
     """The file with what an XML beside it says of its bands, where it says nothing itself.
 
     GDAL keeps gains, offsets and the no-data value in NAME.aux.xml; NAME-SPECTRAL_IMAGE.TIF of EnMAP and DESIS has
-    wavelengths, widths, gains and offsets in NAME-METADATA.XML. Raises CaptureError: gains are impossible.
+    wavelengths, widths, gains and offsets in NAME-METADATA.XML, and the level, which says what gains make of numbers.
+    Raises CaptureError: gains are impossible.
+
+    Source: SNAP's reader of EnMAP, for `base/level`; EnMAP-Box's readers, for names.
     """
     beside = [path.with_name(f"{path.name}.aux.xml") for path in file.files]
     beside += [
@@ -110,7 +116,7 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
     except ValueError:
         warnings.append(f"{found.name} is damaged: what it says is not used")
         return file
-    num_bands, first = file.shape[2], 1
+    num_bands, first, quantity = file.shape[2], 1, None
     elements = list(root.iter("PAMRasterBand"))
     if not found.name.endswith(".aux.xml"):
         places = (".//bandCharacterisation/bandID", ".//bandCharacterisation/band")
@@ -121,6 +127,8 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
             warnings.append(f"{listed}: wavelengths and gains in it are not used")
             return file
         first = 1 + len(elements) - num_bands if detector == "_SWIR" else 1
+        level = _LEVEL.search(root.findtext("base/level") or found.stem)
+        quantity = level and _QUANTITIES[level[1]]
     items = _items_of_bands(elements, first, num_bands)
     bands, of_all = file.bands, {name: texts for name, texts in items.items() if len(texts) == num_bands}
     if bands.wavelengths_nm is None and "wavelength" in of_all:
@@ -130,6 +138,8 @@ def _with_xml(file: SpectralFile, found: Path, warnings: list[str]) -> SpectralF
         bad = np.any(marks, axis=0) if marks else None
         bands = BandTable(table.wavelengths_nm, table.evidence, table.fwhm_nm, bad, bands.names)
     linear = file.linear or gdal_linear(file.path, items, num_bands, found.name, warnings)
+    if linear is not None and quantity:
+        linear = replace(linear, evidence=f"{linear.evidence} of {quantity}")
     texts = items.get("no_data", {}).values()
     no_data = [number for number in map(gdal_number, texts) if number is not None and not math.isnan(number)]
     return replace(
