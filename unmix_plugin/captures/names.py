@@ -136,7 +136,8 @@ def match_poses(
             f"{poses.source} {name_some(list(owners))}; expected the same names, apart from folders and suffixes"
         )
     unposed = [name for name in wanted if name not in found]
-    unused = [name for name in owners if name not in set(found.values())]
+    used = set(found.values())
+    unused = [name for name in owners if name not in used]
     cameras_of, views_of = _owners_of(owners, _stem), _owners_of(wanted, _stem)
     several = {stem for stem in views_of if len(views_of[stem]) + len(cameras_of.get(stem, ())) > 2}
     shared = [view for view in unposed if several & cameras_of.keys() & set(map(_stem, wanted[view]))]
