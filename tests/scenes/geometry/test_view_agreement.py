@@ -104,6 +104,26 @@ def test_views_that_show_nothing_give_no_verdict(demo):
     assert compare_conventions(poses[:3], Views(scene.cameras[[0, 1, 2]], scene.cube)) == {}
 
 
+def test_what_pixels_show_that_do_not_count_changes_no_verdict(demo):
+    scene = load_scene(demo)
+    poses = scene.cameras.camera_to_world.double().numpy()
+    valid = np.ones((64, 64), bool)
+    valid[20:44, 30:] = False
+    found = []
+    for fill in (np.zeros(8), np.random.default_rng(0).random((24 * 34, 8)), np.full(8, np.nan)):
+
+        def read(view, part, fill=fill):
+            cube = np.array(scene.cube(view))
+            cube[~valid] = fill
+            return cube[part]
+
+        found.append(compare_conventions(poses, Views(scene.cameras, read, lambda _: valid)))
+    assert found[0] == found[1] == found[2]
+    assert min(found[0], key=found[0].__getitem__) == "camera to world, OpenGL axes"
+    nothing = Views(scene.cameras, scene.cube, lambda _: np.zeros((64, 64), bool))
+    assert compare_conventions(poses, nothing) == {}
+
+
 BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
 

@@ -167,14 +167,25 @@ def _compare(
     generator = torch.Generator().manual_seed(0)
     used = sorted({*neighbours, *(other for others in neighbours.values() for other in others)})
     thinned = ThinnedViews(views, most_pooled=1)
-    images = view_features([thinned.read(view) for view in used], generator)
+    read = [_with_gaps(thinned, view) for view in used]
+    if not any(bool(image.isfinite().any()) for image in read):
+        return None
+    images = view_features(read, generator)
     features = dict(zip(used, images, strict=True))
     pixels = {view: choose(features[view], generator) for view in neighbours}
+    shown = {view: features[view].flatten(0, 1)[chosen] for view, chosen in pixels.items()}
+    pixels = {view: pixels[view][own.isfinite().all(dim=-1)] for view, own in shown.items()}
     drawn = torch.cat([features[view].flatten(0, 1)[pixels[view]] for view in neighbours])
     chance = float((drawn - drawn[torch.randperm(len(drawn), generator=generator)]).norm(dim=-1).median())
-    if chance <= 0.0:
+    if not chance > 0.0:  # NaN where no pixel counts
         return None
     return _Comparison(neighbours, features, pixels, thinned.cameras(images[0]), chance)
+
+
+def _with_gaps(thinned: ThinnedViews, view: int) -> Float[Tensor, "h w B"]:
+    """A view thinned out, NaN where pixels don't count."""
+    image, share = thinned.read(view), thinned.valid_share(view)
+    return image if share is None else image.masked_fill((share < 1)[..., None], torch.nan)
 
 
 def describe(disagreements: dict[str, float]) -> str | None:
@@ -213,11 +224,11 @@ def _busy_pixels(image: Image, generator: torch.Generator) -> Int[Tensor, " P"]:
 
 
 def _local_change(image: Image) -> Float[Tensor, "h w"]:
-    """How much an image changes around each pixel, along its rows and columns; 0 on its border."""
+    """How much an image changes around each pixel, along its rows and columns; 0 on its border and beside gaps."""
     change = torch.zeros(image.shape[:2])
     across = (image[1:-1, 2:] - image[1:-1, :-2]).norm(dim=-1)
     change[1:-1, 1:-1] = across + (image[2:, 1:-1] - image[:-2, 1:-1]).norm(dim=-1)
-    return change
+    return change.nan_to_num(0.0)
 
 
 def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str | None:

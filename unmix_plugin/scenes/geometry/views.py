@@ -21,7 +21,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 
 Image = Float[Tensor, "h w F"]
-"""Features of a view thinned out."""
+"""Features of a view thinned out, NaN in its gaps."""
 Differences = Float[Tensor, "P D"]
 """Between pixels and what another view shows of points along their rays; inf where it does not see them."""
 _MOST_BANDS = 32
@@ -123,8 +123,10 @@ def choose_neighbours(
 
 
 def view_features(views: list[Float[Tensor, "h w B"]], generator: torch.Generator) -> list[Image]:
-    """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little."""
+    """Principal components of the spectra of all views, the first with a spread of 1, smoothed a little; gaps get wider
+    by a pixel."""
     spectra = torch.cat([view.flatten(0, 1) for view in views])
+    spectra = spectra[spectra.isfinite().all(dim=-1)]
     some = spectra[torch.randperm(len(spectra), generator=generator)[:_PIXELS_OF_FEATURES]]
     mean = some.mean(dim=0)
     _, spreads, axes = torch.linalg.svd(some - mean, full_matrices=False)
@@ -152,7 +154,7 @@ def view_differences(
     # Features first: a norm along a last axis of a few numbers takes ten times as long.
     shown = sampled[0, :, :, 0].view(own.shape[-1], len(own), -1)
     differences = (shown - own.T[:, :, None]).square_().sum(dim=0).sqrt_()
-    return differences.masked_fill(~is_seen.reshape(differences.shape), torch.inf)
+    return differences.masked_fill(~is_seen.reshape(differences.shape) | differences.isnan(), torch.inf)
 
 
 def best_agreement(differences: list[Differences]) -> Differences:
