@@ -45,6 +45,7 @@ def test_the_numbers_are_those_of_the_decoder_and_of_the_tables(family, written)
     means = torch.tensor([constants["GGX_MEAN_A"], constants["GGX_MEAN_B"]])
     torch.testing.assert_close(means, mean_ggx_albedo(roughness[None])[:, 0])
     text = (written / "decoder.glsl").read_text()
+    assert "diffuse_colour, latents_a and latents_b" in " ".join(text[:600].replace("//", "").split())
     declared = re.findall(r"^const \w+ ([A-Z0-9_]+)", text, re.MULTILINE)
     assert set(constants) - {"about"} <= set(declared)
 

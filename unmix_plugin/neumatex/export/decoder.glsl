@@ -1,8 +1,9 @@
-// Neural materials of a neumatex run: from base colour and latents A and B to reflectance.
+// Neural materials of a neumatex run: from diffuse colour and latents A and B to reflectance.
 //
-// GLSL ES 3.00 and GLSL 3.30. Textures: base_colour (sRGB in its PNG: decode it to linear), latents_a and latents_b
-// (linear, 0 to 1). Directions are unit vectors in the local frame of a point, z along its normal: wi to the light, wo to
-// the eye. `reflectance` is in 1/sr, without the cosine, reciprocal, and reflects no more light than it gets.
+// GLSL ES 3.00 and GLSL 3.30. Textures: diffuse_colour, latents_a and latents_b; the PNG of the first is sRGB, decode it
+// to linear, the others are linear, 0 to 1. Directions are unit vectors in the local frame of a point, z along its
+// normal: wi to the light, wo to the eye. `reflectance` is in 1/sr, without the cosine, reciprocal, and reflects no more
+// light than it gets.
 //
 // The latents have no meaning of their own, one by one. A small network, the same for all objects, decodes them to a
 // stack of analytic layers: dust over sheen over clear coat over a glossy surface with haze over the diffuse base.
@@ -147,7 +148,7 @@ vec3 dustReflection(Stack s, float light, float eye) {
   return (1.0 - light) * (1.0 - eye) / max(mean, 1e-6) * DUST_COLOUR / PI;
 }
 
-vec3 reflectance(vec3 baseColour, vec3 latentsA, vec3 latentsB, vec3 wi, vec3 wo) {
+vec3 reflectance(vec3 diffuseColour, vec3 latentsA, vec3 latentsB, vec3 wi, vec3 wo) {
   if (wi.z <= 0.0 || wo.z <= 0.0) return vec3(0.0);
   Stack s = decode(latentsA, latentsB);
   Passing light = passing(s, wi.z);
@@ -171,5 +172,5 @@ vec3 reflectance(vec3 baseColour, vec3 latentsA, vec3 latentsB, vec3 wi, vec3 wo
     + sheen * s.coatWeight * mix(COAT_F0, 1.0, edge) * lobes.x
     + dust * sheenLobe(s.sheenRoughness, h, wi.z, wo.z) * s.sheenColour
     + dustReflection(s, light.dust, eye.dust);
-  return passed * baseColour / PI + specular;
+  return passed * diffuseColour / PI + specular;
 }
