@@ -83,6 +83,15 @@ def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
+def test_a_run_does_not_go_on_with_other_poses(trained, tmp_path):
+    moved = Path(shutil.copytree(trained.parents[3] / "ball", tmp_path / "ball"))
+    content = json.loads((moved / "transforms.json").read_text())
+    content["frames"][1]["transform_matrix"][0][3] += 0.01
+    (moved / "transforms.json").write_text(json.dumps(content))
+    said = refused(train, "neumatex", "--load-run", trained, "--data", moved, "--max-num-iterations", 31)
+    assert "training cameras.camera_to_world differ" in said
+
+
 def test_bad_input_ends_with_status_2_and_one_message(tmp_path):
     folder = write_object(tmp_path / "ball")
     (folder / "environment.exr").write_bytes(b"no picture")

@@ -75,22 +75,20 @@ def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> 
 
 def check_same_scene(scene: SceneRecord, datamanager: DataManager, run: RunFolder) -> None:
     """Refuse another scene than the run's; numbers may differ by what machines round differently. Raises RunError:
-    metadata, scene box or identity differ from what the run was trained with."""
+    metadata, scene box, cameras or identity differ from what the run was trained with."""
     box, other_box = scene.scene_box.aabb.tolist(), datamanager.scene_box.aabb.tolist()
-    sizes, other_sizes = (_sizes(x.train_cameras, x.eval_cameras) for x in (scene, datamanager))
-    kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary), "image sizes": sizes}
+    cameras, other_cameras = (
+        {"training cameras": one.train_cameras.to_json(), "evaluation cameras": one.eval_cameras.to_json()}
+        for one in (scene, datamanager)
+    )
+    kept = {**scene.metadata, "scene_box": box, **datamanager.identity(scene.summary), **cameras}
     found = {**datamanager.metadata(), "scene_box": other_box, **datamanager.identity(datamanager.summary())}
-    differing = differences(kept, {**found, "image sizes": other_sizes})
+    differing = differences(kept, {**found, **other_cameras})
     if differing:
         raise RunError(
             f"the scene at {datamanager.data} is not the one that {run.path} was trained on: "
             f"{name_differences(differing)}; name the right one with --data"
         )
-
-
-def _sizes(*cameras: Cameras) -> list[list[list[int]]]:
-    """Width and height of the image of each camera."""
-    return [[list(some.size(index)) for index in range(len(some))] for some in cameras]
 
 
 def _dictionary(values: dict[str, Any], name: str) -> dict[str, Any]:
