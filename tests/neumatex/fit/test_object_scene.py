@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 import trimesh
@@ -248,6 +249,35 @@ def test_what_means_nothing_where_alpha_is_0_is_0(folder):
     assert_allclose(found[~hidden], given.numbers[~hidden])
 
 
+@pytest.mark.parametrize("layer", ["", "View.Combined."])
+def test_colours_of_an_exr_are_red_green_and_blue_whatever_else_it_holds(tmp_path, layer):
+    values = {"R": 0.9, "G": 0.5, "B": 0.1, "A": 0.4}
+    channels = {layer + name: np.full((2, 3), value, np.float32) for name, value in values.items()}
+    found = read_picture(write_exr(tmp_path / "a.exr", {**channels, "Depth.Z": np.ones((2, 3), "f4")}, {}))
+    assert_allclose(found.numbers[1, 2], [0.9, 0.5, 0.1])
+    assert_allclose(found.opacity, 0.4)
+
+
+def test_channels_of_an_exr_that_are_no_colours_are_refused(tmp_path):
+    for name, channels in (
+        ("xyz", "XYZ"),
+        ("layers", [f"{side}.{colour}" for side in "ab" for colour in "RGB"]),
+    ):
+        path = write_exr(tmp_path / f"{name}.exr", dict.fromkeys(channels, np.ones((2, 3), np.float32)), {})
+        with pytest.raises(UnmixError, match=r"expected R, G and B, of one layer"):
+            read_picture(path)
+
+
+def test_outside_of_the_data_window_of_an_exr_alpha_is_0(tmp_path):
+    windows = {"displayWindow": ((0, 0), (7, 7)), "dataWindow": ((2, 2), (5, 5))}
+    header = {name: tuple(np.array(corner, np.int32) for corner in two) for name, two in windows.items()}
+    header |= {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    OpenEXR.File(header, dict.fromkeys("RGBA", np.ones((4, 4), np.float32))).write(str(tmp_path / "a.exr"))
+    found = read_picture(tmp_path / "a.exr")
+    assert found.has_alpha
+    assert found.opacity.sum() == 16
+
+
 def test_pictures_under_held_out_lights_have_names_that_differ(folder):
     for light, picture in (("a-b", "c"), ("a", "b-c")):
         there = Path(shutil.copytree(folder / DIM, folder / "relit" / light))
@@ -308,7 +338,7 @@ FAULTS = {
         partial(_truth, size=12, names="RGB"),
         r"000.exr: has shape \(12, 12, 3\); expected \(24, 24, 3\): rows and columns of the view 000, and 3 colours",
     ),
-    "truth of five colours": (partial(_truth, size=SIZE, names="RGBXY"), "24, 5.; expected"),
+    "truth of five colours": (partial(_truth, size=SIZE, names="PQRST"), "24, 5.; expected"),
     "response of held-out pictures": (
         lambda folder: write_views(folder / DIM, ".png", COLOUR, count=2),
         "is camera, a response that is learnt from .* but those are linear; expected linear, srgb or agx",

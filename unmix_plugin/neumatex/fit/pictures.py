@@ -86,12 +86,16 @@ def _read_display(path: Path) -> Picture:
 def _read_exr(path: Path) -> Picture:
     from unmix_plugin.captures.readers.exr import channel_names
 
-    numbers, _, nm = read_exr(path)
-    if numbers.shape[2] < 3:
-        raise SceneError(f"{path}: has {numbers.shape[2]} channels of colour; expected R, G and B")
-    alpha = None
-    if "A" in channel_names(path):
-        alpha = read_exr(path, "A")[0][..., 0].astype(np.float32).clip(0, 1)
+    numbers, names, nm = read_exr(path)
+    layers = {name[:-1] for name in names if {name[:-1] + colour for colour in "RGB"} <= set(names)}
+    layer, alpha = min(layers, default=""), None
+    is_clear = "" in layers or len(layers) == 1 or (not layers and len(names) > 3)
+    if len(names) < 3 or (nm is None and not is_clear):
+        raise SceneError(f"{path}: has the channels {', '.join(names)}; expected R, G and B, of one layer")
+    if nm is None and layers:
+        numbers = numbers[..., [names.index(layer + colour) for colour in "RGB"]]
+    if f"{layer}A" in channel_names(path):  # outside of the data window nothing is
+        alpha = np.nan_to_num(read_exr(path, f"{layer}A")[0][..., 0]).astype(np.float32).clip(0, 1)
     return Picture(
         numbers.astype(np.float32), alpha, wavelengths_nm=None if nm is None else tuple(nm.tolist())
     )
