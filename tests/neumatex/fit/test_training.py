@@ -41,6 +41,7 @@ from unmix_plugin.neumatex.fit.start import _as_bright
 from unmix_plugin.neumatex.fit.trained_object import TrainedObject
 from unmix_plugin.neumatex.tracing.families import SpectralFamily
 from unmix_plugin.scenes.scene import Normalisation
+from unmix_plugin.spectral.colour.conversion import agx
 from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.open_run import load_run, snapshot
@@ -90,6 +91,14 @@ def test_a_run_does_not_go_on_with_other_poses(trained, tmp_path):
     (moved / "transforms.json").write_text(json.dumps(content))
     said = refused(train, "neumatex", "--load-run", trained, "--data", moved, "--max-num-iterations", 31)
     assert "training cameras.camera_to_world differ" in said
+
+
+def test_what_pictures_of_light_are_compared_through_does_not_change_how_light_is_shown(tmp_path):
+    settings = NeumatexModelConfig(material="pbr", prior="none", light_curve="linear", plane_resolution=2)
+    pipeline = PipelineConfig(datamanager=ObjectDataManagerConfig(), model=settings)
+    model = pipeline.setup(data=write_object(tmp_path / "ball"), device=torch.device("cpu")).model
+    light = torch.tensor([[0.2, 1.0, 4.0]])
+    assert_close(model.curve(light), agx(light))
 
 
 def test_bad_input_ends_with_status_2_and_one_message(tmp_path):

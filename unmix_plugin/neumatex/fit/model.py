@@ -69,8 +69,7 @@ class NeumatexModel(Model):
             self.anchor["triplane"] = prior
         if not self.config.fit_networks:
             self.triplane.readers.requires_grad_(False)
-        is_light = record.tone_mapping == "linear"
-        self.curve: nn.Module = self.light_curve if is_light else tone_curve(record.tone_mapping)
+        self.curve: nn.Module = tone_curve("agx" if record.tone_mapping == "linear" else record.tone_mapping)
         if record.bands is not None:
             self.curve = SpectralDisplay(record.bands)
         for name, buffer in _empty_buffers(record).items():
