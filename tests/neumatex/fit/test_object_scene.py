@@ -40,6 +40,7 @@ from unmix_plugin.neumatex.fit.pictures import read_picture
 from unmix_plugin.neumatex.tracing.rays import RayMesh
 from unmix_plugin.scenes.placement import Placement
 from unmix_plugin.spectral.bands import Bands
+from unmix_plugin.trained.measures import recorded_scale
 
 DIM = Path("relit/dim")
 
@@ -276,6 +277,14 @@ def test_outside_of_the_data_window_of_an_exr_alpha_is_0(tmp_path):
     found = read_picture(tmp_path / "a.exr")
     assert found.has_alpha
     assert found.opacity.sum() == 16
+
+
+def test_metres_of_a_unit_are_kept_as_those_of_any_scene(folder):
+    _change(folder, metres_per_unit=0.001)
+    manager = ObjectDataManager(ObjectDataManagerConfig(), data=folder, device=torch.device("cpu"))
+    scale = recorded_scale(manager.summary())
+    assert scale is not None
+    assert scale.metres_per_unit == 0.001
 
 
 def test_pictures_under_held_out_lights_have_names_that_differ(folder):

@@ -35,6 +35,7 @@ from unmix_plugin.neumatex.fit.settings import ObjectRecord
 from unmix_plugin.neumatex.fit.tone import TONE_MAPPINGS
 from unmix_plugin.neumatex.prior.observations import well_spread
 from unmix_plugin.neumatex.tracing.rays import RayMesh
+from unmix_plugin.scenes.placement import METRES_KEY
 from unmix_plugin.scenes.reading.loader import readable_name
 from unmix_plugin.scenes.scene import Normalisation
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
@@ -169,7 +170,7 @@ class ObjectDataManager(DataManager):
         return buffers | (_view_arrays(self.object) if self.object.lamp is None else self._pixel_arrays())
 
     def summary(self) -> dict[str, Any]:
-        """Files, splits, normalisation, hashes."""
+        """Files, splits, normalisation, hashes, and how long a unit is where that is known."""
         found = self.object
         return {
             "root": str(found.root),
@@ -180,6 +181,7 @@ class ObjectDataManager(DataManager):
             "tone_mapping": found.pictures.tone,
             "lights": {light.name: light.pictures.names for light in found.lights},
             "input_hashes": dict(found.input_hashes),
+            **({} if found.metres_per_unit is None else {METRES_KEY: found.metres_per_unit}),
         }
 
     @classmethod

@@ -82,6 +82,8 @@ class ObjectScene:
     """All views."""
     split: Split
     """Views to train on and views to evaluate, at least one each."""
+    metres_per_unit: float | None
+    """Of the world; None: unknown."""
     lights: tuple[HeldOutLight, ...]
     bands: Bands | None
     """Of spectral pictures; None for RGB."""
@@ -160,6 +162,7 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
         frame=frame,
         pictures=pictures,
         split=folder.split,
+        metres_per_unit=folder.entry.metres_per_unit,
         lights=tuple(held_out),
         bands=bands,
         lamp=power,
