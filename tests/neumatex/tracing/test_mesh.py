@@ -50,8 +50,66 @@ def test_formats_agree_and_an_open_mesh_is_noted(tmp_path, suffix, first):
     notes = []
     mesh = read_mesh(tmp_path / f"mesh.{suffix}", notes)
     assert ["is open" in note for note in notes] == [True] * first
-    corners = torch.as_tensor(np.array(torus.triangles), dtype=torch.float32)
+    corners = torch.as_tensor(np.array(torus.triangles))
     assert_close(mesh.corners(), corners, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("texture", ["", "1"])
+def test_corners_of_an_obj_have_their_own_normals(tmp_path, texture):
+    """A box whose corners are named once, and have a normal for each face."""
+    box = trimesh.creation.box()
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0 0"]
+    lines += [f"vn {x} {y} {z}" for x, y, z in box.face_normals]
+    for index, face in enumerate(box.faces, start=1):
+        lines.append("f " + " ".join(f"{corner + 1}/{texture}/{index}" for corner in face))
+    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
+    mesh = read_mesh(tmp_path / "box.obj")
+    expected = torch.from_numpy(np.array(box.face_normals)).float()[:, None].expand(12, 3, 3)
+    assert_close(mesh.normals[mesh.faces.long()], expected)
+    assert_close(mesh.corners(), torch.from_numpy(np.array(box.triangles)))
+
+
+def test_without_normals_an_obj_is_smooth_at_seams_of_texture(tmp_path):
+    box = trimesh.creation.icosphere(subdivisions=2)
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0 0", "vt 1 0"]
+    for index, face in enumerate(box.faces):
+        lines.append("f " + " ".join(f"{corner + 1}/{index % 2 + 1}" for corner in face))
+    (tmp_path / "ball.obj").write_text("\n".join(lines) + "\n")
+    mesh = read_mesh(tmp_path / "ball.obj")
+    assert_close(mesh.normals, unit(mesh.vertices).float(), atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "obj", "ply"])
+def test_a_mesh_far_from_the_origin_keeps_its_shape(tmp_path, suffix):
+    near = trimesh.creation.icosphere(subdivisions=3)
+    move = trimesh.transformations.translation_matrix((5e5, 5e6, 100.0))
+    if suffix == "glb":
+        scene = trimesh.Scene()
+        scene.add_geometry(near, transform=move)
+        scene.export(tmp_path / "mesh.glb")
+    else:
+        lines = [" ".join(map(str, vertex)) for vertex in near.vertices + move[:3, 3]]
+        faces = np.array(near.faces) + (suffix == "obj")
+        start, corner, face = ("", "v ", "f ") if suffix == "obj" else (PLY, "", "3 ")
+        lines = [corner + line for line in lines] + [face + " ".join(map(str, one)) for one in faces]
+        (tmp_path / f"mesh.{suffix}").write_text(start + "\n".join(lines) + "\n")
+    mesh = read_mesh(tmp_path / f"mesh.{suffix}")
+    model = mesh.transformed(*mesh.to_model_space())
+    assert model.vertices.dtype == torch.float32
+    assert_close(model.corners(), torch.from_numpy(np.array(near.triangles)).float(), atol=1e-6, rtol=0)
+    assert_close(model.normals, unit(model.vertices), atol=0.02, rtol=0)
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 642
+property double x
+property double y
+property double z
+element face 1280
+property list uchar int vertex_indices
+end_header
+"""
 
 
 def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
@@ -62,8 +120,8 @@ def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
     scene.export(tmp_path / "mesh.glb")
     mesh = read_mesh(tmp_path / "mesh.glb")
     assert len(mesh.faces) == 24
-    assert_close(mesh.vertices.max(dim=0).values, torch.tensor([3.5, 1.0, 1.0]))
-    assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]))
+    assert_close(mesh.vertices.max(dim=0).values, torch.tensor([3.5, 1.0, 1.0]).double())
+    assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]).double())
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.2, 0.1, 0.97), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
@@ -76,7 +134,7 @@ def test_our_own_gltf_comes_back_as_it_was_in_the_world(tmp_path, up, extras):
     faces = np.array(box.faces)
     write_glb(tmp_path / "mesh.glb", stored, normals, np.ones_like(world), faces, {}, extras, turned)
     mesh = read_mesh(tmp_path / "mesh.glb")
-    assert_close(mesh.vertices, torch.from_numpy(world))
+    assert_close(mesh.vertices.float(), torch.from_numpy(world))
     assert_close(mesh.normals, torch.from_numpy(normals))
 
 

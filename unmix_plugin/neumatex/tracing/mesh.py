@@ -48,7 +48,8 @@ class Mesh:
     """Triangles of one object; `mesh_of` makes one from vertices and faces."""
 
     vertices: Float[Tensor, "V 3"]
-    """Positions; in world units as read, in [-1, 1] in model space."""
+    """Positions: in world units as read, float64 since the world's origin may be far away; in [-1, 1] in model space,
+    float32."""
     faces: Int[Tensor, "F 3"]
     """Vertices of each triangle, int32."""
     normals: Float[Tensor, "V 3"]
@@ -58,7 +59,7 @@ class Mesh:
 
     def transformed(self, scale: float, offset: Float[Tensor, "3"]) -> Mesh:
         """The mesh with vertices `scale * (vertices + offset)`, scale > 0."""
-        return replace(self, vertices=scale * (self.vertices + offset.to(self.vertices)))
+        return replace(self, vertices=(scale * (self.vertices.double() + offset)).float())
 
     def with_y_upwards(self) -> Mesh:
         """The mesh turned by 90 degrees about x, so that its y axis points along z, as the world's upward axis does."""
@@ -89,10 +90,11 @@ def mesh_of(
     uv: Float[Tensor, "V 2"] | None = None,
 ) -> Mesh:
     """A mesh of float32 vertices, with area-weighted normals where none are given."""
-    vertices, faces = vertices.float().contiguous(), faces.int().contiguous()
+    faces = faces.int().contiguous()
     if normals is None:
         normals = _area_weighted_normals(vertices, faces)
-    return Mesh(vertices, faces, torch.nn.functional.normalize(normals.float(), dim=-1), uv)
+    normals = torch.nn.functional.normalize(normals.float(), dim=-1)
+    return Mesh(vertices.float().contiguous(), faces, normals, uv)
 
 
 def _area_weighted_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "V 3"]:
@@ -156,14 +158,16 @@ def read_mesh(path: Path, notes: list[str] | None = None) -> Mesh:
     faces = _sound_faces(path, vertices, faces)
     if notes is not None and not _is_closed(vertices, faces):
         notes.append(
-            f"{path.name}: the mesh is open; light may pass through its holes, and its inside is black"
+            f"{path.name}: the mesh is open; light may pass through its holes, and its inside has the materials of "
+            "its outside"
         )
-    return mesh_of(
+    mesh = mesh_of(
         torch.as_tensor(vertices),
         torch.as_tensor(faces),
         None if normals is None else torch.as_tensor(normals),
         None if uv is None else torch.as_tensor(uv.astype(np.float32)),
     )
+    return replace(mesh, vertices=torch.as_tensor(vertices))
 
 
 @dataclass(frozen=True)
@@ -195,7 +199,10 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
         _allow_numbers(path)
     try:
         beside = cast("Any", _Beside(path.parent))
-        scene = trimesh.load_scene(path, resolver=beside, process=False, maintain_order=True)
+        # Where corners of an OBJ have normals of their own, vertices are split: in the file's order trimesh would give
+        # them the normal at the mean of the indices. Without normals they stay whole, and smooth at seams of texture.
+        is_whole = path.suffix.lower() == ".obj" and b"\nvn " not in path.read_bytes()
+        scene = trimesh.load_scene(path, resolver=beside, process=False, maintain_order=is_whole)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
