@@ -175,6 +175,15 @@ def test_a_white_dielectric_gives_back_all_light(roughness: float):
         assert albedo(white, wo).tolist() == pytest.approx([1.0] * 3, abs=0.01)
 
 
+@pytest.mark.parametrize(("roughness", "level"), [(0.0, 0.99977), (0.1, 1.0), (0.2, 0.99), (0.5, 0.9)])
+def test_a_bright_gloss_over_a_white_base_gives_back_all_light(roughness: float, level: float):
+    white = SpectralFamily(torch.ones(1, 1))
+    for cosine in (0.01, 0.1, 0.5):
+        wo = torch.tensor([math.sqrt(1 - cosine**2), 0.0, cosine])
+        found = albedo(torch.tensor([1.0, roughness, level]), wo, white)
+        assert found.tolist() == pytest.approx([1.0], abs=0.02)
+
+
 UP = torch.tensor([[0.0, 0.0, 1.0]])
 
 
