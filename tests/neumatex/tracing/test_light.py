@@ -76,6 +76,20 @@ def test_draws_have_the_stated_density_which_integrates_to_one(rotation):
     assert_close(estimate, expected, rtol=0.03, atol=0)
 
 
+@pytest.mark.parametrize("pole", [0, -1])
+def test_a_small_light_at_a_pole_of_a_fine_picture_has_its_power(pole):
+    height, image = 2048, torch.zeros(2048, 4096, 1)
+    image[pole] = 1.0
+    environment = Environment(image)
+    evenly = torch.quasirandom.SobolEngine(2).draw(1 << 16, dtype=torch.float64)
+    directions, density = environment.sample(evenly)
+    power = float((environment.radiance(directions)[:, 0] / density).double().mean())
+    # The integral of theta where the light is 1, up to half a row from the pole, and falls to 0 in the row after that.
+    expected = 2 * math.pi * (math.pi / height) ** 2 * 13 / 24
+    assert power == pytest.approx(expected, rel=0.002)
+    assert_close(environment.density(directions), density)
+
+
 def test_a_black_environment_is_drawn_from_uniformly():
     directions, density = Environment(torch.zeros(4, 8, 3)).sample(_uniforms(4000))
     assert_close(density, torch.full((4000,), 1 / (4 * math.pi)))
@@ -134,6 +148,10 @@ def test_exr_is_read_and_hdr_flat_run_length_coded_and_in_the_old_code(tmp_path)
     assert torch.equal(flat, runs)
     brightest = torch.from_numpy(image).max(dim=-1, keepdim=True).values
     assert bool(((flat - torch.from_numpy(image)).abs() <= brightest / 128).all())
+    rgbe[3, 0] = 2, 2, 200, 120  # the mark of a coded row, as a pixel
+    (tmp_path / "blue.hdr").write_bytes(_header(image) + rgbe.tobytes())
+    blue = read_environment(tmp_path / "blue.hdr").image[3, 0]
+    assert (blue * 2.0**16).tolist() == [2.0, 2.0, 200.0]
     old = np.full((2, 4, 3), 2.0, np.float32)
     pixel = _rgbe(old)[0, 0].tobytes()
     (tmp_path / "old.hdr").write_bytes(_header(old) + 2 * (pixel + bytes([1, 1, 1, 3])))

@@ -59,7 +59,7 @@ class Environment:
         height, width = self.image.shape[:2]
         rows, columns, down, across = self._pixels.draw(uniforms)
         azimuth = 2 * math.pi * (0.5 - (columns + across) / width) + math.radians(self.rotation_deg)
-        top, bottom = torch.cos(math.pi * rows / height), torch.cos(math.pi * (rows + 1) / height)
+        top, bottom = (torch.cos(math.pi * edge.double() / height) for edge in (rows, rows + 1))
         z = top + (bottom - top) * down
         flat = (1 - z * z).clamp(min=0.0).sqrt()
         directions = torch.stack([flat * azimuth.cos(), flat * azimuth.sin(), z], dim=-1)
@@ -82,7 +82,7 @@ class Environment:
         """u and v in [0, 1]."""
         x, y, z = directions.unbind(dim=-1)
         u = 0.5 - (torch.atan2(y, x) - math.radians(self.rotation_deg)) / (2 * math.pi)
-        return u - u.floor(), torch.acos(z.clamp(-1.0, 1.0)) / math.pi
+        return u - u.floor(), torch.atan2(torch.hypot(x, y), z) / math.pi  # at the poles, z says little
 
     @cached_property
     def _scaled_image(self) -> Float[Tensor, "H W C"]:

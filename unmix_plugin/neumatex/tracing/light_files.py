@@ -179,7 +179,7 @@ def _read_row(data: bytes, start: int, row: np.ndarray) -> int:
     """Fill a row's (W, 4) bytes; where the next row starts."""
     width = len(row)
     coded = _NEW_RUNS[0] <= width <= _NEW_RUNS[1] and data[start : start + 2] == b"\x02\x02"
-    if not coded:
+    if not coded or data[start + 2] > 127:  # a pixel whose blue is brightest, since no row is that wide
         return _read_old_row(data, start, row)
     if data[start + 2] << 8 | data[start + 3] != width:
         raise ValueError("length of the row")
