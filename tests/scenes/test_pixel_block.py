@@ -159,6 +159,55 @@ def test_views_are_never_read_whole_and_bad_values_at_the_edges_of_parts_are_fou
     assert torch.equal(parts.blocks[0].spectra(everything), whole.blocks[0].spectra(everything))
 
 
+@pytest.mark.parametrize("components", ["none", 3])
+def test_a_value_beside_pixels_without_a_measurement_is_mended_by_the_others(tmp_path, components):
+    def write(index: int, cube: np.ndarray) -> np.ndarray:
+        wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
+        wide[8, 10, 4] *= index != 3
+        wide[8, 11] = np.nan
+        return wide.astype(np.float16)
+
+    folder = widen(make_scene(tmp_path / "scene"), 10, write)
+    scene = load_scene(folder.root, SceneOptions(invalid_pixels="mask"))
+    [block] = PixelTable(scene, CPU, (1, 3), mends=True, components=components).blocks
+    assert block.num_bad == 1
+    found, expected = block.spectra(torch.tensor([320 + 8 * 20 + 10]))[0], torch.from_numpy(scene.cube(1))
+    assert torch.allclose(found, expected[8, 10], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("stored", "scale", "components"),
+    [
+        ("<f4", None, "none"),
+        ("<f2", None, 3),
+        ("u1", 255.0, "none"),
+        ("u1", 1000.0, "none"),
+        ("<i2", 60000.0, "none"),
+        ("<u2", 65535.0, "none"),
+    ],
+)
+def test_what_is_mended_is_at_most_full_scale_and_the_largest_number_of_its_type(
+    tmp_path, stored, scale, components
+):
+    """Beside a bad value a pixel is as bright as can be, and the pixels around have a peak there."""
+    dtype = np.dtype(stored)
+    largest = 1.0 if dtype.kind == "f" else min(np.iinfo(dtype).max / (scale or 1.0), 1.0)
+
+    def write(index: int, cube: np.ndarray) -> np.ndarray:
+        is_peak = np.arange(10) == 4
+        wide = largest * np.tile(np.where(is_peak, 1.0, 0.8), (*cube.shape[:2], 1))
+        if index == 3:
+            wide[8, 10] = largest * ~is_peak
+        return as_stored(wide, stored, scale)
+
+    folder = widen(make_scene(tmp_path / "scene"), 10, write)
+    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    [block] = PixelTable(scene, CPU, (1, 3), mends=True, components=components).blocks
+    assert block.num_bad == 1
+    found = block.spectra(torch.tensor([320 + 8 * 20 + 10]))[0]
+    assert torch.allclose(found, torch.full((10,), largest), atol=0.01 * largest)
+
+
 def test_a_cube_that_is_cut_short_while_training_goes_on_is_named(tmp_path):
     folder = make_scene(tmp_path / "scene")
     scene = load_scene(folder.root)

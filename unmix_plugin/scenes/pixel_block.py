@@ -164,7 +164,7 @@ class PixelBlock:
         for top, bottom in self._row_ranges():
             above, below = max(top - reach, 0), min(bottom + reach, self._height)
             seen = self._neighbours(first + above * self._width, first + below * self._width)
-            image = seen.cpu().view(below - above, self._width, self.num_channels)
+            image = seen.cpu().nan_to_num_().view(below - above, self._width, self.num_channels)
             lines = range(top - above, bottom - above)
             (rows, *others), values = (
                 ((none,) * 3, none.float()) if limits is None else repaired(image, limits.cpu(), lines)
@@ -206,7 +206,8 @@ class PixelBlock:
         values = values if scale is None else values * scale
         if self._kept.kind == "f":
             return values
-        whole = values.round().to(torch.int32)
+        largest = _UINT16_VALUES - 1 if self._is_unsigned else np.iinfo(self._kept).max
+        whole = values.round().clamp(max=largest).to(torch.int32)
         return torch.where(whole > _LARGEST_INT16, whole - _UINT16_VALUES, whole)
 
     def pictures(self, of: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Iterator[Tensor]:

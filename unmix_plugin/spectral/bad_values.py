@@ -82,7 +82,7 @@ def repaired(
     rows, columns, bands, excess = (part[kept] for part in (rows, columns, bands, excess))
     is_end = (bands == 0) | (bands == image.shape[-1] - 1)
     values = image[rows, columns, bands] - excess / torch.where(is_end, _END_FACTOR, 1.0)
-    return (rows, columns, bands), values.clamp(min=0)
+    return (rows, columns, bands), values.clamp(0, 1)
 
 
 def _around(
