@@ -16,7 +16,7 @@ def small_chunks(monkeypatch):
     monkeypatch.setattr(pixel_pool, "_PIXELS_PER_STEP", 20)
 
 
-def make_pool(valid=None, num_bytes=800, reads=None) -> PixelPool:
+def make_pool(valid=None, num_bytes=4000, reads=None) -> PixelPool:
     values = torch.arange(PIXELS, dtype=torch.int32)[:, None]
 
     def read(first: int, last: int) -> torch.Tensor:
@@ -65,6 +65,16 @@ def test_chunks_are_read_whole_and_once_a_turn_as_they_come_into_the_pool():
     assert pool.num_bytes == 800
 
 
+@pytest.mark.parametrize("num_bytes", [4000, 8800])
+def test_all_that_a_pool_holds_fits_into_its_memory(num_bytes):
+    pool = make_pool(num_bytes=num_bytes)
+    draw(pool, 0)
+    held = [
+        value for value in vars(pool).values() if isinstance(value, torch.Tensor) and value is not pool._valid
+    ]
+    assert num_bytes - 800 < sum(value.numel() * value.element_size() for value in held) <= num_bytes
+
+
 def test_a_pool_as_large_as_the_block_reads_it_once_a_turn():
     pool = make_pool(num_bytes=10**6)
     assert pool.num_bytes == 4 * PIXELS
@@ -75,6 +85,6 @@ def test_an_error_of_the_disk_is_said_where_pixels_are_drawn():
     def fail(first: int, last: int) -> torch.Tensor:
         raise OSError(f"the disk is gone: {first} to {last}")
 
-    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 800, fail)
+    pool = PixelPool(torch.ones(PIXELS, dtype=torch.bool), 4, 4000, fail)
     with pytest.raises(OSError, match="the disk is gone"):
         draw(pool, 0)

@@ -17,6 +17,8 @@ from torch import Tensor
 
 _CHUNK_BYTES = 4 << 20
 """Of values read at once."""
+_PLACE_BYTES = 16
+"""Of a pixel that is held, beside its values: its number, and its place among those that can be drawn."""
 _PIXELS_PER_STEP = 2048
 """Drawn in a usual step: so many pixels are renewed in it, too."""
 _CHUNKS_AHEAD = 4
@@ -44,7 +46,8 @@ class PixelPool:
         self._chunk_pixels = max(1, min(_CHUNK_BYTES // pixel_bytes, len(valid)))
         firsts = range(0, len(valid), self._chunk_pixels)
         self._firsts = [first for first in firsts if bool(valid[first : first + self._chunk_pixels].any())]
-        self._num_held = min(len(self._firsts), max(2, num_bytes // (self._chunk_pixels * pixel_bytes)))
+        held_bytes = self._chunk_pixels * (pixel_bytes + _PLACE_BYTES)
+        self._num_held = min(len(self._firsts), max(2, num_bytes // held_bytes))
         self.num_bytes = self._num_held * self._chunk_pixels * pixel_bytes
         """Memory that the values held take."""
         self._steps_per_chunk = max(1, self._chunk_pixels // _PIXELS_PER_STEP)
