@@ -115,6 +115,20 @@ def test_a_scene_without_any_matter_is_refused(tmp_path):
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.parametrize(("first", "share"), [(5, 0.0), (2, 0.5)])
+def test_pixels_without_a_measurement_are_no_share_of_the_matter(tmp_path, first, share):
+    values = np.full((4, 5, 2), 0.5, np.float32)
+    values[:, 4] = np.nan
+    mask = np.tile(np.arange(5) >= first, (4, 1)).astype(np.uint8)
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    recipe = ViewRecipe(
+        Calibration(Raster(0, 0, 4, 5, 1), np.arange(2)), 1.0, np.ones((2, 3), np.float32), use_opacity=True
+    )
+    view = CaptureView("a", file_of(values), mask=tmp_path / "mask.png")
+    record = write_view(view, recipe, tmp_path / "scene")
+    assert (record.missing_pixels, record.matter_share) == (4, share)
+
+
 def test_views_of_a_rig_are_never_cut_out_of_a_backdrop_by_themselves():
     views = [CaptureView(name, CUBE) for name in "ab"]
     assert choose_mask(views, "auto") == ("auto", [])

@@ -92,7 +92,7 @@ class ViewRecord:
     missing_pixels: int
     """Black in the view's mask."""
     matter_share: float
-    """Share of pixels that are not background."""
+    """Of the pixels with a measurement, those that are not background."""
     specks: int
     holes: int
     """Parts of the mask that were removed and filled."""
@@ -239,7 +239,7 @@ class _Tally:
             clipped_values=int(self.counts[0]),
             negative_values=int(self.counts[1]),
             missing_pixels=int(self.missing.sum()),
-            matter_share=float((self.opacity > HALF).mean()),
+            matter_share=float(seen.sum() / max(1, np.sum(~self.missing))),
             specks=self.specks,
             holes=self.holes,
             brightness=float(np.median(self.brightness[seen])) if seen.any() else 0.0,
