@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from tests.scenes.scene_factory import look_at
 from tests.trained.camera_scenes import cameras_at
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.field import CoefficientField
+from unmix_plugin.light.lamp import Lamp, MovingLamp
 from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.settings import RendererConfig
 from unmix_plugin.trained.surface import SeenSurface
@@ -74,6 +76,44 @@ def ball_scene(has_wall: bool = False, gloss: float | None = None, **settings: A
     model = make_model(specular=kind, num_specular_spectra=1, renderer=renderer, **settings)
     model.field = BallField(has_wall, gloss)  # type: ignore[assignment]
     return scene_of(model)
+
+
+LAMPLIT_RADIUS, LAMPLIT_MIDDLE = 0.25, (0.45, 0.0, 0.0)
+
+
+class LamplitBallField(BallField):
+    """A matt ball beside the axis about which a lamp turns with the camera, close to it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lamp = MovingLamp(Lamp("turntable", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.3, 4.0)))
+
+    @property
+    def moving_lamp(self) -> MovingLamp:
+        """Beside the camera."""
+        return self.lamp
+
+    def density_of(self, encoded: Tensor) -> tuple[Tensor, Tensor]:
+        """A solid ball."""
+        radius = (encoded - torch.tensor(LAMPLIT_MIDDLE)).norm(dim=-1)
+        return DENSITY * torch.sigmoid((LAMPLIT_RADIUS - radius) / EDGE), encoded
+
+    def get_outputs(
+        self, positions: Tensor, directions: Tensor, features: Tensor, light: Lamplight | None = None
+    ) -> dict[str, Tensor]:
+        """As bright as the lamp stands above the surface."""
+        outputs = super().get_outputs(positions, directions, features, light)
+        if light is not None:
+            normals = torch.nn.functional.normalize(positions - torch.tensor(LAMPLIT_MIDDLE), dim=1)
+            outputs["scaled_abundances"] *= (normals * light.towards).sum(dim=1, keepdim=True).clamp(min=0)
+        return outputs
+
+
+def lamplit_ball_scene() -> TrainedScene:
+    """A scene of that ball, in which nothing casts a shadow."""
+    scene = ball_scene()
+    renderer = replace(scene.renderer, opaque_skips=torch.full_like(scene.renderer.skips, 8))
+    return replace(scene, field=LamplitBallField(), renderer=renderer)
 
 
 def cameras_around(directions: list[tuple[float, float, float]], side_px: int = 40) -> list[Cameras]:

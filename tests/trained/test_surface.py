@@ -5,7 +5,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.products.ball_model import ALL_ROUND, FROM_ABOVE, RADIUS, SHADE, ball_scene, seen_surface
+from tests.products.ball_model import (
+    ALL_ROUND,
+    FROM_ABOVE,
+    LAMPLIT_MIDDLE,
+    LAMPLIT_RADIUS,
+    RADIUS,
+    SHADE,
+    ball_scene,
+    cameras_around,
+    lamplit_ball_scene,
+    seen_surface,
+)
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.products.mesh import gltf_content
 from unmix_plugin.spectral.materials import Coefficients
@@ -127,3 +138,16 @@ def test_densities_are_had_without_the_work_of_abundances(monkeypatch):
     alone, nothing = sample_field(SCENE, points, with_abundances=False)
     assert torch.equal(alone, densities)
     assert nothing.shape == (2, 0)
+
+
+def test_where_a_lamp_goes_with_the_camera_a_surface_is_lit_squarely_on_all_sides():
+    """Pictures show the side towards the axis as bright as the other, since each camera brings its lamp."""
+    scene, sides = lamplit_ball_scene(), torch.tensor([[-1.0, 0.0, 0.3], [1.0, 0.0, 0.3]])
+    normals = torch.nn.functional.normalize(sides, dim=1)
+    places = torch.tensor(LAMPLIT_MIDDLE) + LAMPLIT_RADIUS * normals
+    expected = SHADE * scene.materials.endmembers[0].detach().expand(2, -1)
+    assert_close(look_from_above(scene, places, normals)[1], expected, atol=1e-3, rtol=0)
+    for place, side, spectrum in zip(places, sides.tolist(), expected, strict=True):
+        [camera] = cameras_around([(side[0], side[1], side[2])])
+        column, row = camera.project(place[None], 0)[0][0].long().tolist()
+        assert_close(scene.look(camera).spectra[row, column], spectrum, atol=0, rtol=0.08)

@@ -117,6 +117,12 @@ class TrainedScene:
         """All outputs that take no argument, but those that its bands or its light don't allow."""
         return available_outputs(self.materials)
 
+    @property
+    def squarely_lit(self) -> TrainedScene:
+        """The same scene as if a lamp that moves with the camera shone on every place squarely and cast no shadow, for
+        what no camera looks at from one place: such a lamp stands where the camera says."""
+        return replace(self, renderer=replace(self.renderer, opaque_skips=None))
+
     def output(self, name: str) -> MaterialOutput:
         """An output by its name, such as `rgb`, `band:650nm` or `index:ndvi`; errors as those of `find_output`."""
         return find_output(name, self.materials)

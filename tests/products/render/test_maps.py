@@ -9,7 +9,7 @@ import spectral.io.envi as envi
 import tifffile
 from spectral.io.bipfile import BipFile
 
-from tests.products.ball_model import RADIUS, ball_scene
+from tests.products.ball_model import RADIUS, SHADE, ball_scene, lamplit_ball_scene
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.products.render import RenderOptions, files
 from unmix_plugin.products.render.cameras import choose_cameras
@@ -169,3 +169,16 @@ def test_more_than_a_tiff_can_hold_is_written_as_bigtiff(tmp_path, monkeypatch):
 def test_what_makes_no_map_is_refused(request_, message):
     with pytest.raises(ConfigError, match=message):
         choose_cameras(SCENE, request_, SCALE)
+
+
+def test_where_a_lamp_goes_with_the_camera_a_map_is_lit_squarely(tmp_path):
+    scene = lamplit_ball_scene()
+    cameras = choose_cameras(scene, RenderOptions(cameras="map", pixel_size=0.05))
+    outputs = choose_formats(["spectral", "accumulation"], ["npy"], scene, False)
+    job = RenderJob(scene, cameras, outputs, Survey(), tmp_path)
+    job.render(job.blocks())
+    spectra, opacity = (np.load(tmp_path / name / "map_top.npy") for name in ("spectral", "accumulation"))
+    found = spectra[opacity > 0.99] / opacity[opacity > 0.99, None]
+    assert len(found) > 30
+    expected = SHADE * scene.materials.endmembers[0].numpy()
+    np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=5e-3)

@@ -84,6 +84,7 @@ def take_survey(
     `info`, share."""
     if not needs_survey(outputs):
         return Survey()
+    scene = _lit_for(scene, info)
     maps = [output for output in outputs if is_reflectance_map(output.name)]
     ranged = [output for output in outputs if _is_ranged(output) and output not in maps]
     has_pca = any(output.name == "pca" for output in outputs)
@@ -102,6 +103,11 @@ def take_survey(
         if output.value_range is None and output.kind == "map":
             scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
     return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
+
+
+def _lit_for(scene: RenderableScene, info: MapInfo | None) -> RenderableScene:
+    """The scene as it is shown: rays of a map start from many places, so that no lamp can go with them."""
+    return scene.squarely_lit if info is not None and isinstance(scene, TrainedScene) else scene
 
 
 def _units(output: Output, info: MapInfo | None) -> float:
@@ -165,6 +171,7 @@ class RenderJob:
         processes: Processes = ALONE,
     ) -> None:
         """Of a scene of any method; `survey` is of these cameras and outputs, and each process has a job like this."""
+        scene = _lit_for(scene, cameras.map_info)
         self._scene, self._cameras, self._survey, self._processes = scene, cameras, survey, processes
         asked = [one.output for one in outputs]
         setting = setting_for(scene, cameras.views[0].camera, asked, survey, folder)
