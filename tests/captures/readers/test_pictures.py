@@ -36,6 +36,8 @@ def test_numbers_of_sixteen_bits_keep_them(tmp_path):
     said = "red, green and blue are taken as light, as stored"
     check_file(open_spectral_file(tmp_path / "rgb.png"), values=DEEP, warning=said)
     check_file(open_spectral_file(tmp_path / "grey.png"), values=DEEP[..., :1])
+    (tmp_path / "opaque.png").write_bytes(imagecodecs.png_encode(DEEP[..., :2].copy()))
+    check_file(open_spectral_file(tmp_path / "opaque.png"), values=DEEP[..., :1], note="opacity")
 
 
 def test_opacity_palettes_and_bits(tmp_path):

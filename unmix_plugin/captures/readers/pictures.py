@@ -25,9 +25,10 @@ from unmix_plugin.limits import allow_decoded
 
 _GREY = {"1": "u1", "L": "u1", "LA": "u1", "I;16": "u2", "I;16B": "u2", "I": "u2"}
 _COLOUR = ("RGB", "RGBA", "P", "PA", "CMYK", "YCbCr")
-_DEPTH_AT, _KIND_AT = 24, 25
-"""Bits of a number, and kind of colours, in the first bytes of a PNG."""
-_WITH_COLOURS = (2, 6)
+_DEEP_BANDS = {b"\x10\2": 3, b"\x10\4": 1, b"\x10\6": 3}
+"""Bands of PNG that Pillow would cut to 8 bits, by bits of a number (16) and kind of colours (4 is grey with opacity),
+which lie in its first bytes."""
+_DEPTH_AND_KIND = slice(24, 26)
 _ORIENTATION = 0x0112
 """EXIF's code; 1 to 8, where 1 is not turned."""
 _EXIF_DIRECTORY = 0x8769
@@ -39,19 +40,18 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     damaged, or of a kind that has neither one band nor three."""
     from PIL import Image
 
+    with path.open("rb") as file:
+        begin = file.read(_DEPTH_AND_KIND.stop)
+    deep = _DEEP_BANDS.get(begin[_DEPTH_AND_KIND], 0) if begin[:4] == b"\x89PNG" else 0
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         mode, (width, height), info = picture.mode, picture.size, dict(picture.info)
-        num_bands = 1 if mode in _GREY else 3
+        num_bands = deep or (1 if mode in _GREY else 3)
         allow_decoded(path, width * height * num_bands, CaptureError)  # Exif of a PNG is read by decoding it
         exif = picture.getexif()
         orientation, taken = exif.get(_ORIENTATION, 1), exif.get_ifd(_EXIF_DIRECTORY)
-    with path.open("rb") as file:
-        begin = file.read(_KIND_AT + 1)
-    # Pillow would cut the colours of a PNG of 16 bits to 8.
-    is_deep = begin[:4] == b"\x89PNG" and begin[_DEPTH_AT] == 16 and begin[_KIND_AT] in _WITH_COLOURS
     if mode not in _GREY and mode not in _COLOUR:
         raise CaptureError(f"{path}: a picture of mode {mode}; expected grey or RGB")
-    dtype = np.dtype("u2") if is_deep else np.dtype(_GREY.get(mode, "u1"))
+    dtype = np.dtype("u2") if deep else np.dtype(_GREY.get(mode, "u1"))
     allow_decoded(path, width * height * num_bands * dtype.itemsize, CaptureError)
     alpha = mode in ("RGBA", "LA", "PA") or "transparency" in info
     xmp = parse_xmp(info.get("xmp") or b"")
@@ -62,7 +62,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         metadata["encoding"] = "sRGB"
     if orientation in range(2, 9):
         metadata["orientation"] = orientation
-    warnings = [COLOURS_AS_STORED] if is_deep and bands.wavelengths_nm is None else []
+    warnings = [COLOURS_AS_STORED] if deep == 3 and bands.wavelengths_nm is None else []
     exposed = {name: taken[code] for code, name in _EXPOSURE.items() if code in taken}
     metadata |= exposure_facts(exposed, "tag", warnings)
     if alpha:
@@ -72,7 +72,7 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
         reader="picture",
         shape=(height, width, num_bands),
         dtype=dtype,
-        read_part=lambda rows, wanted: loaded(_load, path, is_deep)[rows][..., wanted],
+        read_part=lambda rows, wanted: loaded(_load, path, deep)[rows][..., wanted],
         bands=bands,
         interleave="bip" if num_bands == 3 else None,
         notes=("the picture has opacity, which is not a band and is left out",) if alpha else (),
@@ -81,12 +81,12 @@ def open_picture(path: Path, _: ReadOptions) -> SpectralFile:
     )
 
 
-def _load(path: Path, is_deep: bool) -> np.ndarray:
-    """Numbers (H, W, 1 or 3), neither turned nor linearised."""
+def _load(path: Path, deep: int) -> np.ndarray:
+    """Numbers (H, W, 1 or 3), neither turned nor linearised; of a PNG of 16 bits so many bands."""
     from PIL import Image
 
-    if is_deep:
-        return import_extra("imagecodecs").png_decode(path.read_bytes())[..., :3]
+    if deep:
+        return import_extra("imagecodecs").png_decode(path.read_bytes())[..., :deep]
     with Image.open(path, formats=("PNG", "JPEG")) as picture:
         if picture.mode in _GREY:
             grey = picture.convert("L") if picture.mode in ("1", "LA") else picture
