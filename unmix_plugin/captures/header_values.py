@@ -429,7 +429,7 @@ def _split(key: str) -> tuple[str, str]:
     >>> _split("Integration_Time [ms]"), _split("camera gain"), _split("exposure time units")
     (('integrationtime', 'ms'), ('gain', ''), ('exposuretime', 'unit'))
     """
-    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", key).lower())
+    words = re.findall(r"[^\W_]+", re.sub(r"(?<=[a-z]{2})(?=[A-Z])", " ", key).lower())
     unit = ""
     if len(words) > 1 and (words[-1] in _SECONDS or words[-1] in ("unit", "units", "db")):
         unit = words.pop().replace("units", "unit")

@@ -30,6 +30,8 @@ from unmix_plugin.captures.spectral_file import Linear
         ({"Integration_Time (us)": "8000"}, 0.008),
         ({"camera exposure time [s]": "0.02"}, 0.02),
         ({"exposure_ms": 4}, 0.004),
+        ({"Exposure (uS)": 4000}, 0.004),
+        ({"exposureTimeMs": 4}, 0.004),
         ({"ExposureTime": "2.5 msec"}, 0.0025),
         ({"expTime": 0.5}, 0.5),
         ({"shutter": "1/50 s"}, 0.02),
@@ -70,6 +72,9 @@ def test_a_faulty_tag_of_exif_leaves_the_others_of_an_exposure(faulty):
     ("entries", "gain"),
     [
         ({"gain": "6.0206 dB"}, 2.0),
+        ({"gain (dB)": "6.0206"}, 2.0),
+        ({"Gain_dB": 6.0206}, 2.0),
+        ({"GainDB": 6.0206}, 2.0),
         ({"camera gain": "4"}, 4.0),
         ({"analog gain": "2", "digital gain": "4"}, 8.0),
         ({"digital gain": "4", "analog gain": "2"}, 8.0),
