@@ -38,6 +38,8 @@ _LONGEST_NAME = 1000
 """Longer texts are no names, and looking for counters in them takes long."""
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
 """What precedes a number that counts instead of measuring."""
+_OTHER_UNIT = re.compile(r" ?(?:cm|mm|[muµμ]s|[kmgt]?hz)(?![a-z])", re.I)
+"""What follows a wavenumber, a length, a time or a frequency, which are no wavelengths in nm."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
 PLAUSIBLE_NM = (100.0, 30_000.0)
@@ -120,7 +122,8 @@ def _nm(text: str, unit: str) -> float | None:
 
 
 def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
-    """Of each name the numbers outside of what all names begin with and end in, except counters."""
+    """Of each name the numbers outside of what all names begin with and end in, except counters and those with a unit
+    that is none of wavelengths."""
 
     begin = len(names[0][: common_length(names)].rstrip("0123456789.,"))
     backwards = [name[::-1] for name in names]
@@ -130,7 +133,7 @@ def _varying_numbers(names: Sequence[str]) -> list[list[str]]:
             match[1]
             for match in _NUMBER.finditer(name)
             if begin <= match.start() and match.end() <= len(name) - end
-            if not _COUNTER.search(name, 0, match.start())
+            if not _COUNTER.search(name, 0, match.start()) and not _OTHER_UNIT.match(name, match.end())
         ]
         for name in names
     ]
