@@ -15,6 +15,7 @@ import torch
 
 from tests.commands.running import SMALL_METHOD, done, run_of
 from tests.gpu.stand_in import StandInTensor, stand_in_gpu
+from tests.neumatex.factory import trained_on, write_object
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.render import render
@@ -103,6 +104,19 @@ def test_training_on_a_gpu_gives_what_the_cpu_gives(scene, cpu_run, tmp_path):
 def test_every_product_is_exported_from_a_gpu(cpu_run, tmp_path, product):
     words = [product, "--run", cpu_run, "--output", tmp_path / "out", *SMALL.get(product, [])]
     done(export, *words)
+
+
+@pytest.fixture(scope="module")
+def object_run(tmp_path_factory) -> Path:
+    folder = write_object(tmp_path_factory.mktemp("object") / "ball")
+    return trained_on(folder, "--pipeline.model.prior=none", steps=1)
+
+
+@pytest.mark.usefixtures("on_gpu")
+@pytest.mark.parametrize("words", [["material", "--texture-size", 64], ["page", "--resolution", 4]])
+def test_the_material_of_an_object_is_exported_from_a_gpu(object_run, tmp_path, monkeypatch, words):
+    monkeypatch.setattr("unmix_plugin.neumatex.export.pbr_fit._STEPS", 1)
+    done(export, *words, "--run", object_run, "--output", tmp_path / "out")
 
 
 @pytest.mark.usefixtures("on_gpu")

@@ -47,7 +47,7 @@ class _Baked:
     atlas: Atlas
     texels: Texels
     parameters: Float[Tensor, "T P"]
-    """[0, 1], on the CPU."""
+    """[0, 1], on the device of the surface."""
 
     @staticmethod
     @torch.no_grad()
@@ -58,7 +58,7 @@ class _Baked:
         texels = texels_of(atlas, texture_size)
         positions = texels.of_corners(vertices, atlas.vertices[atlas.faces])
         points = torch.from_numpy(positions).float().to(mesh.vertices.device)
-        parameters = torch.cat([surface.parameters(part).cpu() for part in points.split(_CHUNK_BAKING)])
+        parameters = torch.cat([surface.parameters(part) for part in points.split(_CHUNK_BAKING)])
         return _Baked(atlas, texels, parameters)
 
     def texture(self, values: Tensor) -> np.ndarray:
@@ -136,8 +136,6 @@ def write_material(
         ConfigError: xatlas is not installed, or the mesh does not fit into the texture.
     """
     family, baked = surface.family, _Baked.of(mesh, surface, texture_size)
-    if isinstance(family, SpectralFamily):
-        family = SpectralFamily(family.endmembers.detach().cpu())  # where the baked parameters are
     seen = InColours(family, bands) if isinstance(family, SpectralFamily) and bands is not None else family
     fitted, error = fit_pbr(seen, baked.parameters, torch.Generator().manual_seed(0))
     textures = _textures_of(seen, baked.parameters, fitted)
@@ -164,7 +162,9 @@ def write_material(
         )
         shares, table = family.abundances(baked.parameters), folder / "endmembers.csv"
         written.append(baked.write_channels(folder / "abundances.exr", shares, names, about))
-        write_spectra_csv(table, SpectraTable(bands, names, family.endmembers.double().numpy()))
+        write_spectra_csv(
+            table, SpectraTable(bands, names, family.endmembers.detach().cpu().double().numpy())
+        )
         written.append(table)
     return written, error
 

@@ -53,16 +53,15 @@ _TONES, _STOPS = 40, (-12.0, 5.0)
 
 def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     """What a page shows of an object; its mesh has vertices about as dense as cells of the resolution."""
-    mesh = _resampled(scene.mesh, 2.0 / resolution)
+    mesh = _resampled(scene.mesh, 2.0 / resolution).to(scene.device)
     family, notes, materials = scene.surface.family, [], None
-    parameters = scene.surface.parameters(mesh.vertices).cpu()
+    parameters = scene.surface.parameters(mesh.vertices)
     arrays: dict[str, np.ndarray] = {}
     if isinstance(family, SpectralFamily) and scene.bands is not None:
-        family = SpectralFamily(family.endmembers.detach().cpu())
-        shares = family.abundances(parameters)
+        shares = family.abundances(parameters).cpu()
         flat = torch.ones(len(scene.bands))
         none = torch.zeros(0, len(scene.bands))
-        materials = Materials(scene.bands, family.endmembers, none, light=flat)
+        materials = Materials(scene.bands, family.endmembers.detach().cpu(), none, light=flat)
         arrays = {"scaled": shares.numpy(), "abundances": shares.numpy()}
         arrays["materials"] = shares.argmax(dim=1).numpy().astype(np.uint8)
         family = InColours(family, scene.bands)
@@ -75,7 +74,12 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
     if len(mesh.faces) < len(scene.mesh.faces):
         notes.append(f"The mesh of {len(scene.mesh.faces):,} triangles is reduced to {len(mesh.faces):,}.")
     lit, roughness, metallicity = fitted.clamp(0, 1).split([3, 1, 1], dim=1)
+    base = family.base_colour(parameters).clamp(0, 1)
     transfer = _transfer(mesh, lit.mean(dim=1) * (1 - metallicity[:, 0]))
+    base, lit, roughness, metallicity, transfer = (
+        one.cpu() for one in (base, lit, roughness, metallicity, transfer)
+    )
+    mesh = mesh.to("cpu")
     openness = (transfer[:, :1] / _harmonics(torch.tensor([[0.0, 0.0, 1.0]]))[:, :1]).clamp(0, 1)
     lights = [scene.with_light(LightChoice(name)).environment for name in scene.lights]
     maps = [_picture(light, scene.bands) for light in lights]
@@ -85,7 +89,7 @@ def page_content(scene: TrainedObject, resolution: int) -> PageContent:
         "positions": scene.frame.to_world(mesh.vertices.double().numpy()),
         "faces": mesh.faces.long().numpy(),
         "normals": directions_to_world(scene.frame, mesh.normals.numpy()),
-        "base": family.base_colour(parameters).clamp(0, 1).numpy(),
+        "base": base.numpy(),
         "lit": lit.numpy(),
         "polish": torch.cat([roughness, metallicity, openness], dim=1).numpy(),
         "transfer": transfer.numpy(),
@@ -145,12 +149,13 @@ def _usual_edge(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"
 def _transfer(mesh: Mesh, reflected: Float[Tensor, " V"]) -> Float[Tensor, "V 16"]:
     """What a white matt surface at each vertex sends back of each harmonic of light, less what the object hides, and
     with what comes by one reflection on it, given the share of light that each vertex sends back."""
-    traced, steps = RayMesh(mesh), torch.arange(_RAYS, dtype=torch.float32)
+    device = mesh.vertices.device
+    traced, steps = RayMesh(mesh, device), torch.arange(_RAYS, dtype=torch.float32, device=device)
     height = ((steps + 0.5) / _RAYS).sqrt()  # density: the cosine
     angle, flat = math.pi * (3 - math.sqrt(5)) * steps, (1 - height * height).sqrt()
     local = torch.stack([flat * angle.cos(), flat * angle.sin(), height], dim=1)
     direct, hits = [], []
-    for part in torch.arange(len(mesh.vertices)).split(_CHUNK):
+    for part in torch.arange(len(mesh.vertices), device=device).split(_CHUNK):
         normals = mesh.normals[part]
         turned = frames(normals).repeat_interleave(_RAYS, dim=0)
         directions = to_world(turned, local.repeat(len(part), 1))
@@ -169,7 +174,7 @@ def _harmonics(directions: Float[Tensor, "*d 3"]) -> Float[Tensor, "*d 16"]:
     """Real spherical harmonics of degrees 0 to 3, orthonormal; number l^2 + l + m has degree l and order m."""
     found = direction_features(directions.reshape(-1, 3)).reshape(*directions.shape[:-1], -1)
     x, y, z, *others = found.unbind(dim=-1)
-    degrees = torch.tensor([0, *[1] * 3, *[2] * 5, *[3] * 7])
+    degrees = torch.tensor([0, *[1] * 3, *[2] * 5, *[3] * 7], device=directions.device)
     return (
         torch.stack([torch.ones_like(x), y, z, x, *others], dim=-1)
         * ((2 * degrees + 1) / (4 * math.pi)).sqrt()
