@@ -1,5 +1,6 @@
 """Where a fit begins: the distance from the prior, its views, materials of a run, the plain material."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.neumatex.factory import write_object
+from tests.neumatex.factory import SIZE, pose, write_object
 from tests.neumatex.surfaces import generator, unit
 from tests.products.ball_model import RADIUS, ball_scene
 from unmix_plugin.errors import ConfigError
@@ -47,6 +48,20 @@ def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypa
     torch.testing.assert_close((full_px - 0.5) / 2 + 0.5, small_px, atol=1e-4, rtol=0)
     middle = views.pictures[2][6, 6]
     torch.testing.assert_close(middle, torch.tensor([0.5, 0.3, 0.1]))
+
+
+def test_views_for_a_prior_are_of_frame_cameras_alone(tmp_path):
+    path = write_object(tmp_path / "ball") / "transforms.json"
+    content = json.loads(path.read_text())
+    for index, left in ((1, 4), (None, 0)):  # one line camera that goes round the ball, then no other view
+        for frame in content["frames"][index : index and index + 1]:
+            keys = [{"row": row, "transform_matrix": pose(row / SIZE).tolist()} for row in (0, SIZE - 1)]
+            frame |= {"transform_matrix": None, "key_poses": keys}
+        path.write_text(json.dumps(content))
+        arrays = _view_arrays(load_object(path.parent))
+        assert sum(name.endswith("_pose") for name in arrays) == left
+    with pytest.raises(ConfigError, match=r"choose --pipeline\.model\.prior none"):
+        views_of(arrays)
 
 
 RUN = _RunMaterials(Path("run"), ball_scene())

@@ -264,10 +264,12 @@ def _sees_mesh(ray_mesh: RayMesh, camera: Cameras) -> Bool[Tensor, "H W"]:
 
 
 def _view_arrays(scene: ObjectScene) -> dict[str, np.ndarray]:
-    """Training views that a prior may look at, as arrays by name."""
-    train = list(scene.split.train)
-    cameras = scene.pictures.cameras[train]
+    """Training views of frame cameras, which a prior may look at, as arrays by name."""
+    train = [view for view in scene.split.train if not scene.pictures.cameras.is_line_camera(view)]
     arrays: dict[str, np.ndarray] = {}
+    if not train:
+        return arrays
+    cameras = scene.pictures.cameras[train]
     for number, row in enumerate(well_spread(cameras.camera_to_world[:, :, 3], _MOST_VIEWS)):
         picture = scene.pictures.read(train[row])
         step = max(1, -(-max(picture.numbers.shape[:2]) // LONGEST_EDGE_PX))

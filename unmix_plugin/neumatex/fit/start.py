@@ -86,8 +86,13 @@ def _plain_parameters(family: MaterialFamily) -> Float[Tensor, "P"]:
 
 
 def views_of(arrays: Mapping[str, np.ndarray]) -> PosedViews:
-    """The views among the arrays that a data manager handed over."""
+    """The views among the arrays that a data manager handed over. Raises ConfigError: there are none."""
     count = sum(name.startswith("view_") and name.endswith("_pose") for name in arrays)
+    if not count:
+        raise ConfigError(
+            "the prior looks at views of frame cameras, and all training views are those of line cameras; choose "
+            "--pipeline.model.prior none"
+        )
     lights, alphas, poses, lenses = (
         [torch.from_numpy(arrays[f"view_{number}_{kind}"]) for number in range(count)]
         for kind in ("light", "alpha", "pose", "lens")
