@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from tests.captures.capture_factory import process, write_cube, write_poses
-from unmix_plugin.captures.calibration.calibration import CalibratedRows
+from tests.captures.file_factory import file_of
+from unmix_plugin.captures.calibration.calibration import CalibratedRows, Calibration, Raster
 from unmix_plugin.captures.poses.lens import Lens, Points, bend_fisheye, bend_ftheta, fit_lens
 from unmix_plugin.captures.writing.resampling import Resampling
 
@@ -103,6 +104,17 @@ def test_missing_pixels_and_those_outside_take_no_part():
     np.testing.assert_allclose(part.values[~part.missing], 0.5, atol=1e-5)
     assert not part.values[part.missing].any()
     assert part.missing[~Resampling.into(lens).inside].all()
+
+
+def test_a_square_of_pixels_with_a_missing_one_takes_no_part():
+    lens = fitted("fisheye of 120 degrees")
+    values = np.full((2 * HEIGHT, 2 * WIDTH, 2), 0.5, np.float32)
+    values[::9, ::9] = np.nan
+    calibration = Calibration(Raster.of(2 * HEIGHT, 2 * WIDTH, None, 2), np.arange(2))
+    file = file_of(values)
+    part = Resampling.into(lens).rows(0, HEIGHT, lambda first, last: calibration.rows(file, first, last))
+    assert 0.1 < part.missing.mean() < 0.5
+    np.testing.assert_allclose(part.values[~part.missing], 0.5, atol=1e-5)
 
 
 def test_saturation_stays_with_its_pixels_and_labels_keep_their_numbers():

@@ -169,6 +169,7 @@ class Calibration:
             values = self._in_bins(values).mean(axis=-1)
             saturated = np.any(self._in_bins(saturated), axis=-1)
         missing = self.raster.any_in_square(~sound)
+        values[missing] = 0.0
         return CalibratedRows(values.astype(np.float32, copy=False), saturated, missing)
 
     def _values(self, file: SpectralFile, whole: np.ndarray, rows: slice) -> Float32[np.ndarray, "h W b"]:
