@@ -285,6 +285,9 @@ def test_the_level_of_enmap_and_desis_says_what_gains_make_of_numbers(tmp_path, 
     text = enmap(THREE, GainOfBand=[1e-4] * 3, OffsetOfBand=[0] * 3).replace("<x>", f"<x>{said}")
     image = write_tiff(tmp_path, name=f"{product}-SPECTRAL_IMAGE.TIF")
     (tmp_path / f"{product}-METADATA.XML").write_text(text)
+    if product.startswith("DESIS"):  # has a header, too, with gains that are radiances elsewhere
+        said = header_text(CUBE, "bip", {}) + "file type = TIFF\n" + by_band([1e-4] * 3, [0] * 3)
+        image.with_suffix(".hdr").write_text(said)
     file = open_spectral_file(image)
     assert (stated_reflectance(file) is not None) == (quantity == "reflectance")
     assert (finished_by(file) is not None) == (quantity is not None)
