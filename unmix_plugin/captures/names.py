@@ -97,8 +97,8 @@ class FoundFiles:
 # Which camera took which view, by the names of files.
 
 BY_ORDER = "#"
-"""Names of cameras whose source gives none begin with it; they are matched in the order of names, sorted as texts as
-LLFF does."""
+"""Names of cameras whose source gives none begin with it; they belong, in their order, to views in the order of names,
+sorted as texts as LLFF does."""
 _IN_ORDER = "by their order, as the poses have no names"
 
 
@@ -123,7 +123,7 @@ def match_poses(
     if all(name.startswith(BY_ORDER) for name in owners):
         if len(owners) != len(wanted):
             raise CaptureError(f"{len(owners)} poses without names and {len(wanted)} views; expected as many")
-        found, how = dict(zip(sorted(wanted), sorted(owners), strict=True)), _IN_ORDER
+        found, how = dict(zip(sorted(wanted), owners, strict=True)), _IN_ORDER
     else:
         found, how = _by_names(owners, wanted), "by name"
     if not found:

@@ -41,6 +41,7 @@ def named(*names):
             ["2 of 2", "1 camera without view: rgb_0011.png"],
         ),
         (["#0000", "#0001"], {"b": [], "a": []}, {"a": "#0000", "b": "#0001"}, ["by their order"]),
+        (["#9999", "#10000"], {"b": [], "a": []}, {"a": "#9999", "b": "#10000"}, ["by their order"]),
         (  # by names as texts, which is said where numbers go otherwise
             ["#0000", "#0001", "#0002"],
             {"v1": [], "v2": [], "v10": []},
