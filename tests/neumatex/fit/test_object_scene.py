@@ -503,9 +503,18 @@ def test_bands_of_frames_that_are_all_in_order_change_nothing(spectral_folder):
     assert load_object(spectral_folder).pictures.num_colours == 5
 
 
+def _spectral_light(folder: Path, dark_nm: float) -> None:
+    """A spectral environment in place of the lamp, black in one band."""
+    shutil.rmtree(folder / "relit")
+    _change(folder, illuminant_path=None)
+    sky = {f"S0.{nm:g},0nm": np.full((8, 16), nm != dark_nm, np.float32) for nm in WAVELENGTHS}
+    write_exr(folder / "environment.exr", sky, {})
+
+
 @pytest.mark.parametrize(
     ("spoil", "expected"),
     [
+        (partial(_spectral_light, dark_nm=500.0), "environment.exr: is black at 500 nm, where nothing"),
         ({"illuminant_path": None}, "light's spectrum is not known"),
         ({"illuminant_path": "none.csv"}, "none.csv"),
         ({"wavelengths": None}, "no 'wavelengths' for pictures of 5 bands"),

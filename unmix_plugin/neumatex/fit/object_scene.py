@@ -152,6 +152,11 @@ def load_object(root: Path, lamp: str | None = None) -> ObjectScene:
     held_out = [_read_held_out(place, frame, pictures, bands, power, notes) for place in places]
     if bands is not None and power is None:
         mean = environment.mean_radiance().double().numpy()
+        if not (mean > 0).all():
+            raise SceneError(
+                f"{folder.environment_path}: is black at {bands.centers_nm[int(np.argmin(mean))]:g} nm, where nothing "
+                "could be told of reflectance; leave such bands out of the pictures"
+            )
         power = mean / mean.max()
     true_materials, abundance_files = (None, ()) if bands is None else _read_truth(root, folder.entry, bands)
     files = (folder.mesh_path, folder.environment_path)
