@@ -34,8 +34,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 
 _SOLID_ACCUMULATION = 0.9
 """Rays of which at least this much ends on something give points."""
-_LEAST_COSINE = 0.999
-"""Between a ray and the way to a point that its pixel shows."""
 _TOLERANCE_PX = 2.0
 """Difference of distances, in pixels as large as they are at the point, that still counts as the same surface."""
 _SCALE_BOUNDS = (1 / 16, 4.0)
@@ -159,11 +157,6 @@ def in_image(
     coords, depths = camera.project(positions, 0)
     size = torch.tensor([camera.width, camera.height])
     inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
-    if camera.is_distorted:
-        # Far outside the image a lens model folds over, into places whose rays go elsewhere.
-        rays = camera.generate_rays(torch.zeros(int(inside.sum()), dtype=torch.int64), coords[inside])
-        towards = torch.nn.functional.normalize(positions[inside] - rays.origins, dim=-1)
-        inside[inside.clone()] = (towards * rays.directions).sum(dim=-1) > _LEAST_COSINE
     return inside, coords[inside], depths[inside]
 
 

@@ -47,6 +47,20 @@ def test_projecting_a_point_of_a_ray_gives_the_pixel_back(coords, lens, index, d
     assert (depths > 0).all()
 
 
+@given(st.floats(-0.8, 0.8), st.floats(-0.2, 0.2), st.integers(0, 2))
+def test_a_point_that_no_ray_meets_is_not_projected_into_the_image(k1, k2, index):
+    cameras = make_cameras(distortion=(k1, k2, 0.0, 0.0))
+    towards = torch.randn(200, 3, generator=torch.Generator().manual_seed(index))
+    points = cameras.camera_to_world[index, :, 3] + towards
+    projected, depths = cameras.project(points, index)
+    inside = (
+        (depths > 0) & (projected >= 0).all(dim=-1) & (projected < torch.tensor([WIDTH, HEIGHT])).all(dim=-1)
+    )
+    rays = cameras.generate_rays(torch.full((int(inside.sum()),), index), projected[inside])
+    towards = torch.nn.functional.normalize(towards[inside], dim=-1)
+    assert ((towards * rays.directions).sum(dim=-1) > 0.999).all()
+
+
 @given(pixels, lenses)
 def test_directions_are_unit_and_origins_are_the_camera_positions(coords, lens):
     cameras = make_cameras(distortion=lens)

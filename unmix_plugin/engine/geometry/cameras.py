@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -188,7 +189,8 @@ class Cameras:
 
         Returns:
             Pixel coordinates x, y (meaningless where the depth is not positive) and depths along the optical axis in
-            scene units, positive in front of the camera. What no row of a line camera sees has depth -1.
+            scene units, positive in front of the camera. What no row of a line camera sees has depth -1, as has what
+            lies so far outside that the lens model folds over, back into the image.
         """
         rows: Tensor | None = None
         if self.key_poses is not None and self.is_line_camera(index):
@@ -202,6 +204,7 @@ class Cameras:
         divisor = torch.where(depths.abs() < 1e-12, torch.full_like(depths, 1e-12), depths)
         coords = torch.stack([local[:, 0], -local[:, 1]], dim=-1) / divisor[:, None]
         if self.is_distorted:
+            depths = torch.where(coords.norm(dim=-1) < _fold_radius(self.distortion[index]), depths, -1.0)
             coords = distort(coords, self.distortion[index])
         pixels = coords * self.focal_px[index] + self.center_px[index]
         if rows is None:
@@ -267,6 +270,14 @@ def distort(
     bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     bent_y = y * radial + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y)
     return torch.stack([bent_x, bent_y], dim=-1)
+
+
+def _fold_radius(coefficients: Float[Tensor, " D"]) -> float:
+    """Distance of ideal coordinates from the axis at which the radial terms turn back towards it; inf: nowhere."""
+    k1, k2, _, _, *higher = coefficients.tolist()
+    slope = [(2 * power + 1) * k for power, k in enumerate([1.0, k1, k2, *higher])]  # by r, in powers of r2
+    roots = np.roots(slope[::-1])
+    return float(min(roots.real[(roots.imag == 0) & (roots.real > 0)], default=np.inf)) ** 0.5
 
 
 def undistort(
