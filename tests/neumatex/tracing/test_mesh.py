@@ -1,6 +1,8 @@
 """Meshes from files, and rays against them."""
 
+import json
 import os
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -209,6 +211,60 @@ def test_bad_meshes_are_refused(tmp_path, monkeypatch):
     }.items():
         with pytest.raises(SceneError, match=said):
             read_mesh(tmp_path / name)
+
+
+def _add_fan(content):
+    content["meshes"][0]["primitives"].append({**content["meshes"][0]["primitives"][0], "mode": 6})
+
+
+LEFT_OUT: dict[str, Callable[[dict[str, Any]], object]] = {
+    "normalized whole numbers": lambda gltf: gltf["accessors"][1].update(normalized=True, componentType=5121),
+    "sparse accessors": lambda gltf: gltf["accessors"][1].update(sparse={"count": 1}),
+    "triangle fans": _add_fan,
+    "KHR_draco_mesh_compression": lambda gltf: gltf.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+    "EXT_mesh_gpu_instancing": lambda gltf: gltf["nodes"][0].update(
+        extensions={"EXT_mesh_gpu_instancing": {"attributes": {}}}
+    ),
+    "morph targets": lambda gltf: gltf["meshes"][0].update(weights=[1.0]),
+    "several parents": lambda gltf: gltf["nodes"].extend([{"children": [0]}, {"children": [0]}]),
+    "last row 0, 0, 0, 1": lambda gltf: gltf["nodes"][0].update(
+        matrix=[1, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    ),
+}
+"""What a mesh would be read without, and what adds it to a glTF of a box."""
+
+
+@pytest.mark.parametrize("what", LEFT_OUT)
+def test_gltf_that_would_be_read_in_part_is_refused(tmp_path, what):
+    exported: Any = trimesh.creation.box().export(file_type="gltf")
+    for name, data in exported.items():
+        (tmp_path / name).write_bytes(data)
+    content = json.loads(exported["model.gltf"])
+    assert content["accessors"][1]["type"] == "VEC3"
+    LEFT_OUT[what](content)
+    (tmp_path / "model.gltf").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=what):
+        read_mesh(tmp_path / "model.gltf")
+
+
+def test_a_ply_in_text_that_lacks_its_last_line_is_refused(tmp_path):
+    text = trimesh.creation.box().export(file_type="ply", encoding="ascii")
+    lines = (text.decode() if isinstance(text, bytes) else text).strip().splitlines()
+    (tmp_path / "box.ply").write_text("\n".join(lines) + "\n")
+    assert len(read_mesh(tmp_path / "box.ply").faces) == 12
+    (tmp_path / "box.ply").write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(SceneError, match="cut short: has 11 of 12 elements 'face'"):
+        read_mesh(tmp_path / "box.ply")
+
+
+@pytest.mark.parametrize("face", ["f 0 1 2", "f 1/1 2/1 0/1", "f 1 2 0"])
+def test_an_obj_whose_corners_count_from_0_is_refused(tmp_path, face):
+    corners = "v 10 0 0\nv 0 10 0\nv 0 0 10\nvt 0 0\n"
+    (tmp_path / "mesh.obj").write_text(f"{corners}f 1 2 3\n")
+    assert len(read_mesh(tmp_path / "mesh.obj").faces) == 1
+    (tmp_path / "mesh.obj").write_text(f"{corners}f 1 2 3\n{face}\n")
+    with pytest.raises(SceneError, match="names vertex 0"):
+        read_mesh(tmp_path / "mesh.obj")
 
 
 def test_model_space_is_centred_with_half_edge_one():

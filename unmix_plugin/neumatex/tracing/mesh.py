@@ -10,6 +10,8 @@ can tell: in files they may be wound either way.
 
 from __future__ import annotations
 
+import mmap
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +41,13 @@ MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply")
 """Formats that are read."""
 _FAR = 1e9
 """Positions, texture coordinates and normals beyond it are damage, as positions of cameras are."""
+_HARMLESS = re.compile("KHR_(materials|texture|lights|mesh_quantization|xmp|animation)|EXT_texture")
+"""Extensions of glTF that move no vertex."""
+_INSTANCING = "EXT_mesh_gpu_instancing"
+_FAN = 6
+"""Mode of a glTF primitive."""
+_CORNER_0 = re.compile(rb"^[ \t]*f[ \t](?:[^\r\n]*[ \t])?0(?=[/\s]|\Z)[^\r\n]{0,40}", re.MULTILINE)
+"""A face of an OBJ with a vertex 0."""
 _SMALLEST_FACE = 1e-14
 """Part of the squared bounding box diagonal; triangles of less area are dropped, since they have no normal."""
 
@@ -196,14 +205,20 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
             f"{path}: is not a mesh format that is read here; convert it to one of {', '.join(MESH_SUFFIXES)}"
         )
     if path.suffix.lower() in (".glb", ".gltf"):
-        _allow_numbers(path)
+        _check_gltf(path)
     try:
+        if path.suffix.lower() == ".obj":
+            _check_corners(path)
         beside = cast("Any", _Beside(path.parent))
         # Where corners of an OBJ have normals of their own, vertices are split: in the file's order trimesh would give
         # them the normal at the mean of the indices. Without normals they stay whole, and smooth at seams of texture.
         is_whole = path.suffix.lower() == ".obj" and b"\nvn " not in path.read_bytes()
         scene = trimesh.load_scene(path, resolver=beside, process=False, maintain_order=is_whole)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+        for mesh in scene.geometry.values():
+            _check_lengths(path, mesh.metadata.get("_ply_raw", {}))
+    except SceneError:
+        raise
     except Exception as error:
         raise SceneError(f"{path}: can't be read as a mesh ({error}); export it again") from error
     parts = [
@@ -221,22 +236,65 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     return parts
 
 
-def _allow_numbers(path: Path) -> None:
-    """Ask glTF before it is decoded how many numbers it has without any bytes in the file: they would be zeros."""
+def _check_gltf(path: Path) -> None:
+    """Refuse glTF by name that asks for more than trimesh follows, which leaves such things out without a word; and
+    numbers without any bytes in the file, which would be zeros.
+
+    Source: glTF 2.0 specification, sections 3.6.2 (accessors) and 3.7 (geometry), KHR_mesh_quantization.
+    """
     try:
         with open_regular(path) as file:
             head, size = file.read(20), MOST_TEXT_BYTES
             if head.startswith(b"glTF"):
                 head, size = b"", int.from_bytes(head[12:16], "little")
             content = parse_json((head + file.read(size)).decode("utf-8-sig"))
-        unfilled = [one for one in content.get("accessors", ()) if "bufferView" not in one]
-        zeros = sum(int(one.get("count", 0)) for one in unfilled)
-    except (OSError, ValueError, RecursionError, AttributeError, TypeError) as error:
+        accessors, nodes = content.get("accessors", ()), content.get("nodes", ())
+        meshes = content.get("meshes", ())
+        primitives = [primitive for mesh in meshes for primitive in mesh["primitives"]]
+        zeros = sum(int(one.get("count", 0)) for one in accessors if "bufferView" not in one)
+        read = {one["attributes"].get(name) for one in primitives for name in ("POSITION", "TEXCOORD_0")}
+        asked = [*content.get("extensionsRequired", ())]
+        asked += [name for one in nodes for name in one.get("extensions", ()) if name == _INSTANCING]
+        children = [child for node in nodes for child in node.get("children", ())]
+        found = {
+            **{f"the extension {name}": not _HARMLESS.match(name) for name in asked},
+            "sparse accessors": any("sparse" in one for one in accessors),
+            "positions or texture coordinates as normalized whole numbers": any(
+                accessors[index].get("normalized") for index in read - {None}
+            ),
+            "triangle fans": any(one.get("mode") == _FAN for one in primitives),
+            "morph targets": any(any(one.get("weights", ())) for one in [*meshes, *nodes]),
+            "a node with several parents": len(set(children)) < len(children),
+        }
+    except (OSError, ValueError, RecursionError, AttributeError, TypeError, LookupError) as error:
         raise SceneError(
             f"{path}: can't be read as a mesh ({type(error).__name__}); export it again"
         ) from error
     if zeros > MAX_TRIANGLES:
         refuse(path, f"{zeros:,} numbers that are not in the file", f"at most {MAX_TRIANGLES:,}", SceneError)
+    if left_out := [what for what, is_there in found.items() if is_there]:
+        raise SceneError(
+            f"{path}: {' and '.join(left_out)}: not read here; export it as plain triangles, uncompressed"
+        )
+
+
+def _check_corners(path: Path) -> None:
+    """Refuse an OBJ whose corners count from 0: trimesh takes the last vertex for it."""
+    with open_regular(path) as file:
+        found = _CORNER_0.search(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    if found is not None:
+        line = found[0].decode("ascii", "replace").strip()
+        raise SceneError(f"{path}: '{line}' names vertex 0; an OBJ counts from 1: export the mesh again")
+
+
+def _check_lengths(path: Path, elements: Mapping[str, Any]) -> None:
+    """Refuse a PLY in text that ends before all is there that its header promises; of others trimesh sees it."""
+    for name, element in elements.items():
+        columns = element.get("data")
+        for column in columns.values() if isinstance(columns, dict) else ():
+            if len(column) != element["length"]:
+                found = f"has {len(column)} of {element['length']} elements '{name}'"
+                raise SceneError(f"{path}: is cut short: {found}; copy it again")
 
 
 def _to_world(transform: np.ndarray, extras: Mapping[str, Any]) -> np.ndarray:
@@ -264,10 +322,11 @@ def _vector(extras: Mapping[str, Any], key: str) -> np.ndarray | None:
 def _placed(path: Path, loaded: Any, transform: np.ndarray) -> dict[str, np.ndarray]:
     """`vertices` and `faces` in the world, and `normals` and `uv` if the file has usable ones."""
     linear, vertices = transform[:3, :3], np.asarray(loaded.vertices, dtype=np.float64)
-    if vertices.shape[1:] != (3,) or not np.isfinite(transform).all():
+    is_affine = np.isfinite(transform).all() and np.abs(transform[3] - (0, 0, 0, 1)).max() < 1e-6
+    if vertices.shape[1:] != (3,) or not is_affine:
         raise SceneError(
             f"{path}: positions of shape {vertices.shape}, moved by {transform.tolist()}; expected 3 finite numbers "
-            "each: export the mesh again"
+            "each, and a last row 0, 0, 0, 1: export the mesh again"
         )
     faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     is_mirrored = np.linalg.det(linear) < 0
