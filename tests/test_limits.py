@@ -27,6 +27,14 @@ def test_a_long_text_of_empty_lists_is_refused_before_they_are_made():
     assert parse_json(json.dumps(points) + " " * 20_000_000) == points
 
 
+def test_a_key_with_two_values_is_refused():
+    """The standard library takes the last: of two focal lengths, nobody knows which is right."""
+    assert parse_json('{"a": {"fl_x": 5, "fl_x": 5}}') == {"a": {"fl_x": 5}}
+    for other in ("6", "5.5", "[5]", '"5"', "null", "{}"):
+        with pytest.raises(ValueError, match="'fl_x' is there twice, with different values"):
+            parse_json(f'[{{"fl_x": 5, "w": 1, "fl_x": {other}}}]')
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-16-le"])
 def test_entities_are_refused_in_every_encoding(encoding):
     text = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>'

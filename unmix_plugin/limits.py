@@ -135,7 +135,8 @@ def parse_json(text: str) -> Any:
     """The value in a text of JSON.
 
     Raises:
-        ValueError: it is none, or has so many values that they would take far more memory than the text.
+        ValueError: it is none, gives a key twice with different values, of which nobody knows the right one, or has so
+            many values that they would take far more memory than the text.
         RecursionError: values lie too deep in one another.
     """
     if len(text) > MOST_TEXT_BYTES:
@@ -144,7 +145,17 @@ def parse_json(text: str) -> Any:
             raise ValueError(
                 f"its values would take up to {needed:,} bytes, and at most {_PARSED_BYTES:,} are read"
             )
-    return json.loads(text)
+    return json.loads(text, object_pairs_hook=_each_once)
+
+
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """The object of these keys and values."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        for key, value in pairs:
+            if repr(found[key]) != repr(value):  # NaN is like NaN, and 1 is not like true
+                raise ValueError(f"{key[:40]!r} is there twice, with different values")
+    return found
 
 
 def parse_xml(data: bytes | str) -> ElementTree.Element:
