@@ -206,6 +206,7 @@ def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
         (SEQUOIA, {"ExposureTime": 0.0008, "FNumber": 2.2}, "EXIF ISOSpeedRatings should hold"),
         (SEQUOIA | {"Camera:VignettingPolynomial2D": "0.4"}, EXIF, "VignettingPolynomial2D should hold 5"),
         (SEQUOIA | {"Camera:VignettingPolynomial2DName": "-1,0"}, EXIF, "powers"),
+        (SEQUOIA | {"Camera:VignettingPolynomial2DName": ""}, EXIF, "expected pairs of powers"),
         (DJI | {"drone-dji:BlackLevel": ""}, EXIF, "BlackLevel should hold 1 number; it is absent"),
         (DJI | {"drone-dji:VignettingData": "-1,0,0,0,0,0"}, EXIF, "expected positive numbers"),
     ],

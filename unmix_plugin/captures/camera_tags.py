@@ -298,10 +298,11 @@ def _sequoia(file: SpectralFile, tags: XmpTags, exif: Mapping[str, Any]) -> _Rad
 
 
 def _vignetting_2d(file: SpectralFile, tags: XmpTags) -> FactorOf:
-    """A polynomial in x / W and y / H, whose powers the file lists; 1 where it lists none."""
+    """A polynomial in x / W and y / H, whose powers the file lists; 1 where there is none."""
     height, width = file.shape[:2]
     powers = [int(power) for power in tag_numbers(tags, "VignettingPolynomial2DName") or ()]
-    if len(powers) % 2 or not all(0 <= power <= _GREATEST_POWER for power in powers):
+    lacks_powers = not powers and tag_numbers(tags, "VignettingPolynomial2D") is not None
+    if lacks_powers or len(powers) % 2 or not all(0 <= power <= _GREATEST_POWER for power in powers):
         raise CaptureError(
             f"{file.path}: the tag XMP VignettingPolynomial2DName holds {powers}; expected pairs of powers from 0 to "
             f"{_GREATEST_POWER}"

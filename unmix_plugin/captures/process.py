@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from unmix_plugin.captures.calibration.references import require_comparable
 from unmix_plugin.captures.finding_poses import check_pose_options, marked_poses, poses_of_written_views
 from unmix_plugin.captures.options import LAYOUTS, ProcessOptions, find_views
 from unmix_plugin.captures.plan import Plan, hashes, input_files, make_plan
@@ -30,7 +31,6 @@ from unmix_plugin.captures.spectral_file import (
     CaptureView,
     ReadOptions,
     SpectralFile,
-    require_comparable,
 )
 from unmix_plugin.captures.wavelengths import parse_wavelengths
 from unmix_plugin.captures.writing.resampling import Resampling

@@ -41,8 +41,6 @@ MOST_WIDTH = 0.25
 """Width of a band, as a share of its wavelength, up to which one wavelength stands for it; panchromatic: 0.7."""
 GIVEN = "given by the user"
 """Evidence of wavelengths that files do not state, or state wrongly."""
-_LARGEST_DIFFERENCE_NM = 0.1
-"""Between the same bands of files of one capture."""
 _MEASURES_NOTHING = 1e30
 _FLOAT32_EPS = float(np.finfo(np.float32).eps)
 _KEPT_BYTES = 2**28
@@ -287,30 +285,6 @@ def _is_number(stored: np.ndarray, number: float) -> Bool[np.ndarray, "*shape"]:
     ends = np.clip(np.sort([number * (1 - share), number * (1 + share)]), limits.min, limits.max)
     low, high = ends.astype(stored.dtype)
     return (stored >= low) & (stored <= high)
-
-
-def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
-    """Refuse a file whose bands are other ones than those of another file of the capture, or whose numbers are of
-    another unit: gains in one alone. Raises CaptureError."""
-    found, expected = file.bands.wavelengths_nm, other.bands.wavelengths_nm
-    if (
-        found is not None
-        and expected is not None
-        and GIVEN not in (file.bands.evidence, other.bands.evidence)
-    ):
-        band = int(np.argmax(np.abs(found - expected)))
-        if abs(found[band] - expected[band]) > _LARGEST_DIFFERENCE_NM:
-            raise CaptureError(
-                f"{file.path} has {found[band]:g} nm at band {band}; expected {expected[band]:g} nm, as "
-                f"{other.path} has"
-            )
-    if (file.linear is None) != (other.linear is None):
-        has, lacks = (file, other) if other.linear is None else (other, file)
-        stated = "" if has.linear is None else has.linear.evidence
-        raise CaptureError(
-            f"{lacks.path} has no gains or scale, {has.path} has ({stated}); expected both or neither, as numbers of "
-            "one can't be compared with those of the other"
-        )
 
 
 def unreadable(path: Path, error: Exception) -> CaptureError:

@@ -196,6 +196,18 @@ def test_names_and_identifiers_of_makers_tell_releases(tmp_path, files, releases
     assert [view.release for view in views] == releases
 
 
+def test_a_file_without_the_calibration_that_others_of_its_lens_have_is_refused(tmp_path):
+    """Its stored numbers would be thousands of times the radiance of the others."""
+    write_flight(tmp_path / "flight", releases=3)
+    write_poses(tmp_path / "poses.json", releases=3)
+    path = next((tmp_path / "flight").glob("*_0001_RED.TIF"))
+    path.write_bytes(path.read_bytes().replace(b"Camera:SensorModel>", b"Camera:SensorModeX>"))
+    with pytest.raises(
+        CaptureError, match=r"_0001_RED\.TIF has no calibration of its maker in its XMP, .*Parrot"
+    ):
+        _process(tmp_path / "flight", tmp_path)
+
+
 def test_lenses_are_told_by_their_file_or_index(tmp_path):
     files = {f"IMG_{n // 2:04d}_{1 + n % 2}.tif": (500 + 100 * (n % 2), {}) for n in range(4)}
     views = rig_of(tmp_path / "number", files).views

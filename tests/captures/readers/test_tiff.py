@@ -173,6 +173,10 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
     (gdal(gdal_items("EXIF_ExposureTime", TIMES)), {"exposure_s": TIMES, "gain": None}),
     (gdal(GAIN, TIME), {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
     (gdal(GAIN, whole("offset", 2)), {"calibrated": CUBE * 4.0 + 2}),
+    (
+        gdal(SCALE.replace("</Item>", "", 1)),
+        {"linear": None, "warning": "GDAL's metadata in the file is damaged"},
+    ),
     # A gain that is applied is not of the camera, too.
     (gdal(gdal_items("gain", [4] * 6), TIME), {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None}),
     (

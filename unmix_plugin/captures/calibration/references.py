@@ -18,11 +18,11 @@ from jaxtyping import Float32, Float64
 from unmix_plugin.captures.camera_tags import radiometric_model
 from unmix_plugin.captures.options import ProcessOptions
 from unmix_plugin.captures.spectral_file import (
+    GIVEN,
     BandIndex,
     CaptureView,
     SpectralFile,
     find_missing,
-    require_comparable,
 )
 from unmix_plugin.errors import CaptureError, ConfigError, SpectrumError, counted, name_some
 from unmix_plugin.spectral.bands import Bands
@@ -31,6 +31,8 @@ from unmix_plugin.spectral.library.spectra_csv import read_spectra_csv
 
 _BLOCK_VALUES = 1 << 22
 """Values read together."""
+_LARGEST_DIFFERENCE_NM = 0.1
+"""Between the same bands of files of one capture."""
 _PATTERN_BLOCK_PX = 8
 _MOST_PATTERN = 4.0
 """Ratio of the variance of blocks' means to that which noise alone would leave, above which rows differ."""
@@ -99,6 +101,34 @@ def stated_values(
     if model is not None:
         return model.apply(stored.astype(np.float32), rows)
     return stored.astype(np.float32) if file.linear is None else file.linear.apply(stored, bands)
+
+
+def require_comparable(file: SpectralFile, other: SpectralFile) -> None:
+    """Refuse a file whose bands are other ones than those of another file of the capture, or whose numbers are of
+    another unit: gains, or a maker's calibration, in one alone. Raises CaptureError."""
+    found, expected = file.bands.wavelengths_nm, other.bands.wavelengths_nm
+    if (
+        found is not None
+        and expected is not None
+        and GIVEN not in (file.bands.evidence, other.bands.evidence)
+    ):
+        band = int(np.argmax(np.abs(found - expected)))
+        if abs(found[band] - expected[band]) > _LARGEST_DIFFERENCE_NM:
+            raise CaptureError(
+                f"{file.path} has {found[band]:g} nm at band {band}; expected {expected[band]:g} nm, as "
+                f"{other.path} has"
+            )
+    maker, other_maker = (model and model.maker for model in map(radiometric_model, (file, other)))
+    for what, own, others in (
+        ("gains or scale", file.linear and file.linear.evidence, other.linear and other.linear.evidence),
+        ("calibration of its maker in its XMP", maker, other_maker),
+    ):
+        if (own is None) != (others is None):
+            has, lacks = (file, other) if others is None else (other, file)
+            raise CaptureError(
+                f"{lacks.path} has no {what}, {has.path} has ({own or others}); expected both or neither, as numbers "
+                "of one can't be compared with those of the other"
+            )
 
 
 def _measured(

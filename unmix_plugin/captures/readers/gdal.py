@@ -40,11 +40,12 @@ _OF_BANDS = {
 """What XML beside a file says of a band, by names in GDAL's, EnMAP's and DESIS's."""
 
 
-def gdal_items(text: str) -> GdalItems:
-    """Entries of a tag; none where it is damaged."""
+def gdal_items(text: str, warnings: list[str]) -> GdalItems:
+    """Entries of a tag; none, and a warning, where it is damaged."""
     try:
-        items = list(parse_xml(text).iter("Item"))
+        items = list(parse_xml(text).iter("Item")) if text else []
     except ValueError:
+        warnings.append("GDAL's metadata in the file is damaged: gains and wavelengths in it are not used")
         return {}
     found: dict[str, dict[int | None, str]] = defaultdict(dict)
     for item in items:

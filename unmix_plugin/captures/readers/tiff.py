@@ -96,7 +96,8 @@ def open_tiff(path: Path, options: ReadOptions) -> SpectralFile:
         tags = camera_tags(first.tags)
         # What holds for the whole file stands in its first page, which may be a preview.
         top: Any = file.pages.first
-        items = next(filter(None, (gdal_items(_text(page, _GDAL_METADATA)) for page in (first, top))), {})
+        texts = dict.fromkeys(_text(page, _GDAL_METADATA) for page in (first, top))
+        items = next(filter(None, (gdal_items(text, warnings) for text in texts)), {})
         entries = gdal_entries(items)
         said = [state_bands(entries, "GDAL metadata")]
         said += [state_bands(_described(page), "image description") for page in (first, top)]
