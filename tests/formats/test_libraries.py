@@ -66,6 +66,8 @@ def test_libraries_of_spectral_python_are_read_exactly_with_their_scale_units_an
         ({"wavelength": "{400, 500}"}, "'wavelength' has 2 values for 3 bands"),
         ({"wavelength_units": "Wavenumber"}, "'wavelength units' is 'Wavenumber'"),
         ({"lines": 20}, "has 24 bytes; 20 spectra of 3 values need 240"),
+        ({"lines": 1, "spectra_names": "{oak}"}, "has 24 bytes; 1 spectra of 3 values need 12"),
+        ({"data_type": 2}, "has 24 bytes; 2 spectra of 3 values need 12"),
         ({"lines": "two"}, "'lines' is two; expected a whole number"),
         ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
         ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),

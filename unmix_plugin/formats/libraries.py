@@ -197,7 +197,7 @@ def _read_envi(path: Path) -> _Table:
     num_spectra, num_bands, _ = layout.shape
     data_path = data_beside(header_path, layout.num_bytes, ".sli")
     found = data_path.stat().st_size
-    if found < layout.num_bytes:
+    if found != layout.num_bytes:  # more is a header that is wrong, too
         raise ValueError(
             f"{data_path.name} has {found} bytes; {num_spectra} spectra of {num_bands} values need {layout.num_bytes}"
         )
