@@ -145,6 +145,18 @@ def test_json_gives_back_the_same_bits():
     assert not make_cameras().is_distorted
 
 
+@pytest.mark.parametrize(("row", "column"), [(0, 0), (2, 1), (1, 2)])
+def test_a_pose_that_is_no_rotation_is_refused(row, column):
+    written = make_cameras(3).to_json()
+    written["camera_to_world"][1][row][column] += 0.1
+    with pytest.raises(ValueError, match="rotations"):
+        Cameras.from_json(written)
+    mirrored = make_cameras(3).to_json()
+    mirrored["camera_to_world"][2][0][:3] = [-value for value in mirrored["camera_to_world"][2][0][:3]]
+    with pytest.raises(ValueError, match="rotations"):
+        Cameras.from_json(mirrored)
+
+
 def cameras_of_two_sizes() -> Cameras:
     cameras = make_cameras(3)
     parts = (cameras.camera_to_world, cameras.focal_px, cameras.center_px, cameras.distortion)

@@ -151,6 +151,7 @@ def test_json_gives_back_the_same_bits_and_frame_cameras_have_none():
         ("counts", [1, 3, 1]),
         ("heights", [0, 5, 4, 7, 0, 1]),
         ("heights", [0.0, math.nan] * 3),
+        ("poses", [[[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]] * 6),
     ],
 )
 def test_damaged_key_poses_are_refused(part, value):

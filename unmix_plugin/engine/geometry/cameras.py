@@ -28,7 +28,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from unmix_plugin.engine.geometry.key_poses import KeyPoses, project_by_row
+from unmix_plugin.engine.geometry.key_poses import KeyPoses, are_rigid, project_by_row
 from unmix_plugin.engine.geometry.space import RayBundle
 
 _LONGEST_EDGE_PX = 1 << 16
@@ -249,9 +249,11 @@ class Cameras:
         )
         if cameras.distortion.shape[1] not in (4, 6):
             raise ValueError(f"{cameras.distortion.shape[1]} coefficients of distortion; expected 4 or 6")
-        parts = (cameras.camera_to_world, cameras.center_px, cameras.distortion, cameras.focal_px)
+        parts = (cameras.center_px, cameras.distortion, cameras.focal_px)
         if not (all(part.isfinite().all() for part in parts) and (cameras.focal_px > 0).all()):
-            raise ValueError("poses, centres and distortion must be finite, focal lengths above 0")
+            raise ValueError("centres and distortion must be finite, focal lengths above 0")
+        if not are_rigid(cameras.camera_to_world):
+            raise ValueError("poses must be rotations and finite positions")
         return cameras
 
 

@@ -116,11 +116,23 @@ class KeyPoses:
         heights = torch.tensor(values["heights"], dtype=torch.float32).reshape(total)
         poses = torch.tensor(values["poses"], dtype=torch.float32).reshape(total, 3, 4)
         found = KeyPoses(poses, heights, counts)
-        if not (poses.isfinite().all() and heights.isfinite().all()):
-            raise ValueError("key poses must be finite")
+        if not (are_rigid(poses) and heights.isfinite().all()):
+            raise ValueError("key poses must be rotations and finite positions")
         if not (found._places.diff() > 0).all():
             raise ValueError("the heights of key poses must increase")
         return found
+
+
+_ROUNDING = 5e-3
+"""Largest element of R^T R - 1 of a rotation in float32, with a margin."""
+
+
+def are_rigid(poses: Float[Tensor, "N 3 4"]) -> bool:
+    """Whether all are a rotation and a finite position: others, as of a damaged file, would show a skewed scene."""
+    rotations = poses[:, :, :3].double()
+    off = (rotations.mT @ rotations - torch.eye(3, dtype=torch.float64, device=poses.device)).abs()
+    is_rotation = bool((off < _ROUNDING).all() and (torch.linalg.det(rotations) > 0).all())
+    return is_rotation and bool(poses.isfinite().all())
 
 
 _MOST_STRIPES = 400
