@@ -248,9 +248,8 @@ def test_gltf_that_would_be_read_in_part_is_refused(tmp_path, what):
 
 
 def test_a_ply_in_text_that_lacks_its_last_line_is_refused(tmp_path):
-    text = trimesh.creation.box().export(file_type="ply", encoding="ascii")
-    lines = (text.decode() if isinstance(text, bytes) else text).strip().splitlines()
-    (tmp_path / "box.ply").write_text("\n".join(lines) + "\n")
+    trimesh.creation.box().export(tmp_path / "box.ply", encoding="ascii")
+    lines = (tmp_path / "box.ply").read_text().strip().splitlines()
     assert len(read_mesh(tmp_path / "box.ply").faces) == 12
     (tmp_path / "box.ply").write_text("\n".join(lines[:-1]) + "\n")
     with pytest.raises(SceneError, match="cut short: has 11 of 12 elements 'face'"):
