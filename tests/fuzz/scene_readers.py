@@ -168,7 +168,7 @@ def labels_reader() -> Reader:
 
 
 def envi_header_reader() -> Reader:
-    other = _ENVI.replace("data type = 4", "data type = 12").replace("Micrometers", "nm").replace("0.", "1")
+    other = _ENVI.replace("data type = 4", "data type = 13").replace("Micrometers", "nm").replace("0.", "1")
     plain = "\n".join(line for line in other.splitlines() if "factor" not in line and "ignore" not in line)
     samples = tuple(text.encode() for text in (_ENVI, other, plain, _ENVI.replace("\n", "\r\n")))
     beside = (("library.sli", np.linspace(0, 9000, 6).astype("<f4").tobytes()),)
