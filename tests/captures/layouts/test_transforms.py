@@ -242,6 +242,21 @@ def test_tensors_of_8_bits_are_fractions_of_255(tmp_path, kind, scale):
         find_hs_nerf(tmp_path, ReadOptions(wavelengths_nm=np.array([450.0, 500.0, 550.0])))
 
 
+def test_a_mask_that_is_not_there_is_refused_and_missing_labels_are_said(tmp_path):
+    write_unmix(tmp_path)
+    (tmp_path / "train" / "frame_00001_seg.png").unlink()
+    (tmp_path / "eval" / "frame_00003_seg.png").unlink()
+    notes = find_unmix_nerf(tmp_path, PLAIN).notes
+    assert any("2 views without the labels that transforms.json names" in note for note in notes)
+    path = tmp_path / "transforms.json"
+    content = json.loads(path.read_text())
+    for named, said in (("masks/1.png", r"lacks 1 file of its views: masks/1\.png"), (5, "'mask_path' is 5")):
+        content["frames"][1]["mask_path"] = named
+        path.write_text(json.dumps(content))
+        with pytest.raises(CaptureError, match=said):
+            find_unmix_nerf(tmp_path, PLAIN)
+
+
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
 def test_pictures_are_cubes_of_three_bands(tmp_path, mode):
     pixels = write_picture(tmp_path / "images" / "a.png", mode)

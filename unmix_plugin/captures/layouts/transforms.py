@@ -45,7 +45,7 @@ from unmix_plugin.captures.spectral_file import (
     linear_values,
 )
 from unmix_plugin.errors import CaptureError, counted
-from unmix_plugin.scenes.reading.faults import Faults, read_numbers
+from unmix_plugin.scenes.reading.faults import Faults, describe, read_numbers
 from unmix_plugin.scenes.reading.splits import split_by_lists
 from unmix_plugin.scenes.reading.transforms_json import (
     read_sensor_entry,
@@ -127,6 +127,9 @@ def _read_frames(root: Path, key: str) -> _FrameList:
     for frame in frames.values():
         if not frame.text(key):
             raise CaptureError(f"{frame.where} has no '{key}', the path of its file: add it")
+        for other in ("mask_path", "seg_file_path"):
+            if not isinstance(value := frame.values.get(other), str | None):
+                raise CaptureError(f"{frame.where}: '{other}' is {describe(value)}; expected a path")
     notes = [f"{counted(n, 'frame')} of {name} listed before: left out" for name, n in repeated.items()]
     return _FrameList(contents, _split_by_lists(tuple(frames.values()), top, root), top, tuple(notes))
 
@@ -202,7 +205,7 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         by_folder = [None] * len(by_folder)
     stated, warnings = _state_cubes(root, listed, options)
     views = []
-    found, moved = FoundFiles(root), 0
+    found, moved, unlabelled = FoundFiles(root), 0, 0
     for frame, name, split, said in zip(listed.frames, names, by_folder, stated, strict=True):
         text = frame.text(_CUBE_KEY)
         cube = found.find(frame.where, text, _in_eval(text))
@@ -210,11 +213,16 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
             continue
         moved += "val" in PurePosixPath(text).parts and not (root / text).is_file()
         picture, mask, labels = (
-            found.look(frame.where, frame.text(key), _in_eval(frame.text(key)), least_parts=least_parts)
+            look(frame.where, frame.text(key), _in_eval(frame.text(key)), least_parts=least_parts)
             if frame.text(key)
             else None
-            for key, least_parts in (("file_path", 1), ("mask_path", 2), ("seg_file_path", 2))
+            for key, look, least_parts in (
+                ("file_path", found.look, 1),
+                ("mask_path", found.find, 2),
+                ("seg_file_path", found.look, 2),
+            )
         )
+        unlabelled += labels is None and frame.text("seg_file_path") != ""
         file, split, shot = _open_cube(cube, said, options), frame.split or split, frame.text("capture")
         view = CaptureView(name, file, said.sensor, picture, mask, labels, release=shot, split=split)
         views.append(view)
@@ -222,6 +230,10 @@ def _find_cubes(layout: str, root: Path, options: ReadOptions) -> Capture:
         "copy them into the folder; if there are RGB pictures alone, take the layout 'nerfstudio'"
     )
     notes = [f"{moved} paths name a folder 'val' whose files lie in 'eval'; they were followed"] * (moved > 0)
+    if unlabelled:
+        notes.append(
+            f"{counted(unlabelled, 'view')} without the labels that transforms.json names: no such files"
+        )
     given = {*listed.top, *(key for frame in listed.frames for key in frame.values)}
     if left := [key for key in _TRUTH_KEYS if key in given]:
         notes.append(f"not taken over from transforms.json: {', '.join(left)}; copy what still fits yourself")
