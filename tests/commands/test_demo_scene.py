@@ -1,6 +1,7 @@
 """`unmix-demo-scene`: what it prints, writes and refuses."""
 
 import json
+import shlex
 
 import pytest
 
@@ -49,12 +50,17 @@ def test_the_light_is_chosen_by_name(tmp_path):
 
 
 def test_raw_writes_a_capture_and_names_the_command_that_makes_a_scene_of_it(tmp_path):
-    words = ["--raw", tmp_path / "capture", "--size", "16", "--bands", "10", "--views", "4"]
-    ended = done(write_demo_scene, *words)
-    printed = ended.out
+    capture = tmp_path / "my capture"
+    printed = done(write_demo_scene, "--raw", capture, "--size", "16", "--bands", "10", "--views", "4").out
     assert "4 raw views of 16 x 16 pixels and 10 bands, 3 of them bad" in printed
     shown = ("view_000.hdr", "white.hdr", "dark.hdr", "poses-true.json", "truth")
-    assert all((tmp_path / "capture" / name).exists() for name in shown)
-    assert all(f"  {tmp_path / 'capture' / name}  " in printed for name in shown)
-    assert f"unmix-process cubes --data {tmp_path / 'capture'} --output-dir SCENE" in printed
-    assert not (tmp_path / "capture" / "transforms.json").exists()
+    assert all((capture / name).exists() for name in shown)
+    assert all(f"  {capture / name}  " in printed for name in shown)
+    words = shlex.split(printed.splitlines()[-1].partition(": ")[2])
+    assert words[:6] == ["unmix-process", "cubes", "--data", str(capture), "--output-dir", "SCENE"]
+    assert words[6:] == [
+        *("--white", f"{capture}/white.hdr", "--dark", f"{capture}/dark.hdr"),
+        "--poses",
+        "estimate",
+    ]
+    assert not (capture / "transforms.json").exists()

@@ -50,7 +50,7 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     assert 0 < float(angles[0]["material 1"]) < np.pi / 2
     for name in ("endmembers.png", "maps.png"):
         assert min(picture_size(folder / name)) > 200
-    assert "exist already; give --overwrite" in refused(image, *words)
+    assert "exist already; give --overwrite or another folder" in refused(image, *words)
     done(image, *words, "--overwrite")
 
 

@@ -76,6 +76,9 @@ def test_existing_files_are_counted_and_refused_unless_overwriting_was_asked_for
         path.write_bytes(b"")
     with pytest.raises(ConfigError, match=r"b and 1 more of its files exist already; give --overwrite"):
         refuse_to_overwrite(paths, overwrite=False)
+    paths[1].unlink()
+    with pytest.raises(ConfigError, match=r"c exists already; give --overwrite or another folder"):
+        refuse_to_overwrite(paths, overwrite=False)
     refuse_to_overwrite(paths, overwrite=True)
 
 

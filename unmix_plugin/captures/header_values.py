@@ -39,7 +39,7 @@ _DIVISOR = "reflectance_scale_factor"
 _LEAST_WIDTH_NM = 0.05
 """Widths below this are in another unit, as are those wider than their wavelengths."""
 _UNUSABLE = "the file gives no wavelengths that can be used, see the notes"
-_ASK = "give the wavelengths yourself (--wavelengths)"
+_ASK = "correct them there, or give them yourself (--wavelengths of unmix-process)"
 
 
 def plain_names(entries: Mapping[str, Any]) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,4 +42,4 @@ def demo(arguments: list[str]) -> None:
     export(["page", *words, "--resolution", "160"])
     print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
     print(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
-    print(f"look around in it: unmix-view --run {run.path}")
+    print(f"look around in it: {shlex.join(['unmix-view', '--run', str(run.path)])}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -83,7 +84,7 @@ def _write_scene(options: _DemoSceneOptions) -> None:
         ("illuminant.csv", "the lamp's spectrum"),
     ):
         print(f"  {folder / name}  {content}")
-    print(f"train on it: unmix-train unmix-nerf --data {folder}")
+    print(f"train on it: {shlex.join(['unmix-train', 'unmix-nerf', '--data', str(folder)])}")
 
 
 def _write_capture(options: _DemoSceneOptions) -> None:
@@ -119,11 +120,10 @@ def _write_capture(options: _DemoSceneOptions) -> None:
         ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
     ):
         print(f"  {folder / name}  {content}")
-    marked = f"markers --marker-size {MARKER_SIZE} --marker-family {MARKER_FAMILY}"
-    print(
-        f"make a scene of it: unmix-process cubes --data {folder} --output-dir SCENE --white {folder / 'white.hdr'} "
-        f"--dark {folder / 'dark.hdr'} --poses {marked if options.markers else 'estimate'}"
-    )
+    words = ["unmix-process", "cubes", "--data", str(folder), "--output-dir", "SCENE"]
+    words += ["--white", str(folder / "white.hdr"), "--dark", str(folder / "dark.hdr"), "--poses"]
+    marked = ["markers", "--marker-size", str(MARKER_SIZE), "--marker-family", MARKER_FAMILY]
+    print(f"make a scene of it: {shlex.join([*words, *(marked if options.markers else ['estimate'])])}")
 
 
 def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:

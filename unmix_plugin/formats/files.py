@@ -44,10 +44,8 @@ def refuse_to_overwrite(paths: Collection[Path], overwrite: bool) -> None:
     """
     existing = [path for path in paths if path.exists()]
     if existing and not overwrite:
-        others = f" and {len(existing) - 1} more of its files" if len(existing) > 1 else ""
-        raise ConfigError(
-            f"{existing[0]}{others} exist already; give --overwrite to replace them or another --output"
-        )
+        others = f" and {len(existing) - 1} more of its files exist" if len(existing) > 1 else " exists"
+        raise ConfigError(f"{existing[0]}{others} already; give --overwrite or another folder")
 
 
 def csv_bytes(rows: Iterable[Sequence[object]]) -> bytes:

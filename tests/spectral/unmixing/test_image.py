@@ -1,9 +1,11 @@
 """One image alone."""
 
 import inspect
+from typing import Any
 
 import numpy as np
 import pytest
+import spectral.io.envi as envi
 import torch
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers
@@ -38,6 +40,15 @@ def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
     pure = shares[1:800].argmax(axis=1)
     assert (pure == angles.argmin(1).numpy()[np.arange(1, 800) % 3]).all()
     assert found.misfit.max() < 0.2
+
+
+def test_an_image_that_spy_loaded_is_unmixed_as_the_array_of_its_numbers(tmp_path):
+    cube = image_of(smooth_endmembers(3)).astype(np.float32)
+    envi.save_image(str(tmp_path / "a.hdr"), cube)
+    opened: Any = envi.open(str(tmp_path / "a.hdr"))
+    found, expected = (unmix_image(image, 3) for image in (opened.load(), cube))
+    np.testing.assert_array_equal(found.abundances, expected.abundances)
+    np.testing.assert_array_equal(found.endmembers, expected.endmembers)
 
 
 def test_confidence_is_high_where_a_pixel_is_pure_and_low_at_a_tie():

@@ -242,8 +242,8 @@ def _find_image(path: Path, arrays: Sequence[FoundArray], options: ReadOptions) 
         images = described or images
     if not images:
         raise CaptureError(
-            f"{path}: no data set has three axes; name one (--dataset), and give rows and columns if it is a list of "
-            f"pixels. The file holds {listed}"
+            f"{path}: no data set has three axes; name one (--dataset) and, in unmix-image, give the size "
+            f"of an image that is stored as a matrix (--size ROWS COLUMNS). The file holds {listed}"
         )
     if len(images) > 1:
         several = f"{len(images)} data sets could be the image"

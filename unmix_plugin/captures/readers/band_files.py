@@ -42,7 +42,7 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
         if (model := radiometric_model(band)) is not None:
             raise CaptureError(
                 f"{band.path}: of one lens of a {model.maker} camera, with a calibration of its own, and bands of "
-                "several lenses do not lie on each other; read the folder with the layout rig"
+                "several lenses do not lie on each other; read the folder with unmix-process rig"
             )
     centres = _joined([band.bands.wavelengths_nm for band in bands])
     named = wavelengths_in_names([band.path.stem for band in bands]) if centres is None else None

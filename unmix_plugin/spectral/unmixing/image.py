@@ -94,7 +94,7 @@ def unmix_image(
     if shares not in get_args(Shares):
         raise SpectrumError(f"shares must be {', '.join(get_args(Shares))}; found {shares!r}")
     used = _used_pixels(cube, mask)
-    cube = np.ma.getdata(cube)
+    cube = np.ma.getdata(cube, subok=False)  # SPy's images index pixels in a way of their own
     spectra = torch.from_numpy(np.ascontiguousarray(cube[used], dtype=np.float32)).clamp(min=0)
     peaks = spectra.amax(dim=1)
     usual = peaks.kthvalue(max(1, round(_LIT_QUANTILE * len(peaks)))).values
@@ -144,7 +144,7 @@ def _used_pixels(cube: np.ndarray, mask: np.ndarray | None) -> Bool[np.ndarray, 
         used = used & ~np.ma.getmaskarray(cube).any(axis=-1)
     if not used.any():
         raise SpectrumError("the mask leaves no pixel to unmix")
-    broken = used & ~np.isfinite(np.ma.getdata(cube)).all(axis=-1)
+    broken = used & ~np.isfinite(np.ma.getdata(cube, subok=False)).all(axis=-1)
     if broken.any():
         raise SpectrumError(
             f"{int(broken.sum())} of {int(used.sum())} pixels hold NaN or infinite values; leave them out with a mask"
