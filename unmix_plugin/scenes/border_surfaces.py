@@ -196,7 +196,23 @@ def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedVie
         parts = parts_of(alike)
         members = np.flatnonzero(np.isin(parts, parts[at_border]) & alike)
         unexplained = border[~alike.ravel()[border]]
-    return FittedView(features, surfaces, farthest, known)
+    return FittedView(features, _of_corners(surfaces, features), farthest, known)
+
+
+def _of_corners(surfaces: list[_Surface], features: Features) -> list[_Surface]:
+    """Of several surfaces those that show in most of a corner: a seam leaves one on either side, but what an edge of
+    the picture cuts off between two corners, such as the foot of an object, stands before the backdrop."""
+    terms = _terms(features.shape[:2])
+    values = np.array([(terms @ each.coefficients).reshape(features.shape) for each in surfaces])
+    away = [norm(features - value) / each.tolerance for value, each in zip(values, surfaces, strict=True)]
+    rows, columns = (max(1, round(BORDER_SHARE * side)) for side in features.shape[:2])
+    corners = [np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]]
+    kept = [
+        surface
+        for surface, own in zip(surfaces, away, strict=True)
+        if any(((own <= 1) & (own <= np.min(away, axis=0)))[corner].mean() > 0.5 for corner in corners)
+    ]
+    return kept or surfaces
 
 
 def _border_surfaces(
