@@ -257,7 +257,7 @@ def _scene_facts(loaded: LoadedRun, materials: Materials, about: Mapping[str, st
         ("Pixels of a view", ", ".join(f"{width} x {height}" for width, height in sizes)),
         ("Bands", str(materials.bands)),
         ("Light", light if materials.is_light_known else "unknown, taken as flat"),
-        ("Size of the scene", " x ".join(describe_length(edge, world.scale) for edge in size)),
+        ("Box that holds the scene", " x ".join(describe_length(edge, world.scale) for edge in size)),
         *([("Scale", world.scale.said)] if world.scale is not None else []),
         ("Training", f"{loaded.training.train_seconds:,.0f} s"),
     ]
