@@ -26,7 +26,7 @@ def test_what_is_no_scene_folder_is_named(folder, tmp_path):
     with pytest.raises(SceneError, match=r"transforms\.json: is a file, not a scene folder; give the folder"):
         load_scene(folder.root / "transforms.json")
     (folder.root / "transforms.json").unlink()
-    assert "transforms.json: is not in the scene folder" in fault_of(folder)
+    assert "transforms.json: is not in the scene folder; unmix-process makes a scene" in fault_of(folder)
 
 
 def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):

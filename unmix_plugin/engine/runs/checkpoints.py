@@ -240,7 +240,8 @@ def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: boo
         model.load_state_dict(values)
     except RuntimeError as error:
         raise RunError(
-            f"the checkpoint does not fit the model that the run's config and scene describe: {error}"
+            "the checkpoint does not fit the model that config and scene describe: leave out settings that differ from "
+            f"the run's, or train anew ({str(error).partition(chr(10))[2].strip() or error})"
         ) from error
     for name, param in model.named_parameters():
         if not param.isfinite().all():

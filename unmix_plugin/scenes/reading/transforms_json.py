@@ -287,7 +287,7 @@ def _read_object(path: Path, faults: Faults) -> dict[str, Any]:
         found = "is a file, not a scene folder" if path.parent.is_file() else "the scene folder is not there"
         faults.add(str(path.parent), f"{found}; give the folder that holds transforms.json with --data")
     elif not path.is_file():
-        faults.add(FILE_NAME, "is not in the scene folder; expected nerfstudio's form (see the README)")
+        faults.add(FILE_NAME, "is not in the scene folder; unmix-process makes a scene of raw files")
     else:
         try:
             content = read_json_file(path)
