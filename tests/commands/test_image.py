@@ -51,7 +51,9 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     for name in ("endmembers.png", "maps.png"):
         assert min(picture_size(folder / name)) > 200
     assert "exist already; give --overwrite or another folder" in refused(image, *words)
-    done(image, *words, "--overwrite")
+    done(image, *words[:-4], "--overwrite")
+    left = {path.name for path in folder.iterdir()}
+    assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (7, set())
 
 
 @pytest.mark.parametrize(

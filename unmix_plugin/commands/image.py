@@ -74,6 +74,8 @@ def image(argv: list[str]) -> None:
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
     place = opened.metadata.get("map")
+    for earlier in {*unmixed_image_paths(folder, True, True)} - {*paths}:
+        earlier.unlink(missing_ok=True)  # it would tell of other materials
     names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)
     for path in paths:
