@@ -127,7 +127,7 @@ def test_a_folder_of_the_lenses_of_a_rig_is_refused_with_the_layout_that_reads_i
     exif = {"ExposureTime": 0.01, "ISOSpeed": 100}
     for lens in (1, 2):
         write_band_file(tmp_path / f"IMG_0000_{lens}.tif", np.full((4, 5), 9), xmp, exif)
-    with pytest.raises(CaptureError, match=r"IMG_0000_1.tif: of one lens of a MicaSense.*the layout rig"):
+    with pytest.raises(CaptureError, match=r"IMG_0000_1.tif: of one lens of a MicaSense.*unmix-process rig"):
         open_spectral_file(tmp_path)
 
 
