@@ -20,7 +20,7 @@ def pose(turn: tuple[float, float, float], place: tuple[float, float, float]) ->
     return torch.cat([rotation_matrix(torch.tensor(turn)), torch.tensor(place)[:, None]], dim=1)
 
 
-def keys(distortion: float = 0.0) -> Cameras:
+def keys(distortion: float = 0.0, p1: float = 0.0) -> Cameras:
     """A frame camera, and two line cameras that move and turn."""
     poses = torch.stack(
         [
@@ -35,7 +35,7 @@ def keys(distortion: float = 0.0) -> Cameras:
     heights = torch.tensor([0.5, 0.5, 15.0, 39.5, 0.0, 40.0])
     key_poses = KeyPoses(poses, heights, (1, 3, 2))
     middle = key_poses.at(torch.arange(3), torch.full((3,), HEIGHT / 2))
-    lens = torch.tensor([distortion, 0.0, 0.0, 0.0]).repeat(3, 1)
+    lens = torch.tensor([distortion, 0.0, p1, 0.0]).repeat(3, 1)
     focal, center = torch.full((3, 2), 30.0), torch.tensor([[6.0, 20.0]]).repeat(3, 1)
     return Cameras(middle, focal, center, lens, WIDTH, HEIGHT, key_poses=key_poses)
 
@@ -75,8 +75,9 @@ def test_each_camera_has_its_own_key_poses_and_a_frame_camera_one_for_all_rows()
     assert [cameras.is_line_camera(index) for index in range(3)] == [False, True, True]
 
 
-def test_a_row_sees_only_its_own_line():
-    cameras = keys()
+@pytest.mark.parametrize("p1", [0.0, 0.05])
+def test_a_row_sees_only_its_own_line(p1):
+    cameras = keys(p1=p1)
     rows = torch.arange(HEIGHT) + 0.5
     for x in (0.5, 11.5):
         rays = cameras.generate_rays(
@@ -89,12 +90,12 @@ def test_a_row_sees_only_its_own_line():
         assert_close(rays.origins, poses[:, :, 3])
 
 
-@pytest.mark.parametrize("distortion", [0.0, -0.1])
+@pytest.mark.parametrize(("distortion", "p1"), [(0.0, 0.0), (-0.1, 0.0), (-0.1, 0.02)])
 @given(
     st.lists(st.tuples(st.floats(0.1, 11.9), st.floats(0.1, 39.9)), min_size=1, max_size=6), st.integers(0, 2)
 )
-def test_projecting_a_point_of_a_ray_gives_the_pixel_back(distortion, coords, index):
-    cameras, pixels = keys(distortion), torch.tensor(coords)
+def test_projecting_a_point_of_a_ray_gives_the_pixel_back(distortion, p1, coords, index):
+    cameras, pixels = keys(distortion, p1), torch.tensor(coords)
     rays = cameras.generate_rays(torch.full((len(coords),), index), pixels)
     found, depths = cameras.project(rays.origins + 3.0 * rays.directions, index)
     assert_close(found, pixels, atol=5e-3, rtol=0)

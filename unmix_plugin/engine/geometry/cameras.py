@@ -5,7 +5,7 @@ coordinates are x to the right and y down in pixels from the image's top left co
 
 A pose is a function of the camera and of y: constant for frame cameras, interpolated between key poses for line
 cameras. At each y a line camera sees the line that its x axis and its optical axis span; its focal length and principal
-point along y don't count.
+point along y don't count, nor does p1, which would bend that line.
 
 Lens distortion is OPENCV's, of image coordinates divided by depth, x to the right and y **down**, r2 = x^2 + y^2, with
 `D` coefficients, 4 (k1, k2, p1, p2) or 6 (and k3, k4):
@@ -157,11 +157,13 @@ class Cameras:
         """Rays of cameras (int64) through points of their images, lens distortion undone; x, y in pixels, the centre of
         column c, row r is (c + 0.5, r + 0.5)."""
         coords = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
+        bending = self.distortion[camera_indices]
         if self.key_poses is not None:
-            on_axis = torch.stack([coords[:, 0], torch.zeros_like(coords[:, 1])], dim=-1)
-            coords = torch.where(self.key_poses.is_line[camera_indices][:, None], on_axis, coords)
+            is_frame = ~self.key_poses.is_line[camera_indices][:, None]
+            coords = torch.cat([coords[:, :1], coords[:, 1:].where(is_frame, 0.0)], dim=1)
+            bending = torch.cat([bending[:, :2], bending[:, 2:3].where(is_frame, 0.0), bending[:, 3:]], dim=1)
         if self.is_distorted:
-            coords = undistort(coords, self.distortion[camera_indices])
+            coords = undistort(coords, bending)
         local = torch.stack([coords[:, 0], -coords[:, 1], -torch.ones_like(coords[:, 0])], dim=-1)
         poses = self.poses_at(camera_indices, pixel_coords[:, 1])
         directions = (poses[:, :, :3] * local[:, None, :]).sum(dim=-1)
