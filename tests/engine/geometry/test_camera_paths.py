@@ -97,6 +97,15 @@ def test_a_path_bends_around_what_its_cameras_look_at():
     torch.testing.assert_close(coords, torch.tensor([[20.0, 15.0]]).expand(60, 2), atol=0.1, rtol=0)
 
 
+def test_a_path_comes_no_nearer_and_goes_no_farther_than_its_cameras():
+    angles, distances = np.arange(9) * 0.7, np.array([4.0, 4, 0.7, 0.7, 4, 0.7, 4, 4, 0.7])
+    places = distances[:, None] * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    path = interpolated(cameras_at([look_at(place, np.zeros(3)) for place in places]), BOX, 301)
+    away = path.camera_to_world[:, :, 3].norm(dim=1)
+    assert float(away.min()) > 0.69
+    assert float(away.max()) < 4.01
+
+
 @pytest.mark.parametrize("target", [-0.1, 2.0])
 def test_opposite_cameras_have_a_path_of_real_cameras(target):
     poses = [look_at(np.array([x, 0.0, 0.0]), np.array([target * x, 0.0, 0.0])) for x in (-3.0, 3.0)]

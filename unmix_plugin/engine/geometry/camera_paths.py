@@ -125,7 +125,7 @@ def _path_around(
     at: Float64[np.ndarray, "F"],
 ) -> Float64[np.ndarray, "F 3 4"] | None:
     """Poses that change smoothly about a centre; None where the path meets it, or what it looks at."""
-    from scipy.interpolate import CubicSpline
+    from scipy.interpolate import CubicSpline, PchipInterpolator
 
     away, backs = poses[:, :, 3] - centre, poses[:, :, 2]
     distances = np.linalg.norm(away, axis=1)
@@ -135,7 +135,8 @@ def _path_around(
     outward, ups = CubicSpline(along, away)(at), CubicSpline(along, poses[:, :, 1])(at)
     if np.linalg.norm(outward, axis=1).min() < _NEAR * distances.min():
         return None
-    positions = CubicSpline(along, distances)(at)[:, None] * _unit(outward)
+    # Distances stay between those of neighbours: a spline swings past a near camera, through the centre.
+    positions = PchipInterpolator(along, distances)(at)[:, None] * _unit(outward)
     backs, ups = positions - gazes, _unit(ups)
     is_close = np.linalg.norm(backs, axis=1).min() < _NEAR * ahead.min()
     if is_close or np.linalg.norm(np.cross(ups, _unit(backs)), axis=1).min() < _NEAR:
