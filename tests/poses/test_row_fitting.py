@@ -87,6 +87,24 @@ def test_a_line_camera_with_key_poses_of_its_own_starts_from_them() -> None:
     assert off_by(fitted(truth, start=truth), truth) < 0.02
 
 
+def test_moved_rays_know_where_they_pass_the_picture() -> None:
+    expected = camera().image_rays(0).offsets
+
+    def look_at_offsets(rays: RayBundle, axes: Float[Tensor, "2 C"]) -> Float[Tensor, "R D"]:
+        """A backdrop that stands still in the picture depends on them."""
+        assert expected is not None
+        assert rays.offsets is not None
+        assert torch.equal(rays.offsets, expected.repeat(len(rays) // len(expected), 1))
+        return look(rays, axes)
+
+    picture = seen(camera().image_rays(0)).view(ROWS, WIDTH, 3)
+    valid = torch.ones(ROWS, WIDTH, dtype=torch.bool)
+    assert (
+        off_by(fit_rows(camera(), picture[..., :2], valid, picture[..., 2], BOX, look_at_offsets), camera())
+        < 0.1
+    )
+
+
 def test_the_channels_that_are_compared_hold_all_that_two_materials_show() -> None:
     generator = torch.Generator().manual_seed(0)
     mixed = torch.rand(200, 2, generator=generator) @ torch.rand(2, 5, generator=generator)

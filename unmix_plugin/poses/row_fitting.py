@@ -159,7 +159,7 @@ class _SweptView:
         each = steps.repeat_interleave(self.measured.shape[1], dim=0).to(self.rays.origins)
         directions = (rotation_matrix(each[:, :3]) @ self.rays.directions[:, :, None])[:, :, 0]
         origins = self.rays.origins + self.distance * each[:, 3:]
-        return RayBundle(origins, directions, self.rays.camera_indices)
+        return replace(self.rays, origins=origins, directions=directions, axes=None)
 
 
 def _fitted(
