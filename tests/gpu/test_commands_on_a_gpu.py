@@ -12,14 +12,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from tests.commands.running import SMALL_METHOD, done, run_of
 from tests.gpu.stand_in import StandInTensor, stand_in_gpu
 from tests.neumatex.factory import trained_on, write_object
+from tests.pose_factory import MIDDLE, box_around, cameras
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import PRODUCTS, export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
+from unmix_plugin.poses.knots import Knots
+from unmix_plugin.poses.refinement import PoseRefinement
 from unmix_plugin.products.product import RunProduct
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 
@@ -37,16 +41,17 @@ SMALL = {
 
 
 @contextmanager
-def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Context in which commands compute on CUDA where it is, else on the stand-in, whatever they are told."""
+def gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
+    """Context in which commands compute on CUDA where it is, else on the stand-in, whatever they are told; gives its
+    device."""
     if HAS_CUDA:
         where = torch.device("cuda", 0)
         _use(where, monkeypatch)
-        yield
+        yield where
         return
     with stand_in_gpu(monkeypatch) as where:
         _use(where, monkeypatch)
-        yield
+        yield where
 
 
 def _use(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,8 +66,8 @@ def scene(tmp_path_factory) -> Path:
     return folder
 
 
-def trained(scene: Path, folder: Path, method: str = "unmix-nerf") -> Path:
-    given = ["--data", scene, "--output-dir", folder, "--max-num-iterations", STEPS]
+def trained(scene: Path, folder: Path, method: str = "unmix-nerf", *words: str) -> Path:
+    given = ["--data", scene, "--output-dir", folder, "--max-num-iterations", STEPS, *words]
     return run_of(done(train, method, *given, "--pipeline.model.initial-opacity", 0.6, *SMALL_METHOD))
 
 
@@ -122,6 +127,29 @@ def test_the_material_of_an_object_is_exported_from_a_gpu(object_run, tmp_path, 
 @pytest.mark.usefixtures("on_gpu")
 def test_the_published_method_trains_on_a_gpu(scene, tmp_path):
     trained(scene, tmp_path, "unmix-nerf-published")
+
+
+@pytest.mark.usefixtures("on_gpu")
+def test_views_with_gains_and_corrected_poses_are_rendered_on_a_gpu(scene, tmp_path):
+    words = ("--light", "per-view", "--poses", "refine", "--pipeline.model.pose-refinement.lens", "radial")
+    run = trained(scene, tmp_path, "unmix-nerf", *words)
+    done(render, "--run", run, "--cameras", "dataset-train", "--view", 0, "--output", tmp_path / "out")
+
+
+def test_poses_of_line_cameras_are_corrected_on_a_gpu(monkeypatch):
+    given, knots = cameras(), Knots.of(cameras())
+    with gpu(monkeypatch) as device:
+        poses, there = PoseRefinement(knots.rows, "radial").to(device), given.to(device)
+        poses.begin(knots.positions(given), box_around(MIDDLE), 0.02)
+        views = torch.arange(len(given), device=device)
+        rays = there.generate_rays(views, torch.full((len(given), 2), 3.5, device=device))
+        steps = poses.free_steps()
+        moved = poses(rays, there, steps, 1 / poses.robust.weights[poses.nearest_knots(rays)])
+        (moved.directions.sum() + poses.penalty(steps)).backward()
+        assert poses.steps.grad is not None
+        poses.undo_runaways()
+        found = poses.refined(given)
+        assert_close(found.camera_to_world, given.camera_to_world, atol=1e-5, rtol=0)
 
 
 @pytest.mark.usefixtures("on_gpu")

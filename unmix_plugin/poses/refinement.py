@@ -172,7 +172,7 @@ class PoseRefinement(nn.Module):
     @torch.no_grad()
     def begin(self, positions: Float[Tensor, "M 3"], box: SceneBox, pixel_size: float) -> None:
         """Take in where the cameras stand at the knots, the scene, and how large a pixel is at its middle."""
-        offsets = positions - box.aabb.mean(dim=0)
+        offsets = (positions - box.aabb.mean(dim=0)).to(self.shares)
         distances = offsets.norm(dim=1).clamp(min=1e-6)
         self.reach.copy_(self.shares * distances)
         self.scale.copy_((pixel_size / distances / _COARSEST_PIXEL).clamp(max=1.0))
@@ -250,7 +250,8 @@ class PoseRefinement(nn.Module):
         row and at the ends."""
         own, steps = self.lens.of(cameras.to(self.steps.device)), self.free_steps()
         middles = 0.5 * self.steps.new_tensor([own.size(index)[1] for index in range(len(own))])
-        moved = replace(own, camera_to_world=self._moved(own, steps, torch.arange(len(own)), middles))
+        views = torch.arange(len(own), device=middles.device)
+        moved = replace(own, camera_to_world=self._moved(own, steps, views, middles))
         if own.key_poses is not None:
             keys = [self._keys(own, steps, view) for view in range(len(own))]
             moved = replace(moved, key_poses=KeyPoses.join(keys))

@@ -51,6 +51,7 @@ def unmix_scene(
         )
     materials = replace(materials, endmembers=frozen[id(model.endmembers)], specular_spectra=specular)
     gains = copy.deepcopy(model.view_gains, frozen)  # type: ignore[arg-type]
+    views = torch.arange(model.metadata["num_train_views"], device=model.device)
     return TrainedScene(
         copy.deepcopy(model.field, frozen).eval(),  # type: ignore[arg-type]
         with_cells(model.renderer, torch.clone),
@@ -64,7 +65,7 @@ def unmix_scene(
             *(["gain"] if model.view_gains is not None else []),
         ),
         scale=recorded_scale(record.summary),
-        view_gains=None if gains is None else gains(torch.arange(len(gains.log_gains)), gains.terms).cpu(),
+        view_gains=None if gains is None else gains(views, gains.terms).cpu(),
     )
 
 
