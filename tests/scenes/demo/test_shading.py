@@ -32,6 +32,8 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
     assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None], PLACEMENTS) == 0
+    before_the_apple = shadow + 0.01 * (LAMP - shadow)
+    assert _direct_light(shadow[None], row(0, 0, 1), before_the_apple[None], PLACEMENTS) > 0
 
 
 def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():

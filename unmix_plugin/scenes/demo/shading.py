@@ -281,9 +281,8 @@ def _direct_light(
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamps - points
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
-    # The segment to the lamp has length 1 here: nothing of the scene lies beyond the lamp.
-    blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
-    return np.where(np.isfinite(blocked), 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
+    blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)  # the lamp is 1 away, a ceiling farther
+    return np.where(blocked < 1, 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 
 def _sky_light(points: Points, normals: Points, thing: Thing, things: Sequence[Thing]) -> PerPoint:
