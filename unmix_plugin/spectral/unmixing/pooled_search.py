@@ -5,8 +5,9 @@ differ, archetypes where materials meet in sharp edges, corners where noise or a
 where nothing is pure. And each scatters with chance. So many sets of K spectra are made, by all of them, and one is
 chosen by a measure that knows neither the scene nor the search: a good set explains pixels as mixtures of any number
 (reconstruction), does so with two (sparsity), and lies where there are pixels (each is near one of them). Of sets that
-do about as well, that is chosen which most searches found, and it is averaged with those that are nearly the same:
-chance decides less. The measure only chooses among whole sets, since a free minimum does not look like real materials.
+do about as well, that is chosen whose spectra most searches found, and it is averaged with those that are nearly the
+same: chance decides less. The measure only chooses among whole sets, as a free minimum does not look like real
+materials.
 
 Archetypes are convex mixtures of pixels of which convex mixtures make up all pixels (A. Cutler and L. Breiman,
 Technometrics 36(4), 1994), found by entropic descent, several runs at once on few pixels each (A. Zouaoui et al.,
@@ -62,12 +63,12 @@ _STEP_SIZES = (16.0, 64.0)
 _SETS_KEPT = 5
 _NEARNESS = 0.2
 """What the distance to the nearest endmember counts in the measure."""
-_REPEATS = 2
-"""Times that all searches are run: with once, chance decides more, and landscapes are a tenth farther off."""
+_REPEATS = 4
+"""Times that all searches are run: with two, chance decides twice as much."""
 _ABOUT_AS_WELL = 0.03
 """Share of the smallest misfit by which others may be larger: less than chance makes of it."""
-_SIMILAR_SET = 0.08
-"""Mean angle in radians up to which a set speaks for another."""
+_SIMILAR = 0.08
+"""Angle in radians between spectra beyond which one hardly speaks for the other."""
 _SAME_SET = 0.06
 """Mean angle in radians up to which two sets are the same materials."""
 
@@ -96,17 +97,21 @@ def pooled_search(
     directions = torch.linalg.eigh((shapes.T @ shapes).double()).eigenvectors.flip(1)
     axes = directions[:, : 3 * num_endmembers + 10].to(shapes)
     shapes = shapes @ axes
-    measured = torch.randperm(len(pixels), generator=generator)[:_NUM_MEASURED].to(pixels.device)
-    lengths = pixels[measured].norm(dim=1).double()
+    lengths = pixels.norm(dim=1).double()
     weights = (lengths / (_DARK * lengths.quantile(0.95))).clamp(max=1).sqrt()
-    seen = normalize(shapes[measured].double(), dim=1)
-    judges, their_weights = seen[:_NUM_JUDGES], weights[:_NUM_JUDGES]
+
+    def drawn(count: int) -> tuple[Tensor, Tensor]:
+        """Some unit spectra and what they weigh."""
+        rows = torch.randperm(len(pixels), generator=generator)[:count].to(pixels.device)
+        return normalize(shapes[rows].double(), dim=1), weights[rows]
+
+    measured = drawn(_NUM_MEASURED)
     sets: list[Tensor] = []
-    for _ in range(_REPEATS):
-        sets += _pair_sets(shapes, judges, their_weights, num_endmembers, generator)
+    for _ in range(_REPEATS):  # with judges of their own: errors of the same few pixels would not cancel
+        sets += _pair_sets(shapes, *drawn(_NUM_JUDGES), num_endmembers, generator)
         sets += _archetypes(shapes, num_endmembers, generator)
         sets += _corners_and_clusters(shapes, num_endmembers, generator)
-    sets = _ranked([normalize(found.double(), dim=1) for found in sets], seen, weights)
+    sets = _ranked([normalize(found.double(), dim=1) for found in sets], *measured)
     spectra = torch.stack([_averaged(sets), *sets[:_SETS_KEPT]]) @ axes.T.double()
     spectra = normalize(spectra.clamp(min=0), dim=-1).to(pixels.dtype)
     return PooledEndmembers(spectra[0], spectra[1:])
@@ -121,9 +126,9 @@ def _pair_sets(
 ) -> list[Float[Tensor, "K d"]]:
     """Sets whose pairs pass near the pixels: of several draws of cluster means, and of the winners together."""
 
-    def searched(candidates: Tensor, price: float) -> Tensor:
+    def searched(candidates: Tensor, *prices: float) -> list[Tensor]:
         distances = distances_to_pairs(seen, candidates).pow_(_POWER).mul_(weights)
-        return candidates[PairSearch(distances, price).best_sets(num_endmembers)[-1]]
+        return [candidates[PairSearch(distances, price).best_sets(num_endmembers)[-1]] for price in prices]
 
     draws = []
     for price in _PURITY_PRICES:
@@ -132,9 +137,8 @@ def _pair_sets(
         few = few if count >= num_endmembers else shapes
         count = max(count, num_endmembers)
         means = normalised_kmeans(few, count, generator, restarts=1, max_iterations=10)[0]
-        draws.append(searched(normalize(means.double(), dim=1), price))
-    together = torch.cat(draws)
-    return [*draws, *(searched(together, price) for price in _POOLED_PRICES)]
+        draws += searched(normalize(means.double(), dim=1), price)
+    return draws + searched(torch.cat(draws), *_POOLED_PRICES)
 
 
 def _corners_and_clusters(
@@ -197,8 +201,7 @@ def _ranked(
     order = sorted(range(len(sets)), key=misfits.__getitem__)
     good = [index for index in order if misfits[index] <= (1 + _ABOUT_AS_WELL) * misfits[order[0]]]
     matched = {index: [_matched(sets[index], other) for other in sets] for index in good}
-    # Of equally many the first has the smallest misfit.
-    chosen = max(good, key=lambda index: int((_angles(matched[index], sets[index]) < _SIMILAR_SET).sum()))
+    chosen = max(good, key=lambda index: _support(matched[index], sets[index]))
     return [matched[chosen][index] for index in (chosen, *(index for index in order if index != chosen))]
 
 
@@ -207,6 +210,12 @@ def _matched(best: Float[Tensor, "K d"], other: Float[Tensor, "K d"]) -> Float[T
     from scipy.optimize import linear_sum_assignment
 
     return other[linear_sum_assignment(-(best @ other.T).cpu().numpy())[1]]
+
+
+def _support(sets: list[Float[Tensor, "K d"]], of: Float[Tensor, "K d"]) -> float:
+    """How many spectra of the sets speak for one of a set's, those that are not quite alike in part."""
+    angles = (torch.stack(sets) * of).sum(dim=-1).clamp(-1, 1).arccos()
+    return float(torch.exp(-((angles / _SIMILAR) ** 2)).sum())
 
 
 def _angles(sets: list[Float[Tensor, "K d"]], to: Float[Tensor, "K d"]) -> Float[Tensor, "S"]:

@@ -141,7 +141,8 @@ class PairSearch:
 
     def _distances(self, chosen: list[int]) -> Float[Tensor, " N"]:
         """Of each pixel to the nearest pair."""
-        return self._pairs[chosen][:, chosen].flatten(0, 1).amin(dim=0)
+        members = torch.tensor(chosen)
+        return self._pairs[members[:, None], members].flatten(0, 1).amin(dim=0)
 
     def _improved(self, chosen: list[int]) -> list[int]:
         """Each member swapped for the best candidate in its place, until no swap helps."""
@@ -162,7 +163,7 @@ class PairSearch:
         """The cost if a candidate joined, for every candidate."""
         if not chosen:
             return (1 + self._price) * self._alone.mean(dim=1)
-        with_one = torch.minimum(self._alone, self._pairs[:, chosen].amin(dim=1))
+        with_one = torch.minimum(self._alone, self._pairs[chosen].amin(dim=0))  # both ways are the same
         nearest = torch.minimum(with_one, self._distances(chosen))
         single = torch.minimum(self._alone, self._alone[chosen].amin(dim=0))
         return nearest.add_(single, alpha=self._price).mean(dim=1)
