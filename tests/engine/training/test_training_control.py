@@ -256,6 +256,13 @@ def test_a_paused_training_saves_when_asked_and_not_otherwise(short_config):
     assert sorted(checkpoint_steps(trainer.run.checkpoints)) == [3, 7, 12]
 
 
+def test_a_save_asked_for_at_a_step_that_saves_anyway_is_made_once(short_config):
+    trainer = quiet_trainer(replace(short_config, steps_per_save=4, checkpoints_kept=9))
+    call_after_step(trainer, 4, trainer.control.request_save)
+    trainer.train()
+    assert sorted(checkpoint_steps(trainer.run.checkpoints)) == [4, 8, 12]
+
+
 @pytest.mark.parametrize("is_paused", [False, True])
 def test_a_stop_ends_training_as_ctrl_c_does_and_it_can_go_on(short_config, is_paused):
     trainer = quiet_trainer(short_config)

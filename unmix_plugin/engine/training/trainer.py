@@ -223,7 +223,7 @@ class Trainer:
             written["rays_per_second"] = record.train_rays_per_second
             written["skipped_steps"] = float(record.skipped_steps)
             self.writer.write(self.step, self.seconds, "train", written)
-        if self._is_time_for(self.config.steps_per_save) or self.control.take_save_request():
+        if self.control.take_save_request() or self._is_time_for(self.config.steps_per_save):
             self.save()
         if self._is_time_for(self.config.steps_per_eval_all_images):
             with nullcontext() if self.average is None else self.average.swapped_in():
