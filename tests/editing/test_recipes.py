@@ -220,7 +220,13 @@ def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multip
 
 @pytest.mark.parametrize(
     ("kind", "values"),
-    [(Retint, (1, (0.0, 0.0, 0.0), None)), (Retint, (1, None)), (Scale, (1, None)), (Rename, (1, None))],
+    [
+        (Retint, (1, (0.0, 0.0, 0.0), None)),
+        (Retint, (1, None)),
+        (Scale, (1, None)),
+        (Rename, (1, None)),
+        (Replace, (None, "x/y")),
+    ],
 )
 def test_an_edit_made_in_python_without_a_value_is_refused(kind: Any, values):
     with pytest.raises((ConfigError, TypeError)):  # of a checker of types, where one runs

@@ -9,7 +9,7 @@ import pytest
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.viewer.access import TrainingViewerOptions, ViewerOptions, free_port, start_notices
 
-ELSEWHERE = {"UNMIX_VIEWER_TOKEN": "barley"}
+ELSEWHERE = {"UNMIX_VIEWER_TOKEN": "barley\n"}
 
 
 def test_a_free_port_is_taken_as_it_is_zero_means_any_and_when_none_near_is_free_that_is_said(monkeypatch):

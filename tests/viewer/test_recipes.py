@@ -159,3 +159,15 @@ def test_changes_of_the_same_thing_in_quick_succession_are_undone_together():
     history.redone()
     history.take(with_change(history.present, Scale(0, 5.0)), (Scale, 0))  # after an undo: by itself
     assert history.undone() == Recipe((Scale(0, 1.3),))
+    for factor in (4.0, 1.3):  # there and back again leaves nothing to undo
+        history.take(with_change(history.present, Scale(0, factor)), (Scale, 0))
+    assert history.undone() == Recipe()
+
+
+def test_as_many_edits_are_kept_as_a_recipe_file_may_hold():
+    edits = (
+        Scale(0, 5.0),
+        *(Scale(number, 2.0) for number in range(1, 255)),
+        *(Swap(0, 1), Swap(1, 2)) * 370,
+    )
+    assert with_change(Recipe(edits), Gloss(None, 0.5)).operations == (*edits, Gloss(None, 0.5))

@@ -92,6 +92,7 @@ class Replace(Operation):
     """Hold the outermost values in bands that the measured reflectance does not reach."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if (self.library is None) == (self.file is None):
             raise ConfigError("give either library or file")
         if self.library is not None and self.spectrum is not None:

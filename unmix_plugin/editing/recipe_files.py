@@ -39,7 +39,7 @@ from unmix_plugin.spectral.colour.conversion import parse_light
 
 _MOST_CHARACTERS = 100_000
 """PyYAML reads about 60,000 characters a second."""
-_MOST_EDITS = 1000
+MOST_EDITS = 1000
 _MOST_ENDMEMBERS = 255
 """That one edit may name; no run has more."""
 _LONGEST_NUMBER, _LONGEST_QUOTE = 40, 60
@@ -84,7 +84,7 @@ def recipe_from_yaml(text: str, source: str = "recipe", folder: Path = Path()) -
             raise _NodeError(document, "a recipe needs edits or an illuminant")
         if "illuminant" in parts:
             light = _read_light(parts["illuminant"], folder.absolute())
-        for node in _sequence(parts["edits"], "edits", _MOST_EDITS) if "edits" in parts else []:
+        for node in _sequence(parts["edits"], "edits", MOST_EDITS) if "edits" in parts else []:
             try:
                 operations.append(_read_edit(node, folder.absolute()))
             except _NodeError as error:  # noqa: PERF203 - one message names every fault

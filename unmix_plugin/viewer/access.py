@@ -53,7 +53,7 @@ class ViewerOptions:
                 raise ConfigError(
                     f"{TOKEN_VARIABLE} is empty; unset it or give a word that others can't guess"
                 )
-            return word
+            return word and word.strip()
         if not self.token.startswith("@"):
             return self.token
         path = Path(self.token[1:])

@@ -24,11 +24,11 @@ from unmix_plugin.editing import (
     Scale,
     Swap,
 )
+from unmix_plugin.editing.recipe_files import MOST_EDITS
 
 _ChangeT = TypeVar("_ChangeT", bound=Operation)
 
 _MOST_UNDONE = 200
-_MOST_OPERATIONS = 500
 _ONE_EDIT_S = 2.0
 """Changes of the same thing in quicker succession, as while a slider is dragged, are undone together."""
 
@@ -53,8 +53,11 @@ class RecipeHistory:
         now, (last_subject, changed_at) = self._clock(), self._last_change
         goes_on = subject is not None and subject == last_subject and now - changed_at <= _ONE_EDIT_S
         before = self._recipes[: self._index if goes_on else self._index + 1]
-        self._recipes = [*before[-_MOST_UNDONE:], recipe]
-        self._index, self._last_change = len(self._recipes) - 1, (subject, now)
+        is_back = before[-1:] == [
+            recipe
+        ]  # dragged to where it was: nothing to undo, and the next change is its own
+        self._recipes = [*before[-_MOST_UNDONE:], *([] if is_back else [recipe])]
+        self._index, self._last_change = len(self._recipes) - 1, (None if is_back else subject, now)
 
     def undone(self) -> Recipe | None:
         """Go back by one; None at the beginning."""
@@ -165,4 +168,4 @@ def _changes_of(recipe: Recipe, endmember: str | int | None) -> list[int]:
 
 
 def _with_operations(recipe: Recipe, operations: Iterable[Operation]) -> Recipe:
-    return replace(recipe, operations=tuple(operations)[-_MOST_OPERATIONS:])
+    return replace(recipe, operations=tuple(operations)[-MOST_EDITS:])
