@@ -25,6 +25,7 @@ from unmix_plugin.formats.libraries import library_of
 from unmix_plugin.products.product import Job
 from unmix_plugin.products.regions import measured_surface
 from unmix_plugin.products.scene_products import Spectrum
+from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.scenes.scene import Scene
 from unmix_plugin.spectral.library.spectra_csv import SpectraTable, write_spectra_csv
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Materials
@@ -163,10 +164,10 @@ def _over_views(job: Job, scene: Scene | None, probe: Probe) -> Float[np.ndarray
     spectra = []
     for view in job.follow("looking at the place", job.views("train")):
         index, camera = numbers.get(view.name), view.camera.to("cpu")
-        coords, depths = camera.project(place[None], 0)
-        (column, row), (width, height) = coords[0].floor().long().tolist(), camera.size(0)
-        if index is None or depths[0] <= 0 or not (0 <= column < width and 0 <= row < height):
+        coords, depths, inside = look_up(camera, 0, place[None])
+        if index is None or not inside[0]:
             continue
+        column, row = coords[0].long().tolist()
         seen = job.scene.probe(camera, column, row)
         near = _SAME_PLACE_PX * float(depths[0] / camera.focal_px[0].min())
         if seen.position is None or np.linalg.norm(seen.position - probe.position) > near:

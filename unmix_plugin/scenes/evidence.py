@@ -206,7 +206,7 @@ def _overlaps(scene: Scene, sensors: list[int], reachable: Cells) -> list[tuple[
     points = scene.scene_box.aabb[0] + unit * scene.scene_box.size
     seen = {sensor: np.zeros(len(points), bool) for sensor in sensors}
     for view in scene.train_indices:
-        seen[scene.frames[view].sensor] |= look_up(scene.cameras, view, points)[1].numpy()
+        seen[scene.frames[view].sensor] |= look_up(scene.cameras, view, points)[2].numpy()
     found = []
     for sensor, own in seen.items() if len(sensors) > 1 else ():
         others = np.any([seen[other] for other in sensors if other != sensor], axis=0)

@@ -24,6 +24,7 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import numbered_apart
+from unmix_plugin.scenes.geometry.views import look_up
 from unmix_plugin.spectral.colour.conversion import describe_colour, rgb_matrix
 from unmix_plugin.spectral.colour.srgb import encode_srgb
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION, Coefficients, Materials
@@ -154,9 +155,7 @@ def in_image(
     camera: Cameras, positions: Float[Tensor, "P 3"]
 ) -> tuple[Bool[Tensor, " P"], Float[Tensor, "inside 2"], Float[Tensor, " inside"]]:
     """Which points are in a camera's image; of these the places in it, pixels, and the depths."""
-    coords, depths = camera.project(positions, 0)
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depths > 0) & (coords >= 0).all(dim=-1) & (coords < size).all(dim=-1)
+    coords, depths, inside = look_up(camera, 0, positions)
     return inside, coords[inside], depths[inside]
 
 

@@ -365,7 +365,7 @@ def count_views(cameras: Cameras, points: Float[Tensor, "P 3"]) -> Int64[Tensor,
     """How many cameras see each point."""
     count = torch.zeros(len(points), dtype=torch.int64)
     for index in range(len(cameras)):
-        count += look_up(cameras, index, points)[1]
+        count += look_up(cameras, index, points)[2]
     return count
 
 

@@ -119,7 +119,7 @@ def _looked_up(
     cameras: Cameras, index: int, image: Float[np.ndarray, "H W"], places: Places, hull: Cells, box: SceneBox
 ) -> Float[Tensor, " P"]:
     """What a view shows of the places, NaN where it does not see them."""
-    coords, inside = look_up(cameras, index, places.positions)
+    coords, _, inside = look_up(cameras, index, places.positions)
     towards = torch.nn.functional.normalize(cameras.camera_to_world[index, :, 3] - places.positions, dim=-1)
     inside &= (towards * places.normals).sum(dim=-1) > _LEAST_FACING
     inside &= ~_is_hidden(places.positions, towards, hull, box)

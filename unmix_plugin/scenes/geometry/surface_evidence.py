@@ -205,7 +205,7 @@ def _looked_up(
     cameras: Cameras, view: int, points: Float[Tensor, "P 3"], distances: Float[Tensor, "h w"], stride: int
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:
     """Of the pixel that a point falls on: the least distance of those around it, its own, and the point's."""
-    pixels, is_seen = look_up(cameras, view, points)
+    pixels, _, is_seen = look_up(cameras, view, points)
     least = -torch.nn.functional.max_pool2d(-distances[None], 3, stride=1, padding=1)[0]
     columns, rows = (pixels / stride).nan_to_num(0.0).clamp(0.0, 1e6).long().unbind(-1)
     rows, columns = rows.clamp(max=len(distances) - 1), columns.clamp(max=distances.shape[1] - 1)

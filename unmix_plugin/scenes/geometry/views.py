@@ -99,11 +99,11 @@ class ThinnedViews:
 
 def look_up(
     cameras: Cameras, view: int, points: Float[Tensor, "P 3"]
-) -> tuple[Float[Tensor, "P 2"], Bool[Tensor, " P"]]:
-    """Where points are in a view, pixels, and whether they lie within it and before its camera."""
+) -> tuple[Float[Tensor, "P 2"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
+    """Where points are in a view, pixels, their depths, and whether they lie within it and before its camera."""
     coords, depths = cameras.project(points, view)
     size = torch.tensor(cameras.size(view))
-    return coords, (depths > 0) & ((coords >= 0) & (coords < size)).all(dim=-1)
+    return coords, depths, (depths > 0) & ((coords >= 0) & (coords < size)).all(dim=-1)
 
 
 def choose_neighbours(
