@@ -202,17 +202,16 @@ def fit_surfaces(features: Features, known: Mask, brightest: float) -> FittedVie
 def _of_corners(surfaces: list[_Surface], features: Features) -> list[_Surface]:
     """Of several surfaces those that show in most of a corner: a seam leaves one on either side, but what an edge of
     the picture cuts off between two corners, such as the foot of an object, stands before the backdrop."""
-    terms = _terms(features.shape[:2])
-    values = np.array([(terms @ each.coefficients).reshape(features.shape) for each in surfaces])
-    away = [norm(features - value) / each.tolerance for value, each in zip(values, surfaces, strict=True)]
+    if len(surfaces) < 2:
+        return surfaces
+    terms, has_corner = _terms(features.shape[:2]).reshape(*features.shape[:2], -1), [False] * len(surfaces)
     rows, columns = (max(1, round(BORDER_SHARE * side)) for side in features.shape[:2])
-    corners = [np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]]
-    kept = [
-        surface
-        for surface, own in zip(surfaces, away, strict=True)
-        if any(((own <= 1) & (own <= np.min(away, axis=0)))[corner].mean() > 0.5 for corner in corners)
-    ]
-    return kept or surfaces
+    for corner in (np.s_[y, x] for y in np.s_[:rows, -rows:] for x in np.s_[:columns, -columns:]):
+        seen, own = features[corner], terms[corner]
+        away = np.array([norm(seen - own @ each.coefficients) / each.tolerance for each in surfaces])
+        shares = ((away <= 1) & (away <= away.min(axis=0))).mean(axis=(1, 2))
+        has_corner = [has or share > 0.5 for has, share in zip(has_corner, shares.tolist(), strict=True)]
+    return [one for one, has in zip(surfaces, has_corner, strict=True) if has] or surfaces
 
 
 def _border_surfaces(

@@ -157,12 +157,15 @@ class Cameras:
         """Rays of cameras (int64) through points of their images, lens distortion undone; x, y in pixels, the centre of
         column c, row r is (c + 0.5, r + 0.5)."""
         coords = (pixel_coords - self.center_px[camera_indices]) / self.focal_px[camera_indices]
-        bending = self.distortion[camera_indices]
+        is_frame: Tensor | None = None
         if self.key_poses is not None:
             is_frame = ~self.key_poses.is_line[camera_indices][:, None]
             coords = torch.cat([coords[:, :1], coords[:, 1:].where(is_frame, 0.0)], dim=1)
-            bending = torch.cat([bending[:, :2], bending[:, 2:3].where(is_frame, 0.0), bending[:, 3:]], dim=1)
         if self.is_distorted:
+            bending = self.distortion[camera_indices]
+            if is_frame is not None:
+                p1 = bending[:, 2:3].where(is_frame, 0.0)
+                bending = torch.cat([bending[:, :2], p1, bending[:, 3:]], dim=1)
             coords = undistort(coords, bending)
         local = torch.stack([coords[:, 0], -coords[:, 1], -torch.ones_like(coords[:, 0])], dim=-1)
         poses = self.poses_at(camera_indices, pixel_coords[:, 1])

@@ -207,12 +207,8 @@ def _parts(path: Path) -> list[tuple[Any, np.ndarray]]:
     if path.suffix.lower() in (".glb", ".gltf"):
         _check_gltf(path)
     try:
-        if path.suffix.lower() == ".obj":
-            _check_corners(path)
+        is_whole = path.suffix.lower() == ".obj" and not _has_corner_normals(path)
         beside = cast("Any", _Beside(path.parent))
-        # Where corners of an OBJ have normals of their own, vertices are split: in the file's order trimesh would give
-        # them the normal at the mean of the indices. Without normals they stay whole, and smooth at seams of texture.
-        is_whole = path.suffix.lower() == ".obj" and b"\nvn " not in path.read_bytes()
         scene = trimesh.load_scene(path, resolver=beside, process=False, maintain_order=is_whole)
         placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
         for mesh in scene.geometry.values():
@@ -278,13 +274,15 @@ def _check_gltf(path: Path) -> None:
         )
 
 
-def _check_corners(path: Path) -> None:
-    """Refuse an OBJ whose corners count from 0: trimesh takes the last vertex for it."""
-    with open_regular(path) as file:
-        found = _CORNER_0.search(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    if found is not None:
-        line = found[0].decode("ascii", "replace").strip()
-        raise SceneError(f"{path}: '{line}' names vertex 0; an OBJ counts from 1: export the mesh again")
+def _has_corner_normals(path: Path) -> bool:
+    """Whether an OBJ has normals, so that vertices are split: in the file's order trimesh would give them the normal at
+    the mean of the indices. Without, they stay whole, and smooth at seams of texture. Refuses an OBJ whose corners
+    count from 0: trimesh takes the last vertex for it."""
+    with open_regular(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as text:
+        if found := _CORNER_0.search(text):
+            line = found[0].decode("ascii", "replace").strip()
+            raise SceneError(f"{path}: '{line}' names vertex 0; an OBJ counts from 1: export the mesh again")
+        return text.find(b"\nvn ") >= 0
 
 
 def _check_lengths(path: Path, elements: Mapping[str, Any]) -> None:
