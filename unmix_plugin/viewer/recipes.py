@@ -53,11 +53,13 @@ class RecipeHistory:
         now, (last_subject, changed_at) = self._clock(), self._last_change
         goes_on = subject is not None and subject == last_subject and now - changed_at <= _ONE_EDIT_S
         before = self._recipes[: self._index if goes_on else self._index + 1]
-        is_back = before[-1:] == [
+        if before[-1:] == [
             recipe
-        ]  # dragged to where it was: nothing to undo, and the next change is its own
-        self._recipes = [*before[-_MOST_UNDONE:], *([] if is_back else [recipe])]
-        self._index, self._last_change = len(self._recipes) - 1, (None if is_back else subject, now)
+        ]:  # dragged to where it was: nothing to undo, and the next change is its own
+            del before[-1]
+            subject = None
+        self._recipes = [*before[-_MOST_UNDONE:], recipe]
+        self._index, self._last_change = len(self._recipes) - 1, (subject, now)
 
     def undone(self) -> Recipe | None:
         """Go back by one; None at the beginning."""

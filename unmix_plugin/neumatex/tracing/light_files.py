@@ -116,11 +116,12 @@ def _light_of_exr(path: Path, bands: Bands | None) -> tuple[np.ndarray, bool]:
 
     try:
         names = channel_names(path)
-        values, _, nm = (None, [], None) if bands is None else read_exr(path)
-        if bands is not None and values is not None and nm is not None:
-            order = np.argsort(nm)
-            spectra = resample_spectra(values[..., order].astype(np.float64), Bands(nm[order]), bands)
-            return spectra.astype(np.float32), True
+        if bands is not None:
+            values, _, nm = read_exr(path)
+            if nm is not None:
+                order = np.argsort(nm)
+                spectra = resample_spectra(values[..., order].astype(np.float64), Bands(nm[order]), bands)
+                return spectra.astype(np.float32), True
         colours = next((colours for colours in ("RGB", "Y") if set(colours) <= set(names)), None)
         if colours is None:
             raise SceneError(f"{path}: has channels {', '.join(names)}; an environment map needs R, G and B")

@@ -281,9 +281,8 @@ def _direct_light(
     """Irradiance of each point from one of the lamp's: 0 in the shadow of `placements`, no fall-off with distance."""
     towards_lamp = lamps - points
     cosines = (dot(towards_lamp, normals) / np.sqrt(dot(towards_lamp, towards_lamp))).clip(0)
-    blocked, _ = first_hits(
-        placements, points + 1e-3 * normals, towards_lamp
-    )  # the lamp is 1 away, a ceiling farther
+    # The segment to the lamp has length 1: a ceiling lies farther away.
+    blocked, _ = first_hits(placements, points + 1e-3 * normals, towards_lamp)
     return np.where(blocked < 1, 0, _LAMP_IRRADIANCE * cosines).astype(np.float32)
 
 

@@ -214,17 +214,16 @@ def _matched(best: Float[Tensor, "K d"], other: Float[Tensor, "K d"]) -> Float[T
 
 def _support(sets: list[Float[Tensor, "K d"]], of: Float[Tensor, "K d"]) -> float:
     """How many spectra of the sets speak for one of a set's, those that are not quite alike in part."""
-    angles = (torch.stack(sets) * of).sum(dim=-1).clamp(-1, 1).arccos()
-    return float(torch.exp(-((angles / _SIMILAR) ** 2)).sum())
+    return float(torch.exp(-((_angles(sets, of) / _SIMILAR) ** 2)).sum())
 
 
-def _angles(sets: list[Float[Tensor, "K d"]], to: Float[Tensor, "K d"]) -> Float[Tensor, "S"]:
-    """Mean angle of the spectra of each set to those of another."""
-    return (torch.stack(sets) * to).sum(dim=-1).clamp(-1, 1).arccos().mean(dim=-1)
+def _angles(sets: list[Float[Tensor, "K d"]], to: Float[Tensor, "K d"]) -> Float[Tensor, "S K"]:
+    """Of the spectra of each set to those of another."""
+    return (torch.stack(sets) * to).sum(dim=-1).clamp(-1, 1).arccos()
 
 
 def _averaged(sets: list[Float[Tensor, "K d"]]) -> Float[Tensor, "K d"]:
     """Mean of the first set and of others that are nearly the same."""
-    is_same = _angles(sets, sets[0]) < _SAME_SET
+    is_same = _angles(sets, sets[0]).mean(dim=-1) < _SAME_SET
     is_same[0] = True  # by rounding, a set has a small angle to itself
     return normalize(torch.stack(sets)[is_same].mean(dim=0), dim=1)
