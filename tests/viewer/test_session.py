@@ -40,6 +40,8 @@ def test_a_reload_keeps_camera_layer_and_edits_and_another_browser_starts_anew(v
         page.wait_until(lambda: len(decoded(page.last_picture)) == 24)
         time.sleep(0.5)  # the edit can reach the picture after the layer
         before = decoded(page.last_picture)
+    while viewer.num_clients:
+        time.sleep(0.01)
     with page_of(viewer, storage=storage) as page:
         page.look_from(0.3)
         page.wait_until(lambda: bool(page.pictures) and len(decoded(page.last_picture)) == 24)

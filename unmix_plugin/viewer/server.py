@@ -170,8 +170,8 @@ class Viewer:
         with self._lock:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
+            self._kept_pages.leave(session.browser, session.state)  # first, since a reload may be back by now
             session.close()
-            self._kept_pages.leave(session.browser, session.state)
 
     def _tick(self) -> None:
         while not self._stopped.wait(_TICK_S):

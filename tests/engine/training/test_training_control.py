@@ -151,13 +151,32 @@ def test_a_turn_of_training_that_has_not_begun_comes_after_the_guests_turn_under
 
     with device.guest_turn():
         training = in_background(warm_up)
-        while device._waiting["training"] == 0:
+        while not device._waiting["training"]:
             time.sleep(0)
     for _ in range(3):
         with device.guest_turn():
             order.append("guest")
     training.join(120)
     assert order == ["training", "guest", "guest", "guest"]
+
+
+def test_guests_have_their_turns_in_the_order_in_which_they_asked():
+    device, order = DeviceShare(), []
+
+    def draw(name, pictures):
+        for _ in range(pictures):
+            with device.guest_turn():
+                order.append(name)
+                time.sleep(0.005)
+
+    with device.guest_turn():
+        guests = []
+        for name in ("page", "picture"):
+            guests.append(in_background(lambda name=name: draw(name, 5)))
+            wait_for(lambda: len(device._waiting["guest"]) == len(guests))
+    for guest in guests:
+        guest.join(120)
+    assert order == ["page", "picture"] * 5
 
 
 def wait_for(holds, timeout_s=120.0):

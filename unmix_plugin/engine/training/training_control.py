@@ -23,7 +23,7 @@ _LARGEST_CREDIT_S = 0.25
 class DeviceShare:
     """Lets training and others compute by turns, so that they never meet on the device or in the weights.
 
-    Turns do not nest.
+    Turns do not nest, and guests have theirs in the order in which they asked.
 
     While training runs, each second of it earns the guest share / (1 - share) seconds of credit. A guest with credit
     goes before the next training step, one without waits. Before training runs, and while it is paused, a guest needs
@@ -39,7 +39,7 @@ class DeviceShare:
         self._turn = threading.Condition()
         self._owner: int | None = None
         self._is_training = False
-        self._waiting = {"training": 0, "guest": 0}
+        self._waiting: dict[str, list[object]] = {"training": [], "guest": []}
         self._last = "training"
         self._credit_s = _LARGEST_CREDIT_S
         self.guest_share = guest_share
@@ -97,11 +97,11 @@ class DeviceShare:
 
     @property
     def _guest_goes_first(self) -> bool:
-        return self._waiting["guest"] > 0 and self.guest_may_go and not self._training_goes_first
+        return bool(self._waiting["guest"]) and self.guest_may_go and not self._training_goes_first
 
     @property
     def _training_goes_first(self) -> bool:
-        return self._waiting["training"] > 0 and self._last == "guest" and not self._is_training
+        return bool(self._waiting["training"]) and self._last == "guest" and not self._is_training
 
     @contextmanager
     def _turn_of(
@@ -110,11 +110,13 @@ class DeviceShare:
         with self._turn:
             if self._owner == threading.get_ident():
                 raise RuntimeError("this thread has the device already: turns do not nest")
-            self._waiting[who] += 1
+            queue, place = self._waiting[who], object()
+            queue.append(place)
             try:
-                self._turn.wait_for(lambda: self._owner is None and may_go())
+                self._turn.wait_for(lambda: self._owner is None and queue[0] is place and may_go())
             finally:
-                self._waiting[who] -= 1
+                queue.remove(place)
+                self._turn.notify_all()
             self._owner, self._last = threading.get_ident(), who
         started = time.perf_counter()
         try:

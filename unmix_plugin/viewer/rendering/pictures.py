@@ -9,10 +9,9 @@ Notation: `P` pixels of a view, row after row.
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -229,9 +228,6 @@ RESTING_COST = 6.0
 REFRESH_S = 2.0
 """How long one picture of a client at rest should take while training."""
 
-_LONGEST_WAIT_S = 1.0
-"""How long rendering waits for pages that ask for the device."""
-
 _TRACE_OPACITY = 0.25
 """Opacity under which a pixel counts as empty once materials are removed."""
 
@@ -252,7 +248,6 @@ class PictureMaker:
             self.aids = SceneAids(source, is_mixed)
             numbers = _num_channels(scene.materials) if is_mixed else 4 * len(scene.outputs)
         self._largest_pixels = max(256, LARGEST_FRAME_BYTES // (4 * numbers))
-        self._queue, self._num_asking = threading.Condition(), 0
 
     def first_render(self, pose: ViewPose, largest_height: int) -> FrameRender:
         """A small picture, for a camera that moved."""
@@ -282,8 +277,6 @@ class PictureMaker:
 
     def advance(self, render: FrameRender, edit: Edit, num_rays: int, cost: float) -> RenderedView | None:
         """Render a block; the frame if that was the last, an UnmixError if the edit does not fit the run."""
-        with self._queue:
-            self._queue.wait_for(lambda: self._num_asking == 0, _LONGEST_WAIT_S)
         with self.source.borrowed(cost) as scene, torch.no_grad():
             shown = edit.apply(scene, self.source.version, self.aids.see)
             started = time.perf_counter()
@@ -307,19 +300,8 @@ class PictureMaker:
     @contextmanager
     def shown_turn(self, edit: Edit) -> Iterator[tuple[RenderableScene, RenderableScene]]:
         """The same for the scene of any method."""
-        self._ask(1)
-        with ExitStack() as stack:
-            try:
-                scene = stack.enter_context(self.source.borrowed())
-            finally:
-                self._ask(-1)
+        with self.source.borrowed() as scene:
             yield scene, edit.apply(scene, self.source.version, self.aids.see)
-
-    def _ask(self, change: int) -> None:
-        """Note that a page waits for the device, or no longer: otherwise the render loop would take turn after turn."""
-        with self._queue:
-            self._num_asking += change
-            self._queue.notify_all()
 
     def with_materials_of(self, edit: Edit, frame: RenderedView) -> RenderedView:
         """What a frame would be with other materials on the same shapes; an UnmixError if the edit does not fit."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -17,8 +16,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene
 from unmix_plugin.viewer.rendering.pictures import PictureMaker
 from unmix_plugin.viewer.rendering.scene import Edit
 
-_PAUSE_S = 0.002
-"""Between two turns on the device, so that pages which wait for it come in between."""
 _STOP_S = 20.0
 """How long a turn under way is waited for."""
 
@@ -96,7 +93,6 @@ class RunRegions:
     @contextmanager
     def _turn(self) -> Iterator[TrainedScene]:
         """The device and the unedited scene, after pages that wait; a ConfigError once stopped."""
-        time.sleep(_PAUSE_S)
         if self._is_stopping:
             raise ConfigError("the viewer was stopped")
         with self._maker.edit_turn(Edit()) as (scene, _):
