@@ -81,6 +81,8 @@ class EnviLayout:
 def read_header(path: Path) -> dict[str, str]:
     """Values by key; keys in lower case with single spaces, lists without their braces.
 
+    Lines that are no `key = value` are the value of the key "".
+
     Raises:
         ValueError: it is no ENVI header, or a list in it is never closed.
         OSError: it can't be read.
@@ -134,6 +136,8 @@ def _parse_header(text: str) -> dict[str, str]:
         name, equals, value = body[position:end].partition("=")
         position = end + 1
         if not equals or _BRACE.search(name):
+            if line := (name + equals + value).strip():
+                header[""] = "\n".join(filter(None, (header.get(""), line)))
             continue
         key = " ".join(name.lower().replace("_", " ").split())
         opening = re.compile(r"\s*([{[])").match(body, end - len(value))

@@ -334,3 +334,10 @@ def test_gains_of_resonon_are_decibels_and_that_is_said(tmp_path, gain, factor):
     assert evidence == "header field 'gain', taken as decibels, as Resonon writes"
     other = open_spectral_file(write_envi(tmp_path / "b.hdr", cube, "bil", "shutter = 20.0\ngain = 6\n"))
     check_file(other, gain=6.0)
+
+
+def test_lines_of_a_header_without_an_equals_sign_are_said(tmp_path):
+    header = write_envi(tmp_path / "cube.hdr", CUBE.astype("<u2"), "bil")
+    header.write_text(header.read_text() + "; by hand\n\nreflectance scale factor: 10000\n")
+    said = open_spectral_file(header).warnings
+    assert said[-1] == "1 line of the header not read for want of '=': 'reflectance scale factor: 10000'"

@@ -10,7 +10,7 @@ import numpy as np
 
 from unmix_plugin.captures.header_values import check_bands, exposure_facts, listed, state_bands, state_linear
 from unmix_plugin.captures.spectral_file import BandIndex, ReadOptions, SpectralFile, take_part
-from unmix_plugin.errors import CaptureError
+from unmix_plugin.errors import CaptureError, counted
 from unmix_plugin.formats.envi import (
     MAP_KEYS,
     EnviLayout,
@@ -131,6 +131,10 @@ def described_image(header_path: Path) -> Path | None:
 def _described(file: SpectralFile, header_path: Path, header: dict[str, str]) -> SpectralFile:
     """The file with bands, gains, exposure and other facts of a header; what the file says itself fills gaps."""
     num_bands, own, warnings = file.shape[2], file.bands, list(file.warnings)
+    if unread := header.pop("", "").splitlines():
+        warnings.append(
+            f"{counted(len(unread), 'line')} of the header not read for want of '=': {unread[0][:80]!r}"
+        )
     stated = state_bands({key: header[key] for key in _OF_BANDS if key in header}, "header field")
     bands = check_bands(stated, num_bands, warnings)
     if bands.wavelengths_nm is None and own.wavelengths_nm is not None:
