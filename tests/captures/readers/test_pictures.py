@@ -137,6 +137,10 @@ def test_folders_that_are_no_image_are_refused(tmp_path):
     Image.fromarray(RGB).save(tmp_path / "a.png")
     with pytest.raises(CaptureError, match="3 bands; expected one band a file"):
         open_spectral_file(tmp_path)
+    (tmp_path / "transforms.json").write_text("{}")
+    with pytest.raises(CaptureError, match=r"is a scene already.*train on it with unmix-train"):
+        open_spectral_file(tmp_path)
+    (tmp_path / "transforms.json").unlink()
     Image.fromarray(RGB[..., 0]).save(tmp_path / "a.png")
     Image.fromarray(RGB[:3, :, 0]).save(tmp_path / "b.png")
     with pytest.raises(CaptureError, match=r"b.png has 3 x 9 pixels; expected the 6 x 9"):

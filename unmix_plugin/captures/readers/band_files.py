@@ -38,7 +38,12 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
     bands = [open_band(path) for path in sorted(files, key=lambda path: natural_order(path.name))]
     for band in bands:
         if band.shape[2] != 1:
-            raise CaptureError(f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}")
+            found = f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}"
+            if (folder / "transforms.json").is_file():
+                found = (
+                    f"{folder}: is a scene already, as its transforms.json says; train on it with unmix-train"
+                )
+            raise CaptureError(found)
         if (model := radiometric_model(band)) is not None:
             raise CaptureError(
                 f"{band.path}: of one lens of a {model.maker} camera, with a calibration of its own, and bands of "
