@@ -146,6 +146,8 @@ def test_exr_is_read_and_hdr_flat_run_length_coded_and_in_the_old_code(tmp_path)
     (tmp_path / "runs.hdr").write_bytes(_header(image) + b"".join(_run_length_row(row) for row in rgbe))
     flat, runs = (read_environment(tmp_path / name).image for name in ("flat.hdr", "runs.hdr"))
     assert torch.equal(flat, runs)
+    (tmp_path / "crlf.hdr").write_bytes(_header(image).replace(b"\n", b"\r\n") + rgbe.tobytes())
+    assert torch.equal(read_environment(tmp_path / "crlf.hdr").image, flat)
     brightest = torch.from_numpy(image).max(dim=-1, keepdim=True).values
     assert bool(((flat - torch.from_numpy(image)).abs() <= brightest / 128).all())
     rgbe[3, 0] = 2, 2, 200, 120  # the mark of a coded row, as a pixel

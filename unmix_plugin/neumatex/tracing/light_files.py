@@ -151,7 +151,7 @@ def _read_hdr(path: Path) -> Float32[np.ndarray, "H W 3"]:
         data = read_bounded(path, MOST_TABLE_BYTES)
     except OSError as error:
         raise SceneError(f"{path}: can't be read ({error.strerror})") from error
-    match = re.search(rb"\n\n(\S+) (\d+) (\S+) (\d+)\n", data[:65536])
+    match = re.search(rb"\r?\n\r?\n(\S+) (\d+) (\S+) (\d+)\r?\n", data[:65536])
     if not data.startswith((b"#?RADIANCE", b"#?RGBE")) or match is None:
         raise SceneError(f"{path}: is no Radiance picture (its header is missing); convert it to .exr")
     if b"FORMAT=32-bit_rle_xyze" in data[: match.start()]:
