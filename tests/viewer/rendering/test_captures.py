@@ -293,3 +293,13 @@ def test_stopping_ends_the_encoder_that_the_render_started(tmp_path, run_instead
     videos.start(late.job)
     assert late.wait() == (None, "cancelled")
     assert late.parts == []
+
+
+def test_a_video_whose_process_cannot_be_begun_ends_with_the_reason(tmp_path, monkeypatch):
+    def refuse(_):
+        raise OSError("no more processes")
+
+    monkeypatch.setattr("unmix_plugin.viewer.rendering.captures._begin", refuse)
+    one = Ending(tmp_path)
+    VideoQueue().start(one.job)
+    assert one.wait() == (None, "rendering the video failed: no more processes")

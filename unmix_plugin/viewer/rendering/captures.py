@@ -139,7 +139,11 @@ class VideoQueue:
         with self._turn:
             with self._lock:
                 job.is_cancelled |= self._is_stopping
-                process = job.process = None if job.is_cancelled else _begin(job.argv)
+                try:
+                    process = job.process = None if job.is_cancelled else _begin(job.argv)
+                except OSError as error:
+                    process = None
+                    lines.append(str(error))
             if process is not None:
                 with process:
                     for line in process.stdout or ():

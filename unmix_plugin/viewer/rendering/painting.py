@@ -130,7 +130,7 @@ def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf)
         return (0.0, 1.0)
     low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
     low = min(low, low_at_most)
-    return (low, high if high > low + 1e-6 else low + 1.0)
+    return (low, high if high - low > 1e-6 * max(abs(low), abs(high)) else low + 1.0)
 
 
 _Painter = Callable[[Any, LayerSettings, Any], tuple[_Picture, Legend]]
