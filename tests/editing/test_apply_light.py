@@ -26,7 +26,7 @@ VISIBLE = Bands.of(np.linspace(400, 700, 31))
 INFRARED = Bands.of(np.linspace(750, 1000, 26))
 
 
-def factors_of(bands: Bands, recorded: np.ndarray | None, light: str) -> np.ndarray:
+def factors_of(bands, recorded, light):
     """Of a light that covers all bands."""
     factors, notes = relighting_factors(bands, recorded, Light(light))
     assert notes == []
@@ -34,9 +34,8 @@ def factors_of(bands: Bands, recorded: np.ndarray | None, light: str) -> np.ndar
 
 
 def test_the_lights_own_spectrum_changes_nothing():
-    np.testing.assert_allclose(factors_of(VISIBLE, None, "E"), 1.0)
-    recorded = 0.3 * illuminant_power("FL2", VISIBLE)
-    np.testing.assert_allclose(factors_of(VISIBLE, recorded, "FL2"), 1.0)
+    for recorded, name in ((None, "E"), (0.3 * illuminant_power("FL2", VISIBLE), "FL2")):
+        np.testing.assert_allclose(factors_of(VISIBLE, recorded, name), 1.0)
 
 
 @pytest.mark.parametrize("name", ["A", "FL11"])
@@ -127,30 +126,27 @@ def test_an_unknown_light_stays_unknown_in_any_other():
         assert sum("taken as flat" in note for note in lit.notes) == 2  # each time that it is lit
 
 
-WIDE_BANDS = Bands.of(np.linspace(400, 700, 31))
-WIDE_LIGHT = illuminant_power("D50", WIDE_BANDS)
-TO_RGB = WIDE_LIGHT[:, None] * rgb_matrix(WIDE_BANDS, torch.float64).numpy()
+TO_RGB = illuminant_power("D50", VISIBLE)[:, None] * rgb_matrix(VISIBLE, torch.float64).numpy()
 
 
-def surface(name: str) -> np.ndarray:
+def surface(name):
     if name == "black":
-        return np.zeros(len(WIDE_BANDS))
-    return measured_library().reflectance(f"ColorChecker/{name}", WIDE_BANDS, "hold")
+        return np.zeros(len(VISIBLE))
+    return measured_library().reflectance(f"ColorChecker/{name}", VISIBLE, "hold")
 
 
-def retinted(reflectance: np.ndarray, linear_rgb: np.ndarray, greatest: float = 1.0) -> np.ndarray:
-    return _retinted(WIDE_BANDS, reflectance, TO_RGB, linear_rgb, greatest)
+def retinted(reflectance, linear_rgb, greatest=1.0):
+    return _retinted(VISIBLE, reflectance, TO_RGB, linear_rgb, greatest)
 
 
 @settings(deadline=None, max_examples=40)
 @given(st.sampled_from(["red", "cyan", "white 9.5", "blue flower", "black"]), st.integers(0, 2**32 - 1))
 def test_the_colour_of_any_smooth_surface_can_be_given_to_any_other(name, seed):
     g, own = np.random.default_rng(seed), surface(name)
-    other = np.interp(WIDE_BANDS.centers_nm, np.linspace(400, 700, 6), g.uniform(0.05, 0.9, 6))
+    other = np.interp(VISIBLE.centers_nm, np.linspace(400, 700, 6), g.uniform(0.05, 0.9, 6))
     changed = retinted(own, other @ TO_RGB)
     np.testing.assert_allclose(changed @ TO_RGB, other @ TO_RGB, atol=1e-5)
-    assert changed.min() >= 0
-    assert changed.max() <= 1
+    assert 0 <= changed.min() <= changed.max() <= 1
     np.testing.assert_allclose(retinted(own, own @ TO_RGB), own, atol=1e-9)
 
 
@@ -192,13 +188,12 @@ def test_of_a_colour_out_of_reach_the_nearest_is_taken(colour):
     """No random surface within the bounds comes nearer on a display, first order of the sRGB curve aside."""
     wanted = np.array(colour)
     changed = retinted(surface("red"), wanted, greatest=0.75)
-    assert changed.min() >= 0
-    assert changed.max() <= 0.75
+    assert 0 <= changed.min() <= changed.max() <= 0.75
     missed = np.linalg.norm(encoded(changed @ TO_RGB) - encoded(wanted))
     assert missed > 0.01
     g = np.random.default_rng(0)
     for _ in range(300):
-        other = np.interp(WIDE_BANDS.centers_nm, np.linspace(400, 700, 7), g.choice([0, 0.75, 0.4], 7))
+        other = np.interp(VISIBLE.centers_nm, np.linspace(400, 700, 7), g.choice([0, 0.75, 0.4], 7))
         assert np.linalg.norm(encoded(other @ TO_RGB) - encoded(wanted)) > 0.8 * missed
 
 

@@ -1,7 +1,7 @@
 """A run loaded with edits: its scene edited, its light new, and what the run recorded as it was."""
 
 from dataclasses import replace
-from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from unmix_plugin.trained.open_run import load_run
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def run(tmp_path_factory):
     """A run of one step."""
     folder = tmp_path_factory.mktemp("run")
     make_demo_scene(folder / "scene", 16, 8, 4)
@@ -31,7 +31,7 @@ def run(tmp_path_factory) -> Path:
     return run_of(done(train, "unmix-nerf", *argv, *SMALL_METHOD))
 
 
-def write_recipe(folder: Path, text: str) -> Path:
+def write_recipe(folder, text):
     path = folder / "edits.yml"
     path.write_text(text)
     return path
@@ -49,9 +49,7 @@ def test_a_run_is_loaded_with_its_materials_edited_and_lit(run, tmp_path):
     loaded = load_edited_run(run, "cpu", write_recipe(tmp_path, recipe), "A")
     plain, scene = load_run(run, "cpu"), loaded.materials_scene
     assert scene.materials.names[0] == "cloth"
-    light, recorded = scene.light_power, plain.materials_scene.light_power
-    assert light is not None
-    assert recorded is not None
+    light, recorded = cast(Any, (scene.light_power, plain.materials_scene.light_power))
     np.testing.assert_allclose(light / light.max(), illuminant_power("A", scene.bands), rtol=1e-6)
     assert not np.allclose(recorded, light)
     assert loaded.record.metadata == plain.record.metadata

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.method_factory import make_model
-from tests.viewer.pages import serving
+from tests.viewer.pages import opened, serving
 from tests.viewer.view_factory import make_source, source_of_model
+from tests.viewer_page import Page
 from unmix_plugin.model import UnmixModel
 from unmix_plugin.viewer.rendering.scene import SceneSource
 from unmix_plugin.viewer.server import Viewer
@@ -46,3 +47,10 @@ def viewer(shared_viewer: Viewer) -> Viewer:
     for folder in (shared_viewer.services.folder, shared_viewer.services.recipes_folder):
         shutil.rmtree(folder, ignore_errors=True)
     return shared_viewer
+
+
+@pytest.fixture
+def page(viewer: Viewer) -> Iterator[Page]:
+    """A page of it."""
+    with opened(viewer) as running:
+        yield running

@@ -20,7 +20,7 @@ from unmix_plugin.editing import Light, Recipe, Retint
 from unmix_plugin.engine.registry import Output
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.engine.runs.run_folder import RunFolder
-from unmix_plugin.engine.training.training_control import DeviceShare, TrainingControl
+from unmix_plugin.engine.training.training_control import DeviceShare
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.formats.files import eight_bits
 from unmix_plugin.spectral.bands import Bands
@@ -48,114 +48,107 @@ def source_of_bands(folder, *centers_nm):
     return source_of_model(model, folder)
 
 
-def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compressed(viewer):
-    with opened(viewer) as page:
-        assert page.last_picture.startswith(b"\x89PNG")
-        page.set("picture height (px)", 128)
-        page.wait_until(lambda: len(decoded(page.last_picture)) == 128)
-        assert page.last_picture.startswith(b"\xff\xd8")
-        labels = show_layer(page, "segmentation").reshape(-1, 3).astype(int)
-        assert page.last_picture.startswith(b"\x89PNG")
-        materials = viewer.services.maker.edited(Edit()).materials
-        colours = (viewer.services.maker.aids.for_layers().colours_of(materials) * 255).round().int().tolist()
-        background = [round(255 * BACKGROUNDS["grey"])] * 3
-        assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
+def test_small_pictures_and_labels_are_sent_without_loss_and_large_ones_compressed(viewer, page):
+    assert page.last_picture.startswith(b"\x89PNG")
+    page.set("picture height (px)", 128)
+    page.wait_until(lambda: len(decoded(page.last_picture)) == 128)
+    assert page.last_picture.startswith(b"\xff\xd8")
+    labels = show_layer(page, "segmentation").reshape(-1, 3).astype(int)
+    assert page.last_picture.startswith(b"\x89PNG")
+    materials = viewer.services.maker.edited(Edit()).materials
+    colours = (viewer.services.maker.aids.for_layers().colours_of(materials) * 255).round().int().tolist()
+    background = [round(255 * BACKGROUNDS["grey"])] * 3
+    assert {*map(tuple, labels.tolist())} <= {*map(tuple, [*colours, background])}
 
 
-def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_what_is_wrong(viewer):
-    with opened(viewer) as page:
-        names = page.props("index")["options"]
-        assert "pri" in names
-        assert "ndvi" not in names
-        first = show_layer(page, "spectral index")
-        page.set("index", "redness")
-        page.wait_for_text("redness index of soils")
-        page.set("formula", " r650/r450 ")
-        page.wait_for_text("formula r650/r450")
-        assert "of radiance: light unknown" in page.texts
-        for wrong, said in (
-            ("r650/(r450", "can't be read here"),
-            ("r650/r900", "needs 900 nm"),
-            ("r650" + "+r650" * 300, "at most 500 characters"),
-            ("nvdi", "there is no index"),
-        ):
-            page.set("formula", wrong)
-            page.wait_for_text(html.escape(said))
-        page.set("formula", "")
-        page.set("index", names[0])
-        page.wait_until(lambda: "characters" not in page.texts and "photochemical" in page.texts)
-        page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
+def test_an_index_is_chosen_by_name_or_typed_as_a_formula_and_a_wrong_one_says_what_is_wrong(page):
+    names = page.props("index")["options"]
+    assert "pri" in names
+    assert "ndvi" not in names
+    first = show_layer(page, "spectral index")
+    page.set("index", "redness")
+    page.wait_for_text("redness index of soils")
+    page.set("formula", " r650/r450 ")
+    page.wait_for_text("formula r650/r450")
+    assert "of radiance: light unknown" in page.texts
+    for wrong, said in (
+        ("r650/(r450", "can't be read here"),
+        ("r650/r900", "needs 900 nm"),
+        ("r650" + "+r650" * 300, "at most 500 characters"),
+        ("nvdi", "there is no index"),
+    ):
+        page.set("formula", wrong)
+        page.wait_for_text(html.escape(said))
+    page.set("formula", "")
+    page.set("index", names[0])
+    page.wait_until(lambda: "characters" not in page.texts and "photochemical" in page.texts)
+    page.wait_until(lambda: np.abs(decoded(page.last_picture) - first).mean() < 3)
 
 
-def test_a_range_of_ones_own_begins_as_it_was_and_stays_where_it_would_end_below_its_beginning(viewer):
-    with opened(viewer) as page:
-        show_layer(page, "depth")
-        page.wait_for_text("distance along the viewing axis")
-        (session,) = viewer._sessions.values()
-        low, high = (page.props(label) for label in ("low", "high"))
-        assert (low["visible"], high["visible"]) == (False, False)
-        before = decoded(page.last_picture)
-        page.set("own range")
-        page.wait_until(lambda: low["visible"] and high["visible"] and high["value"] > 2)
-        page.wait_until(lambda: session.view.settings.value_range is not None)
-        assert page.notices == []
-        least, greatest = session.view.settings.value_range
-        page.set("high", least - 1)
-        page.wait_for_notice("until low is below high")
-        assert session.view.settings.value_range == (least, greatest)
-        page.set("high", greatest + 5)
-        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() > 3)
-        page.set("own range", False)
-        page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
-        assert not low["visible"]
+def test_a_range_of_ones_own_begins_as_it_was_and_stays_where_it_would_end_below_its_beginning(viewer, page):
+    show_layer(page, "depth")
+    page.wait_for_text("distance along the viewing axis")
+    (session,) = viewer._sessions.values()
+    low, high = (page.props(label) for label in ("low", "high"))
+    assert (low["visible"], high["visible"]) == (False, False)
+    before = decoded(page.last_picture)
+    page.set("own range")
+    page.wait_until(lambda: low["visible"] and high["visible"] and high["value"] > 2)
+    page.wait_until(lambda: session.view.settings.value_range is not None)
+    assert page.notices == []
+    least, greatest = session.view.settings.value_range
+    page.set("high", least - 1)
+    page.wait_for_notice("until low is below high")
+    assert session.view.settings.value_range == (least, greatest)
+    page.set("high", greatest + 5)
+    page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() > 3)
+    page.set("own range", False)
+    page.wait_until(lambda: np.abs(decoded(page.last_picture) - before).mean() < 1)
+    assert not low["visible"]
 
 
-def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, monkeypatch):
-    clouds = []
-    add = SceneApi.add_point_cloud
-    monkeypatch.setattr(
-        SceneApi, "add_point_cloud", lambda *args, **more: (clouds.append(args[2:]), add(*args, **more))[1]
-    )
-    with opened(viewer) as page:
-        page.set("point cloud")
-        page.wait_until(lambda: len(clouds) == 1)
-        page.set("light", "A")
-        recipe = page.props("recipe")
-        page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
-        (points, colours), (same, relit) = clouds
-        aids, materials = (
-            viewer.services.maker.aids.for_layers(),
-            viewer.services.maker.edited(Edit()).materials,
-        )
-        assert aids is not None
-        linear = (aids.reference_spectra(materials) @ rgb_matrix(materials.bands)).clamp(0, 1)
-        assert np.array_equal(colours, eight_bits(linear_to_srgb(linear).numpy()))
-        assert np.array_equal(points, same)
-        assert relit[:, 2].mean() < colours[:, 2].mean() - 5
-        page.set("visible", False)
-        page.wait_until(lambda: len(clouds) == 3)
-        assert 0 < len(clouds[-1][0]) < len(points)
-        page.set("point cloud", False)
-        page.set("visible")
-        show_layer(page, "depth")
-        assert len(clouds) == 3
+def test_the_point_cloud_follows_the_light_and_shows_no_hidden_material(viewer, page, monkeypatch):
+    clouds, add = [], SceneApi.add_point_cloud
+
+    def noted(*arguments, **more):
+        clouds.append(arguments[2:])
+        return add(*arguments, **more)
+
+    monkeypatch.setattr(SceneApi, "add_point_cloud", noted)
+    page.set("point cloud")
+    page.wait_until(lambda: len(clouds) == 1)
+    page.set("light", "A")
+    recipe = page.props("recipe")
+    page.wait_until(lambda: len(clouds) == 2 and "illuminant: A" in recipe["value"])
+    (points, colours), (same, relit) = clouds
+    maker = viewer.services.maker
+    materials = maker.edited(Edit()).materials
+    linear = maker.aids.for_layers().reference_spectra(materials) @ rgb_matrix(materials.bands)
+    assert np.array_equal(colours, eight_bits(linear_to_srgb(linear.clamp(0, 1)).numpy()))
+    assert np.array_equal(points, same)
+    assert relit[:, 2].mean() < colours[:, 2].mean() - 5
+    page.set("visible", False)
+    page.wait_until(lambda: len(clouds) == 3)
+    assert 0 < len(clouds[-1][0]) < len(points)
+    put(page, {"point cloud": False, "visible": True})
+    show_layer(page, "depth")
+    assert len(clouds) == 3
 
 
-def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(viewer):
-    with opened(viewer) as page:
-        page.click(0.5, 0.5)
-        page.wait_for_text("endmember_", "position")
-        assert any(props.get("type") == "GuiUplotMessage" for props in page.controls.values())
-        page.set("save as CSV")
-        page.wait_until(lambda: len(page.downloads) == 2)
-        saved = sorted(path.name for path in viewer.services.folder.iterdir())
-        assert saved == ["probe-abundances.csv", "probes.csv"]
-        page.look_from(0.0, distance=40.0)
-        page.click(0.01, 0.01)
-        page.wait_for_notice("nothing is there")
-        assert page.props("probe")["options"] == [page.props("probe")["value"]]
-        page.set("forget all")
-        page.wait_until(lambda: page.props("probe")["options"] == ["none yet"])
+def test_a_click_is_a_probe_with_a_chart_and_bars_and_one_on_nothing_says_so(viewer, page):
+    page.click(0.5, 0.5)
+    page.wait_for_text("endmember_", "position")
+    assert any(props.get("type") == "GuiUplotMessage" for props in page.controls.values())
+    page.set("save as CSV")
+    page.wait_until(lambda: len(page.downloads) == 2)
+    saved = sorted(path.name for path in viewer.services.folder.iterdir())
+    assert saved == ["probe-abundances.csv", "probes.csv"]
+    page.look_from(0.0, distance=40.0)
+    page.click(0.01, 0.01)
+    page.wait_for_notice("nothing is there")
+    assert page.props("probe")["options"] == [page.props("probe")["value"]]
+    page.set("forget all")
+    page.wait_until(lambda: page.props("probe")["options"] == ["none yet"])
 
 
 @pytest.mark.slow
@@ -190,12 +183,6 @@ def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
         page.set("probe where I click")
         page.wait_until(lambda: page.props("measure where I click")["value"] is False)
     (run.path / "measures.json").unlink()
-
-
-def test_no_scale_is_set_before_training_has_ended(tmp_path):
-    with serving(make_source(tmp_path, TrainingControl())) as (viewer, _), opened(viewer) as page:
-        page.set("set scale")
-        page.wait_for_notice("when training has ended")
 
 
 @pytest.mark.slow
@@ -276,16 +263,15 @@ def test_a_region_kept_or_removed_elsewhere_is_listed_or_not_and_numbers_are_of_
         page.wait_until(lambda: "all of it" not in page.props("region")["options"])
 
 
-def test_depth_comes_with_objects_and_goes_with_them(viewer):
-    with opened(viewer) as page:
-        page.set("scene box")
-        page.wait_until(lambda: page.last_depth is not None)
-        put(page, {"cameras": True, "point cloud": True, "scene box": False})
-        show_layer(page, "depth")
-        assert page.last_depth is not None
-        put(page, {"cameras": False, "point cloud": False})
-        page.wait_until(lambda: page.last_depth is None)
-        assert page.notices == []
+def test_depth_comes_with_objects_and_goes_with_them(page):
+    page.set("scene box")
+    page.wait_until(lambda: page.last_depth is not None)
+    put(page, {"cameras": True, "point cloud": True, "scene box": False})
+    show_layer(page, "depth")
+    assert page.last_depth is not None
+    put(page, {"cameras": False, "point cloud": False})
+    page.wait_until(lambda: page.last_depth is None)
+    assert page.notices == []
 
 
 def test_materials_are_edited_undone_saved_and_loaded(viewer):
@@ -306,6 +292,7 @@ def test_materials_are_edited_undone_saved_and_loaded(viewer):
         assert len(other.pictures) == count  # another page's materials are its own
 
 
+NO_EDITS = "edits: []\n"
 CHANGES = (
     ("visible", False, "remove"),
     ("only this one", True, "isolate"),
@@ -320,37 +307,33 @@ CHANGES = (
 
 
 @pytest.mark.slow
-def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(viewer):
-    with opened(viewer) as page:
-        recipe = page.props("recipe")
-        assert page.props("known material")["value"] == "choose one"
-        page.set("known material", "ColorChecker/red")
-        for label, value, written in CHANGES:
-            for control, action in ((label, value), ("changes", "redo")):
-                page.set(control, action)
-                page.wait_until(lambda written=written: written in recipe["value"])
-                page.set("changes", "undo")
-                page.wait_until(lambda: recipe["value"] == "edits: []\n")
-        assert not any(title == "not done" for title, _ in page.notices)
+def test_every_change_is_an_edit_of_the_recipe_and_can_be_undone(page):
+    recipe = page.props("recipe")
+    assert page.props("known material")["value"] == "choose one"
+    page.set("known material", "ColorChecker/red")
+    for label, value, written in CHANGES:
+        for control, action in ((label, value), ("changes", "redo")):
+            page.set(control, action)
+            page.wait_until(lambda written=written: written in recipe["value"])
+            page.set("changes", "undo")
+            page.wait_until(lambda: recipe["value"] == NO_EDITS)
+    assert not any(title == "not done" for title, _ in page.notices)
 
 
 @pytest.mark.slow
-def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(viewer):
-    with opened(viewer) as page:
-        name, recipe = (page.props(label) for label in ("name", "recipe"))
-        for length in range(len("blue cloth") + 1):
-            page.set("name", "blue cloth"[:length])
-        page.wait_until(lambda: "name: blue cloth" in recipe["value"])
-        assert (
-            name["value"] == "endmember_0"
-        )  # as the page was sent: nothing is written back over what is typed
-        page.set("changes", "undo")
-        page.wait_until(lambda: recipe["value"] == "edits: []\n" and name["value"] == "endmember_0")
-        assert page.notices == []
-        page.set("name", "endmember_1")
-        page.wait_for_notice("is called 'endmember_1' already")
-        assert recipe["value"] == "edits: []\n"
-        page.wait_until(lambda: name["value"] == "endmember_0")
+def test_a_name_is_typed_letter_by_letter_as_one_edit_and_one_that_is_taken_goes_back(page):
+    name, recipe = (page.props(label) for label in ("name", "recipe"))
+    for length in range(len("blue cloth") + 1):
+        page.set("name", "blue cloth"[:length])
+    page.wait_until(lambda: "name: blue cloth" in recipe["value"])
+    assert name["value"] == "endmember_0"  # as the page was sent: nothing is written back over what is typed
+    page.set("changes", "undo")
+    page.wait_until(lambda: recipe["value"] == NO_EDITS and name["value"] == "endmember_0")
+    assert page.notices == []
+    page.set("name", "endmember_1")
+    page.wait_for_notice("is called 'endmember_1' already")
+    assert recipe["value"] == NO_EDITS
+    page.wait_until(lambda: name["value"] == "endmember_0")
 
 
 def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_changes_nothing(viewer):
@@ -358,7 +341,7 @@ def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_ch
         page.set("saved", name)
         page.set("load")
         page.wait_for_notice(said)
-        assert page.props("recipe")["value"] == "edits: []\n"
+        assert page.props("recipe")["value"] == NO_EDITS
 
     recipes = viewer.services.recipes_folder
     (recipes.parent / "secret.yml").write_text("edits:\n  - scale: {endmember: 0, factor: 3}\n")
@@ -391,21 +374,20 @@ def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it
             assert edited.light_power is not None
 
 
-def test_pictures_and_spectra_have_the_size_asked_for_and_lie_in_the_run_folder(viewer):
-    with opened(viewer) as page:
-        put(page, {"width": 60, "height": 40, "file name": "../../../evil/../shot"})
-        page.set("save a screenshot (PNG)")
-        page.wait_until(lambda: bool(page.downloads))
-        (path,) = viewer.services.folder.iterdir()
-        assert path.name == "evil_.._shot.png"
-        picture = Image.open(path)
-        assert picture.size == (60, 40)
-        assert np.asarray(picture).std() > 5
-        put(page, {"width": 32, "height": 24, "file name": "view"})
-        page.set("save the spectra (EXR)")
-        page.wait_until(lambda: "view.exr" in page.downloads)
-        found = read_exr(viewer.services.folder / "view.exr")
-        assert found["S0.450,000000nm"].shape == (24, 32)
+def test_pictures_and_spectra_have_the_size_asked_for_and_lie_in_the_run_folder(viewer, page):
+    put(page, {"width": 60, "height": 40, "file name": "../../../evil/../shot"})
+    page.set("save a screenshot (PNG)")
+    page.wait_until(lambda: bool(page.downloads))
+    (path,) = viewer.services.folder.iterdir()
+    assert path.name == "evil_.._shot.png"
+    picture = Image.open(path)
+    assert picture.size == (60, 40)
+    assert np.asarray(picture).std() > 5
+    put(page, {"width": 32, "height": 24, "file name": "view"})
+    page.set("save the spectra (EXR)")
+    page.wait_until(lambda: "view.exr" in page.downloads)
+    found = read_exr(viewer.services.folder / "view.exr")
+    assert found["S0.450,000000nm"].shape == (24, 32)
 
 
 @pytest.mark.slow
@@ -429,17 +411,16 @@ def test_a_colour_that_is_refused_again_and_again_is_one_notice(viewer, monkeypa
 
 
 @pytest.mark.slow
-def test_what_a_user_has_to_know_of_an_edit_is_said_once(viewer):
-    with opened(viewer) as page:
-        page.set("colour", (120, 110, 100))
-        page.wait_until(lambda: bool(page.notices))
-        recipe = page.props("recipe")
-        for label, value, written in (("brightness", 2.0, "scale"), ("light", "A", "illuminant: A")):
-            page.set(label, value)
-            page.wait_until(lambda written=written: written in recipe["value"])
-        show_layer(page, "depth")
-        (notice,) = page.notices
-        assert notice[1].endswith("taken as flat (CIE illuminant E)")
+def test_what_a_user_has_to_know_of_an_edit_is_said_once(page):
+    page.set("colour", (120, 110, 100))
+    page.wait_until(lambda: bool(page.notices))
+    recipe = page.props("recipe")
+    for label, value, written in (("brightness", 2.0, "scale"), ("light", "A", "illuminant: A")):
+        page.set(label, value)
+        page.wait_until(lambda written=written: written in recipe["value"])
+    show_layer(page, "depth")
+    (notice,) = page.notices
+    assert notice[1].endswith("taken as flat (CIE illuminant E)")
 
 
 def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
@@ -451,9 +432,7 @@ def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
 
     with serving(source) as (viewer, _), opened(viewer) as page:
         page.click(0.5, 0.5)
-        page.wait_until(
-            lambda: axes(page) == ["reflectance"] * 3
-        )  # of materials, of the probe, of all probes
+        page.wait_until(lambda: axes(page) == ["reflectance"] * 3)  # of materials, the probe, all probes
         page.set("light", "A")
         page.wait_until(lambda: axes(page) == ["radiance", "reflectance", "reflectance"])
         page.click(0.5, 0.5)  # the first probe keeps its light
@@ -461,36 +440,34 @@ def test_the_axis_of_spectra_says_reflectance_only_in_a_light_of_1(tmp_path):
 
 
 @pytest.mark.slow
-def test_sizes_that_are_too_large_or_out_of_bounds_are_refused(viewer):
-    with opened(viewer) as page:
-        for label, value in (("width", 100_000), ("height", 1e9), ("width", -3)):
-            put(page, {"width": 1024, "height": 1024, label: value})
-            page.set("save the spectra (EXR)" if value < 0 else "save a screenshot (PNG)")
-            page.wait_for_notice(f"{label} is a number of pixels from 16 to 8192; found {value:g}")
-        put(page, {"width": 8192, "height": 8192})
-        page.set("save a screenshot (PNG)")
-        page.wait_for_notice("8192 x 8192 pixels are too many")
-        assert not viewer.services.folder.exists()
+def test_sizes_that_are_too_large_or_out_of_bounds_are_refused(viewer, page):
+    for label, value in (("width", 100_000), ("height", 1e9), ("width", -3)):
+        put(page, {"width": 1024, "height": 1024, label: value})
+        page.set("save the spectra (EXR)" if value < 0 else "save a screenshot (PNG)")
+        page.wait_for_notice(f"{label} is a number of pixels from 16 to 8192; found {value:g}")
+    put(page, {"width": 8192, "height": 8192})
+    page.set("save a screenshot (PNG)")
+    page.wait_for_notice("8192 x 8192 pixels are too many")
+    assert not viewer.services.folder.exists()
 
 
-def test_a_path_through_key_frames_is_a_camera_file(viewer):
-    with opened(viewer) as page:
-        for number, angle in enumerate((0.3, 0.8, 1.3), start=1):
-            page.look_from(angle)
-            page.set("add a key frame here")
-            key = page.props("key frame")
-            page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
-        put(page, {"seconds": 1.0, "frames a second": 10, "width": 641, "height": 360})
-        page.set("save the path")
-        page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
-        (path,) = viewer.services.folder.iterdir()
-        found = read_camera_file(path, world_frame(viewer.services.source.record))
-        assert (len(found.views), found.frames_per_second) == (10, 10.0)
-        camera = found.views[0].camera
-        assert (camera.width, camera.height) == (640, 360)  # even, as encoders of videos want it
-        place = camera.camera_to_world[0, :, 3].tolist()
-        assert place == pytest.approx([4 * math.cos(0.3), 4 * math.sin(0.3), 1.5], abs=1e-4)
-        assert camera.focal_px[0].tolist() == pytest.approx([180 / math.tan(0.4)] * 2, rel=1e-4)
+def test_a_path_through_key_frames_is_a_camera_file(viewer, page):
+    for number, angle in enumerate((0.3, 0.8, 1.3), start=1):
+        page.look_from(angle)
+        page.set("add a key frame here")
+        key = page.props("key frame")
+        page.wait_until(lambda key=key, number=number: key.get("value") == f"{number} of {number}")
+    put(page, {"seconds": 1.0, "frames a second": 10, "width": 641, "height": 360})
+    page.set("save the path")
+    page.wait_until(lambda: any(title == "saved" for title, _ in page.notices))
+    (path,) = viewer.services.folder.iterdir()
+    found = read_camera_file(path, world_frame(viewer.services.source.record))
+    assert (len(found.views), found.frames_per_second) == (10, 10.0)
+    camera = found.views[0].camera
+    assert (camera.width, camera.height) == (640, 360)  # even, as encoders of videos want it
+    place = camera.camera_to_world[0, :, 3].tolist()
+    assert place == pytest.approx([4 * math.cos(0.3), 4 * math.sin(0.3), 1.5], abs=1e-4)
+    assert camera.focal_px[0].tolist() == pytest.approx([180 / math.tan(0.4)] * 2, rel=1e-4)
 
 
 OUTPUTS = (

@@ -25,16 +25,8 @@ from unmix_plugin.editing import (
     recipe_from_yaml,
     recipe_to_yaml,
 )
-from unmix_plugin.viewer.recipes import (
-    RecipeHistory,
-    change_of,
-    is_shown,
-    named_by,
-    numbered,
-    with_change,
-    with_swap,
-    with_visible,
-)
+from unmix_plugin.viewer import recipes
+from unmix_plugin.viewer.recipes import change_of, with_change, with_swap, with_visible
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 CLAY = Rename(0, "clay")
@@ -105,32 +97,32 @@ def test_the_same_swap_twice_in_a_row_takes_it_back():
 def test_visibility_is_one_edit_whatever_was_hidden_before():
     recipe = with_visible(Recipe((Scale(0, 2.0),)), {2, 1}, None)
     assert recipe.operations == (Scale(0, 2.0), Remove((1, 2)))
-    assert [is_shown(recipe, index) for index in range(4)] == [True, False, False, True]
+    assert [recipes.is_shown(recipe, index) for index in range(4)] == [True, False, False, True]
     alone = with_visible(recipe, {1}, 3)
     assert alone.operations == (Scale(0, 2.0), Isolate((3,)))
-    assert [is_shown(alone, index) for index in range(4)] == [False, False, False, True]
-    assert (named_by(alone, Isolate), named_by(alone, Remove)) == ({3}, set())
+    assert [recipes.is_shown(alone, index) for index in range(4)] == [False, False, False, True]
+    assert (recipes.named_by(alone, Isolate), recipes.named_by(alone, Remove)) == ({3}, set())
     assert with_visible(alone, set(), None).operations == (Scale(0, 2.0),)
 
 
 def test_changes_are_undone_and_redone_in_order():
-    history = RecipeHistory()
-    recipes = [Recipe((Scale(0, float(factor)),)) for factor in range(1, 4)]
-    for recipe in (*recipes, recipes[-1]):  # the last of which changes nothing
+    history = recipes.RecipeHistory()
+    made = [Recipe((Scale(0, float(factor)),)) for factor in range(1, 4)]
+    for recipe in (*made, made[-1]):  # the last of which changes nothing
         history.take(recipe)
-    assert [history.undone(), history.undone(), history.undone()] == [recipes[1], recipes[0], Recipe()]
+    assert [history.undone(), history.undone(), history.undone()] == [made[1], made[0], Recipe()]
     assert history.undone() is None
-    assert history.redone() == recipes[0]
-    history.take(recipes[2])
+    assert history.redone() == made[0]
+    history.take(made[2])
     assert history.redone() is None
-    assert history.undone() == recipes[0]
+    assert history.undone() == made[0]
 
 
 def test_names_become_numbers_also_where_they_were_given_in_the_recipe():
     named = (Rename("b", "clay"), Swap("clay", "a"), Remove(("clay", 2)), Replace("a", "x/y"))
     as_they_are = (Gloss(None, 0.5), Scale("x", 2.0))  # the latter is left for whoever applies it
     expected = (Rename(1, "clay"), Swap(1, 0), Remove((1, 2)), Replace(0, "x/y"))
-    found = numbered(Recipe((*named, *as_they_are)), ("a", "b", "c"))
+    found = recipes.numbered(Recipe((*named, *as_they_are)), ("a", "b", "c"))
     assert found.operations == (*expected, *as_they_are)
 
 
@@ -145,7 +137,7 @@ def test_what_a_panel_builds_is_what_is_read_from_its_file(isolated):
 
 def test_changes_of_the_same_thing_in_quick_succession_are_undone_together():
     now = [0.0]
-    history = RecipeHistory(clock=lambda: now[0])
+    history = recipes.RecipeHistory(clock=lambda: now[0])
     for factor in (1.1, 1.2, 1.3):
         history.take(with_change(history.present, Scale(0, factor)), (Scale, 0))
         now[0] += 0.1

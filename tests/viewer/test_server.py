@@ -57,6 +57,8 @@ def test_the_training_panel_steers_the_training(tmp_path):
     control = TrainingControl()
     source = make_source(tmp_path, control)
     with serving(source) as (viewer, _), opened(viewer) as page, control.running():
+        page.set("set scale")
+        page.wait_for_notice("when training has ended")
         for label, other in (("pause", "resume"), ("resume", "pause")):
             page.set(label)
             page.wait_until(lambda other=other: has_control(page, other))
@@ -104,18 +106,17 @@ NO_CAMERAS: tuple[dict[str, Any], ...] = (
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.viser. .* does not match annotation")
-def test_cameras_and_values_that_no_page_would_send_harm_nobody(viewer):
-    with opened(viewer) as page:
-        page.set("own range")
-        for label in ("layer", "formula", "low", "picture height (px)", "width", "brightness"):
-            for value in (math.nan, math.inf, -1e300, "x" * 1000, None, [1, 2], {"a": 1}, True):
-                page.set(label, value)
-        for number, changes in enumerate(({}, *NO_CAMERAS)):
-            page.look_from(0.5, **changes)
-            show_layer(page, ("depth", "colour")[number % 2])
-            count = len(page.pictures)
-            page.look_from(0.9 + number)
-            page.wait_until(lambda count=count: len(page.pictures) > count)
+def test_cameras_and_values_that_no_page_would_send_harm_nobody(page):
+    page.set("own range")
+    for label in ("layer", "formula", "low", "picture height (px)", "width", "brightness"):
+        for value in (math.nan, math.inf, -1e300, "x" * 1000, None, [1, 2], {"a": 1}, True):
+            page.set(label, value)
+    for number, changes in enumerate(({}, *NO_CAMERAS)):
+        page.look_from(0.5, **changes)
+        show_layer(page, ("depth", "colour")[number % 2])
+        count = len(page.pictures)
+        page.look_from(0.9 + number)
+        page.wait_until(lambda count=count: len(page.pictures) > count)
 
 
 def test_a_page_that_sends_nonsense_loses_its_connection_and_others_go_on(viewer):
@@ -292,27 +293,18 @@ def test_bytes_of_any_kind_are_a_message_or_none(data):
         _is_heard(data)
 
 
-def test_what_a_page_uploads_is_not_kept(viewer):
-    with page_of(viewer) as page:
-        page.look_from(0.3)
-        page.wait_until(lambda: has_control(page, "formula"))
-        upload = {"source_component_uuid": page.control("formula"), "transfer_uuid": "some"}
-        start = {"filename": "a", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2000}
-        page.send("FileTransferStartUpload", **upload, **start)
-        page.send("FileTransferPart", **upload, part_index=0, content=bytes(1000))
-        show_layer(page, "depth")
-        apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
-        assert len(apis) >= 2
-        assert all(not api._current_file_upload_states for api in apis)
-
-
-@pytest.mark.slow
-def test_nobody_can_ask_for_a_public_tunnel(viewer, monkeypatch):
+def test_what_a_page_uploads_is_not_kept_and_nobody_can_ask_for_a_public_tunnel(viewer, page, monkeypatch):
     tunnels = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *words, **_: tunnels.append(words))
-    with opened(viewer) as page:
-        page.send("ShareUrlRequest")
-        show_layer(page, "depth")
+    page.send("ShareUrlRequest")
+    upload = {"source_component_uuid": page.control("formula"), "transfer_uuid": "some"}
+    start = {"filename": "a", "mime_type": "text/plain", "part_count": 2, "size_bytes": 2000}
+    page.send("FileTransferStartUpload", **upload, **start)
+    page.send("FileTransferPart", **upload, part_index=0, content=bytes(1000))
+    show_layer(page, "depth")
+    apis = [viewer._server.gui, *(client.gui for client in viewer._server.get_clients().values())]
+    assert len(apis) >= 2
+    assert all(not api._current_file_upload_states for api in apis)
     assert tunnels == []
 
 

@@ -31,7 +31,7 @@ def test_the_distance_counts_each_parameter_by_its_expected_error():
     errors = (parameters - said.parameters_at(positions)) ** 2
     expected = (errors / said.log_variance(positions).exp()).sum() / 7
     found = _distance(said, parameters, positions)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     found.backward()
     assert float(_distance(said, said.parameters_at(positions).detach(), positions)) < 1e-9
 
@@ -45,9 +45,8 @@ def test_views_for_a_prior_are_the_training_views_thinned_out(tmp_path, monkeypa
     whole, thin = scene.pictures.cameras[list(scene.split.train)], views.cameras
     points = scene.mesh.vertices[:20]
     full_px, small_px = whole.project(points, 3)[0], thin.project(points, 3)[0]
-    torch.testing.assert_close((full_px - 0.5) / 2 + 0.5, small_px, atol=1e-4, rtol=0)
-    middle = views.pictures[2][6, 6]
-    torch.testing.assert_close(middle, torch.tensor([0.5, 0.3, 0.1]))
+    assert_close((full_px - 0.5) / 2 + 0.5, small_px, atol=1e-4, rtol=0)
+    assert_close(views.pictures[2][6, 6], torch.tensor([0.5, 0.3, 0.1]))
 
 
 def test_views_for_a_prior_are_of_frame_cameras_alone(tmp_path):
@@ -65,7 +64,6 @@ def test_views_for_a_prior_are_of_frame_cameras_alone(tmp_path):
 
 
 RUN = _RunMaterials(Path("run"), ball_scene())
-COUNT = len(RUN.scene.materials.endmembers)
 TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 SCALE, SHIFT = 0.5, np.array([0.3, -0.1, 0.2])
 
@@ -91,23 +89,18 @@ def test_abundances_are_those_of_the_runs_surface_at_the_same_place_in_the_world
     assert_close(shares[clear, 0], (outwards[clear, 2] > 0).float(), atol=0.02, rtol=0)
     assert_close(shares.sum(dim=1), torch.ones(len(shares)))
 
-
-def test_endmembers_become_reflectances_by_the_light():
-    materials = RUN.scene.materials
-    lamp = np.linspace(0.5, 1.0, len(materials.bands))
-    found = RUN.reflectances(materials.bands, lamp, COUNT)
-    light = torch.from_numpy(lamp).float() if materials.light is None else materials.light
-    assert_close(found * light, materials.endmembers.detach())
-
-
-def test_a_run_of_other_bands_another_number_or_another_place_is_refused():
-    own, others = RUN.scene.materials.bands, Bands.of([400, 500])
-    for bands, count, said in ((others, COUNT, "must be the same"), (own, COUNT + 1, "num-endmembers is")):
-        with pytest.raises(ConfigError, match=said):
-            RUN.reflectances(bands, np.ones(len(bands)), count)
-    positions, normals, _ = _points()
     with pytest.raises(ConfigError, match="of the mesh's surface only"):
         RUN.abundances(positions, normals, _corners(scale=3.0))
+
+
+def test_endmembers_become_reflectances_by_the_light_and_those_of_other_bands_or_numbers_are_refused():
+    materials = RUN.scene.materials
+    own, lamp = materials.bands, np.linspace(0.5, 1.0, len(materials.bands))
+    light = torch.from_numpy(lamp).float() if materials.light is None else materials.light
+    assert_close(RUN.reflectances(own, lamp, 3) * light, materials.endmembers.detach())
+    for bands, count, said in ((Bands.of([400, 500]), 3, "must be the same"), (own, 4, "num-endmembers is")):
+        with pytest.raises(ConfigError, match=said):
+            RUN.reflectances(bands, np.ones(len(bands)), count)
 
 
 @pytest.mark.parametrize("family", [NeuralFamily(), PbrFamily()])

@@ -4,7 +4,6 @@ under other light; where fits begin, and gains of endmembers."""
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -13,25 +12,16 @@ import torch
 from torch.testing import assert_close
 
 from tests.commands.running import done, picture_size, refused, run
-from tests.neumatex.factory import (
-    CENTRE,
-    ENDMEMBERS,
-    LAMP,
-    RADIUS,
-    SMALL,
-    trained_on,
-    write_light,
-    write_object,
-    write_spectral_object,
-)
+from tests.neumatex import factory
+from tests.neumatex.factory import SMALL, trained_on, write_light, write_object, write_spectral_object
 from tests.neumatex.surfaces import generator, unit
-from tests.products.ball_model import RADIUS as RUN_RADIUS
-from tests.products.ball_model import ball_scene
+from tests.products import ball_model
 from unmix_plugin.commands.eval import evaluate
 from unmix_plugin.commands.export import export
 from unmix_plugin.commands.render import render
 from unmix_plugin.commands.train import train
 from unmix_plugin.engine import PipelineConfig, load_model
+from unmix_plugin.neumatex.export import pbr_fit
 from unmix_plugin.neumatex.export.material import material_paths
 from unmix_plugin.neumatex.fit import data_manager, start
 from unmix_plugin.neumatex.fit.data_manager import ObjectDataManagerConfig
@@ -48,13 +38,43 @@ from unmix_plugin.trained.open_run import load_run, snapshot
 from unmix_plugin.viewer.rendering.painting import layers_of
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 
-PBR = "--pipeline.model.material=pbr"
+PBR, NO_PRIOR = "--pipeline.model.material=pbr", "--pipeline.model.prior=none"
+SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_pixels():
+    """A ball of two materials needs few pixels to start from."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(data_manager, "_NUM_PIXELS", 2000)
+        patch.setattr(start, "_POINTS", 512)
+        yield
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(tmp_path_factory):
     """A run of 30 steps."""
     return trained_on(write_object(tmp_path_factory.mktemp("neumatex") / "ball"), PBR, steps=30)
+
+
+@pytest.fixture(scope="module")
+def neural(tmp_path_factory):
+    """A run of two steps with neural materials."""
+    return trained_on(write_object(tmp_path_factory.mktemp("object") / "ball"), NO_PRIOR, steps=2)
+
+
+@pytest.fixture(scope="module")
+def spectral(tmp_path_factory):
+    """A run of 30 steps."""
+    folder = write_spectral_object(tmp_path_factory.mktemp("neumatex") / "ball")
+    return trained_on(folder, *SPECTRAL, steps=30)
+
+
+@pytest.fixture(scope="module")
+def scene(spectral) -> TrainedObject:
+    found = load_run(spectral, "cpu").scene
+    assert isinstance(found, TrainedObject)
+    return found
 
 
 def test_evaluation_finds_colour_and_light_again_also_under_a_light_never_seen(trained):
@@ -62,21 +82,17 @@ def test_evaluation_finds_colour_and_light_again_also_under_a_light_never_seen(t
     figures = json.loads((trained / "eval" / "metrics.json").read_text())
     assert {"psnr", "relit_psnr", "base_colour_psnr", "views", "lights", "train_seconds"} <= set(figures)
     assert (figures["views"], figures["lights"]) == (1, 1)
-    assert figures["psnr"] > 22
-    assert figures["relit_psnr"] > 22
+    assert min(figures["psnr"], figures["relit_psnr"]) > 22
     # Even light can't tell a metal from what is diffuse, so only light has to be right.
-    assert figures["base_colour_psnr"] > 8
-    assert figures["base_colour_psnr_scaled"] >= figures["base_colour_psnr"]
-    names = [image["name"] for image in figures["per_image"]]
-    assert names == ["000", "dim-000", "dim-001"]
-    assert picture_size(trained / "eval" / "rgb" / "000.png") == (1058, 546)
-    assert picture_size(trained / "eval" / "relit_rgb" / "dim-001.png") == (1058, 546)
-    assert picture_size(trained / "eval" / "base_colour" / "000.png") == (1058, 546)
+    assert 8 < figures["base_colour_psnr"] <= figures["base_colour_psnr_scaled"]
+    assert [image["name"] for image in figures["per_image"]] == ["000", "dim-000", "dim-001"]
+    for picture in ("rgb/000.png", "relit_rgb/dim-001.png", "base_colour/000.png"):
+        assert picture_size(trained / "eval" / picture) == (1058, 546)
 
 
 def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
     straight = trained_on(write_object(tmp_path / "ball"), PBR, "--steps-per-save=3", steps=6)
-    begun = Path(shutil.copytree(straight, tmp_path / "begun"))
+    begun = shutil.copytree(straight, tmp_path / "begun")
     for path in begun.glob("checkpoints/step-000006*"):
         path.unlink()
     done(train, "neumatex", "--load-run", begun, "--max-num-iterations", 6)
@@ -85,7 +101,7 @@ def test_a_resumed_run_ends_where_a_straight_one_does(tmp_path):
 
 
 def test_a_run_does_not_go_on_with_other_poses(trained, tmp_path):
-    moved = Path(shutil.copytree(trained.parents[3] / "ball", tmp_path / "ball"))
+    moved = shutil.copytree(trained.parents[3] / "ball", tmp_path / "ball")
     content = json.loads((moved / "transforms.json").read_text())
     content["frames"][1]["transform_matrix"][0][3] += 0.01
     (moved / "transforms.json").write_text(json.dumps(content))
@@ -102,17 +118,23 @@ def test_what_pictures_of_light_are_compared_through_does_not_change_how_light_i
 
 
 def test_bad_input_ends_with_status_2_and_one_message(tmp_path):
-    folder = write_object(tmp_path / "ball")
-    (folder / "environment.exr").write_bytes(b"no picture")
-    ended = run(train, "neumatex", "--data", folder, "--output-dir", tmp_path / "out", *SMALL, PBR)
-    assert ended.status == 2
-    assert "environment.exr" in ended.err
-    assert len(ended.err.strip().splitlines()) == 1
-    assert not (tmp_path / "out").exists()
+    for material, write, expected in (
+        ("pbr", write_spectral_object, "does not fit pictures of 5 bands; choose spectral"),
+        ("spectral", write_object, "does not fit pictures of 3 colours; choose neural or pbr"),
+        ("pbr", write_object, "environment.exr"),
+    ):
+        folder = write(tmp_path / material / write.__name__)
+        if expected == "environment.exr":
+            (folder / "environment.exr").write_bytes(b"no picture")
+        words = ["--data", folder, "--output-dir", tmp_path / "out", f"--pipeline.model.material={material}"]
+        ended = run(train, "neumatex", *words, *SMALL)
+        assert (ended.status, len(ended.err.strip().splitlines())) == (2, 1)
+        assert expected in ended.err
+        assert not (tmp_path / "out").exists()
 
 
 def test_display_pictures_train_their_response(tmp_path):
-    run = trained_on(write_object(tmp_path / "ball", suffix=".png"), PBR, steps=3)
+    run = trained_on(write_object(tmp_path / "ball", suffix=".png"), PBR, NO_PRIOR, steps=3)
     model = load_model(run, "cpu").model
     assert float(model.get_parameter("curve.coefficients").detach().abs().max()) > 0
 
@@ -125,19 +147,15 @@ def test_the_loss_leaves_the_noise_of_the_render_out():
     assert float(_squared_error(one_for_both, found)) > 1
 
 
-@pytest.mark.parametrize("fit_networks", [False, True])
-def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, fit_networks):
+@pytest.mark.parametrize(("material", "fit_networks"), [("pbr", False), ("neural", True)])
+def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, material, fit_networks):
     folder = write_object(tmp_path / "ball")
-    settings = NeumatexModelConfig(
-        material="pbr", prior="small", fit_networks=fit_networks, samples=2, plane_resolution=32
-    )
-    pixels = ObjectDataManagerConfig(train_num_rays_per_batch=64)
-    pipeline = PipelineConfig(datamanager=pixels, model=settings).setup(
-        data=folder, device=torch.device("cpu")
-    )
+    settings = NeumatexModelConfig(material=material, prior="small", samples=2, plane_resolution=32)
+    settings = replace(settings, fit_networks=fit_networks)
+    config = PipelineConfig(datamanager=ObjectDataManagerConfig(train_num_rays_per_batch=64), model=settings)
+    pipeline = config.setup(data=folder, device=torch.device("cpu"))
     pipeline.initialise()
-    groups = pipeline.model.get_param_groups()
-    assert bool(groups["networks"]) is fit_networks
+    assert bool(pipeline.model.get_param_groups()["networks"]) is fit_networks
     pipeline.train()
     pipeline.seed_step(0)
     _, losses, _ = pipeline.get_train_loss_dict(0)
@@ -153,14 +171,13 @@ def test_a_fit_begins_at_the_prior_which_stays_as_it_is(tmp_path, fit_networks):
     assert all(name.startswith("triplane.") for name in moved)
 
 
-@pytest.fixture(scope="module")
-def neural(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two steps with neural materials."""
-    return trained_on(write_object(tmp_path_factory.mktemp("object") / "ball"), steps=2)
-
-
-def test_the_material_is_exported_with_its_latents_and_decoder(neural, tmp_path):
-    words = ["material", "--run", neural, "--output", tmp_path, "--device", "cpu", "--texture-size", 64]
+def test_the_material_is_exported_with_its_decoder_and_mixtures_are_not(neural, tmp_path, monkeypatch):
+    monkeypatch.setattr(pbr_fit, "_STEPS", 5)
+    place = ["--run", neural, "--output", tmp_path, "--device", "cpu"]
+    said = refused(export, "endmembers", *place)
+    assert "the method neumatex makes no scene of mixed materials" in said
+    assert "unmix-export has products of its own for it: material" in said
+    words = ["material", *place, "--texture-size", 64]
     done(export, *words)
     scene = load_run(neural, "cpu").scene
     assert isinstance(scene, TrainedObject)
@@ -169,12 +186,6 @@ def test_the_material_is_exported_with_its_latents_and_decoder(neural, tmp_path)
     assert {"decoder.glsl", "latents_a.png", "latents_b.exr"} <= {path.name for path in expected}
     assert "--overwrite" in refused(export, *words)
     assert "choose 16 to 8192" in refused(export, *words, "--overwrite", "--texture-size", 3)
-
-
-def test_products_of_mixed_materials_are_refused_in_one_sentence(neural, tmp_path):
-    said = refused(export, "endmembers", "--run", neural, "--output", tmp_path, "--device", "cpu")
-    assert "the method neumatex makes no scene of mixed materials" in said
-    assert "unmix-export has products of its own for it: material" in said
 
 
 def test_a_view_is_rendered_under_a_map_from_a_file(neural, tmp_path):
@@ -190,42 +201,14 @@ def test_a_view_is_rendered_under_a_map_from_a_file(neural, tmp_path):
     assert "there is no such environment map" in said
 
 
-SPECTRAL = ["--pipeline.model.material=spectral", "--pipeline.model.num-endmembers=2"]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_pixels():
-    """A ball of two materials needs few pixels to start from."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(data_manager, "_NUM_PIXELS", 2000)
-        patch.setattr(start, "_POINTS", 512)
-        yield
-
-
-@pytest.fixture(scope="module")
-def spectral(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 30 steps."""
-    folder = write_spectral_object(tmp_path_factory.mktemp("neumatex") / "ball")
-    return trained_on(folder, *SPECTRAL, steps=30)
-
-
-@pytest.fixture(scope="module")
-def scene(spectral) -> TrainedObject:
-    found = load_run(spectral, "cpu").scene
-    assert isinstance(found, TrainedObject)
-    return found
-
-
 def test_evaluation_finds_reflectances_and_shares_again_and_the_light_of_another_environment(spectral):
     done(evaluate, "--run", spectral, "--device", "cpu")
     figures = json.loads((spectral / "eval" / "metrics.json").read_text())
     assert (figures["views"], figures["lights"]) == (1, 1)
-    assert figures["psnr"] > 22
-    assert figures["relit_psnr"] > 25
-    assert figures["base_colour_psnr"] > 20
-    assert figures["endmember_angle"] < 0.15
-    assert figures["abundance_rmse"] < 0.2
-    assert figures["sam"] < 0.15
+    for name, least in {"psnr": 22, "relit_psnr": 25, "base_colour_psnr": 20}.items():
+        assert figures[name] > least
+    for name, most in {"endmember_angle": 0.15, "abundance_rmse": 0.2, "sam": 0.15}.items():
+        assert figures[name] < most
     width, height = picture_size(spectral / "eval" / "base_colour" / "000.png")
     assert width > 2 * height - 100 > 900  # two pictures of 512 pixels, enlarged and titled
 
@@ -259,7 +242,7 @@ def test_the_viewer_paints_abundances_as_a_mixture_of_the_colours_of_the_segment
 def test_another_light_in_colours_gets_the_lamps_spectrum(scene):
     relit = scene.with_light(LightChoice("overcast", 0.0, 0.0))
     spectrum = relit.environment.image[3, 5].double().numpy()
-    np.testing.assert_allclose(spectrum / spectrum.max(), LAMP, rtol=1e-5)
+    np.testing.assert_allclose(spectrum / spectrum.max(), factory.LAMP, rtol=1e-5)
     back = relit.with_light(LightChoice(None, 0.0, 0.0))
     assert torch.equal(back.environment.image, scene.environment.image)
 
@@ -270,7 +253,7 @@ def test_the_export_has_abundance_textures_and_endmembers(spectral):
     table = read_spectra_csv(folder / "endmembers.csv")
     assert table.names == ("endmember_0", "endmember_1")
     found = table.spectra / np.linalg.norm(table.spectra, axis=1, keepdims=True)
-    true = ENDMEMBERS / np.linalg.norm(ENDMEMBERS, axis=1, keepdims=True)
+    true = factory.ENDMEMBERS / np.linalg.norm(factory.ENDMEMBERS, axis=1, keepdims=True)
     assert np.sort((found @ true.T).max(axis=1)).min() > 0.98
     channels = OpenEXR.File(str(folder / "abundances.exr"), separate_channels=True).channels()
     total = np.sum([channel.pixels for channel in channels.values()], axis=0)
@@ -286,8 +269,8 @@ def test_the_number_of_materials_is_proposed_where_it_is_asked_for(tmp_path):
 
 
 def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monkeypatch):
-    there = Normalisation(np.eye(3), -CENTRE, RUN_RADIUS / RADIUS)
-    of_run = replace(ball_scene(), frame=there)
+    there = Normalisation(np.eye(3), -factory.CENTRE, ball_model.RADIUS / factory.RADIUS)
+    of_run = replace(ball_model.ball_scene(), frame=there)
     monkeypatch.setattr(start, "_opened", lambda _: of_run)
     folder = write_spectral_object(tmp_path / "ball")
     settings = [SPECTRAL[0], "--pipeline.model.from-run=run", "--pipeline.datamanager.lamp=E"]
@@ -300,22 +283,6 @@ def test_a_fit_starts_from_the_endmembers_and_abundances_of_a_run(tmp_path, monk
     assert float((found * expected).sum(dim=1).min()) > 0.999
     poles = torch.tensor([[0.0, 0.1, 0.99], [0.1, 0.0, -0.99]])
     assert model.surface.parameters(poles)[:, :3].argmax(dim=1).tolist() == [0, 1]
-
-
-@pytest.mark.parametrize(
-    ("material", "is_spectral", "expected"),
-    [
-        ("pbr", True, "does not fit pictures of 5 bands; choose spectral"),
-        ("spectral", False, "does not fit pictures of 3 colours; choose neural or pbr"),
-    ],
-)
-def test_a_material_that_does_not_fit_the_pictures_ends_with_status_2(
-    tmp_path, material, is_spectral, expected
-):
-    write = write_spectral_object if is_spectral else write_object
-    folder = write(tmp_path / "ball")
-    words = ["--data", folder, "--output-dir", tmp_path / "out", f"--pipeline.model.material={material}"]
-    assert expected in refused(train, "neumatex", *words, *SMALL)
 
 
 DARK_AND_BRIGHT = torch.tensor([[0.05, 0.1, 0.2, 0.1], [0.9, 0.8, 0.4, 0.2]])
@@ -332,38 +299,38 @@ def test_mixed_pixels_do_not_make_dark_endmembers_brighter_nor_bright_ones_darke
     assert_close(unit(found), unit(DARK_AND_BRIGHT))
 
 
+MIXTURE = torch.tensor([[0.4, 0.6, 0.5, 0.2]])
+
+
 @pytest.mark.parametrize("gains", [(0.5, 1.05), (3.0, 2.0)])
 def test_gains_that_are_settled_leave_what_is_reflected_or_at_most_1_and_spectral_angles(gains):
     endmembers, factors = DARK_AND_BRIGHT.clone(), torch.tensor(gains)
-    family, parameters = SpectralFamily(endmembers, factors), torch.tensor([[0.4, 0.6, 0.5, 0.2]])
-    before = family.base_colour(parameters)
-    assert_close(before, (torch.tensor([[0.4, 0.6]]) * factors) @ DARK_AND_BRIGHT)
+    family = SpectralFamily(endmembers, factors)
+    before = family.base_colour(MIXTURE)
+    assert_close(before, (MIXTURE[:, :2] * factors) @ DARK_AND_BRIGHT)
     family.settle_gains()
     assert_close(unit(endmembers), unit(DARK_AND_BRIGHT))
-    assert float(endmembers.max()) <= 1
-    assert factors.tolist() == [1.0, 1.0]
+    assert (float(endmembers.max()) <= 1, factors.tolist()) == (True, [1.0, 1.0])
     if max(gains) < 1.1:
-        assert_close(family.base_colour(parameters), before)
+        assert_close(family.base_colour(MIXTURE), before)
+
+
+def test_the_gradient_of_a_gain_is_that_of_all_bands_of_its_endmember_together():
+    endmembers, gains = DARK_AND_BRIGHT.clone().requires_grad_(), torch.ones(2, requires_grad=True)
+    light = SpectralFamily(endmembers, gains).base_colour(MIXTURE).square().sum()
+    of_endmembers, of_gains = torch.autograd.grad(light, (endmembers, gains))
+    assert_close(of_gains, (of_endmembers * endmembers).sum(dim=1))
 
 
 def test_training_that_goes_on_does_not_change_a_scene(neural):
     loaded = load_model(neural, "cpu")
     scene = snapshot(loaded.model, "neumatex", loaded.scene)
     assert isinstance(scene, TrainedObject)
-    camera = scene.views[0].camera
-    before = scene.render(camera, ["base_colour", "latents_a", "uncertainty"])
+    camera, names = scene.views[0].camera, ["base_colour", "latents_a", "uncertainty"]
+    before = scene.render(camera, names)
     with torch.no_grad():
         for param in loaded.model.parameters():
             param.add_(0.5)
-    after = scene.render(camera, ["base_colour", "latents_a", "uncertainty"])
-    for name, values in before.items():
-        assert_close(after[name], values, rtol=0, atol=0)
+    assert_close(scene.render(camera, names), before, rtol=0, atol=0)
     changed = snapshot(loaded.model, "neumatex", loaded.scene).render(camera, ["base_colour"])
     assert not torch.equal(changed["base_colour"], before["base_colour"])
-
-
-def test_the_gradient_of_a_gain_is_that_of_all_bands_of_its_endmember_together():
-    endmembers, gains = DARK_AND_BRIGHT.clone().requires_grad_(), torch.ones(2, requires_grad=True)
-    light = SpectralFamily(endmembers, gains).base_colour(torch.tensor([[0.4, 0.6, 0.5, 0.2]])).square().sum()
-    of_endmembers, of_gains = torch.autograd.grad(light, (endmembers, gains))
-    assert_close(of_gains, (of_endmembers * endmembers).sum(dim=1))

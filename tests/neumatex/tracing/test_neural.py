@@ -24,8 +24,7 @@ def test_encoded_materials_look_like_the_layered_ones():
     layered = draw_materials(2000, generator)
     neural = FAMILY.from_layered(layered)
     assert torch.equal(neural[:, :3], layered[:, :3])
-    assert neural.min() >= 0
-    assert neural.max() <= 1
+    assert 0 <= neural.min() <= neural.max() <= 1
     truth, found = LayeredFamily().stack(layered), FAMILY.stack(neural)
     error = response_error(truth, found, layered[:, :3].T, 16, generator)
     assert -10 * math.log10(float(error.mean())) > 36

@@ -22,18 +22,7 @@ from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.model_scene import LightChoice
 from unmix_plugin.trained.outputs import find_output
 from unmix_plugin.viewer.rendering import captures, render_loop
-from unmix_plugin.viewer.rendering.captures import (
-    _NO_VIDEO,
-    VideoJob,
-    VideoQueue,
-    check_size,
-    differences,
-    joined_strips,
-    output_of,
-    render_argv,
-    strip_of_spectra,
-    write_spectra,
-)
+from unmix_plugin.viewer.rendering.captures import VideoJob, VideoQueue
 from unmix_plugin.viewer.rendering.painting import LAYERS
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings, first_settings
@@ -79,9 +68,11 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
         ends = torch.cat([camera.camera_to_world, sized_camera(some_pose(1), 17, 13).camera_to_world])
         camera = replace(camera, key_poses=KeyPoses(ends, torch.tensor([0.5, 12.5]), (2,)))
     frame = make_frame(source, camera)
-    strips, _ = captured(services, camera, strip_of_spectra)
+    strips, _ = captured(services, camera, captures.strip_of_spectra)
     assert len(strips) > 1
-    for found, expected in zip(joined_strips(strips, 13), strip_of_spectra(frame), strict=True):
+    for found, expected in zip(
+        captures.joined_strips(strips, 13), captures.strip_of_spectra(frame), strict=True
+    ):
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -89,16 +80,14 @@ def test_spectra_of_strips_are_those_of_the_whole(services, source, monkeypatch,
 def test_a_saved_picture_says_whether_it_is_radiance_or_reflectance(source, tmp_path, light, quantity):
     frame = make_frame(source, sized_camera(some_pose(), 17, 13))
     materials = replace(frame.materials, light=light)
-    path = write_spectra(tmp_path / "view.exr", strip_of_spectra(frame), materials)
+    path = captures.write_spectra(tmp_path / "view.exr", captures.strip_of_spectra(frame), materials)
     file = OpenEXR.File(str(path), separate_channels=True)
     assert file.header()["comments"] == f"{quantity} on black, 1 = full scale"
     layer = "T" if quantity == "reflectance" else "S0"
     assert sum(name.startswith(f"{layer}.") for name in file.channels()) == 5
 
 
-def test_a_picture_that_is_cancelled_or_left_ends_and_a_strip_that_is_not_taken_keeps_nobody_waiting(
-    services,
-):
+def test_a_picture_that_is_cancelled_ends_and_a_strip_that_is_not_taken_keeps_nobody_waiting(services):
     camera, cancelled = sized_camera(some_pose(), 16, 16), threading.Event()
     cancelled.set()
     with pytest.raises(ConfigError, match="cancelled"):
@@ -126,47 +115,45 @@ def test_pictures_of_two_pages_are_rendered_in_turn_and_one_that_waits_can_be_ca
     assert services.loop._num_blocks == 0
 
 
-@pytest.mark.parametrize(
-    ("size", "message"),
-    [
-        ((8192, 8192, None), "8192 x 8192 pixels are too many for pictures in the viewer; .* 33.6 million"),
-        ((4096, 4096, 31), "4096 x 4096 pixels are too many for spectra in the viewer; .* 4.3 million"),
-    ],
-)
-def test_pictures_that_would_not_fit_are_refused(size, message):
-    with pytest.raises(ConfigError, match=message):
-        check_size(*size)
-    check_size(4096, 4096)
-    check_size(1024, 1024, 31)
+def test_pictures_that_would_not_fit_are_refused():
+    captures.check_size(4096, 4096)
+    captures.check_size(1024, 1024, 31)
+    with pytest.raises(ConfigError, match=r"8192 x 8192 pixels are too many for pictures .* 33\.6 million"):
+        captures.check_size(8192, 8192)
+    with pytest.raises(ConfigError, match=r"4096 x 4096 pixels are too many for spectra .* 4\.3 million"):
+        captures.check_size(4096, 4096, 31)
 
 
-@pytest.mark.parametrize("layer", [name for name in LAYERS if name not in _NO_VIDEO])
+@pytest.mark.parametrize("layer", [name for name in LAYERS if name not in captures._NO_VIDEO])
 def test_every_layer_that_renders_know_is_an_output_of_theirs(layer, source):
-    chosen = LayerSettings(wavelength_nm=500.0, false_colour_nm=(650.0, 550.0, 450.0), index="r650 / r500")
+    chosen = LayerSettings(layer, wavelength_nm=500.0, index="r650 / r500")
     with source.borrowed() as scene:
-        products = choose_formats(
-            (output_of(replace(chosen, layer=layer), scene.bands),), ("mp4",), scene, True
-        )
+        products = choose_formats((captures.output_of(chosen, scene.bands),), ("mp4",), scene, True)
     assert [product.format for product in products] == ["mp4"]
     if layer in ("band", "false-colour"):  # the first settings are outputs for bands anywhere
         bands = Bands.of([1000.0, 1200.0, 1400.0, 1600.0])
         materials = Materials(bands, torch.full((2, 4), 0.5), torch.zeros(0, 4))
-        find_output(output_of(replace(first_settings(bands), layer=layer), bands), materials)
+        find_output(captures.output_of(replace(first_settings(bands), layer=layer), bands), materials)
 
 
-def test_an_absorption_goes_by_its_own_name_and_what_is_no_output_is_refused():
-    bands = Bands.of([450.0, 550.0, 650.0])
-    assert output_of(LayerSettings(layer="index", index="absorption:650-700"), bands) == "absorption:650-700"
-    for layer in ("error", "index", "diffuse", "specular"):
-        with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
-            output_of(LayerSettings(layer=layer), bands)
-
-
-def test_a_wavelength_in_a_gap_of_the_bands_goes_by_the_band_that_is_shown():
+@pytest.mark.parametrize(
+    ("layer", "output"),
+    [
+        ("band", "band:1330nm"),  # shown for a wavelength in a gap of the bands
+        ("false-colour", "false-colour:1330,1330,1000"),
+        ("index", "absorption:650-700"),
+    ],
+)
+def test_an_output_goes_by_the_bands_that_are_shown_or_by_its_own_name(layer, output):
     bands = Bands.of([1000.0, 1010, 1020, 1330, 1340])
-    settings = LayerSettings("band", 1200.0, (1335.0, 1200.0, 990.0))
-    assert output_of(settings, bands) == "band:1330nm"
-    assert output_of(replace(settings, layer="false-colour"), bands) == "false-colour:1330,1330,1000"
+    settings = LayerSettings(layer, 1200.0, (1335.0, 1200.0, 990.0), index="absorption:650-700")
+    assert captures.output_of(settings, bands) == output
+
+
+@pytest.mark.parametrize("layer", ["error", "index", "diffuse", "specular"])
+def test_what_is_no_output_is_refused(layer):
+    with pytest.raises(ConfigError, match=f"videos can't show the layer {layer}"):
+        captures.output_of(LayerSettings(layer), Bands.of([450.0, 550.0, 650.0]))
 
 
 @pytest.mark.parametrize(
@@ -183,7 +170,7 @@ def test_a_wavelength_in_a_gap_of_the_bands_goes_by_the_band_that_is_shown():
 )
 def test_what_a_video_has_otherwise_than_the_page_is_said(settings, expected):
     shown = LayerSettings(**settings)
-    found = differences(shown, LAYERS[shown.layer].controls)
+    found = captures.differences(shown, LAYERS[shown.layer].controls)
     assert len(found) == len(expected)
     assert all(words in said for words, said in zip(expected, found, strict=True))
 
@@ -191,12 +178,12 @@ def test_what_a_video_has_otherwise_than_the_page_is_said(settings, expected):
 def test_the_words_are_those_of_the_command(tmp_path):
     paths = (tmp_path, tmp_path / "path.json", "rgb", tmp_path / "out", tmp_path / "recipe.yml")
     light = LightChoice("studio", rotation_deg=-30.0, exposure_stops=0.5)
-    options = tyro.cli(RenderOptions, args=render_argv(*paths, light))
+    options = tyro.cli(RenderOptions, args=captures.render_argv(*paths, light))
     assert (options.run, options.cameras) == (tmp_path, str(tmp_path / "path.json"))
     assert (options.outputs, options.formats, options.overwrite) == (("rgb",), ("mp4",), True)
     assert (options.edits, options.environment) == (tmp_path / "recipe.yml", "studio")
     assert (options.environment_rotation, options.environment_exposure) == (-30.0, 0.5)
-    plain = tyro.cli(RenderOptions, args=render_argv(*paths[:4], None))
+    plain = tyro.cli(RenderOptions, args=captures.render_argv(*paths[:4], None))
     assert (plain.edits, plain.environment) == (None, RenderOptions().environment)
 
 

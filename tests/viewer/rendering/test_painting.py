@@ -21,24 +21,10 @@ from unmix_plugin.spectral.maps.indices import _MAX_LENGTH
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.trained.model_scene import ModelView
 from unmix_plugin.trained.run_materials import endmember_colours
-from unmix_plugin.viewer.rendering import painting
-from unmix_plugin.viewer.rendering.painting import (
-    LAYERS,
-    _colour_table,
-    _layer_of,
-    _over_background,
-    _paint_values,
-    _to_display,
-)
+from unmix_plugin.viewer.rendering import painting, settings
+from unmix_plugin.viewer.rendering.painting import LAYERS, _to_display
 from unmix_plugin.viewer.rendering.scene import MeasuredViews
-from unmix_plugin.viewer.rendering.settings import (
-    BACKGROUNDS,
-    COLOUR_MAPS,
-    EXPOSURE_BOUNDS,
-    GAMMA_BOUNDS,
-    VIEW_TRANSFORMS,
-    LayerSettings,
-)
+from unmix_plugin.viewer.rendering.settings import BACKGROUNDS, LayerSettings
 
 names = st.sampled_from([entry.name for entry in fields(LayerSettings)])
 anything = st.recursive(
@@ -50,30 +36,33 @@ anything = st.recursive(
 
 @given(names, anything)
 def test_settings_are_always_valid(name, value):
-    settings = LayerSettings().changed(name, value)
-    assert isinstance(settings.layer, str)
-    for number, (low, high) in ((settings.exposure_ev, EXPOSURE_BOUNDS), (settings.gamma, GAMMA_BOUNDS)):
-        assert low <= number <= high
-    assert settings.background in BACKGROUNDS
-    assert settings.colour_map in COLOUR_MAPS
-    assert settings.view_transform in VIEW_TRANSFORMS
-    assert all(math.isfinite(value) for value in (settings.wavelength_nm, *settings.false_colour_nm))
-    assert 0 <= settings.endmember < 255
-    assert len(settings.index) <= 1000
-    assert settings.value_range is None or settings.value_range[0] < settings.value_range[1]
+    found = LayerSettings().changed(name, value)
+    assert isinstance(found.layer, str)
+    for number, bounds in (
+        (found.exposure_ev, settings.EXPOSURE_BOUNDS),
+        (found.gamma, settings.GAMMA_BOUNDS),
+    ):
+        assert bounds[0] <= number <= bounds[1]
+    assert found.background in BACKGROUNDS
+    assert found.colour_map in settings.COLOUR_MAPS
+    assert found.view_transform in settings.VIEW_TRANSFORMS
+    assert all(math.isfinite(value) for value in (found.wavelength_nm, *found.false_colour_nm))
+    assert 0 <= found.endmember < 255
+    assert len(found.index) <= 1000
+    assert found.value_range is None or found.value_range[0] < found.value_range[1]
 
 
 def test_sound_values_are_taken_as_they_are_and_a_range_that_is_none_leaves_the_one_before():
-    settings = LayerSettings()
+    found = LayerSettings()
     sound = {"layer": "pca", "wavelength_nm": 610.0, "false_colour_nm": (700.0, 600.0, 500.0), "endmember": 4}
     sound |= {"index": "(r800-r670)/(r800+r670)", "colour_map": "magma", "value_range": (-1.0, 2.0)}
     sound |= {"exposure_ev": -2.5, "gamma": 2.2, "view_transform": "agx", "background": "black"}
     for name, value in sound.items():
-        settings = settings.changed(name, value)
-        assert getattr(settings, name) == value
+        found = found.changed(name, value)
+        assert getattr(found, name) == value
     for nonsense in ((2.0, 1.0), (math.nan, 1.0), "ab", 3, (1.0,)):
-        assert settings.changed("value_range", nonsense).value_range == (-1.0, 2.0)
-    assert settings.changed("value_range", None).value_range is None
+        assert found.changed("value_range", nonsense).value_range == (-1.0, 2.0)
+    assert found.changed("value_range", None).value_range is None
 
 
 def test_a_formula_that_is_too_long_stays_too_long_rather_than_becoming_another_one():
@@ -97,13 +86,12 @@ def test_the_srgb_transform_is_srgb_up_to_white_gamma_lifts_the_dark_and_a_stop_
         assert_close(_to_display(light, stops, 1.0, "agx"), _to_display(light * 2**stops, 0.0, 1.0, "agx"))
 
 
-@pytest.mark.parametrize("transform", list(VIEW_TRANSFORMS))
+@pytest.mark.parametrize("transform", list(settings.VIEW_TRANSFORMS))
 def test_more_light_is_never_darker_and_grey_stays_grey(transform):
     shown = _to_display(greys, 0.0, 1.0, transform)
     assert (shown.diff(dim=0) >= -1e-6).all()
     assert (shown.amax(dim=1) - shown.amin(dim=1)).max() < 1e-3
-    assert float(shown.min()) >= 0
-    assert float(shown.max()) <= 1
+    assert 0 <= shown.min() <= shown.max() <= 1
 
 
 def test_agx_shows_middle_grey_in_the_middle_tells_highlights_apart_and_lets_bright_colours_fade():
@@ -161,9 +149,8 @@ def test_every_layer_is_a_picture_that_shows_something_also_of_a_single_material
     assert picture.flatten(0, 1).std(dim=0).max() > 0.01
     assert isinstance(legend, ColourScale | tuple | str)
     for shown in (picture, painted(single[0], single[1], layer)[0]):
-        assert picture.isfinite().all()
-        assert float(shown.min()) >= 0
-        assert float(shown.max()) <= 1
+        assert shown.isfinite().all()
+        assert 0 <= shown.min() <= shown.max() <= 1
 
 
 def test_colour_is_the_output_of_renders_mixed_with_the_background_in_linear_light(frame, aids):
@@ -177,15 +164,14 @@ def test_colour_is_the_output_of_renders_mixed_with_the_background_in_linear_lig
 
 @pytest.mark.parametrize("layer", ["rgb", "false-colour", "band", "diffuse"])
 def test_nothing_shines_through_a_sky(frame, aids, layer):
+    def over(view, background):
+        settings = {"background": background, "value_range": (0.0, 1.0), "colour_map": "gray"}
+        return painted(view, aids, layer, **settings)[0]
+
     world = replace(frame, scene=replace(frame.scene, field=with_a_sky(frame.scene.field)))
     for view, is_alike in ((frame, False), (world, True)):
-        black, white = (
-            painted(view, aids, layer, background=name, value_range=(0.0, 1.0), colour_map="gray")[0]
-            for name in ("black", "white")
-        )
-        assert torch.equal(black, white) is is_alike
-    expected = painted(frame, aids, layer, background="black", value_range=(0.0, 1.0), colour_map="gray")[0]
-    assert_close(black, expected, atol=0.02, rtol=0)
+        assert torch.equal(over(view, "black"), over(view, "white")) is is_alike
+    assert_close(over(world, "white"), over(frame, "black"), atol=0.02, rtol=0)
 
 
 def test_bands_and_shares_are_painted_by_their_value_between_the_ends_of_the_scale(frame, aids):
@@ -210,13 +196,11 @@ def test_wavelengths_beyond_the_bands_show_the_outermost_band(frame, aids):
 
 
 def test_pure_pixels_have_the_colours_of_all_figures(frame, aids):
-    count = len(frame.materials.names)
+    count, num_specular = len(frame.materials.names), frame.coefficients.specular.shape[-1]
     colours = torch.as_tensor(endmember_colours(frame.materials), dtype=torch.float32)
-    pure = torch.eye(count)[None]
-    ones = torch.ones(1, count)
-    num_specular = frame.coefficients.specular.shape[-1]
-    coefficients = Coefficients.of(ones, ones, pure, pure, torch.zeros(1, count, num_specular))
-    row = replace(frame, coefficients=coefficients)
+    pure, ones = torch.eye(count)[None], torch.ones(1, count)
+    no_gloss = torch.zeros(1, count, num_specular)
+    row = replace(frame, coefficients=Coefficients.of(ones, ones, pure, pure, no_gloss))
     for layer in ("abundances", "segmentation"):
         picture, legend = painted(row, aids, layer)
         assert_close(picture[0], colours, atol=1e-6, rtol=0)
@@ -228,7 +212,7 @@ def test_labels_have_the_colours_and_the_names_that_they_have_in_renders(classes
     output = Output("segmentation", "labels", "segmentation", "what is there", classes=classes)
     ids = torch.tensor([[0, 1, 7, 255]], dtype=torch.uint8)
     view = ModelView(ring()[0], {"segmentation": ids, "accumulation": (ids != 255).float()})
-    picture, legend = _layer_of(output).paint(view, LayerSettings(), None)
+    picture, legend = painting._layer_of(output).paint(view, LayerSettings(), None)
     expected = opaque_tiles(output, ids.numpy(), (ids != 255).float().numpy(), Palette.of(None, {}))[:, :, 0]
     assert_close(picture, torch.from_numpy(expected / 255).float(), atol=0.003, rtol=0)
     names = [name for name, _ in legend] if isinstance(legend, tuple) else legend
@@ -260,7 +244,7 @@ def test_an_error_is_painted_where_it_is_known(frame, aids, monkeypatch):
     monkeypatch.setattr(MeasuredViews, "error", lambda *_: (values, is_known, "train_007"))
     known = replace(aids, measured=object.__new__(MeasuredViews))
     picture, legend = painted(frame, known, "error", value_range=(0.0, 0.1), background="white")
-    assert_close(picture[3, 4], _colour_table("viridis")[512], atol=0.01, rtol=0)
+    assert_close(picture[3, 4], painting._colour_table("viridis")[512], atol=0.01, rtol=0)
     assert_close(picture[0, 0], torch.ones(3))
     assert "train_007" in legend.label
 
@@ -277,22 +261,21 @@ def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_und
     shown = replace(frame, scene=replace(frame.scene, materials=lit))
     values = shown[f"index:{FORMULA}"]
     assert 0.05 < float(values.isnan().float().mean()) < 0.95
-    settings = LayerSettings(layer="index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
-    picture, legend = paint_layer(shown, settings, aids)
+    chosen = LayerSettings("index", index=FORMULA, value_range=(-1.0, 1.0), background="white")
+    picture, legend = paint_layer(shown, chosen, aids)
     opacity = frame.coefficients.accumulation * values.isfinite()
-    expected = _over_background(_paint_values(values, (-1.0, 1.0), "viridis"), opacity, settings)
-    assert_close(picture, expected, atol=1e-5, rtol=0)
+    solid_colours = painting._paint_values(values, (-1.0, 1.0), "viridis")
+    assert_close(picture, painting._over_background(solid_colours, opacity, chosen), atol=1e-5, rtol=0)
     assert_close(picture[values.isnan()], torch.ones_like(picture[values.isnan()]))
     assert isinstance(legend, ColourScale)
     assert ("of radiance: light unknown" in legend.label) == (light is None)
 
 
-def test_a_named_index_has_its_usual_range_unless_one_is_chosen(frame, aids):
-    _, legend = painted(frame, aids, "index", index="pri")
-    assert (legend.low, legend.high) == (-0.2, 0.2)
+@pytest.mark.parametrize(("chosen", "shown"), [(None, (-0.2, 0.2)), ((0.0, 0.1), (0.0, 0.1))])
+def test_a_named_index_has_its_usual_range_unless_one_is_chosen(frame, aids, chosen, shown):
+    _, legend = painted(frame, aids, "index", index="pri", value_range=chosen)
+    assert (legend.low, legend.high) == shown
     assert legend.label.startswith("photochemical reflectance index, (r531-r570)/(r531+r570)")
-    _, legend = painted(frame, aids, "index", index="pri", value_range=(0.0, 0.1))
-    assert (legend.low, legend.high) == (0.0, 0.1)
 
 
 def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):

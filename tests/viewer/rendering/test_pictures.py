@@ -10,18 +10,7 @@ from torch.testing import assert_close
 from tests.viewer.view_factory import make_frame, make_source
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.trained.trained_scene import TrainedScene
-from unmix_plugin.viewer.rendering.pictures import (
-    _BLOCK_S,
-    _FAR,
-    _FEWEST_PIXELS,
-    _LONGEST_MOVING_S,
-    FrameRender,
-    _finer_height,
-    _moving_height,
-    _num_channels,
-    _picture_depth,
-    _Speedometer,
-)
+from unmix_plugin.viewer.rendering import pictures
 from unmix_plugin.viewer.view_cameras import camera_of, pose_of
 
 
@@ -35,13 +24,13 @@ def test_blocks_give_what_the_scene_gives_at_once(tmp_path, specular, subpixels,
     with source.borrowed() as scene:
         assert isinstance(scene, TrainedScene)
         expected = scene.look(camera, subpixels).coefficients
-        render = FrameRender(camera, subpixels)
+        render = pictures.FrameRender(camera, subpixels)
         total = 0
         while render.rays_left:
             total += render.render_block(scene, block)
         frame = render.frame(scene)
         assert isinstance(frame, MaterialView)
-        assert _num_channels(scene.materials) == expected.packed.shape[-1]
+        assert pictures._num_channels(scene.materials) == expected.packed.shape[-1]
     assert total == render.num_rays == camera.width * camera.height * subpixels**2
     assert frame.coefficients.num_endmembers == expected.num_endmembers
     assert_close(frame.coefficients.packed, expected.packed, atol=1e-5, rtol=1e-5)
@@ -62,17 +51,17 @@ speeds = st.floats(1e3, 1e8)
 
 @given(speeds, st.floats(0.2, 5), st.integers(16, 2048))
 def test_a_moving_picture_takes_no_longer_than_its_time(speed, aspect, largest):
-    height = _moving_height(speed, aspect, largest)
+    height = pictures._moving_height(speed, aspect, largest)
     assert 1 <= height <= largest
     pixels = height * height * aspect
-    assert pixels <= max(speed * _LONGEST_MOVING_S, _FEWEST_PIXELS) * 1.01
-    assert _moving_height(3e7, 1.0, 512) == 512
+    assert pixels <= max(speed * pictures._LONGEST_MOVING_S, pictures._FEWEST_PIXELS) * 1.01
+    assert pictures._moving_height(3e7, 1.0, 512) == 512
 
 
 @given(st.integers(1, 512), st.integers(16, 2048))
 def test_pictures_become_finer_until_the_finest_and_then_no_more(start, largest):
     heights = [min(start, largest)]
-    while (finer := _finer_height(heights[-1], largest)) is not None:
+    while (finer := pictures._finer_height(heights[-1], largest)) is not None:
         assert finer > heights[-1]
         heights.append(finer)
     assert heights[-1] == largest
@@ -80,25 +69,25 @@ def test_pictures_become_finer_until_the_finest_and_then_no_more(start, largest)
 
 
 def test_a_speedometer_follows_what_is_measured():
-    speed = _Speedometer()
+    speed = pictures._Speedometer()
     for _ in range(30):
         speed.add(1000, 0.01)
     assert speed.rays_per_second == pytest.approx(1e5, rel=0.01)
-    assert speed.block_rays == pytest.approx(1e5 * _BLOCK_S, rel=0.01)
+    assert speed.block_rays == pytest.approx(1e5 * pictures._BLOCK_S, rel=0.01)
     before = speed.rays_per_second
     speed.add(0, 1.0)
     speed.add(100, 0.0)
     assert speed.rays_per_second == before
-    assert (_Speedometer(1.0).block_rays, _Speedometer(1e12).block_rays) == (256, 1 << 17)
+    assert (pictures._Speedometer(1.0).block_rays, pictures._Speedometer(1e12).block_rays) == (256, 1 << 17)
 
 
 def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     camera = camera_of(pose_of(source.record.train_cameras[0]), 32)
     frame = make_frame(source, camera)
-    depth = _picture_depth(frame)
+    depth = pictures._picture_depth(frame)
     accumulation = frame.coefficients.accumulation.numpy()
     assert depth.shape == (camera.height, camera.width)
-    assert (depth[accumulation <= 0.5] == np.float32(np.round(_FAR / 512e-5) * 512e-5)).all()
+    assert (depth[accumulation <= 0.5] == np.float32(np.round(pictures._FAR / 512e-5) * 512e-5)).all()
     seen = accumulation > 0.5
     assert seen.any()
     bundle = camera.image_rays(0)
@@ -109,6 +98,6 @@ def test_depth_is_along_the_axis_where_something_is_and_far_elsewhere(source):
     units = np.round(depth.astype(np.float64) * 100_000).astype(np.int64)  # the browser's; low bits are empty
     assert_close(units % 512, np.zeros_like(units))
     fine = make_frame(source, camera_of(pose_of(source.record.train_cameras[0]), 300))  # of every other pixel
-    depth, accumulation = _picture_depth(fine), fine.coefficients.accumulation[1::2, 1::2].numpy()
+    depth, accumulation = pictures._picture_depth(fine), fine.coefficients.accumulation[1::2, 1::2].numpy()
     assert depth.shape == (150, fine.camera.width // 2)
     assert ((depth > 100) == (accumulation <= 0.5)).all()

@@ -8,20 +8,13 @@ import pytest
 import torch
 
 from tests.method_factory import make_model
-from tests.viewer.view_factory import (
-    LARGEST,
-    Screen,
-    finest,
-    finish,
-    make_loop,
-    running_loop,
-    some_pose,
-    source_of_model,
-)
+from tests.viewer import view_factory
+from tests.viewer.view_factory import LARGEST, Screen, finest, finish, make_loop, some_pose
 from unmix_plugin.editing import Light, Recipe, Remove, Scale
 from unmix_plugin.engine.training.training_control import TrainingControl
 from unmix_plugin.trained.outputs import MaterialView
 from unmix_plugin.viewer.rendering.pictures import FrameRender, PictureMaker, _num_channels
+from unmix_plugin.viewer.rendering.render_loop import View
 from unmix_plugin.viewer.rendering.scene import Edit
 from unmix_plugin.viewer.rendering.settings import LayerSettings
 from unmix_plugin.viewer.view_cameras import camera_of
@@ -161,16 +154,14 @@ def test_removed_materials_leave_no_faint_specks(loop, screen):
 
 
 def test_more_rays_a_pixel_are_cast_for_the_finest_picture_only(loop, screen, monkeypatch):
-    created = []
-    original = FrameRender.__init__
+    created, original = [], FrameRender.__init__
 
     def noting(self, camera, subpixels=1):
         original(self, camera, subpixels)
         created.append((camera.height, subpixels))
 
     monkeypatch.setattr(FrameRender, "__init__", noting)
-    loop.change(screen.view, pose=some_pose())
-    loop.change(screen.view, largest_height=24, subpixels=2)
+    loop.change(screen.view, pose=some_pose(), largest_height=24, subpixels=2)
     finest(loop, screen)
     assert created[-1] == (24, 2)
     assert all(subpixels == 1 for height, subpixels in created[:-1])
@@ -221,12 +212,13 @@ def test_a_defect_in_a_picture_is_said_logged_and_ends_nothing(loop, screen, mon
 
 
 def test_a_client_that_cannot_be_shown_anything_does_not_end_the_loop(loop, screen, caplog):
-    gone = Screen()
-    gone.view.show = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
-    gone.view.report = lambda _: (_ for _ in ()).throw(ConnectionError("gone"))
-    loop.add(gone.view)
-    loop.change(gone.view, pose=some_pose())
-    loop.change(screen.view, pose=some_pose())
+    def fail(_):
+        raise ConnectionError("gone")
+
+    gone = View(show=fail, report=fail)
+    loop.add(gone)
+    for view in (gone, screen.view):
+        loop.change(view, pose=some_pose())
     finest(loop, screen)
     assert "ConnectionError" in caplog.text
 
@@ -248,8 +240,8 @@ def test_a_view_that_is_removed_in_mid_render_is_shown_nothing_more(loop, screen
 def training(tmp_path):
     """A model under training, and a loop that shows it in a thread of its own."""
     control, model, screen = TrainingControl(), make_model(), Screen()
-    source = source_of_model(model, tmp_path, control)
-    with running_loop(source) as loop:
+    source = view_factory.source_of_model(model, tmp_path, control)
+    with view_factory.running_loop(source) as loop:
         screen.view.largest_height = LARGEST
         loop.add(screen.view)
         yield control, model, source, loop, screen

@@ -1,5 +1,6 @@
 """Recipes on a scene that may be training, and what training views measured of it."""
 
+import math
 import shutil
 from dataclasses import replace
 from typing import Any
@@ -151,26 +152,20 @@ def on_ball(camera):
 
 
 def test_the_error_at_a_training_view_is_the_difference_to_its_picture(views, scene, ball_of):
-    index = 2
-    camera = scene.cameras[scene.train_indices[index]]
-    frame = ball_of(camera)
+    index = scene.train_indices[2]
+    frame = ball_of(scene.cameras[index])
     errors, is_known, name = views.error(frame)
-    assert name == scene.frames[scene.train_indices[index]].name
     hits = frame.coefficients.accumulation > 0.5
-    assert bool(hits.any())
+    assert (name, bool(hits.any())) == (scene.frames[index].name, True)
     assert torch.equal(is_known, hits)
-    expected = difference(scene, scene.train_indices[index])
-    assert_close(errors[hits], expected[hits], atol=1e-6, rtol=0)
-    assert float(errors[~hits].abs().max()) == 0
+    assert_close(errors, torch.where(hits, difference(scene, index), 0.0), atol=1e-6, rtol=0)
 
 
 def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, scene, ball_of):
     camera = scene.cameras[scene.train_indices[0]]
-    turned = camera.camera_to_world.clone()
-    angle = torch.tensor(0.9)
-    turn = torch.tensor([[angle.cos(), -angle.sin(), 0.0], [angle.sin(), angle.cos(), 0.0], [0.0, 0.0, 1.0]])
-    turned[0] = turn @ turned[0]
-    frame = ball_of(replace(camera, camera_to_world=turned))
+    sine, cosine = math.sin(0.9), math.cos(0.9)
+    turn = torch.tensor([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    frame = ball_of(replace(camera, camera_to_world=turn @ camera.camera_to_world))
     _, is_known, _ = views.error(frame)
     hits = frame.coefficients.accumulation > 0.5
     assert 0 < int(is_known.sum()) < int(hits.sum())
@@ -180,12 +175,9 @@ def test_from_between_two_views_only_what_the_nearest_sees_has_an_error(views, s
 def test_a_point_is_measured_by_the_view_nearest_to_the_camera_and_one_inside_by_none(views, scene, ball_of):
     index = scene.train_indices[1]
     camera = scene.cameras[index]
-    found = views.measurement(on_ball(camera), camera, None, ball_of(camera).scene)
-    assert found is not None
-    name, spectrum = found
+    name, spectrum = views.measurement(on_ball(camera), camera, None, ball_of(camera).scene)
     assert name == scene.frames[index].name
-    coords, _ = camera.project(on_ball(camera)[None], 0)
-    column, row = (int(value) for value in coords[0])
+    column, row = camera.project(on_ball(camera)[None], 0)[0][0].long().tolist()
     np.testing.assert_allclose(spectrum, scene.cube(index)[row, column])
     assert views.measurement(torch.zeros(3), camera, None, ball_of(camera).scene) is None
 
@@ -203,10 +195,9 @@ def test_pixels_that_do_not_count_are_no_measurement(scene, source, views, ball_
     _, is_known, _ = holed.error(frame)
     assert torch.equal(is_known, was_known & torch.from_numpy(np.isfinite(cube).all(axis=-1)))
     assert 0 < int(is_known.sum()) < int(was_known.sum())
-    found = holed.measurement(on_ball(camera), camera, None, frame.scene)
-    assert found is not None  # by another view, which sees the point too
-    assert found[0] != scene.frames[index].name
-    assert float(found[1].min()) > 0
+    measured: Any = holed.measurement(on_ball(camera), camera, None, frame.scene)
+    assert measured[0] != scene.frames[index].name  # but another view, which sees the point too
+    assert float(measured[1].min()) > 0
 
 
 LIGHT = torch.tensor([0.2, 0.4, 0.6, 0.8, 1.0, 0.5])
@@ -219,10 +210,10 @@ GAIN = torch.linspace(0.5, 2.0, 6)
 def test_what_was_measured_is_compared_from_where_as_lit_and_as_exposed_as_the_scene(
     views, scene, ball_of, shift_px, light, gain
 ):
-    index, shift = (
-        scene.train_indices[2],
-        lambda camera: replace(camera, center_px=camera.center_px + shift_px),
-    )
+    def shift(camera):
+        return replace(camera, center_px=camera.center_px + shift_px)
+
+    index = scene.train_indices[2]
     camera = shift(scene.cameras[index])
     frame = ball_of(camera)
     gains = torch.ones(len(scene.train_indices), 6)
@@ -241,18 +232,15 @@ def test_what_was_measured_is_compared_from_where_as_lit_and_as_exposed_as_the_s
 
 
 def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_of, source, monkeypatch):
-    camera = scene.cameras[scene.train_indices[1]]
-    ball = replace(source, take=lambda: ball_of(camera).scene)
-    maker = PictureMaker(ball)
+    index = scene.train_indices[1]
+    camera = scene.cameras[index]
+    maker = PictureMaker(replace(source, take=lambda: ball_of(camera).scene))
     maker.aids.measured = views
     turns, turn = [], source.device.guest_turn
     monkeypatch.setattr(source.device, "guest_turn", lambda cost: turns.append(cost) or turn(cost))
     taken = _take_probe(maker, Edit(), camera, (camera.width / 2, camera.height / 2), 1)
-    assert len(turns) == 1
-    assert taken.measured_in == scene.frames[scene.train_indices[1]].name
-    expected = scene.cube(scene.train_indices[1])[camera.height // 2, camera.width // 2]
-    assert taken.measured is not None
-    np.testing.assert_allclose(taken.measured, expected)
+    assert (len(turns), taken.measured_in) == (1, scene.frames[index].name)
+    assert taken.measured == pytest.approx(scene.cube(index)[camera.height // 2, camera.width // 2])
 
 
 def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_rendered(
@@ -266,6 +254,5 @@ def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_ren
         return render(*arguments)
 
     monkeypatch.setattr(aids_module, "render_reference", slowly)
-    found = aids.for_layers()
-    assert found is not None
+    found: Any = aids.for_layers()
     assert found.measured is views
