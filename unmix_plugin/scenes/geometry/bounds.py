@@ -146,19 +146,24 @@ def _tighten(cameras: Cameras, rays: RayBundle, box: SceneBox, hull: Cells) -> S
     """
     if not hull.any():  # finer cells may find that nothing fits after all
         return box
-    count = _count_views(cameras, box, _HULL_CELLS)
+    count = _count_views(cameras, box, _HULL_CELLS, hull)
     for share in _HULL_SHARES:
-        tight = _extent(box, hull & (count >= share * count.max(where=hull, initial=0)), margin_cells=1)
+        tight = _extent(box, hull & (count >= share * count.max()), margin_cells=1)
         t_near, t_far = tight.intersect(rays.origins, rays.directions)
         if float((t_far > t_near).double().mean()) >= MIN_EXPLAINED:
             return tight
     return _extent(box, hull, margin_cells=1)
 
 
-def _count_views(cameras: Cameras, box: SceneBox, cells: int) -> Int64[np.ndarray, "R R R"]:
-    """How many cameras see the centre of each cell."""
-    points = box.aabb[0] + unit_centres(cells) * box.size
-    return count_views(cameras, points).view(cells, cells, cells).numpy()
+def _count_views(
+    cameras: Cameras, box: SceneBox, cells: int, among: Cells | None = None
+) -> Int64[np.ndarray, "R R R"]:
+    """How many cameras see the centre of each cell, of the cells `among` all; 0 for others."""
+    asked = np.ones((cells, cells, cells), dtype=bool) if among is None else among
+    points = box.aabb[0] + unit_centres(cells)[torch.from_numpy(asked).flatten()] * box.size
+    count = np.zeros(asked.shape, dtype=np.int64)
+    count[asked] = count_views(cameras, points).numpy()
+    return count
 
 
 def _extent(box: SceneBox, kept: Cells, margin_cells: int) -> SceneBox:

@@ -352,7 +352,7 @@ def _carve_world(cameras: Cameras, box: SceneBox, resolution: int) -> Cells:
 
 def unit_centres(cells: int) -> Float[Tensor, "M 3"]:
     """Centres of the cells of a unit cube, so many along each edge; x outermost."""
-    return (torch.cartesian_prod(*[torch.arange(cells)] * 3) + 0.5) / cells
+    return torch.cartesian_prod(*[(torch.arange(cells) + 0.5) / cells] * 3)
 
 
 def refined(grid: Bool[Tensor, "r r r"], resolution: int) -> Bool[Tensor, "R R R"]:
