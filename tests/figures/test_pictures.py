@@ -1,5 +1,3 @@
-"""Tiles in a grid: no name is cut off, and each tile stands under its own."""
-
 import numpy as np
 
 from unmix_plugin.figures.pictures import Canvas, CanvasLayout
@@ -11,10 +9,8 @@ def test_small_tiles_have_room_for_their_names():
     """The strips of names that differ in their last letter differ, however narrow the tiles are."""
     layout = CanvasLayout.of((16, 8), NAMES)
     canvas = Canvas(layout, 3, NAMES, [(0.5, 0.5, 0.5)] * 3)
-    strips = [
-        canvas.pixels[: layout.above_px, left : left + layout.column_px]
-        for _, left in (layout.corner(index) for index in range(3))
-    ]
+    lefts = [layout.corner(index)[1] for index in range(3)]
+    strips = [canvas.pixels[: layout.above_px, left : left + layout.column_px] for left in lefts]
     assert not np.array_equal(strips[0], strips[1])
     assert not np.array_equal(strips[1], strips[2])
     assert all((strip[:, -2:] == 255).all() for strip in strips)

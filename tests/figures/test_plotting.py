@@ -1,5 +1,3 @@
-"""Line charts are drawn as they should; colours of materials: near their own, told apart, visible."""
-
 import re
 from xml.etree import ElementTree as ET
 
@@ -9,15 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from unmix_plugin.figures.plotting import (
-    RIGHT,
-    WRONG,
-    ChartLine,
-    SpectraChart,
-    distinct_colours,
-    draw_chart,
-    own_colours,
-)
+from unmix_plugin.figures import plotting
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.colour.conversion import srgb_to_linear
 
@@ -27,8 +17,8 @@ COLOUR = "#123456"
 
 def drawn(*values):
     """A chart of a line, as a tree."""
-    line = ChartLine(X[: len(values)], np.array(values, dtype=float), "line", COLOUR)
-    return ET.fromstring(draw_chart(SpectraChart([line], "radiance", (640.0, 300.0))))
+    line = plotting.ChartLine(X[: len(values)], np.array(values, dtype=float), "line", COLOUR)
+    return ET.fromstring(plotting.draw_chart(plotting.SpectraChart([line], "radiance", (640.0, 300.0))))
 
 
 def strokes(drawing):
@@ -52,10 +42,13 @@ def test_lines_rise_with_their_values_inside_the_chart_above_zero():
     assert np.ptp(above[:, 1]) < 0.3 * np.ptp(points[:, 1])  # in the upper part, where zero is shown
 
 
-@pytest.mark.parametrize(
-    ("values", "num_dots"),
-    [([0.7], 1), ([1.0, 2.0, np.nan, 3.0], 1), ([np.nan, 1.0, np.nan, 2.0], 2), ([1.0, 2.0, 3.0], 0)],
-)
+NONE = np.nan
+
+
+DOTS = [([0.7], 1), ([1, 2, NONE, 3], 1), ([NONE, 1, NONE, 2], 2), ([1, 2, 3], 0)]
+
+
+@pytest.mark.parametrize(("values", "num_dots"), DOTS)
 def test_a_missing_value_is_a_gap_and_one_without_neighbours_a_dot(values, num_dots):
     drawing = drawn(*values)
     dots = drawing.iter("{http://www.w3.org/2000/svg}use")
@@ -84,7 +77,7 @@ def least_difference(colours):
 
 @pytest.mark.parametrize(("count", "least"), [(8, 0.15), (26, 0.12), (100, 0.05), (255, 0.04)])
 def test_colours_are_told_apart_even_if_all_materials_look_the_same(count, least):
-    colours = distinct_colours(np.full((count, 3), 0.45))
+    colours = plotting.distinct_colours(np.full((count, 3), 0.45))
     assert colours.shape == (count, 3)
     assert least_difference(colours) > least
     assert 0 <= colours.min() < colours.max() <= 1
@@ -93,24 +86,24 @@ def test_colours_are_told_apart_even_if_all_materials_look_the_same(count, least
 @settings(max_examples=20)
 @given(st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=2, max_size=10))
 def test_colours_differ_and_stand_out_from_white_paper_and_black_text(own):
-    colours = distinct_colours(np.array(own))
+    colours = plotting.distinct_colours(np.array(own))
     assert least_difference(colours) > 0.1
     assert 0.055 < luminance(colours).min() <= luminance(colours).max() < 0.68
-    for mark in (RIGHT, WRONG):
+    for mark in (plotting.RIGHT, plotting.WRONG):
         assert np.abs(colours - mark).max(axis=1).min() > 0.15
 
 
 def test_colours_that_are_told_apart_already_stay():
     own = np.array([[0.8, 0.2, 0.2], [0.2, 0.3, 0.8], [0.2, 0.65, 0.3]])
-    np.testing.assert_allclose(distinct_colours(own), own, atol=0.03)
-    np.testing.assert_array_equal(distinct_colours(own), distinct_colours(own))
-    assert distinct_colours(np.zeros((0, 3))).shape == (0, 3)
+    np.testing.assert_allclose(plotting.distinct_colours(own), own, atol=0.03)
+    np.testing.assert_array_equal(plotting.distinct_colours(own), plotting.distinct_colours(own))
+    assert plotting.distinct_colours(np.zeros((0, 3))).shape == (0, 3)
 
 
 def test_a_materials_own_colour_is_that_of_its_spectrum():
     wavelengths = torch.from_numpy(BANDS.centers_nm.copy())
     white, black = torch.ones(31), torch.zeros(31)
     red, blue = (wavelengths > 600).float(), (wavelengths < 480).float()
-    colours = own_colours(torch.stack([white, black, red, blue]), BANDS)
+    colours = plotting.own_colours(torch.stack([white, black, red, blue]), BANDS)
     np.testing.assert_allclose(colours[:2], [[1.0] * 3, [0.0] * 3], atol=1e-6)
     assert colours[2:].argmax(axis=1).tolist() == [0, 2]

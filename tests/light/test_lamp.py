@@ -1,6 +1,3 @@
-"""A lamp that moves with the camera: where it is, what it reaches, and that training moves it to where it is."""
-
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +9,7 @@ from torch.testing import assert_close
 
 from tests.method_factory import BOX, CAMERA, CONFIG, initial_data, make_model, make_rays, scene_of
 from unmix_plugin.editing.edited_field import EditedField
+from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.light.lamp import Lamp, MovingLamp
 from unmix_plugin.light.shading import FINEST, Lamplight, ShadowDetail, _visible_part, lamplight
@@ -24,10 +22,7 @@ NUMBERS = TURNTABLE.numbers()
 
 
 def turned(points: torch.Tensor, angle: float) -> torch.Tensor:
-    turn = torch.tensor(
-        [[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1.0]]
-    )
-    return points @ turn.T
+    return points @ rotation_matrix(torch.tensor([[0.0, 0.0, angle]]))[0].T
 
 
 def wall(cells: int = 64) -> torch.Tensor:
@@ -68,9 +63,8 @@ def test_shadows_come_nearer_and_get_sharper_until_training_ends():
     plate[:, :, 32:36] = 1
     below = torch.tensor([[0.0, 0.0, -0.2], [0.0, 0.0, -0.7]])
     lamps, skips = below + torch.tensor([0.0, 0.0, 5.0]), skip_distances(plate != 0)
-    first, middle, last = (
-        _visible_part(below, lamps, BOX, skips, ShadowDetail.at(progress)) for progress in (0.0, 0.5, 1.0)
-    )
+    details = [ShadowDetail.at(progress) for progress in (0.0, 0.5, 1.0)]
+    first, middle, last = (_visible_part(below, lamps, BOX, skips, detail) for detail in details)
     assert torch.equal(_visible_part(below, lamps, BOX, skips), last)
     assert bool((first > middle).all() & (middle > last).all())
     assert float(last.max()) < 0.05
@@ -86,10 +80,9 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
     def mean_visible(change: float) -> torch.Tensor:
         with torch.no_grad():
             lamp.change.copy_(torch.tensor([0.0, change, 0.0]))
-        generator = torch.Generator().manual_seed(0)
-        return lamplight(
-            lamp, origins, positions, BOX, skip_distances(wall() != 0), ShadowDetail.at(0.0), generator
-        ).visible.mean()
+        skips, generator = skip_distances(wall() != 0), torch.Generator().manual_seed(0)
+        lit = lamplight(lamp, origins, positions, BOX, skips, ShadowDetail.at(0.0), generator)
+        return lit.visible.mean()
 
     high, low = (float(mean_visible(change).detach()) for change in (0.05, -0.05))
     expected = (high - low) / 0.1
@@ -202,9 +195,7 @@ def test_gloss_follows_the_lamp_and_not_the_eye_alone():
     assert (one["specular_coefficients"] - other["specular_coefficients"]).abs().max() > 1e-4
 
 
-@pytest.mark.parametrize(
-    ("numbers", "words"), [(NUMBERS, "the place of its lamp follows from shadows"), ((), "no shadows tell")]
-)
+@pytest.mark.parametrize(("numbers", "words"), [(NUMBERS, "follows from shadows"), ((), "no shadows tell")])
 def test_the_lamp_follows_from_the_data(numbers, words):
     """Where it is not known shading depends on the direction of view."""
     data = {**initial_data(), "light": np.array("camera"), "lamp": np.array(numbers)}

@@ -1,5 +1,3 @@
-"""Where the lamp that moves with the camera is, found from pictures of a ball and of things on a table."""
-
 import numpy as np
 import pytest
 import torch

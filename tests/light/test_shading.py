@@ -1,5 +1,3 @@
-"""Surfaces in a lamp's light: as bright as they face it, glossy where they mirror it, and normals that are learnt."""
-
 import torch
 from torch.nn.functional import normalize
 from torch.testing import assert_close

@@ -1,5 +1,3 @@
-"""What measured spectra say of abundances: the loss, the penalty of further materials, and the error of margins."""
-
 import torch
 from torch.testing import assert_close
 
@@ -25,10 +23,8 @@ def guide():
 
 
 def measured(spectra, alpha=1.0, first=0):
-    count = len(spectra)
-    return MeasuredPixels(
-        None, count, spectra, torch.full((count,), alpha), torch.arange(first, first + count)
-    )
+    pixels = torch.arange(first, first + len(spectra))
+    return MeasuredPixels(None, len(spectra), spectra, torch.full((len(spectra),), alpha), pixels)
 
 
 def error(abundances, spectra, alpha=1.0):

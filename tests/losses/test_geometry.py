@@ -1,5 +1,3 @@
-"""Losses that know where surfaces are and how they face."""
-
 import pytest
 import torch
 from torch import nn
@@ -18,11 +16,9 @@ NAN = float("nan")
 
 def stray(weights, cells_off, ray_indices, surfaces):
     """Of samples so many cells away from the middle of the box along x."""
-    positions = torch.full((len(weights), 3), 0.5)
+    positions, rays = torch.full((len(weights), 3), 0.5), torch.tensor(ray_indices)
     positions[:, 0] += CELL * torch.tensor(cells_off)
-    return stray_light(
-        torch.as_tensor(weights), positions, torch.tensor(ray_indices), torch.tensor(surfaces), SPACE
-    )
+    return stray_light(torch.as_tensor(weights), positions, rays, torch.tensor(surfaces), SPACE)
 
 
 def test_light_counts_in_full_at_the_surface_and_not_at_all_far_from_it():
@@ -72,12 +68,8 @@ def shading_of(normal: tuple[float, float, float]) -> LampShading:
     return shading
 
 
-@pytest.mark.parametrize(
-    ("normal", "expected"), [((0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 2.0)]
-)
-def test_the_error_is_one_less_the_cosine_to_the_densities_own_normals_and_0_without_samples(
-    normal, expected
-):
+@pytest.mark.parametrize(("normal", "expected"), [((0, 0, 1.0), 0), ((1.0, 0, 0), 1), ((0, 0, -1.0), 2)])
+def test_the_error_is_one_less_the_cosine_to_densities_own_normals_and_0_without_samples(normal, expected):
     generator = torch.Generator().manual_seed(0)
     for count, wanted in ((40, expected), (0, 0.0)):
         places, weights = torch.rand(count, 3), torch.rand(count)
@@ -99,9 +91,8 @@ def test_normals_are_guided_less_and_less_and_only_where_a_lamp_moves():
     guided = losses(model_with_lamp(), 0.1)
     guided["normals"].backward()
     assert float(guided["normals"].detach()) > 0
-    assert float(losses(model_with_lamp(), 0.9)["normals"].detach()) < 0.02 * float(
-        guided["normals"].detach()
-    )
+    later = losses(model_with_lamp(), 0.9)
+    assert float(later["normals"].detach()) < 0.02 * float(guided["normals"].detach())
     assert "normals" not in losses(model_with_lamp(), 1.0)
     assert "normals" not in losses(make_model(), 0.1)
 

@@ -1,5 +1,3 @@
-"""What the losses of the model ask for, with alpha and without."""
-
 from typing import Any
 
 import pytest
@@ -29,15 +27,11 @@ def test_a_perfect_prediction_has_no_loss_over_any_background(background):
 
 
 def test_colours_count_by_default_where_alpha_tells_black_from_the_void():
-    spectra, alpha = torch.rand(8, NUM_BANDS), torch.ones(8)
-    losses = {
-        has_alpha: losses_of(
-            make_model(has_alpha=has_alpha), {"spectra": spectra, "alpha": alpha}, spectra / 2, alpha
-        )
-        for has_alpha in (True, False)
-    }
-    assert float(losses[True]["rgb"]) > 0
-    assert "rgb" not in losses[False]
+    batch = {"spectra": torch.rand(8, NUM_BANDS), "alpha": torch.ones(8)}
+    models = (make_model(has_alpha=has_alpha) for has_alpha in (True, False))
+    masked, bare = (losses_of(model, batch, batch["spectra"] / 2, batch["alpha"]) for model in models)
+    assert float(masked["rgb"]) > 0
+    assert "rgb" not in bare
 
 
 @pytest.mark.parametrize(
@@ -81,9 +75,8 @@ def test_relative_errors_count_the_more_the_darker_the_rendered_pixel_is(power):
 
 
 def test_transparency_is_penalised_only_where_no_alpha_says_what_is_solid():
-    spectra = torch.tensor([0.5, 0.5, 0.0])[:, None].repeat(
-        1, NUM_BANDS
-    )  # the last pixel is black: it may be void
+    # The last pixel is black: it may be void.
+    spectra = torch.tensor([0.5, 0.5, 0.0])[:, None].repeat(1, NUM_BANDS)
     batch = {"spectra": spectra, "alpha": torch.ones(3)}
     opacities = torch.tensor([1.0, 0.5, 0.0])
     closed = losses_of(make_model(has_alpha=False), batch, spectra, opacities)

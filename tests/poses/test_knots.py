@@ -1,5 +1,3 @@
-"""Corrections of a line camera's poses: waves over its rows, and knots close enough for them."""
-
 import numpy as np
 import pytest
 import torch
@@ -39,12 +37,8 @@ def test_corrections_between_inner_knots_are_a_cubic_b_spline():
     place = torch.linspace(1.0, 7.0, 50)
     values = np.random.default_rng(0).normal(size=9)
     theirs = BSpline(np.arange(-2, 11), values, 3)(place.numpy())
-    assert_close(
-        dense_weights(place, 9).double() @ torch.from_numpy(values),
-        torch.from_numpy(theirs),
-        atol=1e-5,
-        rtol=0,
-    )
+    ours = dense_weights(place, 9).double() @ torch.from_numpy(values)
+    assert_close(ours, torch.from_numpy(theirs), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("count", [4, 5, 9])
@@ -70,12 +64,9 @@ def test_a_bend_of_a_line_camera_costs_and_a_drift_does_not():
         with torch.no_grad():
             found.steps.fill_(0.1)
             for first, shape in zip((1, 12), shapes, strict=True):
-                found.steps[first : first + 11] = torch.linalg.solve(row_waves(11), shape[:, None]).expand(
-                    -1, 6
-                )
-            return float(found.penalty(found.free_steps())) - refinement._SIZE_PENALTY * float(
-                found.free_steps().square().mean()
-            )
+                found.steps[first : first + 11] = torch.linalg.solve(row_waves(11), shape)[:, None]
+            of_size = refinement._SIZE_PENALTY * found.free_steps().square().mean()
+            return float(found.penalty(found.free_steps())) - float(of_size)
 
     drift, bump = torch.linspace(0.0, 0.2, 11), torch.eye(11)[5] * 0.01
     assert cost(drift, -3 * drift + 0.5) < 1e-10

@@ -1,8 +1,3 @@
-"""Poses corrected while training: rays and cameras agree, what can't be seen stays, what runs away is undone.
-
-Poses that disagree with all others: their pixels hardly shape the scene, but still pull at the pose.
-"""
-
 from dataclasses import replace
 from typing import Any
 
@@ -16,16 +11,10 @@ from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle
 from unmix_plugin.engine.processes import Processes
 from unmix_plugin.field import CoefficientField
-from unmix_plugin.light.shading import Lamplight
 from unmix_plugin.model import UnmixModel
+from unmix_plugin.poses import refinement as pose_refinement
 from unmix_plugin.poses.knots import Knots, row_waves
-from unmix_plugin.poses.refinement import (
-    _COARSEST_PIXEL,
-    LARGEST_RATIO,
-    LARGEST_STEP,
-    PoseRefinement,
-    _RobustWeights,
-)
+from unmix_plugin.poses.refinement import LARGEST_RATIO, LARGEST_STEP, PoseRefinement, _RobustWeights
 from unmix_plugin.poses.training import PoseTraining
 from unmix_plugin.sensors.batches import MeasuredPixels
 from unmix_plugin.settings import PoseConfig
@@ -138,7 +127,8 @@ def test_steps_are_a_share_of_a_pixel_and_bounds_a_share_of_the_picture():
     found = PoseRefinement((0,) * 4)
     directions = torch.eye(3)[[0, 1, 2, 0]]
     distances = torch.tensor([2.0, 4.0, 16.0, 16.0])
-    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), 4 * _COARSEST_PIXEL)
+    pixel = 4 * pose_refinement._COARSEST_PIXEL
+    found.begin(distances[:, None] * directions, box_around(torch.zeros(3), 1.0), pixel)
     found.gauge.zero_()
     with torch.no_grad():
         found.steps.fill_(0.1)
@@ -199,20 +189,9 @@ class Blob(CoefficientField):
     def abundances_of(self, features: torch.Tensor) -> torch.Tensor:
         return torch.softmax(3 * torch.sin(4 * features + torch.arange(3)), dim=-1)
 
-    def get_outputs(
-        self,
-        positions: torch.Tensor,
-        directions: torch.Tensor,
-        features: torch.Tensor,
-        light: Lamplight | None = None,
-    ) -> dict[str, torch.Tensor]:
-        abundances = self.abundances_of(features)
-        specular = 0.3 * (1 + directions[:, :1] * directions[:, 1:2])
-        return {
-            "abundances": abundances,
-            "scaled_abundances": 0.7 * abundances,
-            "specular_coefficients": specular,
-        }
+    def get_outputs(self, positions, directions, features, light=None):
+        shares, specular = self.abundances_of(features), 0.3 * (1 + directions[:, :1] * directions[:, 1:2])
+        return {"abundances": shares, "scaled_abundances": 0.7 * shares, "specular_coefficients": specular}
 
 
 def test_the_gradient_of_a_picture_by_a_pose_is_that_of_finite_differences():

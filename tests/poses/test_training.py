@@ -1,5 +1,3 @@
-"""Training that corrects poses: it carves by corrected cameras, goes on where it stopped, and moves its views."""
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +7,14 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from tests.engine.stopped_runs import quiet_trainer
+from tests.engine.stopped_runs import quiet_trainer, stop_at
 from tests.method_factory import CONFIG
+from tests.scenes.line_factory import make_line_scene
 from tests.scenes.scene_factory import make_scene
 from unmix_plugin.engine.configs import PipelineConfig, TrainerConfig
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
-from unmix_plugin.engine.runs.load_run import load_model
+from unmix_plugin.engine.runs.load_run import load_config, load_model
 from unmix_plugin.engine.training.trainer import Trainer
 from unmix_plugin.method_config import unmix_nerf
 from unmix_plugin.poses.refinement import PoseRefinement
@@ -27,9 +26,8 @@ def config_for(
     folder: Path, poses: Literal["fixed", "refine"] = "refine", steps: int = 12, **refinement: Any
 ) -> TrainerConfig:
     data = HyperspectralDataManagerConfig(train_num_rays_per_batch=64, grid_resolution=16)
-    model = replace(
-        CONFIG, num_endmembers=1, poses=poses, pose_refinement=PoseConfig(start=0.0, **refinement)
-    )
+    correcting = PoseConfig(start=0.0, **refinement)
+    model = replace(CONFIG, num_endmembers=1, poses=poses, pose_refinement=correcting)
     return replace(
         unmix_nerf.config,
         data=folder / "scene",
@@ -112,3 +110,34 @@ def test_refined_poses_are_the_run_s_training_cameras(folder):
     assert float((found - given).abs().max()) > 1e-5
     lines = (trainer.run.path / "metrics.jsonl").read_text().splitlines()
     assert "poses" in json.loads(lines[-1])
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory) -> Path:
+    place = tmp_path_factory.mktemp("lines")
+    make_line_scene(place / "scene")
+    return place
+
+
+def test_a_run_gives_back_its_line_cameras_and_renders_all_bands(lines):
+    trainer = trained(config_for(lines, "fixed"))
+    scene = open_run(trainer.run.path, "cpu")
+    view = scene.views[0]
+    assert view.camera.is_line_camera(0)
+    mine, theirs = view.camera.image_rays(0), trainer.pipeline.datamanager.train_cameras.image_rays(0)
+    assert torch.equal(mine.origins, theirs.origins)
+    found = scene.render(view.camera, ["spectral", "depth"])["spectral"]
+    assert found.shape == (16, 20, 4)
+    assert bool(found.isfinite().all())
+    assert float(found.std()) > 0
+
+
+def test_refined_training_on_line_cameras_goes_on_exactly_where_it_stopped(lines):
+    config = config_for(lines, steps=8, coarse_steps=2)
+    straight = trained(config).pipeline
+    poses, given = straight.model.poses, straight.datamanager.train_cameras
+    assert isinstance(poses, PoseRefinement)
+    assert not torch.equal(poses.refined(given).image_rays(0).directions, given.image_rays(0).directions)
+    resumed = trained(load_config(stop_at(config, 6).run)).pipeline.model.state_dict()
+    for name, value in straight.model.state_dict().items():
+        assert torch.equal(value, resumed[name]), name

@@ -1,5 +1,3 @@
-"""Pictures looked at from the front are those of the careful way, but for a stated error."""
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -34,16 +32,12 @@ def test_with_nothing_left_out_both_ways_are_equal(opacity):
 
 
 @pytest.mark.parametrize("at_once", [front_to_back.FEWEST_SAMPLES, front_to_back.SAMPLES_MARCHED])
-@pytest.mark.parametrize(
-    ("smallest_weight", "opacity"), [(1e-3, 0.05), (4e-3, 0.01), (4e-3, 0.3), (1e-3, 0.9)]
-)
-def test_what_is_left_out_costs_no_more_than_the_careful_way_and_a_few_smallest_weights(
-    monkeypatch, smallest_weight, opacity, at_once
-):
-    """Light behind the end, samples that carry too little, and the bend of a network within merged samples; as many
-    samples of a ray at once as on the CPU, and as on a GPU."""
+@pytest.mark.parametrize(("smallest", "opacity"), [(1e-3, 0.05), (4e-3, 0.01), (4e-3, 0.3), (1e-3, 0.9)])
+def test_what_is_left_out_costs_no_more_than_in_the_careful_way(monkeypatch, smallest, opacity, at_once):
+    """And a few smallest weights: light behind the end, samples that carry too little, and the bend of a network within
+    merged samples; as many samples of a ray at once as on the CPU, and as on a GPU."""
     monkeypatch.setattr("unmix_plugin.rendering.front_to_back.FEWEST_SAMPLES", at_once)
-    renderer, field = textured(smallest_weight, opacity)
+    renderer, field = textured(smallest, opacity)
     bundle = rays(80)
     with torch.no_grad():
         careful = renderer.render(field, bundle).coefficients
@@ -53,7 +47,7 @@ def test_what_is_left_out_costs_no_more_than_the_careful_way_and_a_few_smallest_
     unit = torch.ones_like(exact[0])
     unit[1] = 3.0  # distances: of the middle of the box
     errors = [((x.packed - exact).abs() / unit).mean(dim=0) for x in (fast, careful)]
-    assert (errors[0] < errors[1] + 2 * smallest_weight).all()
+    assert (errors[0] < errors[1] + 2 * smallest).all()
 
 
 def test_a_ray_ends_where_hardly_any_light_is_left_and_counts_as_opaque(monkeypatch):
@@ -110,15 +104,13 @@ def test_pictures_of_a_trained_scene_are_those_of_the_careful_renderer(tmp_path)
     pipeline = trained(config_for(tmp_path, "fixed", steps=150)).pipeline
     model: Any = pipeline.model.eval()
     rays = pipeline.datamanager.eval_cameras.image_rays(0)
-    exactly, quickly = (
-        replace(model.renderer, smallest_weight=weight) for weight in (0.0, WITH_ALPHA.smallest_weight)
-    )
+    smallest = WITH_ALPHA.smallest_weight
+    exactly, quickly = (replace(model.renderer, smallest_weight=weight) for weight in (0.0, smallest))
     with torch.no_grad():
         exact, found = exactly.render(model.field, rays).coefficients, quickly.composite(model.field, rays)
         errors = (model.materials.spectra(found) - model.materials.spectra(exact)).abs()
     assert float(exact.accumulation.max()) > 0.8
     assert 0 < float(errors.square().mean().sqrt()) < 1e-3
     # Rays end where so much of their light is left, which takes the colour of what lies before.
-    ending_light = 3 * WITH_ALPHA.smallest_weight
-    assert float(errors.max()) < ending_light
-    assert float((found.accumulation - exact.accumulation).abs().max()) < ending_light
+    assert float(errors.max()) < 3 * smallest
+    assert float((found.accumulation - exact.accumulation).abs().max()) < 3 * smallest

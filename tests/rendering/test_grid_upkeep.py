@@ -1,5 +1,3 @@
-"""Which cells count as occupied, by how much light they stop."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""Rendering an unbounded world: what rays see outside the box, and the sky that fills what is left."""
-
 import math
 from dataclasses import replace
 from typing import Any

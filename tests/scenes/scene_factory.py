@@ -99,9 +99,7 @@ def ball_alpha(pose: np.ndarray, radius: float, width: int, height: int, focal: 
     x = (np.arange(width)[:, None] + steps).reshape(-1)
     y = (np.arange(height)[:, None] + steps).reshape(-1)
     grid_x, grid_y = np.meshgrid(x, y)
-    local = np.stack(
-        [(grid_x - width / 2) / focal, -(grid_y - height / 2) / focal, -np.ones_like(grid_x)], -1
-    )
+    local = np.stack([grid_x - width / 2, height / 2 - grid_y, np.full_like(grid_x, -focal)], -1)
     directions = local @ pose[:3, :3].T
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
     along = -(directions @ pose[:3, 3])
@@ -141,18 +139,15 @@ def make_scene(
         (root / folder).mkdir(parents=True)
     poses = ring_poses(frames) if poses is None else poses
     entries = [write_view(root, index, pose, radius if alpha else None) for index, pose in enumerate(poses)]
-    (root / "endmembers.csv").write_text(
-        "wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n680,0.1,0.4\n", encoding="utf-8"
-    )
+    materials = "wavelength,leaf,clay\n450,0.1,0.2\n520,0.3,0.5\n600,0.1,0.8\n680,0.1,0.4\n"
+    (root / "endmembers.csv").write_text(materials, encoding="utf-8")
     (root / "illuminant.csv").write_text("wavelength,power\n450,1\n600,2\n680,4\n", encoding="utf-8")
+    lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     content = {
         "camera_model": "OPENCV",
         "w": WIDTH,
         "h": HEIGHT,
-        "fl_x": FOCAL,
-        "fl_y": FOCAL,
-        "cx": WIDTH / 2,
-        "cy": HEIGHT / 2,
+        **lens,
         "wavelengths": list(WAVELENGTHS),
         "materials": ["leaf", "clay"],
         "illuminant_path": "illuminant.csv",

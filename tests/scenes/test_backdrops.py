@@ -1,5 +1,3 @@
-"""Backdrops that are much alike within and over views: found and cut out with soft edges, and not seen in rooms."""
-
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -8,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.captures.file_factory import present
 from tests.scenes.scene_factory import cameras_of
 from unmix_plugin.scenes.backdrops import Backdrop, find_before_backdrop, judge_backdrop
 from unmix_plugin.scenes.geometry.views import Views
@@ -70,9 +69,8 @@ def landscape(_: int, generator: np.random.Generator) -> np.ndarray:
 
 def corner(_: int, generator: np.random.Generator) -> np.ndarray:
     """Four plain sides of a room around its back wall."""
-    colours = generator.permutation(np.linspace(0.15, 0.9, 4))[:, None] * np.random.default_rng(1).uniform(
-        0.3, 1, (4, BANDS)
-    )
+    brightness = generator.permutation(np.linspace(0.15, 0.9, 4))[:, None]
+    colours = brightness * np.random.default_rng(1).uniform(0.3, 1, (4, BANDS))
     across, down = COLUMNS / WIDTH - 0.5, ROWS / HEIGHT - 0.5
     side = np.where(np.abs(across) > np.abs(down), 2 * (across > 0), 1 + 2 * (down > 0))
     return colours[side]
@@ -116,20 +114,17 @@ def judge(images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Backdrop 
 
 def seen_in(image: np.ndarray, images: list[np.ndarray], known: np.ndarray = EVERYWHERE) -> Any:
     """The backdrop of some views, and what it looks like in one."""
-    backdrop = judge(images, known)
-    assert backdrop is not None
+    backdrop = present(judge(images, known))
     return backdrop, backdrop.find(backdrop.features(image), known)
 
 
 @pytest.mark.parametrize("name", BACKDROPS)
 def test_a_plain_backdrop_is_found_said_and_cut_out_with_soft_edges(name: str):
     images, covers = pictures(BACKDROPS[name])
-    backdrop = judge(images)
-    assert backdrop is not None
+    backdrop = present(judge(images))
     assert name not in ("black", "grey", "white") or backdrop.in_words.startswith(name)
     for image, cover in zip(images, covers, strict=True):
-        seen = backdrop.find(backdrop.features(image), EVERYWHERE)
-        assert seen is not None
+        seen = present(backdrop.find(backdrop.features(image), EVERYWHERE))
         opacity = seen.opacity(~seen.shown)
         assert ((opacity > 0.5) != (cover > 0.5)).mean() < 0.012
         sides = np.r_[0:3, WIDTH - 3 : WIDTH]
@@ -192,8 +187,7 @@ def test_a_backdrop_of_large_views_is_kept_thinned_out():
     for shift, view in enumerate(views):
         view[100 : 300 + 10 * shift, 150:350] = np.linspace(0.05, 0.9, 200)[:, None]
     cameras = cameras_of([np.eye(4)] * 5, 500, 450, 1.0)
-    found = find_before_backdrop(Views(cameras, lambda view, part: views[view][part]))
-    assert found is not None
+    found = present(find_before_backdrop(Views(cameras, lambda view, part: views[view][part])))
     assert sum(mask.size for mask in found.thinned) == 5 * 150 * 167
     for mask, view in zip(found.masks(), views, strict=True):
         assert mask.shape == (450, 500)

@@ -1,5 +1,3 @@
-"""What the pool holds follows from the step alone, and every pixel comes up equally often."""
-
 import pytest
 import torch
 
@@ -69,9 +67,7 @@ def test_chunks_are_read_whole_and_once_a_turn_as_they_come_into_the_pool():
 def test_all_that_a_pool_holds_fits_into_its_memory(num_bytes):
     pool = make_pool(num_bytes=num_bytes)
     draw(pool, 0)
-    held = [
-        value for value in vars(pool).values() if isinstance(value, torch.Tensor) and value is not pool._valid
-    ]
+    held = [x for x in vars(pool).values() if isinstance(x, torch.Tensor) and x is not pool._valid]
     assert num_bytes - 800 < sum(value.numel() * value.element_size() for value in held) <= num_bytes
 
 

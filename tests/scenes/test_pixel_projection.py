@@ -1,5 +1,3 @@
-"""Pixels kept as few numbers are what they were but for noise; what they can't hold is kept whole."""
-
 import numpy as np
 import pytest
 import torch
@@ -25,13 +23,14 @@ def few_bands_are_enough(monkeypatch):
     monkeypatch.setattr(pixel_table, "FEWEST_CHANNELS", BANDS)
 
 
+SMOOTH = np.exp(-(((np.linspace(0, 1, BANDS) - np.array([[0.1], [0.5], [0.9]])) / 0.3) ** 2))
+
+
 def spectra_of(cube: np.ndarray, change=None) -> np.ndarray:
     """From four bands to `BANDS` that mix three smooth spectra."""
-    nm = np.linspace(0, 1, BANDS)
-    smooth = np.stack([np.exp(-(((nm - centre) / 0.3) ** 2)) for centre in (0.1, 0.5, 0.9)])
-    wide = cube[..., :3].astype(np.float64) @ smooth
+    wide = cube[..., :3].astype(np.float64) @ SMOOTH
     height, width = cube.shape[:2]
-    wide *= 1 + 0.3 * np.sin(np.arange(width))[:, None] * np.cos(np.arange(height))[:, None, None] * smooth[1]
+    wide *= 1 + 0.3 * np.sin(np.arange(width))[:, None] * np.cos(np.arange(height))[:, None, None] * SMOOTH[1]
     if change is not None:
         change(wide)
     return wide.clip(0, 1).astype("<f2")
@@ -44,9 +43,7 @@ def make(folder, change=None) -> Scene:
 
 def test_odd_and_saturated_pixels_are_kept_whole():
     generator = torch.Generator().manual_seed(0)
-    nm = torch.linspace(0, 1, BANDS)
-    smooth = torch.stack([torch.exp(-(((nm - centre) / 0.3) ** 2)) for centre in (0.1, 0.5, 0.9)])
-    pixels = torch.rand(2000, 3, generator=generator) @ smooth / 3
+    pixels = torch.rand(2000, 3, generator=generator) @ torch.from_numpy(SMOOTH).float() / 3
     projection = Projection(pixels, 3)
     pixels[700], pixels[1700, 4:7] = torch.rand(BANDS, generator=generator), 1.0
     held = ProjectedPixels(projection, 2000, CPU)
@@ -66,9 +63,7 @@ def test_pixels_that_do_not_fit_are_projected_and_drawn_as_if_they_were_held(tmp
     few = PixelTable(scene, CPU, VIEWS, components="auto")
     [note] = few.notes
     assert f"instead of {BANDS} (target-components)" in note
-    [found], [expected] = (
-        table.draw(300, torch.Generator().manual_seed(1), step=7) for table in (few, plain)
-    )
+    [found], [expected] = (table.draw(300, torch.Generator().manual_seed(1), 7) for table in (few, plain))
     for name in ("numbers", "cameras", "corners", "alpha"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
     assert float((found.spectra - expected.spectra).square().mean().sqrt()) < 0.004
@@ -82,10 +77,8 @@ def test_auto_projects_neither_what_fits_nor_what_has_no_subspace(tmp_path, monk
     scene = make(tmp_path / "scene")
     fits = PixelTable(scene, CPU, VIEWS, components="auto")
     assert fits.notes == []
-    assert torch.equal(
-        fits.blocks[0].spectra(torch.arange(1600)),
-        PixelTable(scene, CPU, VIEWS).blocks[0].spectra(torch.arange(1600)),
-    )
+    everything, whole = torch.arange(1600), PixelTable(scene, CPU, VIEWS)
+    assert torch.equal(fits.blocks[0].spectra(everything), whole.blocks[0].spectra(everything))
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: WHOLE)
     [note] = PixelTable(make(tmp_path / "rough", rough), CPU, VIEWS, components="auto").notes
     assert "stay on disk" in note

@@ -1,5 +1,3 @@
-"""Pixels of all views and sensors are drawn evenly and come out as their sensors measured them."""
-
 import numpy as np
 import pytest
 import torch
@@ -28,9 +26,8 @@ def test_drawn_pixels_are_those_of_their_views(rig):
     assert [group.sensor for group in groups] == [0, 1, 2]
     assert sum(len(group.cameras) for group in groups) == 500
     for group in groups:
-        for camera, (column, row), spectrum, alpha in zip(
-            group.cameras.tolist(), group.corners.tolist(), group.spectra, group.alpha, strict=True
-        ):
+        places = zip(group.cameras.tolist(), group.corners.tolist(), group.spectra, group.alpha, strict=True)
+        for camera, (column, row), spectrum, alpha in places:
             view = (1, 3, 4, 5)[camera]
             assert rig.frames[view].sensor == group.sensor
             assert rig.valid_mask(view)[row, column]

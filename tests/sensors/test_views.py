@@ -1,5 +1,3 @@
-"""What sensors see: weights of bands, and gains of views."""
-
 from dataclasses import replace
 from typing import Literal
 
@@ -47,18 +45,16 @@ def test_errors_count_by_the_weight_of_their_band_and_weights_of_1_change_no_bit
 
 def test_a_noisy_band_hardly_moves_the_mixtures_of_pixels():
     generator = torch.Generator().manual_seed(0)
-    endmembers = torch.tensor(
-        [[0.6, 0.2, 0.2, 0.2, 0.3], [0.2, 0.6, 0.8, 0.2, 0.3], [0.2, 0.2, 0.5, 0.6, 0.3]]
-    )
+    rows = [[0.6, 0.2, 0.2, 0.2, 0.3], [0.2, 0.6, 0.8, 0.2, 0.3], [0.2, 0.2, 0.5, 0.6, 0.3]]
+    endmembers = torch.tensor(rows)
     shares = torch.eye(3)[torch.randint(3, (200,), generator=generator)]
     pixels = shares @ endmembers
     pixels[:, 2] = (pixels[:, 2] + 0.3 * torch.randn(200, generator=generator)).clamp(min=0)
     errors = []
     for weights in ((), WEIGHTS):
         balance = weighted(weights).balance
-        found = sparse_abundances(
-            balance.scaled(pixels, None), balance.scaled(endmembers, None), torch.tensor(0.01)
-        )
+        scaled = (balance.scaled(spectra, None) for spectra in (pixels, endmembers))
+        found = sparse_abundances(*scaled, torch.tensor(0.01))
         errors.append(float((found - shares).square().mean()))
     assert errors[1] < 0.3 * errors[0]
 
@@ -135,10 +131,8 @@ def test_training_finds_the_exposure_of_each_view():
 
 
 def predicted_view(spectra: torch.Tensor, opacity: float = 1.0) -> PredictedView:
-    opacities = torch.full(spectra.shape[:2], opacity)
-    return PredictedView(
-        spectra, opacities, opacities[..., None], opacities.to(torch.uint8), opacities[..., None]
-    )
+    flat = torch.full(spectra.shape[:2], opacity)
+    return PredictedView(spectra, flat, flat[..., None], flat.to(torch.uint8), flat[..., None])
 
 
 def random_spectra() -> torch.Tensor:
@@ -151,9 +145,8 @@ def everywhere(spectra: torch.Tensor) -> torch.Tensor:
 
 def test_a_view_is_aligned_by_exposure_and_smooth_white_balance():
     shown = random_spectra()
-    truth = ViewTruth(
-        "view", shown * (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp(), everywhere(shown)
-    )
+    gain = (torch.tensor([0.2, -0.1, 0.05]) @ smooth_terms(WAVELENGTHS)).exp()
+    truth = ViewTruth("view", shown * gain, everywhere(shown))
     found = truth.shown(align_gain(predicted_view(shown), truth, WAVELENGTHS))
     assert_close(found, truth.spectra, atol=1e-4, rtol=0)
 

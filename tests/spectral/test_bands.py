@@ -7,13 +7,10 @@ from hypothesis import strategies as st
 from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.bands import Bands
 
-samplings = st.lists(st.floats(1, 3000), min_size=1, max_size=40, unique_by=lambda x: round(x, 2)).map(
-    lambda values: Bands.of(sorted(values))
-)
 
-
-@given(samplings)
-def test_intervals_hold_their_centres_and_tile_all_but_the_gaps(bands):
+@given(st.lists(st.floats(1, 3000), min_size=1, max_size=40, unique_by=lambda x: round(x, 2)))
+def test_intervals_hold_their_centres_and_tile_all_but_the_gaps(centers):
+    bands = Bands.of(sorted(centers))
     edges = bands.edges_nm
     assert len(edges) == len(bands) + 1
     assert (edges[:-1] < bands.centers_nm).all()
@@ -44,14 +41,11 @@ def test_edges_lie_midway_with_symmetric_outermost_bands_and_a_stated_width_of_a
     assert Bands.of([379, 380, 780, 781]).visible_mask.tolist() == [False, True, True, False]
 
 
-def without_water(step: float = 10.0) -> Bands:
-    """1000-1700 nm without 1345-1455 nm."""
-    nm = np.arange(1000, 1700 + step / 2, step)
-    return Bands.of(nm[(nm < 1345) | (nm > 1455)])
+WITHOUT_WATER = Bands.of([*range(1000, 1341, 10), *range(1460, 1701, 10)])
 
 
 def test_bands_beside_a_gap_reach_no_farther_into_it_than_half_their_spacing():
-    bands = without_water()
+    bands = WITHOUT_WATER
     np.testing.assert_array_equal(bands.ranges_nm, [[995, 1345], [1455, 1705]])
     np.testing.assert_array_equal(bands.widths_nm, 10)
     assert bands.coverage == "995-1345, 1455-1705 nm"
@@ -64,12 +58,10 @@ def test_bands_beside_a_gap_reach_no_farther_into_it_than_half_their_spacing():
 
 
 def test_bands_reach_as_far_into_a_gap_as_the_instrument_is_known_to_see():
-    centers = without_water().centers_nm
-    np.testing.assert_array_equal(
-        Bands(centers, np.full(len(centers), 30.0)).ranges_nm, [[995, 1355], [1445, 1705]]
-    )
-    assert len(Bands(centers, np.full(len(centers), 4.0)).ranges_nm) == 2
-    assert len(Bands(centers, np.full(len(centers), 200.0)).ranges_nm) == 1
+    centers = WITHOUT_WATER.centers_nm
+    ranges = [Bands(centers, np.full(len(centers), width)).ranges_nm for width in (30.0, 4.0, 200.0)]
+    np.testing.assert_array_equal(ranges[0], [[995, 1355], [1445, 1705]])
+    assert (len(ranges[1]), len(ranges[2])) == (2, 1)
 
 
 def test_a_lone_band_beyond_a_gap_reaches_no_farther_than_half_the_largest_other_step():
@@ -83,18 +75,11 @@ def test_a_lone_band_beyond_a_gap_reaches_no_farther_than_half_the_largest_other
     np.testing.assert_array_equal(Bands.of(ten).ranges_nm[-1], [791, 893])
 
 
-@pytest.mark.parametrize(
-    "centers",
-    [
-        [400, 410, 420, 440, 450, 460],  # one band left out
-        [475, 560, 668, 717, 842],  # a multispectral camera
-        [400, 400.3, 405, 405.4, 410, 410.5, 415],  # two cameras of 5 nm
-        [400, 900],
-        [475, 842, 1610],
-    ],
-)
-def test_uneven_steps_are_no_gaps(centers):
-    assert len(Bands.of(centers).ranges_nm) == 1
+def test_uneven_steps_are_no_gaps():
+    one_left_out, camera = [400, 410, 420, 440, 450, 460], [475, 560, 668, 717, 842]
+    two_cameras = [400, 400.3, 405, 405.4, 410, 410.5, 415]
+    for centers in (one_left_out, camera, two_cameras, [400, 900], [475, 842, 1610]):
+        assert len(Bands.of(centers).ranges_nm) == 1, centers
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,8 @@
-"""When alpha is trusted, and what light says instead."""
-
 import pytest
 import torch
 from torch.testing import assert_close
 
-from unmix_plugin.spectral.evidence import (
-    alpha_trust,
-    background_level,
-    bounded_square,
-    brightness,
-    exposure_of,
-    is_blown_out,
-    may_show_matter,
-    relative_power_of,
-)
+from unmix_plugin.spectral import evidence
 
 GENERATOR = torch.Generator().manual_seed(0)
 
@@ -25,17 +14,17 @@ def noisy_background(count: int) -> torch.Tensor:
 def test_noise_of_the_background_is_told_from_the_faintest_matter():
     spectra = torch.cat([noisy_background(2000), torch.full((500, 6), 0.1)])
     alpha = torch.cat([torch.zeros(2000), torch.ones(500)])
-    level = background_level(spectra, alpha)
+    level = evidence.background_level(spectra, alpha)
     assert level is not None
-    assert float((brightness(spectra[:2000]) > level).double().mean()) < 0.002
+    assert float((evidence.brightness(spectra[:2000]) > level).double().mean()) < 0.002
     assert level < 0.005
 
 
 def test_a_background_as_bright_as_matter_says_nothing():
     spectra = torch.cat([torch.full((50, 6), 0.8), torch.full((50, 6), 0.3)])
     alpha = torch.cat([torch.zeros(50), torch.ones(50)])
-    assert background_level(spectra, alpha) is None
-    assert_close(alpha_trust(spectra, alpha, None), torch.ones(100))
+    assert evidence.background_level(spectra, alpha) is None
+    assert_close(evidence.alpha_trust(spectra, alpha, None), torch.ones(100))
 
 
 @pytest.mark.parametrize(
@@ -51,20 +40,20 @@ def test_a_background_as_bright_as_matter_says_nothing():
 )
 def test_alpha_is_believed_unless_light_contradicts_it(value, alpha, trust, shows):
     spectra, alphas = torch.full((1, 6), value), torch.tensor([alpha])
-    assert float(alpha_trust(spectra, alphas, 0.002)) == trust
-    assert bool(may_show_matter(spectra, alphas, 0.002)) == shows
+    assert float(evidence.alpha_trust(spectra, alphas, 0.002)) == trust
+    assert bool(evidence.may_show_matter(spectra, alphas, 0.002)) == shows
 
 
 def test_only_dark_scenes_are_exposed_and_one_saturated_band_blows_a_pixel_out():
-    assert exposure_of(torch.full((10, 3), 0.4)) == 1.0
-    assert exposure_of(torch.full((10, 3), 0.02)) == pytest.approx(10.0)
-    assert exposure_of(torch.zeros(10, 3)) == 100.0
-    assert is_blown_out(torch.tensor([[0.2, 0.95, 0.3], [0.2, 0.85, 0.3]])).tolist() == [True, False]
+    assert evidence.exposure_of(torch.full((10, 3), 0.4)) == 1.0
+    assert evidence.exposure_of(torch.full((10, 3), 0.02)) == pytest.approx(10.0)
+    assert evidence.exposure_of(torch.zeros(10, 3)) == 100.0
+    assert evidence.is_blown_out(torch.tensor([[0.2, 0.95, 0.3], [0.2, 0.85, 0.3]])).tolist() == [True, False]
 
 
 def test_large_errors_grow_in_proportion_with_a_continuous_slope():
     errors = torch.tensor([[-0.5, 1.0], [2.0, 3.0]], requires_grad=True)
-    found = bounded_square(errors, torch.ones(2, 1))
+    found = evidence.bounded_square(errors, torch.ones(2, 1))
     assert_close(found.detach(), torch.tensor([[0.25, 1.0], [3.0, 5.0]]))
     (slopes,) = torch.autograd.grad(found.sum(), errors)
     assert_close(slopes, torch.tensor([[-1.0, 2.0], [2.0, 2.0]]))
@@ -81,14 +70,13 @@ def pixels_of_contrast(contrast: float) -> torch.Tensor:
 def test_errors_count_absolutely_unless_some_of_the_scene_is_much_brighter_than_the_rest(factor):
     """However bright the scene is."""
     contrasts = (1.0, 2.5, 3.0, 4.0, 8.0)
-    powers = [relative_power_of(factor * pixels_of_contrast(contrast)) for contrast in contrasts]
+    powers = [evidence.relative_power_of(factor * pixels_of_contrast(contrast)) for contrast in contrasts]
     assert powers[:2] == [0.0, 0.0]
     assert 0 < powers[2] < powers[3] < 1.5
     assert powers[4] == 1.5
-    assert powers == pytest.approx(
-        [relative_power_of(pixels_of_contrast(contrast)) for contrast in contrasts]
-    )
+    plain = [evidence.relative_power_of(pixels_of_contrast(contrast)) for contrast in contrasts]
+    assert powers == pytest.approx(plain)
     highlights = torch.full((100, 3), 0.1)
     highlights[:5] = 1.0
     for pixels in (highlights, torch.zeros(0, 3), torch.zeros(10, 3)):
-        assert relative_power_of(pixels) == 0.0
+        assert evidence.relative_power_of(pixels) == 0.0

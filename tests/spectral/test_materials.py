@@ -1,8 +1,3 @@
-"""Packed coefficients return what they were made of, whatever the axes before them.
-
-Names of endmembers, colours of spectra beyond the sensor's full scale, and confidence in materials.
-"""
-
 from dataclasses import replace
 
 import pytest

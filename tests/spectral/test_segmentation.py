@@ -82,11 +82,7 @@ def test_figures_of_small_scenes_counted_by_hand(pred, true, numbers, matching, 
 
 def test_matching_is_on_intersection_over_union_not_on_hits():
     # By hits 0-0 and 1-1 win (0 + 7 against 2 + 4 pixels); by IoU the other way round does.
-    views = [
-        (labels(*[pred] * count), labels(*[true] * count))
-        for pred, true, count in ((0, 1, 2), (1, 0, 4), (1, 1, 7))
-    ]
-    scores = scored(2, 2, *views)
+    scores = scored(2, 2, (labels(*[0] * 2, *[1] * 11), labels(*[1] * 2, *[0] * 4, *[1] * 7)))
     straight, crossed = (0 + 7 / 13) / 2, (2 / 9 + 4 / 11) / 2
     assert crossed > straight
     assert scores.matching == {0: 1, 1: 0}

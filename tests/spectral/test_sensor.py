@@ -1,5 +1,3 @@
-"""A sensor simulated from its spectral response: weighted means, what is covered, the order of channels, bad files."""
-
 from pathlib import Path
 
 import numpy as np
@@ -33,11 +31,9 @@ def write(folder: Path, text: str) -> Path:
 
 
 @settings(deadline=None, max_examples=30)
-@given(
-    st.lists(st.floats(0.01, 1), min_size=4, max_size=4), st.lists(st.floats(0, 1), min_size=4, max_size=4)
-)
+@given(st.tuples(*[st.floats(0.01, 1)] * 4), st.tuples(*[st.floats(0, 1)] * 3))
 def test_a_flat_spectrum_is_1_in_every_channel(first, second):
-    seen = sensor([410, 433, 570.5, 690], a=first, b=[*second[:3], 1.7]).seen_by(BANDS)
+    seen = sensor([410, 433, 570.5, 690], a=first, b=[*second, 1.7]).seen_by(BANDS)
     assert seen.matrix.shape == (31, 2)
     assert seen.matrix.min() >= 0
     np.testing.assert_allclose(np.ones(31) @ seen.matrix, 1, rtol=1e-12)
@@ -83,15 +79,10 @@ def test_channels_are_sorted_by_their_centres():
 
 def test_channels_beyond_the_bands_are_left_out_and_named():
     nm = [450, 550, 550.1, 1564.9, 1565, 1655]
-    both = sensor(nm, SWIR1=[0, 0, 0, 0, 1, 1], visible=[1, 1, 0, 0, 0, 0])
-    seen = both.seen_by(BANDS)
-    assert (seen.names, seen.notes) == (
-        ("visible",),
-        ("left out SWIR1 (1565-1655 nm): the bands cover 395-705 nm",),
-    )
-    with pytest.raises(
-        SpectrumError, match=r"'toy' sees nothing: the bands cover 395-705 nm, .*SWIR1 \(1565-1655 nm\)"
-    ):
+    seen = sensor(nm, SWIR1=[0, 0, 0, 0, 1, 1], visible=[1, 1, 0, 0, 0, 0]).seen_by(BANDS)
+    assert seen.names == ("visible",)
+    assert seen.notes == ("left out SWIR1 (1565-1655 nm): the bands cover 395-705 nm",)
+    with pytest.raises(SpectrumError, match=r"'toy' sees nothing: .* 395-705 nm, .*SWIR1 \(1565-1655 nm\)"):
         sensor(nm, SWIR1=[0, 0, 0, 0, 1, 1]).seen_by(BANDS)
 
 

@@ -5,30 +5,20 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tests.scenes.scene_factory import look_at, ring_poses
+from tests.scenes.scene_factory import cameras_of, look_at, ring_poses
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.runs.load_run import SceneRecord
 from unmix_plugin.scenes.scene import Normalisation
 
 BOX = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-FRAME = Normalisation(
-    np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.3, -2.0, 5.0]), 0.25
-)
+_QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+FRAME = Normalisation(_QUARTER, np.array([0.3, -2.0, 5.0]), 0.25)
 """From world to model space of these runs."""
 
 
 def cameras_at(poses: list[np.ndarray], width: int = 40, height: int = 30, focal: float = 50.0) -> Cameras:
-    """Pinhole cameras at these poses."""
-    count = len(poses)
-    return Cameras(
-        torch.tensor(np.stack(poses)[:, :3], dtype=torch.float32),
-        torch.full((count, 2), focal),
-        torch.tensor([[width / 2, height / 2]]).expand(count, 2).contiguous(),
-        torch.zeros(count, 4),
-        width,
-        height,
-    )
+    return cameras_of(poses, width, height, focal)
 
 
 def around(count: int = 12) -> Cameras:

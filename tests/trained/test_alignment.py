@@ -1,5 +1,3 @@
-"""Evaluation views are aligned with what was measured: poses of frames, and of the rows of line cameras."""
-
 from dataclasses import replace
 
 import numpy as np

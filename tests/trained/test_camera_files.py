@@ -1,5 +1,3 @@
-"""Camera files: what is read, that what is written comes back, and what is refused."""
-
 import json
 import math
 from dataclasses import replace
@@ -21,21 +19,15 @@ POSE = look_at(np.array([1.0, -3.0, 2.0]), np.zeros(3))
 def nerfstudio(**changes):
     """A camera_path.json as nerfstudio's viewer saves it."""
     entry = {"camera_to_world": POSE.reshape(-1).tolist(), "fov": 50.0, "aspect": 1.6}
-    values = {"camera_type": "perspective", "render_height": 60, "render_width": 96, "fps": 30, "seconds": 4}
-    values |= {
-        "is_cycle": False,
-        "keyframes": [],
-        "camera_path": [entry, {**entry, "fov": 25.0}],
-        "crop": None,
-    }
-    return {**values, **changes}
+    path = {"camera_path": [entry, {**entry, "fov": 25.0}], "keyframes": [], "is_cycle": False, "crop": None}
+    size = {"render_height": 60, "render_width": 96, "fps": 30, "seconds": 4}
+    return {"camera_type": "perspective", **size, **path, **changes}
 
 
 def frames(**changes):
     """A transforms.json with two views."""
-    entries = [
-        {"file_path": f"images/{name}.png", "transform_matrix": POSE.tolist()} for name in ("a", "b c")
-    ]
+    paths = ("images/a.png", "images/b c.png")
+    entries = [{"file_path": path, "transform_matrix": POSE.tolist()} for path in paths]
     return {"w": 96, "h": 60, "fl_x": 70.0, "frames": entries, **changes}
 
 

@@ -1,5 +1,3 @@
-"""The evaluation of a scene: perfect predictions, what counts, what has no truth."""
-
 import math
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""The scale of a run: what sets it, what is kept, and what is refused."""
-
 import json
 from dataclasses import replace
 from unittest.mock import MagicMock
@@ -12,36 +10,25 @@ from tests.trained.camera_scenes import FRAME
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError
-from unmix_plugin.trained.measures import (
-    Scale,
-    describe_area,
-    describe_length,
-    keep_scale,
-    read_measures,
-    recorded_scale,
-    require_on_surface,
-    scale_between,
-)
+from unmix_plugin.trained import measures
 from unmix_plugin.trained.protocol import Probe
 from unmix_plugin.trained.run_views import RunView
 from unmix_plugin.trained.trained_scene import TrainedScene
 
-VIEWS = tuple(
-    RunView(f"view_{index}", camera)
-    for index, camera in enumerate(cameras_around([(1.0, 0.2, 0.3), (-1.0, 0.1, 0.5)]))
-)
+CAMERAS = cameras_around([(1.0, 0.2, 0.3), (-1.0, 0.1, 0.5)])
+VIEWS = tuple(RunView(f"view_{index}", camera) for index, camera in enumerate(CAMERAS))
 BALL = replace(ball_scene(), frame=FRAME, views=VIEWS)
 
 
 def test_two_points_and_their_distance_tell_the_unit(tmp_path):
-    scale = scale_between((1.0, 2.0, 3.0), (1.0, 2.0, 3.5), 0.12)
+    scale = measures.scale_between((1.0, 2.0, 3.0), (1.0, 2.0, 3.5), 0.12)
     assert scale.metres_per_unit == pytest.approx(0.24)
-    assert (describe_length(0.5, scale), describe_area(0.5, scale)) == ("12 cm", "288 cm²")
+    assert (measures.describe_length(0.5, scale), measures.describe_area(0.5, scale)) == ("12 cm", "288 cm²")
     assert "0.12 m between 1 2 3 and 1 2 3.5" in scale.said
     run = RunFolder(tmp_path)
-    assert read_measures(run).scale is None
-    keep_scale(run, scale)
-    assert read_measures(run).scale == scale
+    assert measures.read_measures(run).scale is None
+    measures.keep_scale(run, scale)
+    assert measures.read_measures(run).scale == scale
 
 
 def test_no_distance_and_no_two_points_are_refused():
@@ -52,15 +39,15 @@ def test_no_distance_and_no_two_points_are_refused():
         ((0.0, 0.0, 1.0), 1e12, "a unit of the scene would be 1e\\+12 m long"),
     ):
         with pytest.raises(ConfigError, match=message):
-            scale_between((0.0, 0.0, 0.0), second, distance)
+            measures.scale_between((0.0, 0.0, 0.0), second, distance)
 
 
 def test_points_count_on_the_surface_that_views_show():
     facing = np.array([1.0, 0.2, 0.3]) / np.linalg.norm([1.0, 0.2, 0.3])
-    require_on_surface(BALL, FRAME.to_world(RADIUS * facing).tolist())
+    measures.require_on_surface(BALL, FRAME.to_world(RADIUS * facing).tolist())
     for place, reason in (((RADIUS + 0.3) * facing, "pixels off"), (np.array([0.0, 0, 90]), "no view shows")):
         with pytest.raises(ConfigError, match=f"not on the object: .*{reason}"):
-            require_on_surface(BALL, FRAME.to_world(place).tolist())
+            measures.require_on_surface(BALL, FRAME.to_world(place).tolist())
 
 
 def test_a_point_in_haze_that_hardly_shows_is_not_on_the_surface():
@@ -68,9 +55,9 @@ def test_a_point_in_haze_that_hardly_shows_is_not_on_the_surface():
     hazy = MagicMock(spec=TrainedScene, frame=FRAME, views=VIEWS)
     hazy.probe.return_value = Probe({}, 0.1, None, place)
     with pytest.raises(ConfigError, match="not on the object: no view shows anything there"):
-        require_on_surface(hazy, place.tolist())
+        measures.require_on_surface(hazy, place.tolist())
     hazy.probe.return_value = Probe({}, 0.9, None, place)
-    require_on_surface(hazy, place.tolist())
+    measures.require_on_surface(hazy, place.tolist())
 
 
 def test_a_damaged_file_is_refused(tmp_path):
@@ -84,11 +71,12 @@ def test_a_damaged_file_is_refused(tmp_path):
     ):
         (tmp_path / "measures.json").write_text(json.dumps({"format_version": RUN_FORMAT, "scale": scale}))
         with pytest.raises(RunError, match=r"measures\.json is damaged"):
-            read_measures(RunFolder(tmp_path))
+            measures.read_measures(RunFolder(tmp_path))
 
 
 def test_a_scene_may_know_its_unit():
-    assert recorded_scale({}) is None
-    assert recorded_scale({"metres_per_unit": 0.001}) == Scale(0.001, "as the scene's poses say")
+    assert measures.recorded_scale({}) is None
+    millimetres = measures.Scale(0.001, "as the scene's poses say")
+    assert measures.recorded_scale({"metres_per_unit": 0.001}) == millimetres
     with pytest.raises(RunError, match=r"scene\.json is damaged"):
-        recorded_scale({"metres_per_unit": "a metre"})
+        measures.recorded_scale({"metres_per_unit": "a metre"})

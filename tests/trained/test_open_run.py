@@ -1,5 +1,3 @@
-"""From a model to its scene, which says what training corrected; and whether the measured scene is found again."""
-
 import json
 import shutil
 from dataclasses import replace
@@ -124,13 +122,9 @@ OTHER = {
     "another cube": (
         halve_a_cube,
         RunError,
-        r"is not the one that /runs/this .*: files.cubes/view_0.npy differ$",
+        "not the one that /runs/this .*: files.cubes/view_0.npy differ$",
     ),
-    "another lens": (
-        lambda root: edit(root, lambda content: content.update(fl_x=30.0)),
-        RunError,
-        "focal_px.* differ",
-    ),
+    "another lens": (lambda root: edit(root, lambda c: c.update(fl_x=30.0)), RunError, "focal_px.* differ"),
     "damage": (lambda root: (root / "transforms.json").write_text("{"), SceneError, "JSON"),
 }
 

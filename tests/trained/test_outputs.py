@@ -1,5 +1,3 @@
-"""Every output computes, has the shape that its kind promises, and says between which values its colours go."""
-
 import inspect
 from dataclasses import replace
 

@@ -1,5 +1,3 @@
-"""Outputs made of reflectance: indices and targets in a render."""
-
 import numpy as np
 import pytest
 import torch
@@ -24,7 +22,7 @@ def target(tmp_path_factory):
     """A file of one reflectance."""
     path = tmp_path_factory.mktemp("targets") / "paint.csv"
     rows = [f"{nm},{0.1 + 0.15 * index}" for index, nm in enumerate(WAVELENGTHS_NM)]
-    path.write_text("wavelength,paint\n" + "\n".join(rows) + "\n")
+    path.write_text("\n".join(["wavelength,paint", *rows]))
     return path
 
 
@@ -96,9 +94,8 @@ def test_a_target_is_looked_for_in_the_bands_with_light(target, method, dark):
 def test_an_absorption_is_that_of_the_bands_with_light():
     bands = Bands.of([400.0, 450.0, 500.0, 550.0, 600.0, 650.0])
     light = torch.tensor([0.0, 1.0, 1.0, 0.0, 1.0, 1.0])
-    reflectance = seen_reflectance(
-        light * torch.tensor([[0.5, 0.5, 0.3, 0.9, 0.4, 0.5]]), torch.ones(1), light
-    )
+    radiance = light * torch.tensor([[0.5, 0.5, 0.3, 0.9, 0.4, 0.5]])
+    reflectance = seen_reflectance(radiance, torch.ones(1), light)
     asked = parse_reflectance_map("absorption:area:450-650", bands, light > 0)
     [area] = asked.fit(torch.zeros(0, 6))(reflectance)
     assert float(area) == pytest.approx(25 * 0.4 + 50 * (0.4 + 0.2) + 25 * 0.2)
@@ -117,16 +114,12 @@ def test_too_few_bands_with_light_are_refused(target):
         parse_reflectance_map(f"target:mf:{target}", bands, torch.zeros(5, dtype=torch.bool))
 
 
-LIBRARY = "\n".join(
-    ["wavelength,rising,falling,flat", *(f"{nm},{nm},{1200 - nm},500" for nm in WAVELENGTHS_NM)]
-)
-
-
 @pytest.fixture(scope="module")
 def library(tmp_path_factory):
     """A file of three reflectances of one shape each."""
     path = tmp_path_factory.mktemp("libraries") / "mine.csv"
-    path.write_text(LIBRARY)
+    rows = [f"{nm},{nm},{1200 - nm},500" for nm in WAVELENGTHS_NM]
+    path.write_text("\n".join(["wavelength,rising,falling,flat", *rows]))
     return path
 
 

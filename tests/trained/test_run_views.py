@@ -1,5 +1,3 @@
-"""Views of a run by name or number, and its world."""
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,29 +1,17 @@
-"""Light, shadow and gloss in the built-in scene.
-
-Speckles on the demo scene's surfaces.
-"""
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from tests.scenes.demo.demo_parts import APPLE, LAMP, PLACEMENTS, row
+from unmix_plugin.scenes.demo import shading
 from unmix_plugin.scenes.demo.scene import demo_cameras
-from unmix_plugin.scenes.demo.shading import (
-    _COAT_REFLECTANCE,
-    _LAMP_IRRADIANCE,
-    _coat_highlight,
-    _direct_light,
-    _trace,
-    speckled_things,
-)
 
 
 def test_direct_light_follows_the_cosine_where_nothing_is_in_the_way():
     point = row(1.1, -0.3, 0)
     towards = LAMP - point[0]
-    expected = _LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
-    assert_allclose(_direct_light(point, row(0, 0, 1), LAMP[None], PLACEMENTS), expected, rtol=1e-5)
+    expected = shading._LAMP_IRRADIANCE * towards[2] / np.linalg.norm(towards)
+    assert_allclose(shading._direct_light(point, row(0, 0, 1), LAMP[None], PLACEMENTS), expected, rtol=1e-5)
 
 
 def test_a_point_behind_the_apple_lies_in_its_shadow():
@@ -31,16 +19,16 @@ def test_a_point_behind_the_apple_lies_in_its_shadow():
     along = center - LAMP
     shadow = (LAMP + along * (LAMP[2] / -along[2])).astype(np.float32)
     assert np.hypot(shadow[0], shadow[1]) < 1.3, "the shadow's middle falls on the table"
-    assert _direct_light(shadow[None], row(0, 0, 1), LAMP[None], PLACEMENTS) == 0
+    assert shading._direct_light(shadow[None], row(0, 0, 1), LAMP[None], PLACEMENTS) == 0
     before_the_apple = shadow + 0.01 * (LAMP - shadow)
-    assert _direct_light(shadow[None], row(0, 0, 1), before_the_apple[None], PLACEMENTS) > 0
+    assert shading._direct_light(shadow[None], row(0, 0, 1), before_the_apple[None], PLACEMENTS) > 0
 
 
 def test_a_highlight_seen_head_on_is_the_fresnel_reflectance_over_four_squared_roughness():
     # Eye, lamp and normal coincide: D = 1 / (pi a^2), both Smith terms 1, cosines 1.
     normal = LAMP[None] / np.linalg.norm(LAMP)
-    got = _coat_highlight(np.zeros((1, 3), np.float32), normal, normal, 0.2, tuple(LAMP.tolist()))
-    assert_allclose(got, _COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
+    got = shading._coat_highlight(np.zeros((1, 3), np.float32), normal, normal, 0.2, tuple(LAMP.tolist()))
+    assert_allclose(got, shading._COAT_REFLECTANCE / (4 * 0.2**2), rtol=1e-4)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +36,9 @@ def hits():
     """The same rays at the plain and at the speckled scene."""
     rays = demo_cameras(96, 4).image_rays(1)
     origins, directions = rays.origins.numpy(), rays.directions.numpy()
-    return _trace(origins, directions, LAMP[None]), _trace(origins, directions, LAMP[None], speckled_things())
+    return shading._trace(origins, directions, LAMP[None]), shading._trace(
+        origins, directions, LAMP[None], shading.speckled_things()
+    )
 
 
 def test_speckles_change_abundances_and_nothing_else(hits):

@@ -1,5 +1,3 @@
-"""Rays against the shapes of the built-in scene."""
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -23,7 +21,11 @@ def test_a_sphere_is_hit_where_the_quadratic_formula_says(x, y, radius):
     assert_allclose(distance, expected, rtol=1e-3)
 
 
-@pytest.mark.parametrize("primitive", ["sphere", "cylinder", "box"])
+EXTENT = {"sphere": [[0, 1, 2]], "cylinder": [[0, 1], [2]], "box": [[0], [1], [2]]}
+"""Axes over which the length of a local point on the surface is at most 1."""
+
+
+@pytest.mark.parametrize("primitive", EXTENT)
 @given(azimuth=st.floats(0, 6.28), height=st.floats(-0.95, 0.95), x=coordinates, y=coordinates, z=coordinates)
 def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, azimuth, height, x, y, z):
     placement = Placement(primitive, (0.3, -0.2, 0.1), (0.5, 0.7, 0.4), turn_deg=25.0, tilt_deg=50.0)
@@ -34,12 +36,8 @@ def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, 
     distance = placement.entry_distances(origin, direction)
     assert 0 < distance[0] < 1
     local = placement.to_local(origin + distance[:, None] * direction)[0]
-    extent = {
-        "sphere": np.linalg.norm(local),
-        "cylinder": max(np.hypot(local[0], local[1]), abs(local[2])),
-        "box": np.abs(local).max(),
-    }[primitive]
-    assert extent == pytest.approx(1, abs=1e-3)
+    lengths = [np.linalg.norm(local[axes]) for axes in EXTENT[primitive]]
+    assert max(lengths) == pytest.approx(1, abs=1e-3)
     normal = placement.normals_at(local[None])[0]
     assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
     assert normal @ direction[0] < 0
@@ -47,10 +45,8 @@ def test_a_ray_enters_a_shape_through_its_surface_against_the_normal(primitive, 
 
 def test_a_cylinder_is_hit_on_its_cap_from_above_and_on_its_side_from_the_side():
     cylinder = Placement("cylinder", (1.0, 0.0, 0.0), (0.5, 0.5, 2.0))
-    origins, directions = (
-        np.vstack([row(1.2, 0.1, 7), row(-3, 0, 1)]),
-        np.vstack([row(0, 0, -1), row(1, 0, 0)]),
-    )
+    origins = np.vstack([row(1.2, 0.1, 7), row(-3, 0, 1)])
+    directions = np.vstack([row(0, 0, -1), row(1, 0, 0)])
     distances = cylinder.entry_distances(origins, directions)
     assert_allclose(distances, [5.0, 3.5], rtol=1e-6)
     normals = cylinder.normals_at(cylinder.to_local(origins + distances[:, None] * directions))

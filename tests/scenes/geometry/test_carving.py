@@ -1,8 +1,3 @@
-"""The hull never cuts into foreground, and cuts away what views look through.
-
-Masks that contradict each other are told from masks that fit together.
-"""
-
 from dataclasses import replace
 from itertools import product
 
@@ -14,21 +9,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from tests.scenes.geometry.ball_views import BOX, FOCAL, SIDE, ball_matter, make_cameras
-from tests.scenes.scene_factory import ball_alpha, look_at, make_scene, ring_poses, set_frame
+from tests.scenes.scene_factory import ball_alpha, cameras_of, look_at, make_scene, ring_poses, set_frame
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.key_poses import rotation_matrix
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.evidence import AlphaEvidence
+from unmix_plugin.scenes.geometry import carving
 from unmix_plugin.scenes.geometry.bounds import find_bounds
-from unmix_plugin.scenes.geometry.carving import (
-    MIN_EXPLAINED,
-    _needed_witnesses,
-    carve_box,
-    count_views,
-    foreground_rays,
-    mask_warning,
-    share_through,
-)
+from unmix_plugin.scenes.geometry.carving import _needed_witnesses, carve_box, foreground_rays
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import Scene
@@ -105,14 +93,12 @@ def test_without_alpha_exactly_the_cells_in_front_of_some_camera_stay():
     assert 0 < seen.mean() < near.mean() < 1
 
 
-def test_pixels_that_a_mask_ignores_count_as_matter(tmp_path):
-    folder = make_scene(tmp_path / "scene")
+def test_pixels_that_a_mask_ignores_count_as_matter(folder):
     mask = np.where(np.arange(20) < 10, 255, 0).astype(np.uint8)[None].repeat(16, 0)
     Image.fromarray(mask).save(folder.root / "mask.png")
     scene = load_scene(folder.edit(set_frame(1, mask_path="mask.png")).root)
-    masked, other, *_ = AlphaEvidence(
-        PixelTable(scene, torch.device("cpu"), scene.train_indices), True
-    ).foreground()
+    table = PixelTable(scene, torch.device("cpu"), scene.train_indices)
+    masked, other, *_ = AlphaEvidence(table, True).foreground()
     assert masked[:, 10:].all()
     for view, shown in ((1, masked[:, :10]), (2, other)):
         alpha = scene.alpha(view)
@@ -163,9 +149,8 @@ def test_the_model_box_is_centred_and_its_longest_edge_is_two(tmp_path, has_alph
 
 
 def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
-    cameras = make_cameras(
-        [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
-    )
+    poses = [look_at(np.array([x, -2.0, 0.2]), np.array([x, 0.0, 0.0])) for x in (-0.6, 0.0, 0.6)]
+    cameras = make_cameras(poses)
     foreground = [np.ones((SIDE, SIDE), bool)] * 3
     kept = [carve_box(cameras, foreground, BOX, 24, fewest_views=n) for n in (1, 2, 3)]
     count = np.sum([seen_by(cameras, index, 24, 0, 0.1) for index in range(3)], axis=0)
@@ -177,17 +162,12 @@ def test_cells_that_too_few_views_see_are_carved_and_the_others_stay():
 
 def test_views_of_two_sizes_carve_and_bound_the_same_ball():
     poses, radius = ring_poses(8), 0.5
-    scales = [1 if index % 2 else 0.5 for index in range(8)]
-    whole = make_cameras(poses)
-    factors = torch.tensor(scales)[:, None]
-    sizes = [(int(SIDE * scale), int(SIDE * scale)) for scale in scales]
-    mixed = Cameras.of_sizes(
-        whole.camera_to_world, whole.focal_px * factors, whole.center_px * factors, whole.distortion, sizes
-    )
-    foreground = [
-        ball_alpha(pose, radius, side, side, FOCAL * scale) > 0
-        for pose, (side, _), scale in zip(poses, sizes, scales, strict=True)
-    ]
+    sides = [SIDE if index % 2 else SIDE // 2 for index in range(8)]
+    whole, factors = make_cameras(poses), torch.tensor(sides)[:, None] / SIDE
+    lens = whole.focal_px * factors, whole.center_px * factors, whole.distortion
+    mixed = Cameras.of_sizes(whole.camera_to_world, *lens, [(side, side) for side in sides])
+    seen = zip(poses, sides, strict=True)
+    foreground = [ball_alpha(pose, radius, side, side, FOCAL * side / SIDE) > 0 for pose, side in seen]
     hull = carve_box(mixed, foreground, BOX, 32)
     distances = np.linalg.norm(centres(32), axis=-1)
     assert hull[distances < radius].all()
@@ -229,7 +209,8 @@ def test_where_many_views_look_through_what_the_others_see_more_must_agree():
     witnesses = _needed_witnesses(cameras, spoilt(5), BOX, rays)
     assert witnesses == 4
     few, enough = (carve_box(cameras, spoilt(5), BOX, 64, witnesses=count) for count in (3, witnesses))
-    assert share_through(rays, BOX, few) < MIN_EXPLAINED <= share_through(rays, BOX, enough)
+    shares = [carving.share_through(rays, BOX, hull) for hull in (few, enough)]
+    assert shares[0] < carving.MIN_EXPLAINED <= shares[1]
     assert _needed_witnesses(cameras, spoilt(20), BOX, rays) == 6
 
 
@@ -251,14 +232,12 @@ def turned(scene: Scene, size: float) -> Scene:
 @pytest.mark.parametrize(("turn", "is_told"), [(0.0, False), (0.002, False), (0.1, True)])
 def test_poses_that_are_off_by_several_pixels_are_told_and_right_ones_raise_no_alarm(demo, turn, is_told):
     alphas = [demo.alpha(index) for index in demo.train_indices]
-    warning = mask_warning(turned(demo, turn), [alpha > 0 for alpha in alphas if alpha is not None])
+    warning = carving.mask_warning(turned(demo, turn), [alpha > 0 for alpha in alphas if alpha is not None])
     assert (warning is not None) == is_told
     assert warning is None or ("contradict each other" in warning and "--poses refine" in warning)
 
 
 def test_a_point_on_the_right_or_lower_edge_of_an_image_is_outside_as_everywhere():
-    camera = Cameras(
-        torch.eye(4)[None, :3], torch.full((1, 2), 8.0), torch.full((1, 2), 4.0), torch.zeros(1, 4), 8, 8
-    )
+    camera = cameras_of([np.eye(4)], 8, 8, 8.0)
     edges = torch.tensor([[-0.5, 0.0, -1.0], [0.0, 0.5, -1.0], [0.5, 0.0, -1.0], [0.0, -0.5, -1.0]])
-    assert count_views(camera, edges).tolist() == [1, 1, 0, 0]
+    assert carving.count_views(camera, edges).tolist() == [1, 1, 0, 0]

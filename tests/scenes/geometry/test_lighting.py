@@ -1,5 +1,3 @@
-"""Whether a light is distinguished from one that moves with the camera, on a matt ball."""
-
 import numpy as np
 import pytest
 import torch

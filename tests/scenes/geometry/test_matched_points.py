@@ -1,5 +1,3 @@
-"""Places that views agree on, and the box of what a flight sees."""
-
 import json
 
 import numpy as np
@@ -7,6 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
+from tests.captures.file_factory import present
 from tests.scenes.geometry.ground_views import (
     FOCAL,
     HEIGHT,
@@ -35,12 +34,9 @@ def above_ground(places):
     return places[:, 2] - SLOPE * places[:, 0]
 
 
-@pytest.mark.parametrize(
-    "cameras", [flight_cameras(flight_poses()), strip_cameras()], ids=["frames", "lines"]
-)
+@pytest.mark.parametrize("cameras", [flight_cameras(flight_poses()), strip_cameras()])
 def test_matched_places_lie_on_the_ground_at_the_depths_of_their_cameras(cameras):
-    found = find_matched_points(views_of(cameras))
-    assert found is not None
+    found = present(find_matched_points(views_of(cameras)))
     assert above_ground(found.places).abs().quantile(0.9) < 0.05
     assert found.are_equally_far
     if cameras.is_line_camera(0):
@@ -56,12 +52,10 @@ def test_places_stay_where_they_are_in_views_thinned_out_and_beside_pixels_that_
     views = ground_views(cameras)
     for view in views:
         view[::31, ::29], view[150:, 160:] = np.nan, np.inf
-    found = find_matched_points(views_of(cameras, views))
-    assert found is not None
+    found = present(find_matched_points(views_of(cameras, views)))
     assert above_ground(found.places).abs().quantile(0.9) < 0.1
     monkeypatch.setattr("unmix_plugin.scenes.geometry.matched_points.LONGEST_SIDE_PX", WIDTH // 2)
-    found = find_matched_points(views_of(cameras))
-    assert found is not None
+    found = present(find_matched_points(views_of(cameras)))
     assert above_ground(found.places).mean().abs() < 0.02
 
 
@@ -74,12 +68,10 @@ def test_what_masks_leave_out_is_no_feature_and_does_not_tell_exposures():
     views = ground_views(cameras)
     for view, gain in zip(views, gains, strict=True):
         view[~valid] *= gain
-    everything = find_matched_points(views_of(cameras, views))
-    assert everything is not None
+    everything = present(find_matched_points(views_of(cameras, views)))
     assert judge_exposure(cameras, everything.places, everything.seen_by(16)) == "per-view"
     valid[::31, ::29] = False  # dead pixels spoil no feature
-    found = find_matched_points(views_of(cameras, views, lambda _: valid))
-    assert found is not None
+    found = present(find_matched_points(views_of(cameras, views, lambda _: valid)))
     assert judge_exposure(cameras, found.places, found.seen_by(16)) == "fixed"
     for end in (0, 1):
         for view in found.pairs[:, end].unique().tolist():
@@ -103,8 +95,7 @@ def test_exposures_that_differ_are_told_by_matched_places(spread, light):
     cameras = flight_cameras(flight_poses(16))
     gains = np.exp(np.random.default_rng(2).normal(size=16) * spread).astype(np.float32)
     views = [view * gain for view, gain in zip(ground_views(cameras), gains, strict=True)]
-    found = find_matched_points(views_of(cameras, views))
-    assert found is not None
+    found = present(find_matched_points(views_of(cameras, views)))
     assert judge_exposure(cameras, found.places, found.seen_by(16)) == light
 
 

@@ -1,22 +1,17 @@
-"""Distances that views agree on, and the cells that views look through."""
-
 import numpy as np
 import pytest
 import torch
 
+from tests.captures.file_factory import present
 from tests.scenes.demo.demo_parts import one_ray_a_pixel
 from tests.scenes.geometry.ball_views import make_cameras
 from tests.scenes.scene_factory import look_at
 from unmix_plugin.engine.geometry.space import SceneBox, UnitSpace
 from unmix_plugin.scenes.demo.scene import PLACES, make_demo_scene
 from unmix_plugin.scenes.demo.shapes import first_hits
+from unmix_plugin.scenes.geometry import surface_evidence
 from unmix_plugin.scenes.geometry.carving import carve
-from unmix_plugin.scenes.geometry.surface_evidence import (
-    SurfaceEvidence,
-    _seen_through,
-    _sweep_depths,
-    _SweptDepths,
-)
+from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence, _sweep_depths
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.pixel_table import PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -56,9 +51,8 @@ def true_distances(scene, rays):
 
 
 def test_drawn_pixels_are_shown_where_their_true_surfaces_are(scene, evidence):
-    (pixels,) = PixelTable(scene, CPU, scene.train_indices, None).draw(
-        4000, torch.Generator().manual_seed(0), 0
-    )
+    table = PixelTable(scene, CPU, scene.train_indices, None)
+    (pixels,) = table.draw(4000, torch.Generator().manual_seed(0), 0)
     points = evidence.points(pixels)
     known = ~points.isnan().any(dim=-1)
     assert 0.2 < known.float().mean() < 0.9
@@ -100,8 +94,7 @@ def test_views_of_differing_exposure_and_large_noisy_views_are_swept_too(scene, 
         return (gains[view] * cube + noise)[part]
 
     views = Views(cameras.resized(edge * cameras.width, edge * cameras.height), read)
-    depths = _sweep_depths(views, scene.scene_box)
-    assert depths is not None
+    depths = present(_sweep_depths(views, scene.scene_box))
     assert depths.stride == 2 * (1 if edge == 1 else 3)
     share, right = share_right(scene, views.cameras, [0, 5, 10], depths)
     assert share > 0.3
@@ -116,8 +109,7 @@ def test_the_distances_of_what_masks_leave_out_stay_unknown(scene):
 
     def swept(read_valid):
         views = Views(cameras, lambda view, part: scene.cube(train[view], part), read_valid)
-        depths = _sweep_depths(views, scene.scene_box)
-        assert depths is not None
+        depths = present(_sweep_depths(views, scene.scene_box))
         return depths.distances
 
     found, everything = swept(lambda _: valid), swept(None)
@@ -160,8 +152,7 @@ def test_nothing_is_known_of_views_that_show_one_colour_or_are_too_few():
 
     assert _sweep_depths(Views(cameras, plain), BOX) is None
     assert _sweep_depths(Views(cameras[[0, 1, 2]], noisy), BOX) is None
-    unrelated = _sweep_depths(Views(cameras, noisy), BOX)
-    assert unrelated is not None
+    unrelated = present(_sweep_depths(Views(cameras, noisy), BOX))
     assert torch.isfinite(unrelated.distances).float().mean() < 0.05
 
 
@@ -177,8 +168,8 @@ def test_three_views_must_look_through_a_cell(num_views):
     positions = [np.array([2.5, side, 0.3]) for side in (-0.4, 0.0, 0.4)]
     cameras = make_cameras([look_at(position, np.array([-20.0, 0.0, 0.0])) for position in positions])
     shape = (num_views, cameras.height, cameras.width)
-    depths = _SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
-    empty = _seen_through(depths, cameras, BOX, 32)
+    depths = surface_evidence._SweptDepths(tuple(range(num_views)), torch.full(shape, 3.0), 1)
+    empty = surface_evidence._seen_through(depths, cameras, BOX, 32)
     # Before the surface, on it, behind it, and behind the cameras.
     points = torch.tensor([[0.5, 0.0, 0.3], [-0.5, 0.0, 0.3], [-1.5, 0.0, 0.3], [4.0, 0.0, 0.3]])
     cells = (UnitSpace(BOX, is_unbounded=True).to_unit(points) * 32).long()

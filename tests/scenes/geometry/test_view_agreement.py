@@ -1,8 +1,3 @@
-"""Poses of a wrong convention are found, and the right convention is named.
-
-Cameras at one place are told before a training.
-"""
-
 import json
 import shutil
 from pathlib import Path
@@ -15,11 +10,8 @@ from tests.scenes.scene_factory import look_at, make_scene
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
-from unmix_plugin.scenes.geometry.view_agreement import (
-    check_scene_poses,
-    compare_conventions,
-    parallax_warning,
-)
+from unmix_plugin.scenes.geometry import view_agreement
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import HyperspectralDataManagerConfig
@@ -69,9 +61,7 @@ APPLIED = {"applied_transform": TURN, "applied_scale": 0.5, "offset": [-2.5e6, -
 
 @pytest.mark.parametrize("with_alpha", [False, True])
 @pytest.mark.parametrize("wrong", [None, *WRONG])
-def test_conventions_are_told_in_a_scene_that_was_turned_and_is_geo_referenced(
-    demo, tmp_path, wrong, with_alpha
-):
+def test_conventions_are_told_in_scenes_turned_and_geo_referenced(demo, tmp_path, wrong, with_alpha):
     folder = rewritten(demo, tmp_path / "scene", WRONG.get(wrong, lambda pose: pose), with_alpha)
     path = folder / "transforms.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | ({} if with_alpha else APPLIED)))
@@ -109,15 +99,14 @@ def test_what_pixels_show_that_do_not_count_changes_no_verdict(demo):
     poses = scene.cameras.camera_to_world.double().numpy()
     valid = np.ones((64, 64), bool)
     valid[20:44, 30:] = False
-    found = []
-    for fill in (np.zeros(8), np.random.default_rng(0).random((24 * 34, 8)), np.full(8, np.nan)):
 
-        def read(view, part, fill=fill):
-            cube = np.array(scene.cube(view))
-            cube[~valid] = fill
-            return cube[part]
+    def verdict(fill):
+        def read(view, part):
+            return np.where(valid[..., None], scene.cube(view), np.float32(fill))[part]
 
-        found.append(compare_conventions(poses, Views(scene.cameras, read, lambda _: valid)))
+        return compare_conventions(poses, Views(scene.cameras, read, lambda _: valid))
+
+    found = [verdict(fill) for fill in (0.0, np.random.default_rng(0).random((64, 64, 8)), np.nan)]
     assert found[0] == found[1] == found[2]
     assert min(found[0], key=found[0].__getitem__) == "camera to world, OpenGL axes"
     nothing = Views(scene.cameras, scene.cube, lambda _: np.zeros((64, 64), bool))
@@ -130,7 +119,7 @@ BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 def test_cameras_at_one_place_are_told_from_those_that_are_apart():
     for base, is_said in ((0.0, True), (0.005, True), (0.05, False)):
         positions = np.array([[0.0, 0.0, 4.0], [0.0, 0.0, 4.0], [base, 0.0, 4.0]])
-        assert (parallax_warning(positions, BOX) is not None) == is_said, base
+        assert (view_agreement.parallax_warning(positions, BOX) is not None) == is_said, base
 
 
 def test_a_camera_that_only_turns_is_said_before_a_training(tmp_path):

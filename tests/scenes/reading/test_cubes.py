@@ -1,5 +1,3 @@
-"""Headers of .npy files, read by several threads; and the scale of a scene's cubes."""
-
 from __future__ import annotations
 
 import threading
@@ -45,9 +43,7 @@ def integers(tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [(None, 0.25), (2000.0, 0.5)])
-def test_integers_are_divided_by_the_scale_of_the_scene_unless_an_option_says_another(
-    integers, option, value
-):
+def test_integers_are_divided_by_the_scale_of_the_scene_unless_an_option_is_given(integers, option, value):
     integers.edit(lambda content: content.update(value_scale=4000))
     scene = load_scene(integers.root, SceneOptions(value_scale=option))
     assert scene.options.value_scale == (option or 4000)

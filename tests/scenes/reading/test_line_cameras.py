@@ -1,5 +1,3 @@
-"""Scenes of line cameras: what is read, what is refused, and that nothing behind them needs to know."""
-
 import copy
 
 import numpy as np
@@ -71,9 +69,8 @@ def test_a_scene_may_mix_frame_cameras_and_line_cameras(folder):
     folder.edit(set_frame(4, row_poses=None, transform_matrix=pose.tolist()))
     scene = load_scene(folder.root)
     assert [scene.cameras.is_line_camera(index) for index in (3, 4, 5)] == [True, False, True]
-    assert torch.equal(
-        scene.cameras.image_rays(4).origins.unique(dim=0), scene.cameras.camera_to_world[[4], :, 3]
-    )
+    origins = scene.cameras.image_rays(4).origins.unique(dim=0)
+    assert torch.equal(origins, scene.cameras.camera_to_world[[4], :, 3])
 
 
 def test_the_one_pose_of_a_view_does_not_change_with_key_poses_beyond_the_image(folder):
@@ -115,17 +112,11 @@ def test_poses_that_do_not_fit_the_rows_are_one_error(folder):
         (lambda keys: {"key_poses": keys[:1]}, "at least two poses"),
         (lambda _: {"key_poses": "a"}, "at least two poses"),
         (lambda keys: {"key_poses": [keys[0], 7]}, "expected an object with 'row'"),
-        (
-            lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]},
-            'has the row "x"; expected an object',
-        ),
+        (lambda keys: {"key_poses": [keys[0], {**keys[1], "row": "x"}]}, 'has the row "x"; expected an'),
         (lambda keys: {"key_poses": [keys[0], {"row": 15}]}, "'transform_matrix' is absent"),
         (lambda keys: {"key_poses": turned(keys, 1)}, "turns by 180 degrees from row 0 to row 15"),
         (lambda keys: {"row_poses": [k["transform_matrix"] for k in keys]}, "'row_poses' and 'key_poses'"),
-        (
-            lambda keys: {"transform_matrix": keys[0]["transform_matrix"]},
-            "'key_poses' and 'transform_matrix'",
-        ),
+        (lambda keys: {"transform_matrix": keys[0]["transform_matrix"]}, "'key_poses' and 'transform_matri"),
         (lambda _: {"key_poses": None, "row_poses": [1, 2]}, "the pose is"),
     ],
 )

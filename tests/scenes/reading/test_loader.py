@@ -1,5 +1,3 @@
-"""A sound scene is read as it was written."""
-
 import hashlib
 import json
 
@@ -27,11 +25,6 @@ from unmix_plugin.scenes.reading.faults import find_named
 from unmix_plugin.scenes.reading.images import UnreadableImageError, read_colour, read_mask
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return make_scene(tmp_path / "scene")
 
 
 def test_every_part_of_a_scene_is_what_was_written(folder):
@@ -70,10 +63,8 @@ def test_endmembers_come_at_the_scenes_bands_by_the_names_of_materials(folder):
 def test_lines_of_a_lamp_between_bands_count_in_the_light_of_a_scene_as_in_a_light_to_show_it_in(folder):
     path = folder.root / "illuminant.csv"
     path.write_text("wavelength,power\n450,1\n559,1\n560,101\n561,1\n680,1\n")
-    light = load_scene(folder.root).illuminant
-    assert light is not None
-    # 560 nm is where the intervals of the bands at 520 and 600 nm meet, which are 75 and 80 nm wide: each has half of a
-    # triangle of 100 nm over 1.
+    light = present(load_scene(folder.root).illuminant)
+    # At 560 nm the bands at 520 and 600 nm meet, 75 and 80 nm wide: each has half of a triangle of 100 nm over 1.
     np.testing.assert_allclose(light, np.array([1, 1 + 50 / 75, 1 + 50 / 80, 1]) / (1 + 50 / 75))
 
 
@@ -88,15 +79,12 @@ def test_cameras_see_the_same_pixels_before_and_after_normalisation(folder):
     np.testing.assert_allclose(depth.item(), -local[0, 2] * scene.normalisation.scale, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("dtype", "scale"),
-    [
-        *((dtype, None) for dtype in ("<f2", "<f4", ">f4", "<f8", "fortran")),
-        *(("u1", 255.0), ("<u2", 65535.0), ("<i2", 10000.0), ("<i4", 10000.0)),
-    ],
-)
-def test_cubes_of_every_type_and_byte_order_read_alike(folder, dtype, scale):
-    expected = load_scene(folder.root).cube(1)
+SCALES = {"u1": 255.0, "<u2": 65535.0, "<i2": 10000.0, "<i4": 10000.0}
+
+
+@pytest.mark.parametrize("dtype", ["<f2", "<f4", ">f4", "<f8", "fortran", *SCALES])
+def test_cubes_of_every_type_and_byte_order_read_alike(folder, dtype):
+    expected, scale = load_scene(folder.root).cube(1), SCALES.get(dtype)
 
     def change(cube):
         scaled = cube if scale is None else np.round(cube.astype(np.float64) * scale)
@@ -241,18 +229,11 @@ MATRIX = [[34.0, 0, 9.5], [0, 34.0, 8.5], [0, 0, 1]]
         ({}, {"camera_angle_x": ANGLE}, {"focal": [33.0, 33.0]}, {}),
         ({}, {"intrinsic_matrix": MATRIX}, {"focal": [34.0, 34.0], "center": [9.5, 8.5]}, {}),
         ({"distortion_params": [0.1, 0.2, 0, 0, 0.3, 0.4]}, {}, {"distortion": [0.1, 0.2, 0.3, 0.4]}, None),
-        (
-            {},
-            {"k1": 0.1, "k3": 0.02, "k4": 0.03},
-            {"distortion": [0.1, 0, 0, 0, 0.02, 0.03]},
-            {"distortion": [0] * 6},
-        ),
+        ({}, {"k3": 0.02, "k4": 0.3}, {"distortion": [0, 0, 0, 0, 0.02, 0.3]}, {"distortion": [0] * 6}),
     ],
 )
-def test_a_frames_own_lens_goes_before_that_of_the_scene_and_sizes_may_be_left_to_the_cubes(
-    tmp_path, keys, of_frame, expected, others
-):
-    """`others`: what other frames have in place of the lens of the scene; None where it is theirs, too."""
+def test_a_frames_own_lens_goes_before_that_of_the_scene(folder, keys, of_frame, expected, others):
+    """And sizes may be left to the cubes. `others`: what other frames have; None where it is the same."""
 
     def change(content):
         for key in ("w", "h", *(("fl_x", "fl_y", "cx", "cy") if "camera_angle_x" in keys else ())):
@@ -260,7 +241,7 @@ def test_a_frames_own_lens_goes_before_that_of_the_scene_and_sizes_may_be_left_t
         content.update(keys)
         content["frames"][4].update(of_frame)
 
-    cameras = load_scene(make_scene(tmp_path / "scene").edit(change).root).cameras
+    cameras = load_scene(folder.edit(change).root).cameras
     assert (cameras.width, cameras.height) == (WIDTH, HEIGHT)
     for frame, lens in ((4, LENS | expected), (3, LENS | (expected if others is None else others))):
         assert_allclose(cameras.focal_px[frame].numpy(), lens["focal"], rtol=1e-6)
@@ -274,16 +255,10 @@ def test_a_frames_own_lens_goes_before_that_of_the_scene_and_sizes_may_be_left_t
         (set_frame(0, rolling_shutter=[0, 0, 1, 0]), ["'rolling_shutter' is set and not followed"]),
         (set_frame(0, mask_file="masks/0.png"), ["keys that are not known and not used: mask_file"]),
         *(
-            (
-                lambda c, key=key: c.update({key: [0, 1, 2, 3]}),
-                [f"{key}: not followed beside 'frames'; give it in each"],
-            )
+            (lambda c, key=key: c.update({key: [0, 1, 2, 3]}), [f"{key}: not followed beside 'frames'; give"])
             for key in ("mask_path", "bands", "sensor", "capture", "transform_matrix")
         ),
-        (
-            set_frame(2, applied_scale=2.0, materials=["leaf", "clay"]),
-            ["applied_scale: not followed in frames; give it beside 'frames'"],
-        ),
+        (set_frame(2, applied_scale=2.0, materials=["leaf", "clay"]), ["applied_scale: not followed in fr"]),
         (set_frame(1, fl_x=FOCAL, fl_y=None), []),
         (set_frame(1, fl_x=33.0, k1=0.01), ["fl_x: frames have other values than the scene"]),
     ],
@@ -342,10 +317,8 @@ def test_links_out_of_the_folder_are_followed_when_allowed(folder, tmp_path):
     (folder.root / "cubes/view_1.npy").rename(outside)
     (folder.root / "cubes/view_1.npy").symlink_to(outside)
     (folder.root / "cubes/view_2.npy").rename(tmp_path / "other.npy")
-    folder.edit(lambda c: c["frames"][2].update(hyperspectral_file_path="../other.npy"))
-    folder.edit(
-        lambda c: c["frames"][3].update(hyperspectral_file_path=str(folder.root / "cubes/view_3.npy"))
-    )
+    folder.edit(set_frame(2, hyperspectral_file_path="../other.npy"))
+    folder.edit(set_frame(3, hyperspectral_file_path=str(folder.root / "cubes/view_3.npy")))
     scene = load_scene(folder.root, SceneOptions(allow_outside_paths=True))
     assert scene.cube(1).shape == scene.cube(2).shape == (HEIGHT, WIDTH, len(WAVELENGTHS))
 
@@ -363,16 +336,14 @@ def test_a_view_that_is_far_off_is_left_out_and_named(tmp_path, away):
 @pytest.mark.parametrize("lenses", [1, 5])
 def test_far_off_is_told_among_ten_places_or_more(tmp_path, lenses):
     """Five lenses 2 cm apart, or views of one lens, and one 2 m away."""
-    target = np.zeros(3)
-    poses = [
-        look_at(np.array([3.0 + 0.02 * (index % lenses), 0.05 * (index // lenses), 0.5]), target)
-        for index in range(9 if lenses == 1 else 15)
-    ]
-    folder = make_scene(tmp_path / "scene", poses=[*poses, look_at(np.array([3.0, 20.0, 0.5]), target)])
-    for index in range(len(poses) if lenses > 1 else 0):
+    count, target = 9 if lenses == 1 else 15, np.zeros(3)
+    places = [(3.0 + 0.02 * (index % lenses), 0.05 * (index // lenses), 0.5) for index in range(count)]
+    poses = [look_at(np.array(place), target) for place in [*places, (3.0, 20.0, 0.5)]]
+    folder = make_scene(tmp_path / "scene", poses=poses)
+    for index in range(count if lenses > 1 else 0):
         folder.edit(set_frame(index, capture=f"shot_{index // lenses}"))
     scene = load_scene(folder.root)
-    assert scene.train_indices == tuple(range(1, len(poses) + 1))
+    assert scene.train_indices == tuple(range(1, count + 1))
     assert not any("left out" in said for said in scene.warnings)
 
 

@@ -1,5 +1,3 @@
-"""Scenes whose frames differ in bands and size."""
-
 import json
 
 import numpy as np
@@ -7,7 +5,7 @@ import pytest
 
 from tests.captures.file_factory import present
 from tests.scenes.rig_factory import RESPONSES, halve, make_rig
-from tests.scenes.scene_factory import fault_of, make_scene, set_frame
+from tests.scenes.scene_factory import fault_of, set_frame
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
 from unmix_plugin.spectral.sensor import SceneSensor
@@ -36,8 +34,7 @@ def test_channels_of_responses_are_weighted_means_in_the_order_of_the_columns(tm
     assert red[3] == blue[3] == 0 < blue[0]
 
 
-def test_frames_of_two_sizes_and_equal_bands_are_two_sensors_and_those_of_one_no_rig(tmp_path):
-    folder = make_scene(tmp_path / "scene")
+def test_frames_of_two_sizes_and_equal_bands_are_two_sensors_and_those_of_one_no_rig(folder):
     scene = load_scene(folder.root)
     assert not scene.is_rig
     assert not {"sensors", "frame_sensors"} & scene.summary().keys()

@@ -1,5 +1,3 @@
-"""What can be wrong in transforms.json: each wrong value gets one clear message."""
-
 import json
 import math
 from contextlib import suppress
@@ -8,16 +6,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from tests.scenes.scene_factory import SceneFolder, fault_of, make_scene
+from tests.captures.file_factory import present
+from tests.scenes.scene_factory import fault_of, make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.lenses import read_lens
 from unmix_plugin.scenes.reading.loader import load_scene
-
-
-@pytest.fixture
-def folder(tmp_path) -> SceneFolder:
-    return make_scene(tmp_path / "scene")
 
 
 def test_what_is_no_scene_folder_is_named(folder, tmp_path):
@@ -33,8 +27,7 @@ def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):
     params = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
     content = {"fl_x": 500.0, "camera_model": "OPENCV_FISHEYE", "distortion_params": params, "w": 64}
     faults = Faults(tmp_path)
-    expected = read_lens(content, {}, "frame 0", faults)
-    assert expected is not None
+    expected = present(read_lens(content, {}, "frame 0", faults))
     assert expected.model == "OPENCV_FISHEYE"
     assert read_lens(content, dict.fromkeys(content), "frame 0", faults) == expected
     read_lens({**content, "k6": 0.1}, {"k6": None}, "frame 0", faults)
@@ -46,11 +39,7 @@ def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):
     ("scene", "frame", "expected"),
     [
         ({"distortion_params": [0.1, 0.2, 0, 0, 0, 0]}, {"k1": -0.3}, {"distortion": (-0.3, 0.2, 0, 0)}),
-        (
-            {"k1": 0.1, "k2": 0.2},
-            {"distortion_params": [-0.3, 0, 0, 0, 0, 0]},
-            {"distortion": (-0.3, 0, 0, 0)},
-        ),
+        ({"k1": 0.1, "k2": 0.2}, {"distortion_params": [-0.3, *[0] * 5]}, {"distortion": (-0.3, 0, 0, 0)}),
         ({"k1": 0.1, "distortion_params": [-0.3, 0, 0, 0, 0, 0]}, {}, {"distortion": (-0.3, 0, 0, 0)}),
         ({"camera_angle_x": 1.0}, {"x_fov": 30}, {"angles": (math.radians(30), None)}),
         ({"x_fov": 30}, {"camera_angle_x": 1.0}, {"angles": (1.0, None)}),
@@ -59,12 +48,8 @@ def test_null_in_a_frame_leaves_the_lens_that_the_file_has(tmp_path):
         ({"fl_x": 500, "fl_y": 510}, {"fl_x": 900}, {"focal_px": (900, 510)}),
     ],
 )
-def test_a_lens_given_twice_is_that_of_the_frame_and_degrees_go_before_radians(
-    tmp_path, scene, frame, expected
-):
-    faults = Faults(tmp_path)
-    lens = read_lens(scene, frame, "frame 0", faults)
-    assert lens is not None
+def test_a_lens_given_twice_is_that_of_the_frame_and_degrees_go_first(tmp_path, scene, frame, expected):
+    lens = present(read_lens(scene, frame, "frame 0", Faults(tmp_path)))
     assert {name: getattr(lens, name) for name in expected} == expected
 
 

@@ -1,8 +1,3 @@
-"""L*a*b* and CIEDE2000 against their published values.
-
-Metamers: built to look alike in one light, they are found, and nothing else is.
-"""
-
 import numpy as np
 import pytest
 import torch

@@ -17,9 +17,8 @@ NUM_MEASURED = 174
 def small_library() -> MaterialLibrary:
     centers = np.array([400.0, 500.0, 600.0, 700.0])
     rows = {"a/flat": [0.5, 0.5, 0.5, 0.5], "a/red": [0.1, 0.1, 0.5, 0.9], "b/red": [0.1, 0.2, 0.3, 0.8]}
-    return MaterialLibrary(
-        tuple(LibraryMaterial(name, Bands(centers), np.array(row), "made up") for name, row in rows.items())
-    )
+    made = (LibraryMaterial(name, Bands(centers), np.array(row), "made up") for name, row in rows.items())
+    return MaterialLibrary(tuple(made))
 
 
 def test_measured_reflectances_are_those_of_colour_science():
@@ -100,13 +99,11 @@ def test_a_comparison_of_absorptions_ignores_the_slope_also_of_materials_that_be
     dip = 1 - 0.5 * np.exp(-(((wavelengths - 550) / 20) ** 2))
     other = 1 - 0.5 * np.exp(-(((wavelengths - 500) / 20) ** 2))
     slope = np.linspace(0.2, 0.8, 31)
-    materials = (
-        LibraryMaterial("dip", VISIBLE, 0.8 * dip, ""),
-        LibraryMaterial("other", VISIBLE, slope * other, ""),
-    )
+    made = {"dip": 0.8 * dip, "other": slope * other}
+    both = MaterialLibrary(tuple(LibraryMaterial(name, VISIBLE, row, "") for name, row in made.items()))
     spectrum = (slope * dip)[None]
-    assert MaterialLibrary(materials).nearest(spectrum, VISIBLE)[0][0].name == "other"
-    assert MaterialLibrary(materials).nearest(spectrum, VISIBLE, comparison="continuum")[0][0].name == "dip"
+    assert both.nearest(spectrum, VISIBLE)[0][0].name == "other"
+    assert both.nearest(spectrum, VISIBLE, comparison="continuum")[0][0].name == "dip"
     edge = LibraryMaterial("edge", VISIBLE, np.linspace(0, 0.8, 31) ** 2, "")
     half = edge.reflectance[None] / 2
     [match] = MaterialLibrary((edge,)).nearest(half, VISIBLE, comparison="continuum")[0]
@@ -133,9 +130,8 @@ def test_a_material_is_found_by_its_full_or_its_short_name_in_any_case():
 
 
 def test_where_a_material_was_not_measured_it_is_neither_compared_nor_made_up():
-    holed = LibraryMaterial(
-        "holed", Bands.of([400, 500, 600, 700, 800]), np.array([0.1, 0.2, math.nan, 0.4, 0.5]), ""
-    )
+    values = np.array([0.1, 0.2, math.nan, 0.4, 0.5])
+    holed = LibraryMaterial("holed", Bands.of([400, 500, 600, 700, 800]), values, "")
     library, bands = MaterialLibrary((holed,)), Bands.of([400, 450, 600, 750, 800])
     angles, counts = library.angles(np.array([[0.2, 0.3, 77.0, 0.9, 1.0]]), bands)
     assert (angles[0, 0], counts[0]) == (pytest.approx(0, abs=1e-7), 4)

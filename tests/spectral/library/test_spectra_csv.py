@@ -12,9 +12,8 @@ from unmix_plugin.spectral.library.spectra_csv import (
     write_spectra_csv,
 )
 
-SMALL = SpectraTable(
-    Bands.of([400, 500, 600]), ("leaf", "soil, dry"), np.array([[0.1, 0.5, 0.2], [0, 1, 2.5]])
-)
+VALUES = np.array([[0.1, 0.5, 0.2], [0, 1, 2.5]])
+SMALL = SpectraTable(Bands.of([400, 500, 600]), ("leaf", "soil, dry"), VALUES)
 
 
 def written(tmp_path, text, encoding="utf-8"):
@@ -58,10 +57,7 @@ def test_a_byte_order_mark_blank_lines_spaces_and_windows_line_ends_are_read(tmp
         ("wavelength,leaf\n400,1\n500,nan\n", "spectra must be finite; found nan in 'leaf' at 500 nm"),
         ("wavelength,leaf\n400,inf\n", "spectra must be finite; found inf in 'leaf' at 400 nm"),
         ("wavelength,leaf,soil\n400,1,1\n500,1,-0.5\n", "not be negative; found -0.5 in 'soil' at 500 nm"),
-        (
-            "wavelength,leaf\n500,1\n400,1\n",
-            "strictly increase; found 500 nm at index 0 then 400 nm at index 1",
-        ),
+        ("wavelength,leaf\n500,1\n400,1\n", "strictly increase; found 500 nm at index 0 then 400 nm"),
         ("wavelength,leaf\n-4,1\n", "be positive; found -4 nm"),
     ],
 )
@@ -73,20 +69,13 @@ def test_a_faulty_file_is_refused_with_its_name_and_the_place(tmp_path, text, me
 
 def test_a_file_that_is_missing_a_folder_or_no_text_is_refused(tmp_path):
     written(tmp_path, "wavelength,caf\xe9\n400,1\n", "latin-1")
-    for name, said in (
-        ("nowhere.csv", ": No such file"),
-        ("", ""),
-        ("spectra.csv", "not a CSV file in UTF-8"),
-    ):
-        with pytest.raises(
-            SpectrumError, match=said if "CSV" in said else f"{name}: can't read spectra{said}"
-        ):
+    missing = r"nowhere\.csv: can't read spectra: No such file"
+    for name, said in (("nowhere.csv", missing), ("", "read spectra"), ("spectra.csv", "CSV file in UTF-8")):
+        with pytest.raises(SpectrumError, match=said):
             read_spectra_csv(tmp_path / name)
 
 
-@given(
-    st.floats(-1, 1), st.lists(st.floats(401, 599), min_size=1, max_size=9, unique_by=lambda x: round(x, 2))
-)
+@given(st.floats(-1, 1), st.lists(st.floats(401, 599), min_size=1, max_size=9, unique_by=round))
 def test_resampling_is_exact_for_straight_spectra(slope, centers):
     bands = Bands.of(sorted(centers))
     straight = 1.5 + slope * (SMALL.bands.centers_nm - 500) / 100
@@ -107,9 +96,6 @@ def test_resampling_interpolates_linearly_and_keeps_leading_axes():
 
 
 def test_extrapolation_is_refused_with_the_distance():
-    for centers, said in (
-        ([390, 500], "10 nm below"),
-        ([399, 601.5], "1 nm below and 1.5 nm above their range"),
-    ):
+    for centers, said in (([390, 500], "10 nm below"), ([399, 601.5], "1 nm below and 1.5 nm above")):
         with pytest.raises(SpectrumError, match=said):
             SMALL.resampled(Bands.of(centers))

@@ -1,5 +1,3 @@
-"""Formulas bind as in Python, their faults are shown, and named indices have the values of their definitions."""
-
 import math
 import time
 from pathlib import Path

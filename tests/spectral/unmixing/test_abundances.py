@@ -11,6 +11,8 @@ from unmix_plugin.errors import SpectrumError
 from unmix_plugin.spectral.unmixing import abundances as sparse_unmixing
 from unmix_plugin.spectral.unmixing.abundances import fcls, nnls, sparse_abundances
 
+SMOOTH = {count: smooth_endmembers(count).float() for count in range(1, 17)}
+
 
 def random_problem(num_endmembers, num_pixels=40, num_bands=9, seed=0):
     """Endmembers and pixels that their mixtures do not reach, in float64."""
@@ -29,9 +31,7 @@ def test_amounts_are_those_of_scipy(num_endmembers, seed):
 
 
 @given(st.integers(1, 8), st.floats(0.01, 100.0), st.integers(0, 500))
-def test_of_amounts_no_small_allowed_change_is_better_and_they_grow_with_brightness(
-    num_endmembers, gain, seed
-):
+def test_no_small_allowed_change_of_amounts_is_better_and_they_grow_with_light(num_endmembers, gain, seed):
     pixels, endmembers = random_problem(num_endmembers, seed=seed)
     amounts = nnls(pixels, endmembers)
     slopes = (amounts @ endmembers - pixels) @ endmembers.T
@@ -91,13 +91,9 @@ def test_black_spectra_show_nothing_and_many_pixels_are_all_solved():
     assert_close(nnls(many, endmembers)[-7:], nnls(pixels, endmembers))
 
 
-def endmembers_of(num_endmembers):
-    return smooth_endmembers(num_endmembers).float()
-
-
 @pytest.mark.parametrize("num_endmembers", [1, 2, 3, 5, 25])
 def test_pure_spectra_are_pure_under_any_shading(num_endmembers):
-    endmembers = endmembers_of(num_endmembers) if num_endmembers < 10 else torch.eye(num_endmembers)
+    endmembers = SMOOTH[num_endmembers] if num_endmembers < 10 else torch.eye(num_endmembers)
     shading = torch.linspace(0.1, 1.5, num_endmembers)[:, None]
     found = sparse_abundances(shading * endmembers, endmembers, 0.02)
     assert_close(found, torch.eye(num_endmembers), atol=1e-3, rtol=0)
@@ -106,14 +102,14 @@ def test_pure_spectra_are_pure_under_any_shading(num_endmembers):
 @given(st.integers(0, 50), st.floats(0.2, 0.8))
 @settings(max_examples=20)
 def test_abundances_of_mixtures_of_two_are_found_whatever_the_brightness_of_endmembers(seed, share):
-    endmembers = endmembers_of(5) * torch.rand(5, 1, generator=seeded(seed)).clamp(min=0.2)
+    endmembers = SMOOTH[5] * torch.rand(5, 1, generator=seeded(seed)).clamp(min=0.2)
     mixture = 0.4 * (share * endmembers[1] + (1 - share) * endmembers[3])
     found = sparse_abundances(mixture[None], endmembers, 1e-4)
     assert_close(found, torch.tensor([[0.0, share, 0.0, 1 - share, 0.0]]), atol=5e-3, rtol=0)
 
 
 def test_spectra_show_at_most_three_materials_of_sum_one_and_none_that_explains_less_than_the_penalty():
-    endmembers = endmembers_of(7)
+    endmembers = SMOOTH[7]
     mixtures = torch.rand(200, 7, generator=seeded(1)) @ endmembers
     found = sparse_abundances(mixtures, endmembers, 0.001)
     assert_close(found.sum(dim=1), torch.ones(200))
@@ -156,15 +152,14 @@ def _noisy_mixtures(endmembers, count=300):
     """Of one to three endmembers."""
     generator = seeded(4)
     places = torch.rand(count, len(endmembers), generator=generator).argsort(dim=1)[:, :3]
-    amounts = torch.rand(count, 3, generator=generator) * (
-        torch.arange(count)[:, None] % 3 >= torch.arange(3)
-    )
-    clean = torch.zeros(count, len(endmembers)).scatter(1, places, amounts + 0.0) @ endmembers
+    is_in = torch.arange(count)[:, None] % 3 >= torch.arange(3)
+    amounts = torch.rand(count, 3, generator=generator) * is_in
+    clean = torch.zeros(count, len(endmembers)).scatter(1, places, amounts) @ endmembers
     return clean + 0.002 * torch.randn(clean.shape, generator=generator)
 
 
 def test_few_endmembers_are_searched_wholly_and_extending_sets_finds_the_same(monkeypatch):
-    endmembers = endmembers_of(5)
+    endmembers = SMOOTH[5]
     mixtures = _noisy_mixtures(endmembers)
     whole = sparse_abundances(mixtures, endmembers, 0.01)
     monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 0)
@@ -173,7 +168,7 @@ def test_few_endmembers_are_searched_wholly_and_extending_sets_finds_the_same(mo
 
 
 def test_of_many_endmembers_nearly_every_spectrum_gets_the_mixture_of_the_whole_search(monkeypatch):
-    endmembers = endmembers_of(16)
+    endmembers = SMOOTH[16]
     mixtures = _noisy_mixtures(endmembers)
     screened = _cost(sparse_abundances(mixtures, endmembers, 0.01), mixtures, endmembers, 0.01)
     monkeypatch.setattr(sparse_unmixing, "_MOST_SEARCHED", 16)

@@ -1,5 +1,3 @@
-"""The contract of benchmarks/unmixing_2d.py with scripts outside this repository."""
-
 import json
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""Spectra on all bands from sensors that see some of them."""
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -89,11 +87,7 @@ SPOILT = torch.cat([torch.full((1, 24), float("nan")), torch.full((1, 24), float
     [
         (SOUND, 25, "between 1 and the number of bands, 24; found 25"),
         (SOUND, 0, "found 0"),
-        (
-            smooth_endmembers(3).repeat(100, 1),
-            4,
-            r"4 endmembers .* only 3 distinct pixels .* \(of 300\); ask for at most 3",
-        ),
+        (smooth_endmembers(3).repeat(100, 1), 4, r"4 .* only 3 distinct pixels .* \(of 300\); .* at most 3"),
         (torch.zeros(10, 4), 2, "only 0 distinct pixels .* check the scale"),
         (torch.zeros(0, 4), 2, r"only 0 distinct pixels .* \(of 0\)"),
         (SPOILT, 3, rf"2 of {len(SPOILT)} pixels hold NaN"),

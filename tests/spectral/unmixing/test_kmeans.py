@@ -15,10 +15,9 @@ def shaded_clusters(num_clusters, per_cluster=60, seed=0, noise=0.01):
     materials = smooth_endmembers(num_clusters)
     ids = torch.arange(num_clusters).repeat_interleave(per_cluster)
     shading = 0.05 + 0.95 * torch.rand(len(ids), 1, dtype=torch.float64, generator=seeded(seed))
-    spread = noise * torch.randn(
-        len(ids), materials.shape[1], dtype=torch.float64, generator=seeded(seed + 1)
-    )
-    return (materials[ids] + spread).clamp(min=1e-3) * shading, ids, materials
+    pixels = materials[ids]
+    pixels += noise * torch.randn(pixels.shape, dtype=torch.float64, generator=seeded(seed + 1))
+    return pixels.clamp(min=1e-3) * shading, ids, materials
 
 
 def same_partition(a, b):

@@ -1,5 +1,3 @@
-"""Endmembers on which several searches agree."""
-
 import pytest
 import torch
 from torch.testing import assert_close

@@ -8,12 +8,8 @@ from torch.testing import assert_close
 
 from tests.spectral.mixtures import mixed_pixels, seeded, smooth_endmembers, worst_angle
 from unmix_plugin.errors import SpectrumError
-from unmix_plugin.spectral.unmixing.simplex_corners import (
-    _estimated_snr_db,
-    minimum_volume_simplex,
-    nfindr,
-    vca,
-)
+from unmix_plugin.spectral.unmixing import simplex_corners
+from unmix_plugin.spectral.unmixing.simplex_corners import minimum_volume_simplex, nfindr, vca
 
 HIGH_SNR_DB, LOW_SNR_DB = 80.0, 5.0
 
@@ -31,9 +27,7 @@ def scene(num_endmembers, shading_seed=None, mixtures_seed=1):
 
 
 @given(st.integers(2, 7), st.integers(0, 1000), st.sampled_from([HIGH_SNR_DB, LOW_SNR_DB]))
-def test_pure_pixels_of_noiseless_mixtures_are_found_exactly_by_both_projections_shaded_ones_by_one(
-    num_endmembers, seed, snr_db
-):
+def test_pure_pixels_are_found_exactly_by_both_projections_shaded_ones_by_one(num_endmembers, seed, snr_db):
     pixels, places = scene(num_endmembers)
     found, indices = vca(pixels, num_endmembers, seeded(seed), snr_db=snr_db)
     assert sorted(indices.tolist()) == places.tolist()
@@ -55,8 +49,8 @@ def test_noise_is_estimated_and_the_projection_takes_it_out_of_the_chosen_pixels
     noise = torch.randn(many.shape, generator=seeded(1), dtype=torch.float64)
     for true_db in (10.0, 25.0, 40.0):
         scaled = noise * math.sqrt(float(many.square().mean()) / 10 ** (true_db / 10))
-        assert abs(_estimated_snr_db(many + scaled, 4) - true_db) < 0.3
-    assert _estimated_snr_db(many, 4) == math.inf
+        assert abs(simplex_corners._estimated_snr_db(many + scaled, 4) - true_db) < 0.3
+    assert simplex_corners._estimated_snr_db(many, 4) == math.inf
     clean, places = scene(3)
     noisy = clean + 0.02 * torch.randn(clean.shape, generator=seeded(4), dtype=torch.float64)
     found, indices = vca(noisy, 3, seeded())

@@ -37,11 +37,7 @@ SHADES = torch.linspace(0.1, 1, 150, dtype=torch.float64)[:, None]
         (torch.rand(100, 80, generator=seeded()), 0, "0 were asked for"),
         (torch.zeros(0, 4), 2, "non-zero length"),
         (torch.tensor([[0.0, 0.0], [0.1, 0.2], [0.2, 0.1]]), 2, "non-zero length; found 1 that are zero"),
-        (
-            smooth_endmembers(3).repeat(50, 1) * SHADES,
-            4,
-            "only 3 distinct spectral shapes among 150 pixels: 4 end",
-        ),
+        (smooth_endmembers(3).repeat(50, 1) * SHADES, 4, "only 3 distinct spectral shapes among 150 pixels"),
     ],
 )
 def test_numbers_out_of_range_no_or_black_pixels_and_too_few_shapes_are_refused(pixels, count, said):
@@ -76,10 +72,8 @@ def test_the_search_finds_the_best_set_that_brute_force_finds():
     pixels = torch.rand(9, 5, dtype=torch.float64, generator=seeded(3))
     shapes = normalize(pixels, dim=1)
     distances = distances_to_pairs(shapes, shapes)
-    best = min(
-        float(distances[list(ids)][:, list(ids)].flatten(0, 1).amin(0).mean())
-        for ids in combinations(range(9), 3)
-    )
+    threes = [list(ids) for ids in combinations(range(9), 3)]
+    best = min(float(distances[ids][:, ids].flatten(0, 1).amin(0).mean()) for ids in threes)
     # Nine distinct pixels: every one is a candidate and a judge.
     assert two_material_fits(pixels, 3, seeded())[-1].mean_distance == pytest.approx(best, abs=1e-6)
 

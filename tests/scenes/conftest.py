@@ -1,0 +1,10 @@
+"""A sound scene, which a test may damage."""
+
+import pytest
+
+from tests.scenes.scene_factory import SceneFolder, make_scene
+
+
+@pytest.fixture
+def folder(tmp_path) -> SceneFolder:
+    return make_scene(tmp_path / "scene")
