@@ -68,8 +68,10 @@ def test_a_wobble_is_found(size_px: float) -> None:
     assert off_by(fitted(truth), truth) < 0.1
 
 
-def test_rows_that_fit_stay_where_they_are() -> None:
+def test_rows_that_fit_stay_where_they_are_also_those_of_key_poses() -> None:
     assert off_by(fitted(camera()), camera()) < 0.02
+    truth = camera(1.0)
+    assert off_by(fitted(truth, start=truth), truth) < 0.02
 
 
 def test_pixels_that_are_not_valid_do_not_pull() -> None:
@@ -78,11 +80,6 @@ def test_pixels_that_are_not_valid_do_not_pull() -> None:
     assert off_by(fitted(camera(), valid, slice(20, 30)), camera()) < 0.02
     found = fitted(camera(1.0), torch.zeros(ROWS, WIDTH, dtype=torch.bool))
     assert_close(found.image_rays(0).directions, camera().image_rays(0).directions, atol=1e-6, rtol=0)
-
-
-def test_a_line_camera_with_key_poses_of_its_own_starts_from_them() -> None:
-    truth = camera(1.0)
-    assert off_by(fitted(truth, start=truth), truth) < 0.02
 
 
 def test_moved_rays_know_where_they_pass_the_picture() -> None:

@@ -17,11 +17,13 @@ from unmix_plugin.rendering.grid_upkeep import update_grid
 from unmix_plugin.rendering.renderer import VolumeRenderer
 from unmix_plugin.settings import UnmixFieldConfig
 
+SMALL = UnmixFieldConfig(log2_rows_per_level=8)
+
 
 def make(density: float = 1e-6) -> tuple[VolumeRenderer, UnmixField]:
     """A field that is as dense everywhere."""
     torch.manual_seed(0)
-    field = UnmixField(UnmixFieldConfig(log2_rows_per_level=8), BOX, 3, 1, density, 0.1, is_unbounded=True)
+    field = UnmixField(SMALL, BOX, 3, 1, density, 0.1, is_unbounded=True)
     with torch.no_grad():
         field.table.zero_()
     cells = torch.ones(16, 16, 16)
@@ -136,11 +138,11 @@ def test_a_world_without_end_begins_with_cells_as_large_as_those_of_a_coarse_gri
 
 
 def test_a_backdrop_may_stand_still_in_the_picture_and_a_sky_does_not():
-    config, bundle = UnmixFieldConfig(log2_rows_per_level=8), rays(20)
+    bundle = rays(20)
     aside = replace(bundle, offsets=torch.full((20, 2), 0.3))
     elsewhere = replace(bundle, origins=bundle.origins + 0.5)
     for is_unbounded in (False, True):
-        field = UnmixField(config, BOX, 3, 1, 1.0, 0.1, is_unbounded=is_unbounded, has_sky=True)
+        field = UnmixField(SMALL, BOX, 3, 1, 1.0, 0.1, is_unbounded=is_unbounded, has_sky=True)
         with torch.no_grad():
             here, others = field.sky(bundle), [field.sky(aside), field.sky(elsewhere)]
         assert here is not None
@@ -151,8 +153,7 @@ def test_a_backdrop_may_stand_still_in_the_picture_and_a_sky_does_not():
 
 def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
     """As the light of a lens falls from the middle to the sides."""
-    config = UnmixFieldConfig(log2_rows_per_level=8)
-    field = UnmixField(config, BOX, 3, 1, 1.0, 0.1, has_sky=True)
+    field = UnmixField(SMALL, BOX, 3, 1, 1.0, 0.1, has_sky=True)
     across = torch.linspace(-0.7, 0.7, 64)
     bundle = replace(rays(64), offsets=torch.stack([across, across], dim=1))
     wanted = 1.3 - 1.2 * across.square()
@@ -169,11 +170,10 @@ def test_a_backdrop_brighter_and_darker_than_its_endmember_is_learnt():
 
 
 def test_a_bounded_field_has_a_sky_behind_all_matter_only_where_there_is_a_backdrop():
-    config = UnmixFieldConfig(log2_rows_per_level=8)
-    bare = UnmixField(config, BOX, 3, 1, 1.0, 0.1)
+    bare = UnmixField(SMALL, BOX, 3, 1, 1.0, 0.1)
     assert bare.sky(rays(2)) is None
     assert not [name for name in bare.state_dict() if "sky" in name]
-    field = UnmixField(config, BOX, 3, 1, 1e-9, 0.1, has_sky=True)
+    field = UnmixField(SMALL, BOX, 3, 1, 1e-9, 0.1, has_sky=True)
     reachable = torch.ones((8, 8, 8), dtype=torch.bool)
     renderer = VolumeRenderer(BOX, torch.zeros((8, 8, 8), dtype=torch.uint8), reachable, 0.05, 1e-3)
     bundle = rays(20)

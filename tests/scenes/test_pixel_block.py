@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from tests.captures.file_factory import present
-from tests.scenes.scene_factory import make_scene, widen
+from tests.scenes.scene_factory import widen
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes import pixel_block, pixel_table
 from unmix_plugin.scenes.pixel_block import PixelBlock
@@ -18,6 +18,13 @@ OTHERS = [("<f2", None), (">f4", None), ("u1", 255.0), ("<f8", None), (">u2", 65
 
 def as_stored(cube: np.ndarray, stored: str, scale: float | None) -> np.ndarray:
     return (cube * (scale or 1.0)).round(5).astype(stored)
+
+
+def with_a_dead_value(index: int, cube: np.ndarray) -> np.ndarray:
+    """The cube in ten smooth bands, and in view 3 a value of 0 in one of them."""
+    wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
+    wide[8, 10, 4] *= index != 3
+    return wide
 
 
 def read_block(scene, views: tuple[int, ...]) -> PixelBlock:
@@ -40,8 +47,8 @@ def test_pixels_are_those_of_the_scene_at_the_size_they_were_stored_in(folder, s
         assert torch.equal(block.alpha[320 * row :][:320], alpha)
 
 
-def test_clipped_pixels_come_out_clipped_and_views_of_different_types_as_single_precision(tmp_path):
-    folder = make_scene(tmp_path / "scene").edit_cube(1, lambda cube: cube - np.float16(0.01) * (cube < 0.1))
+def test_clipped_pixels_come_out_clipped_and_views_of_different_types_as_single_precision(folder):
+    folder.edit_cube(1, lambda cube: cube - np.float16(0.01) * (cube < 0.1))
     folder.edit_cube(3, lambda cube: cube.astype(np.float64))
     scene = load_scene(folder.root, SceneOptions(invalid_pixels="clip"))
     assert np.load(folder.root / "cubes/view_1.npy").min() < 0
@@ -77,8 +84,8 @@ def test_pixels_on_disk_are_the_same_as_those_in_memory(folder, monkeypatch, sto
         torch.testing.assert_close(one, torch.from_numpy(own).float())
 
 
-def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeypatch):
-    scene = load_scene(make_scene(tmp_path / "scene").root)
+def test_pixels_are_held_unless_they_need_more_than_the_budget(folder, monkeypatch):
+    scene = load_scene(folder.root)
     needed = 5 * 320 * (4 * 2 + 5)
     monkeypatch.setattr(pixel_table, "available_bytes", lambda _: 2 * needed)
     assert PixelTable(scene, CPU, scene.train_indices).notes == []
@@ -91,13 +98,8 @@ def test_pixels_are_held_unless_they_need_more_than_the_budget(tmp_path, monkeyp
 
 @pytest.mark.parametrize("components", ["none", 3])
 @pytest.mark.parametrize(("stored", "scale"), STORED)
-def test_pixels_are_mended_whole_or_projected_and_kept_as_small(tmp_path, stored, scale, components):
-    def write(index: int, cube: np.ndarray) -> np.ndarray:
-        wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
-        wide[8, 10, 4] *= index != 3
-        return as_stored(wide, stored, scale)
-
-    folder = widen(make_scene(tmp_path / "scene"), 10, write)
+def test_pixels_are_mended_whole_or_projected_and_kept_as_small(folder, stored, scale, components):
+    widen(folder, 10, lambda index, cube: as_stored(with_a_dead_value(index, cube), stored, scale))
     scene = load_scene(folder.root, SceneOptions(value_scale=scale))
     size = PixelTable(scene, CPU, (1, 3), components=components).blocks[0].held_bytes
     table = PixelTable(scene, CPU, (1, 3), mends=True, components=components)
@@ -109,7 +111,7 @@ def test_pixels_are_mended_whole_or_projected_and_kept_as_small(tmp_path, stored
 
 @pytest.mark.parametrize("components", ["none", 3])
 @pytest.mark.parametrize(("stored", "scale"), [STORED[0], STORED[1], STORED[4]])
-def test_views_are_never_read_whole_and_all_is_mended(tmp_path, monkeypatch, stored, scale, components):
+def test_views_are_never_read_whole_and_all_is_mended(folder, monkeypatch, stored, scale, components):
     """Bad values at the edges of parts too."""
 
     def write(_: int, cube: np.ndarray) -> np.ndarray:
@@ -118,8 +120,7 @@ def test_views_are_never_read_whole_and_all_is_mended(tmp_path, monkeypatch, sto
         wide[[7, 7, 8, 9], [10, 11, 11, 9], [4, 2, 7, 0]] = 0.0
         return as_stored(wide, stored, scale)
 
-    folder = widen(make_scene(tmp_path / "scene"), 10, write)
-    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    scene = load_scene(widen(folder, 10, write).root, SceneOptions(value_scale=scale))
     whole = PixelTable(scene, CPU, scene.train_indices, mends=True, components=components)
     assert whole.bad_share == pytest.approx(4 / (320 * 10))
     monkeypatch.setattr(pixel_block, "_CHUNK_VALUES", 4 * 20 * 10)
@@ -140,14 +141,13 @@ def test_views_are_never_read_whole_and_all_is_mended(tmp_path, monkeypatch, sto
 
 
 @pytest.mark.parametrize("components", ["none", 3])
-def test_a_value_beside_pixels_without_a_measurement_is_mended_by_the_others(tmp_path, components):
+def test_a_value_beside_pixels_without_a_measurement_is_mended_by_the_others(folder, components):
     def write(index: int, cube: np.ndarray) -> np.ndarray:
-        wide = np.repeat(cube[..., 2:3].astype(np.float64), 10, axis=-1) * np.linspace(0.9, 1.0, 10)
-        wide[8, 10, 4] *= index != 3
+        wide = with_a_dead_value(index, cube)
         wide[8, 11] = np.nan
         return wide.astype(np.float16)
 
-    folder = widen(make_scene(tmp_path / "scene"), 10, write)
+    widen(folder, 10, write)
     scene = load_scene(folder.root, SceneOptions(invalid_pixels="mask"))
     [block] = PixelTable(scene, CPU, (1, 3), mends=True, components=components).blocks
     assert block.num_bad == 1
@@ -159,7 +159,7 @@ BRIGHTEST = [("<f4", None), ("<f2", None), ("u1", 255.0), ("u1", 1000.0), ("<i2"
 
 
 @pytest.mark.parametrize(("stored", "scale"), BRIGHTEST)
-def test_what_is_mended_is_at_most_full_scale_and_the_largest_number_of_its_type(tmp_path, stored, scale):
+def test_what_is_mended_is_at_most_full_scale_and_the_largest_number_of_its_type(folder, stored, scale):
     """Beside a bad value a pixel is as bright as can be, and the pixels around have a peak there."""
     dtype, components = np.dtype(stored), 3 if stored == "<f2" else "none"
     largest = 1.0 if dtype.kind == "f" else min(np.iinfo(dtype).max / (scale or 1.0), 1.0)
@@ -171,8 +171,7 @@ def test_what_is_mended_is_at_most_full_scale_and_the_largest_number_of_its_type
             wide[8, 10] = largest * ~is_peak
         return as_stored(wide, stored, scale)
 
-    folder = widen(make_scene(tmp_path / "scene"), 10, write)
-    scene = load_scene(folder.root, SceneOptions(value_scale=scale))
+    scene = load_scene(widen(folder, 10, write).root, SceneOptions(value_scale=scale))
     [block] = PixelTable(scene, CPU, (1, 3), mends=True, components=components).blocks
     assert block.num_bad == 1
     found = block.spectra(torch.tensor([320 + 8 * 20 + 10]))[0]

@@ -53,8 +53,8 @@ def test_a_noisy_band_hardly_moves_the_mixtures_of_pixels():
     errors = []
     for weights in ((), WEIGHTS):
         balance = weighted(weights).balance
-        scaled = (balance.scaled(spectra, None) for spectra in (pixels, endmembers))
-        found = sparse_abundances(*scaled, torch.tensor(0.01))
+        seen, corners = (balance.scaled(spectra, None) for spectra in (pixels, endmembers))
+        found = sparse_abundances(seen, corners, torch.tensor(0.01))
         errors.append(float((found - shares).square().mean()))
     assert errors[1] < 0.3 * errors[0]
 

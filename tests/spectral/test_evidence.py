@@ -4,15 +4,10 @@ from torch.testing import assert_close
 
 from unmix_plugin.spectral import evidence
 
-GENERATOR = torch.Generator().manual_seed(0)
-
-
-def noisy_background(count: int) -> torch.Tensor:
-    return (1e-3 * torch.randn(count, 6, generator=GENERATOR)).abs()
-
 
 def test_noise_of_the_background_is_told_from_the_faintest_matter():
-    spectra = torch.cat([noisy_background(2000), torch.full((500, 6), 0.1)])
+    noise = (1e-3 * torch.randn(2000, 6, generator=torch.Generator().manual_seed(0))).abs()
+    spectra = torch.cat([noise, torch.full((500, 6), 0.1)])
     alpha = torch.cat([torch.zeros(2000), torch.ones(500)])
     level = evidence.background_level(spectra, alpha)
     assert level is not None

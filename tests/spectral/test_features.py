@@ -39,7 +39,8 @@ def test_of_measured_reflectances_all_features_equal_those_of_other_programs(mat
     depth = 1 - float(parabola(offset))
     centre = w[window][lowest] + offset if depth >= LEAST_DEPTH else np.nan
     expected = {"depth": depth, "area": np.trapezoid(1 - below, w[window]), "centre": centre}
-    found = {what: float(absorption(spectrum[window], w[window], what)) for what in expected}
+    part = spectrum[window], w[window]
+    found = {what: float(absorption(*part, what)) for what in ("depth", "centre", "area")}
     assert found == pytest.approx(expected, abs=1e-6, nan_ok=True)
     for order in (1, 2):
         expected = savgol_filter(values, 5, 2, order, delta=w[1] - w[0])

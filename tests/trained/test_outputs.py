@@ -141,12 +141,14 @@ class Described(RgbNerf):
     outputs = (Output("rgb", "srgb", "colour", "sRGB on black, 0 to 1"),)
 
 
-def other_scene() -> RenderableScene:
-    model = Described(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
-    return model_scene(model, record(around(2), around(1)))
+def described() -> Described:
+    return Described(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
 
 
-@pytest.mark.parametrize("scene", [SCENE, other_scene()], ids=["materials", "model"])
+RECORD = record(around(2), around(1))
+
+
+@pytest.mark.parametrize("scene", [SCENE, model_scene(described(), RECORD)], ids=["materials", "model"])
 def test_scenes_of_both_kinds_keep_the_protocol(scene):
     assert isinstance(scene, RenderableScene)
     assert isinstance(scene.look(CAMERA), RenderedView)
@@ -162,16 +164,16 @@ def test_scenes_of_both_kinds_keep_the_protocol(scene):
 
 
 def test_the_scene_of_a_model_stays_as_it_was_while_training_goes_on_and_needs_outputs():
-    model = Described(RgbNerfConfig(), scene_box=BOX, metadata={"grid_size": 6})
-    scene = model_scene(model, record(around(2), around(1)))
+    model = described()
+    scene = model_scene(model, RECORD)
     before = scene.render(CAMERA, ["rgb"])["rgb"]
     with torch.no_grad():
         for param in model.parameters():
             param.add_(1.0)
     assert torch.equal(scene.render(CAMERA, ["rgb"])["rgb"], before)
     averages = {name: param.detach() - 1 for name, param in model.named_parameters()}
-    averaged = model_scene(model, record(around(2), around(1)), averages)
+    averaged = model_scene(model, RECORD, averages)
     assert_close(averaged.render(CAMERA, ["rgb"])["rgb"], before)
     model.outputs = ()
     with pytest.raises(ConfigError, match="Described names no outputs"):
-        model_scene(model, record(around(2), around(1)))
+        model_scene(model, RECORD)

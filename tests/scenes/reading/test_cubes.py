@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from tests.scenes.scene_factory import fault_of, make_scene
+from tests.scenes.scene_factory import fault_of
 from unmix_plugin.scenes.reading import cubes as arrays
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import SceneOptions
@@ -38,8 +38,8 @@ def test_headers_are_parsed_one_at_a_time(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def integers(tmp_path):
-    return make_scene(tmp_path / "scene").edit_cubes(lambda cube: np.full(cube.shape, 1000, np.uint16))
+def integers(folder):
+    return folder.edit_cubes(lambda cube: np.full(cube.shape, 1000, np.uint16))
 
 
 @pytest.mark.parametrize(("option", "value"), [(None, 0.25), (2000.0, 0.5)])

@@ -201,7 +201,7 @@ def test_a_colour_that_stands_for_transparency_is_alpha(folder, mode):
     assert load_scene(folder.root).has_alpha
 
 
-def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):
+def test_a_scene_needs_no_pictures_and_no_truth(folder):
     def bare(content):
         for key in ("materials", "illuminant_path", "endmembers_path", "train_filenames", "test_filenames"):
             del content[key]
@@ -209,7 +209,7 @@ def test_a_scene_needs_no_pictures_and_no_truth(tmp_path):
             for key in ("file_path", "seg_file_path", "abundance_file_path"):
                 del frame[key]
 
-    scene = load_scene(make_scene(tmp_path / "scene").edit(bare).root)
+    scene = load_scene(folder.edit(bare).root)
     absent = (scene.srgb(0), scene.labels(0), scene.abundances(0), scene.material_names, scene.illuminant)
     assert absent == (None,) * 5
     assert (scene.has_alpha, scene.has_labels, scene.has_abundances) == (False, False, False)

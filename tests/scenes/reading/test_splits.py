@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.scenes.scene_factory import SceneFolder, make_scene
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.reading.faults import Faults
 from unmix_plugin.scenes.reading.loader import load_scene
@@ -95,8 +94,7 @@ def test_a_split_that_can_not_be_made_is_refused():
         split_of(["a", "b"], "lists")
 
 
-def test_the_options_choose_the_split_of_a_scene(tmp_path):
-    folder: SceneFolder = make_scene(tmp_path / "scene")
+def test_the_options_choose_the_split_of_a_scene(folder):
     scene = load_scene(folder.root, SceneOptions(eval_split="interval", eval_interval=3))
     assert scene.eval_indices == (0, 3)
     assert scene.train_indices == (1, 2, 4, 5)

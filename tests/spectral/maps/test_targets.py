@@ -34,11 +34,6 @@ def pixels(count=300, bands=5, seed=0):
 SAMPLE = Background.fit(pixels())
 
 
-def loaded_covariance(background):
-    covariance = np.cov(background.numpy().T)
-    return covariance + LOADING * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
-
-
 TARGET = torch.linspace(0.2, 0.9, 5).double()
 
 
@@ -60,7 +55,9 @@ def test_adaptive_coherence_tells_directions_from_the_mean_one_towards_the_targe
 
 def test_both_detectors_agree_with_spy():
     (background, seen), target = pixels(600).split(300), TARGET
-    stats = GaussianStats(background.mean(dim=0).numpy(), loaded_covariance(background))
+    covariance = np.cov(background.numpy().T)
+    loaded = covariance + LOADING * np.trace(covariance) / 5 * np.eye(5)
+    stats = GaussianStats(background.mean(dim=0).numpy(), loaded)
     found = Background.fit(background)
     image = seen.reshape(20, 15, 5)
     expected = spy_matched_filter(image.numpy(), target.numpy(), background=stats)
