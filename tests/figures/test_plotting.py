@@ -16,7 +16,6 @@ COLOUR = "#123456"
 
 
 def drawn(*values):
-    """A chart of a line, as a tree."""
     line = plotting.ChartLine(X[: len(values)], np.array(values, dtype=float), "line", COLOUR)
     return ET.fromstring(plotting.draw_chart(plotting.SpectraChart([line], "radiance", (640.0, 300.0))))
 
@@ -65,12 +64,10 @@ BANDS = Bands.of(np.linspace(400, 700, 31))
 
 
 def luminance(srgb):
-    """Relative luminance of sRGB colours, [0, 1]."""
     return srgb_to_linear(torch.from_numpy(srgb)).numpy() @ [0.2126, 0.7152, 0.0722]
 
 
 def least_difference(colours):
-    """Smallest distance of two colours in sRGB."""
     distances = np.linalg.norm(colours[:, None] - colours[None], axis=-1)
     return (distances + 9 * np.eye(len(colours))).min()
 

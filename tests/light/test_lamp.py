@@ -93,7 +93,6 @@ def test_the_slope_of_the_visible_part_follows_what_moving_the_lamp_changes():
 
 
 def cast_shadows(model: UnmixModel, opaque: torch.Tensor) -> None:
-    """Make these cells of the model's grid the opaque ones."""
     assert model.grid.opaque is not None
     assert model.grid.opaque_skips is not None
     model.grid.opaque.copy_(opaque)
@@ -101,7 +100,6 @@ def cast_shadows(model: UnmixModel, opaque: torch.Tensor) -> None:
 
 
 def lit_by(numbers: tuple[float, ...], cells: int = 8) -> UnmixModel:
-    """A model whose light moves with the camera."""
     config = replace(CONFIG, light="camera", lamp=numbers)
     model = config.setup(scene_box=BOX, metadata={**make_model().metadata, "grid_resolution": cells})
     assert isinstance(model, UnmixModel)

@@ -51,7 +51,6 @@ class SceneFolder:
         return self
 
     def edit_cubes(self, change: Callable[[np.ndarray], np.ndarray | None]) -> SceneFolder:
-        """Change all cubes."""
         for index in range(len(self.content["frames"])):
             self.edit_cube(index, change)
         return self
@@ -81,7 +80,6 @@ def ring_poses(count: int, distance: float = 4.0) -> list[np.ndarray]:
 def cameras_of(
     poses: list[np.ndarray], width: int, height: int, focal: float, distortion: tuple[float, ...] = (0.0,) * 4
 ) -> Cameras:
-    """Cameras with these poses and one lens."""
     count = len(poses)
     return Cameras(
         camera_to_world=torch.from_numpy(np.stack(poses)[:, :3]).float(),
@@ -181,5 +179,4 @@ def fault_of(folder: SceneFolder, **options: Any) -> str:
 
 
 def set_frame(index: int, **values: Any) -> Callable[[dict[str, Any]], None]:
-    """An edit that gives a frame other values."""
     return lambda content: content["frames"][index].update(values)

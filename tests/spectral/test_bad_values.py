@@ -68,7 +68,6 @@ NOISY_BANDS, NUM_PIXELS = 20, 4000
 
 
 def mixtures(noise: float = 0.005) -> torch.Tensor:
-    """Pixels of three smooth materials, with noise."""
     generator = torch.Generator().manual_seed(0)
     x = torch.linspace(0, 1, NOISY_BANDS)
     materials = torch.stack([0.2 + 0.6 * x, 0.7 - 0.5 * x, 0.5 + 0.3 * torch.sin(6 * x)])

@@ -16,7 +16,6 @@ def labels(*values):
 
 
 def scored(num_pred, num_true, *views):
-    """Scores of views, each of predicted and true labels."""
     tally = SegmentationTally(num_pred, num_true)
     for pred, true in views:
         tally.add(pred, true)

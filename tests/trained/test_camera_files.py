@@ -25,7 +25,6 @@ def nerfstudio(**changes):
 
 
 def frames(**changes):
-    """A transforms.json with two views."""
     paths = ("images/a.png", "images/b c.png")
     entries = [{"file_path": path, "transform_matrix": POSE.tolist()} for path in paths]
     return {"w": 96, "h": 60, "fl_x": 70.0, "frames": entries, **changes}
@@ -134,7 +133,6 @@ def test_what_is_written_is_read_back_as_the_same_cameras(tmp_path, frames_per_s
 
 
 def path_of(camera_to_world, fov=50):
-    """A camera path of one camera."""
     return nerfstudio(camera_path=[{"camera_to_world": camera_to_world, "fov": fov}])
 
 

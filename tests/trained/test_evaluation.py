@@ -49,7 +49,6 @@ def perfect(order: list[int] = SHUFFLED) -> PredictedView:
 
 
 def evaluated(view: ViewTruth, predicted: PredictedView, order: list[int] = SHUFFLED) -> Evaluation:
-    """An evaluation of one view."""
     evaluation = Evaluation(SCENE, ENDMEMBERS[order])
     evaluation.add(view, predicted)
     return evaluation

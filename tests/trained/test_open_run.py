@@ -19,7 +19,6 @@ from unmix_plugin.trained.run_views import views_of
 
 
 def model_with(**settings):
-    """A model that has not begun to train."""
     return replace(CONFIG, **settings).setup(scene_box=BOX, metadata=make_model().metadata).eval()
 
 
@@ -95,7 +94,6 @@ def test_a_scene_is_found_where_it_was_or_is_said_to_be(copy, tmp_path):
 
 
 def edit(root, change):
-    """Change the content of transforms.json."""
     path = root / "transforms.json"
     content = json.loads(path.read_text())
     change(content)

@@ -19,7 +19,6 @@ INDEX = "index:(r650-r500)/(r650+r500)"
 
 @pytest.fixture(scope="module")
 def target(tmp_path_factory):
-    """A file of one reflectance."""
     path = tmp_path_factory.mktemp("targets") / "paint.csv"
     rows = [f"{nm},{0.1 + 0.15 * index}" for index, nm in enumerate(WAVELENGTHS_NM)]
     path.write_text("\n".join(["wavelength,paint", *rows]))

@@ -71,7 +71,6 @@ def test_abundances_lie_on_the_simplex_and_labels_are_the_largest_where_half_a_p
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A small scene as it is written."""
     directory = tmp_path_factory.mktemp("demo") / "scene"
     demo_scene.make_demo_scene(directory, size=24, bands=7, views=7)
     return directory
@@ -79,14 +78,12 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def coarse():
-    """Views of one ray a pixel, where files are tested rather than pixels."""
     with one_ray_a_pixel() as patch:
         yield patch
 
 
 @pytest.fixture
 def small_default(coarse):
-    """The cached scene, but small."""
     for name, value in (("DEFAULT_SIZE", 16), ("DEFAULT_BANDS", 3), ("DEFAULT_VIEWS", 4)):
         coarse.setattr(demo_scene, name, value)
 

@@ -30,7 +30,6 @@ def views_of(cameras, pictures=None, valid=None):
 
 
 def above_ground(places):
-    """Signed heights."""
     return places[:, 2] - SLOPE * places[:, 0]
 
 

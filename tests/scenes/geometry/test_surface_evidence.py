@@ -32,13 +32,11 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def scene(folder):
-    """Those objects, read as an unbounded world."""
     return load_scene(folder, SceneOptions(world="unbounded"))
 
 
 @pytest.fixture(scope="module")
 def evidence(scene):
-    """Where its surfaces are."""
     return SurfaceEvidence(scene, CPU)
 
 

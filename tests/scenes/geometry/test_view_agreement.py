@@ -73,7 +73,6 @@ def test_conventions_are_told_in_scenes_turned_and_geo_referenced(demo, tmp_path
 
 
 def warnings_of(folder):
-    """What is said before a training."""
     config = HyperspectralDataManagerConfig(grid_resolution=8)
     return config.setup(data=folder, device=torch.device("cpu"), seed=0).warnings()
 

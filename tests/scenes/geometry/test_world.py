@@ -20,7 +20,6 @@ BOX = SceneBox(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """Small scenes of each place."""
     root = tmp_path_factory.mktemp("places")
     with one_ray_a_pixel():
         for name, size in (("table", 48), ("world", 48), ("room", 72)):

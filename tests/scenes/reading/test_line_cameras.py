@@ -18,7 +18,6 @@ def folder(tmp_path):
 
 @pytest.fixture(scope="module")
 def lines(tmp_path_factory):
-    """The scene that is not changed."""
     return load_scene(make_line_scene(tmp_path_factory.mktemp("lines") / "scene").root)
 
 
@@ -86,7 +85,6 @@ def test_the_one_pose_of_a_view_does_not_change_with_key_poses_beyond_the_image(
 
 
 def turned(entries, row):
-    """The poses with one turned by half a circle."""
     changed = copy.deepcopy(entries)
     matrix = np.array(changed[row]["transform_matrix"])
     matrix[:3, :3] = matrix[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
