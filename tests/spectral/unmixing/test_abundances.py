@@ -48,6 +48,8 @@ def test_mixtures_are_taken_apart_exactly():
     assert_close(nnls(weights @ endmembers, endmembers), weights, atol=1e-8, rtol=0)
     shares = weights / weights.sum(1, keepdim=True)
     assert_close(fcls(shares @ endmembers, endmembers), shares, atol=1e-5, rtol=0)
+    alike = endmembers[:1] * (1 + 0.003 * torch.randn(5, endmembers.shape[1], generator=seeded()))
+    assert_close(fcls(shares @ alike, alike), shares, atol=1e-5, rtol=0)
 
 
 @given(st.integers(1, 6), st.integers(0, 200))

@@ -40,6 +40,11 @@ def test_materials_and_their_shares_are_found_in_whole_numbers_of_any_unit():
     assert found.misfit.max() < 0.2
 
 
+def test_the_misfit_of_an_exact_mixture_is_0():
+    shade = torch.rand(20, 20, 1, generator=seeded()) + 0.2
+    assert unmix_image((shade * smooth_endmembers(1)[0].float()).numpy(), 1).misfit.max() < 1e-5
+
+
 def test_an_image_that_spy_loaded_is_unmixed_as_the_array_of_its_numbers(tmp_path):
     cube = image_of(smooth_endmembers(3)).astype(np.float32)
     envi.save_image(str(tmp_path / "a.hdr"), cube)

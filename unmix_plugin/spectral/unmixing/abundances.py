@@ -62,9 +62,12 @@ def fcls(pixels: Float[Tensor, "N B"], endmembers: Float[Tensor, "K B"]) -> Floa
     Source: Heinz and Chang, IEEE TGRS 39(3), 2001: a heavy band, 1 in all spectra, enforces the sum.
     """
     _require_fitting(pixels, endmembers)
-    weight = _SUM_WEIGHT * float(endmembers.double().norm(dim=1).max().clamp(min=1e-12))
-    spectra = torch.cat([endmembers.double(), torch.full_like(endmembers[:, :1], weight).double()], dim=1)
-    augmented = torch.cat([pixels.double(), torch.full_like(pixels[:, :1], weight).double()], dim=1)
+    # Of shares with sum 1, what all spectra have in common makes no difference; with it, small ones would drown in it.
+    centre = endmembers.double().mean(dim=0)
+    own, seen = endmembers.double() - centre, pixels.double() - centre
+    weight = _SUM_WEIGHT * float(own.norm(dim=1).max().clamp(min=1e-12))
+    spectra = torch.cat([own, torch.full_like(own[:, :1], weight)], dim=1)
+    augmented = torch.cat([seen, torch.full_like(seen[:, :1], weight)], dim=1)
     shares = nnls(augmented, spectra)
     # The penalty leaves sums about 1e-6 off 1.
     return (shares / shares.sum(dim=1, keepdim=True).clamp(min=1e-12)).to(pixels.dtype)

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Shaped
 from torch import Tensor
 
 from unmix_plugin.errors import SpectrumError, counted
+from unmix_plugin.spectral.metrics import spectral_angle
 from unmix_plugin.spectral.unmixing.abundances import nnls
 from unmix_plugin.spectral.unmixing.endmembers import (
     as_lit_pixels,
@@ -114,10 +115,8 @@ def unmix_image(
     order = _shares(amounts).sum(dim=0).argsort(descending=True)
     own = _shares(amounts[:, order])
     certain = _confidence(pixels, own, found, compared, order)
-    explained = amounts @ compared
-    cosines = torch.nn.functional.cosine_similarity(pixels, explained, dim=1)
     is_lit = amounts.sum(dim=1) > 0
-    misfit = torch.where(is_lit, cosines.clamp(-1, 1).arccos(), 0.0)
+    misfit = torch.where(is_lit, spectral_angle(pixels, amounts @ compared), 0.0)
     return UnmixedImage(
         (lit[order] * (brightest / _LIT)).numpy(),
         _placed(own, used),
