@@ -115,6 +115,9 @@ def test_doubtful_files_of_spectra_are_refused(tmp_path):
     refuse(r"ochre must be in reflectances, 1 for white; found 59\.5", ochre=(60, 50))
     held = "extrapolate: true holds the outermost values instead$"
     refuse(f"ochre.* 30 nm below and 10 nm above their range.*{held}", wavelengths=(480, 640))
+    refuse(
+        "dark must be in reflectances, 1 for white; found 55 in its file", ", spectrum: dark", ochre=(60, 50)
+    )
 
 
 def test_a_scaled_endmember_is_that_much_brighter_by_its_new_name_which_ends_up_in_tables():

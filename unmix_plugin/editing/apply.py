@@ -74,7 +74,6 @@ from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
     MaterialLibrary,
     measured_library,
-    require_reflectance,
 )
 from unmix_plugin.spectral.materials import Coefficients
 from unmix_plugin.spectral.sensor import Sensor
@@ -229,7 +228,7 @@ def _replace(state: MaterialState, edit: Replace, where: str) -> None:
     if edit.extrapolate and is_unknown.any():
         unknown = _listed(state.bands, is_unknown)
         state.notes.append(f"{where}: {name} was not measured at {unknown}: the values beside are held there")
-    require_reflectance(reflectance, name)
+    library.require_reflectance(name, reflectance, name)
     state.spectra[index] = reflectance * state.light
 
 

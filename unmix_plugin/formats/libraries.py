@@ -30,7 +30,12 @@ from unmix_plugin.spectral.library.material_library import (
     MaterialLibrary,
     measured_library,
 )
-from unmix_plugin.spectral.library.spectra_csv import is_number, read_number_table
+from unmix_plugin.spectral.library.spectra_csv import (
+    PERCENT,
+    is_number,
+    read_number_table,
+    without_percent,
+)
 
 BUILT_IN = "+builtin"
 """Stands among a user's files for the spectra that come with the program."""
@@ -167,8 +172,6 @@ def _materials(
 _CSV_HEAD = re.compile(
     r"(?:wave ?length|wl|lambda)s?[\s_]*[\[(]?\s*(?:in )?([^\])]*?)\s*[\])]?", re.IGNORECASE
 )
-_PERCENT = re.compile(r"(?:[\s_]*[\[(](?:%|percent|per cent)[\])]|(?<![\d\s_])[\s_]*%)\s*$", re.IGNORECASE)
-"""`paint (%)`, `paint %`; `clay 20 %` is a name."""
 
 
 def _read_csv(path: Path) -> _Table:
@@ -181,11 +184,10 @@ def _read_csv(path: Path) -> _Table:
         )
     if len(header) == 1:
         raise SpectrumError("no spectra: there is no column beside the wavelengths")
-    names = [_PERCENT.sub("", name) for name in header[1:]]
-    percent = [name != given for name, given in zip(names, header[1:], strict=True)]
+    names, scales = without_percent(header[1:])
     if not all(names) or len(set(names)) < len(names):
         raise SpectrumError(f"each spectrum needs a name of its own; found {name_some(names, 8)}")
-    return names, values[:, 0] * factor, values[:, 1:].T, np.where(percent, 100.0, 1.0)[:, None]
+    return names, values[:, 0] * factor, values[:, 1:].T, scales
 
 
 def _read_envi(path: Path) -> _Table:
@@ -286,7 +288,7 @@ def _read_text(path: Path) -> _Table:
         raise SpectrumError(f"'Y Units' is {said['y units']!r}; expected reflectance")
     # The second line from the last before the numbers of splib06 is the title.
     title = said.get("name") or (words[-2] if is_usgs and len(words) > 1 else path.stem)
-    scale = 100.0 if "percent" in quantity or _PERCENT.search(head) else 1.0
+    scale = 100.0 if "percent" in quantity or PERCENT.search(head) else 1.0
     return [" ".join(title.split())], wavelengths * factor, values[None], scale
 
 

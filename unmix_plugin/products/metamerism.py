@@ -27,7 +27,6 @@ from unmix_plugin.spectral.colour.difference import (
     metameric_pairs,
     reflectance_to_lab,
 )
-from unmix_plugin.spectral.library.material_library import require_reflectance
 from unmix_plugin.spectral.materials import Materials
 from unmix_plugin.trained.run_materials import LIGHT_UNKNOWN
 
@@ -85,7 +84,7 @@ def _find_metamers(materials: Materials, asked: Metamerism) -> _Metamers:
             known = library.reflectance(material.name, bands)
         except SpectrumError:  # of those that do not reach all bands
             continue
-        require_reflectance(known, f"{material.name} ({material.source})")
+        library.require_reflectance(material.name, known, f"{material.name} ({material.source})")
         rows.append(known)
         names.append(material.name)
     reflectance = np.array(rows).reshape(len(names), len(bands))

@@ -41,6 +41,12 @@ def test_a_byte_order_mark_blank_lines_spaces_and_windows_line_ends_are_read(tmp
     np.testing.assert_array_equal(table.bands.centers_nm, [400, 500])
 
 
+def test_columns_in_percent_are_divided_as_those_of_libraries_are(tmp_path):
+    table = read_spectra_csv(written(tmp_path, "wavelength,leaf (%),clay 20 %\n400,5,0.5\n500,30,0.6\n"))
+    assert table.names == ("leaf", "clay 20 %")
+    np.testing.assert_allclose(table.spectra, [[0.05, 0.3], [0.5, 0.6]])
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

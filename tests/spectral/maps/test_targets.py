@@ -104,11 +104,13 @@ PAINTS = SpectraTable(
 
 @pytest.fixture
 def gold(tmp_path):
-    """A file of gold alone, beside others: of all paints, of gold in percent, and one that is none."""
+    """A file of gold alone, beside others: of all paints, of gold and of dark coal in percent, and one that is none."""
     write_spectra_csv(tmp_path / "paints.csv", PAINTS)
     for name, unit in (("gold", 1), ("percent", 100)):
         table = SpectraTable(PAINTS.bands, ("gold",), unit * PAINTS.spectra[:1])
         write_spectra_csv(tmp_path / f"{name}.csv", table)
+    table = SpectraTable(PAINTS.bands, ("gold", "coal"), PAINTS.spectra[[0, 0]] * [[100], [2]])
+    write_spectra_csv(tmp_path / "dark.csv", table)
     (tmp_path / "bad.csv").write_text("nm,gold\n400,1\n")
     return tmp_path / "gold.csv"
 
@@ -203,6 +205,7 @@ def test_a_target_says_what_its_numbers_are(gold):
         ("{0}/paints.csv#golt", ConfigError, "no spectrum 'golt'; did you mean gold. it has gold, cobalt"),
         ("{0}/paints.csv#", ConfigError, "no spectrum ''; it has gold"),
         ("mf:{0}/percent.csv", SpectrumError, "'gold' .* reflectances, 1 for white; found 80 .divide perc"),
+        ("ace:{0}/dark.csv#coal", SpectrumError, "'coal' .* found 50 in its file .divide percent"),
         ("{0}/paints.csv#black", SpectrumError, "'black' .* is zero in all bands: no angle to it is defined"),
         ("{0}/bad.csv", SpectrumError, r"bad\.csv: the first column must be headed 'wavelength'"),
     ],

@@ -12,7 +12,7 @@ import difflib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,14 +61,6 @@ _GREATEST_REFLECTANCE = 2.0
 """Values above it are not reflectances; glossy and fluorescent surfaces exceed 1."""
 DARK_LIGHT = 1e-3
 """Light at a band, relative to its greatest, below which nothing is known of the reflectance there."""
-
-
-def require_reflectance(values: Float[np.ndarray, " B"], what: str) -> None:
-    """Refuse percent and the like where the unit counts."""
-    if values.max() > _GREATEST_REFLECTANCE:
-        raise SpectrumError(
-            f"{what} must be in reflectances, 1 for white; found {values.max():g} (divide percent by 100)"
-        )
 
 
 @dataclass(frozen=True)
@@ -149,6 +141,27 @@ class MaterialLibrary:
             gap = bands.centers_nm[np.argmin(np.isfinite(found))]
             raise SpectrumError(f"{material.name} was not measured at {gap:g} nm; leave that band out")
         return found
+
+    def require_reflectance(self, name: str, values: Float[np.ndarray, " B"], what: str) -> None:
+        """Refuse percent and the like where the unit counts: by a material's values that are used, and of a dark one
+        by the median of any spectrum of its file."""
+        file = self.find(name).origin
+        beside = self._greatest_medians[file[0]] if file else 0.0
+        own = float(values.max())
+        greatest, where = (own, "") if own > _GREATEST_REFLECTANCE else (beside, " in its file")
+        if greatest > _GREATEST_REFLECTANCE:
+            raise SpectrumError(
+                f"{what} must be in reflectances, 1 for white; found {greatest:g}{where} (divide percent by 100)"
+            )
+
+    @cached_property
+    def _greatest_medians(self) -> dict[Path, float]:
+        medians: dict[Path, float] = {}
+        for one in self.materials:
+            if one.origin:
+                median = float(np.nanmedian(one.reflectance))
+                medians[one.origin[0]] = max(median, medians.get(one.origin[0], 0.0))
+        return medians
 
     def resampled(self, bands: Bands) -> Float64[np.ndarray, "M B"]:
         """Reflectance of every material at other wavelengths; NaN where it was not measured."""

@@ -1,15 +1,18 @@
 """Spectra as CSV: one row a wavelength, one column a spectrum.
 
 `wavelength,name,name,...` for endmembers and libraries, `wavelength,power` for an illuminant. Wavelengths in nm,
-strictly increasing; values finite and not negative. UTF-8, with or without a byte order mark; blank lines are skipped.
+strictly increasing; values finite and not negative, divided by 100 where a name ends in % or (%). UTF-8, with or
+without a byte order mark; blank lines are skipped.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from array import array
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +29,8 @@ _MOST_BYTES = 1 << 26
 TOLERANCE_NM = 1e-3
 """What tables lose of wavelengths by rounding them: centres that differ by no more are the same, and a reach beyond the
 data by no more is not extrapolation."""
+PERCENT = re.compile(r"(?:[\s_]*[\[(](?:%|percent|per cent)[\])]|(?<![\d\s_])[\s_]*%)\s*$", re.IGNORECASE)
+"""`paint (%)`, `paint %`; `clay 20 %` is a name."""
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,17 @@ def read_spectra_csv(path: Path) -> SpectraTable:
             raise SpectrumError("no spectra: there is no column beside 'wavelength'")
         bands = Bands(values[:, 0].copy())
         require_nanometres(bands.centers_nm)
-        return SpectraTable(bands, tuple(header[1:]), np.ascontiguousarray(values[:, 1:].T))
+        names, scales = without_percent(header[1:])
+        return SpectraTable(bands, tuple(names), values[:, 1:].T / scales)
     except SpectrumError as error:
         raise SpectrumError(f"{path}: {error}") from error
+
+
+def without_percent(names: Sequence[str]) -> tuple[list[str], Float64[np.ndarray, "K 1"]]:
+    """Names of columns without the mark of percent, and what the columns are to be divided by."""
+    bare = [PERCENT.sub("", name) for name in names]
+    is_percent = [name != given for name, given in zip(bare, names, strict=True)]
+    return bare, np.where(is_percent, 100.0, 1.0)[:, None]
 
 
 def read_number_table(path: Path) -> tuple[list[str], Float64[np.ndarray, "R C"]]:

@@ -21,11 +21,7 @@ from torch import Tensor
 
 from unmix_plugin.errors import ConfigError, SpectrumError, did_you_mean
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.library.material_library import (
-    LibraryMaterial,
-    MaterialLibrary,
-    require_reflectance,
-)
+from unmix_plugin.spectral.library.material_library import LibraryMaterial, MaterialLibrary
 from unmix_plugin.spectral.metrics import spectral_angle
 
 LOADING = 1e-3
@@ -211,7 +207,7 @@ def parse_target(text: str, bands: Bands, read: Callable[[Path], Sequence[Librar
     if method == "angle" and not reflectance.any():
         raise SpectrumError(f"{what} is zero in all bands: no angle to it is defined; choose mf or ace")
     if method != "angle":
-        require_reflectance(reflectance, what)
+        library.require_reflectance(name, reflectance, what)
     if method != "mf" and len(reflectance) < 2:
         raise SpectrumError(f"{method} compares spectra of two bands or more; found 1 band")
     return _Target(method, name, Path(file).name, torch.from_numpy(reflectance.copy()), threshold)
