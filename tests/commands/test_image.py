@@ -121,7 +121,8 @@ def test_the_dark_lines_of_a_file_are_subtracted_from_raw_numbers_alone(
         (lambda cube: np.full_like(cube, np.nan), (), "no pixel holds a measurement in all bands"),
         (lambda cube: cube[5:6, 5:6], (), "only 1 distinct pixels"),
         (np.array, ("--library", "+builtin"), "its wavelengths are not known, so no spectrum of a library"),
-        (np.array, ("--mnf", -1), "--mnf is -1; expected a number of components"),
+        (np.array, ("--mnf", -1), "--mnf is -1; expected 1 to 24"),
+        (np.array, ("--mnf", 25), "--mnf is 25; expected 1 to 24"),
         (np.array, ("--endmembers", 30), "between 1 and the number of bands, 24; found 30"),
     ],
 )

@@ -93,9 +93,10 @@ def test_a_metamer_is_found_with_the_light_that_tells_it_apart_and_those_that_di
     [
         (LIGHTS[:1], BANDS, (2.0, 4.0), "at least two lights; found 1"),
         (LIGHTS, Bands.of(np.linspace(700, 1000, 31)), (2.0, 4.0), "can't tell colours apart"),
+        ([*LIGHTS, BANDS.centers_nm > 660.0], BANDS, (2.0, 4.0), "light 3 of 3 has no power where the eye"),
         (LIGHTS, BANDS, (4.0, 4.0), "found 4 and 4"),
     ],
 )
 def test_what_makes_no_sense_is_refused(lights, bands, thresholds, message):
     with pytest.raises(SpectrumError, match=message):
-        metameric_pairs(surfaces(), lights, bands, *thresholds)
+        metameric_pairs(surfaces(), np.array(lights), bands, *thresholds)

@@ -99,7 +99,8 @@ def metameric_pairs(
     differ most first; `alike` and `different` are the CIEDE2000 up to and from which they look so.
 
     Raises:
-        SpectrumError: fewer than two lights, bands in which colours can't be told, or thresholds the wrong way round.
+        SpectrumError: fewer than two lights or one that is no white to an eye, bands in which colours can't be told,
+            or thresholds the wrong way round.
     """
     if len(lights) < 2:
         raise SpectrumError(f"metamerism needs at least two lights; found {len(lights)}")
@@ -111,6 +112,13 @@ def metameric_pairs(
         raise SpectrumError(
             "the difference of surfaces that look alike must be below that of those that look different; "
             f"found {alike:g} and {different:g}"
+        )
+    whites = lights @ xyz_matrix(bands, torch.float64).numpy()
+    if not (whites > 0).all():
+        light = int(np.argmin((whites > 0).all(axis=1)))
+        raise SpectrumError(
+            f"light {light + 1} of {len(lights)} has no power where the eye tells blue, green and red apart, so no eye "
+            "adapts to it; leave it out"
         )
     first, second = np.triu_indices(len(reflectance), k=1)
     differences = _pair_differences(reflectance, lights, bands)
