@@ -197,6 +197,26 @@ def test_indices_of_a_sensor_are_those_whose_wavelengths_it_sees():
     assert available_indices(VISIBLE) == ["pri", "mcari", "cri1", "ari1", "redness", "iron-oxide"]
 
 
+@pytest.mark.parametrize("centers", [(492, 560, 665, 833), (450, 560, 650, 730, 840), (660, 850)])
+def test_multispectral_cameras_give_the_index_of_their_red_and_infrared(centers):
+    """Interpolated between red or red edge and infrared, the ndvi of this leaf was as low as 0.55."""
+    reflectance = torch.tensor([0.5 if nm > 740 else 0.25 if nm > 700 else 0.05 for nm in centers])
+    index = parse_index("ndvi", Bands.of(centers))
+    assert float(index(reflectance)) == pytest.approx(0.45 / 0.55)
+    near = [min(centers, key=lambda nm: abs(nm - asked)) for asked in (800, 670)]
+    assert f"(r{near[0]}-r{near[1]})/(r{near[0]}+r{near[1]})" in index.what
+    with pytest.raises(SpectrumError, match="index pri needs 531"):  # of one band, or of none
+        parse_index("pri", Bands.of(centers))
+
+
+def test_a_band_alone_far_away_gives_no_index():
+    """Both wavelengths of the ndvi lie nearest to the first band: it was 0 everywhere."""
+    with pytest.raises(
+        SpectrumError, match=r"within 50 nm, but the bands lie at 842, 1610 nm; .* reach: none"
+    ):
+        parse_index("ndvi", Bands.of([842, 1610]))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("rays", [(), (0,), (2, 3)])
 def test_the_result_has_the_rays_and_the_type_of_the_input(rays, dtype):

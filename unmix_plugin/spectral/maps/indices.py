@@ -6,7 +6,8 @@ which only the nodes of these operations are evaluated: nothing that a user wrot
 
 Notation: `B` bands, `*rays` any leading axes. Reflectance is what an index is defined on; ratios alone take radiance in
 a light of equal power just as well. Between two band centres reflectance is interpolated linearly, in the outer half of
-an outermost band it is that band's; beyond, an index is refused: nothing is extrapolated.
+an outermost band it is that band's; beyond, an index is refused: nothing is extrapolated. Named indices are not
+interpolated between bands that are far apart: they take the nearest.
 """
 
 from __future__ import annotations
@@ -24,11 +25,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from unmix_plugin.errors import ConfigError, SpectrumError
+from unmix_plugin.errors import ConfigError, SpectrumError, name_some
 from unmix_plugin.spectral.bands import Bands
 
 _MAX_LENGTH = 500
 """Characters of a formula."""
+_FAR_NM = 50.0
+"""Bands farther apart are those of multispectral cameras: from red to infrared a leaf's spectrum is a step, not a line.
+Their bands are as broad, so one stands for wavelengths so far away, as the red and infrared of broad-band indices."""
 _ALLOWED = (
     "numbers, r800 (the reflectance at 800 nm), + - * / ** ^, parentheses, sqrt log exp abs of one value, "
     "min max of several"
@@ -227,18 +231,44 @@ def parse_index(text: str, bands: Bands) -> _SpectralIndex:
             f"nothing is extrapolated; named ones that these bands reach: "
             f"{', '.join(available_indices(bands)) or 'none'}"
         )
+    if named:
+        on_bands = named_formula(name, bands)
+        if on_bands is None:
+            raise SpectrumError(
+                f"index {name} needs {_listed(formula.wavelengths_nm)} nm, and of each a band of its own within "
+                f"{_FAR_NM:g} nm, but the bands lie at {name_some([f'{nm:g}' for nm in bands.centers_nm], 12)} nm; "
+                f"named ones that they reach: {', '.join(available_indices(bands)) or 'none'}"
+            )
+        formula = parse_formula(on_bands)
     used = {index for nm in formula.wavelengths_nm for index in _neighbours(nm, bands)[:2]}
     centres = _listed(float(bands.centers_nm[index]) for index in sorted(used))
-    title = f"{named.title}, {named.formula} ({named.source})" if named else f"formula {formula.text}"
+    title = f"{named.title}, {formula.text} ({named.source})" if named else f"formula {formula.text}"
     what = f"{' '.join(title.split())}; from the bands at {centres} nm"
     return _SpectralIndex(name, what, named.usual_range if named else None, bands, formula)
 
 
 def available_indices(bands: Bands) -> list[str]:
     """Names of the indices whose wavelengths the bands reach, in the order of `NAMED_INDICES`."""
-    return [
-        name for name, named in NAMED_INDICES.items() if not _missing(parse_formula(named.formula), bands)
-    ]
+    return [name for name in NAMED_INDICES if named_formula(name, bands)]
+
+
+def named_formula(name: str, bands: Bands) -> str | None:
+    """A named index's formula for these bands, with the nearest band instead of a wavelength between bands that are
+    far apart; None where they do not reach a wavelength or don't tell two apart.
+
+    >>> named_formula("ndvi", Bands.of([560, 650, 840]))
+    '(r840-r650)/(r840+r650)'
+    """
+    formula = parse_formula(NAMED_INDICES[name].formula)
+    taken = {}
+    for nm in formula.wavelengths_nm if not _missing(formula, bands) else ():
+        left, right, _ = _neighbours(nm, bands)
+        step = bands.centers_nm[right] - bands.centers_nm[left]
+        taken[nm] = nm if 0 < step <= _FAR_NM else float(bands.centers_nm[bands.nearest(nm)])
+    is_near = all(abs(place - nm) <= _FAR_NM for nm, place in taken.items())
+    if not taken or not is_near or len(set(taken.values())) < len(taken):
+        return None
+    return re.sub(r"(?<=r)\d+", lambda match: f"{taken[float(match[0])]:.10g}", formula.text)
 
 
 def _require_formula(text: str) -> str:
