@@ -281,3 +281,11 @@ def test_a_library_is_refused_where_it_covers_too_little_of_what_is_lit(tmp_path
     for light in (None, lights[400], lights[690]):  # 11 of 31 bands, and 2 of 2
         with pytest.raises(SpectrumError, match=r"less than half of 31 bands, 400-700 nm, .* without light"):
             library_of([red], bands, light)
+
+
+def test_rows_that_were_left_out_are_a_gap_and_no_line(tmp_path):
+    rows = "".join(f"{nm},0.5\n" for nm in range(1000, 2001, 10) if not 1380 < nm < 1520)
+    library = library_of([written(tmp_path, "a.csv", f"wavelength,a\n{rows}")])
+    assert library.reflectance("a", Bands.of([1300, 1380, 1520])).tolist() == [0.5] * 3
+    with pytest.raises(SpectrumError, match="a was not measured at 1450 nm; leave that band out"):
+        library.reflectance("a", Bands.of([1300, 1450]))

@@ -148,8 +148,14 @@ _Table = tuple[
 def _materials(
     names: Sequence[str], wavelengths_nm: np.ndarray, spectra: np.ndarray, path: Path
 ) -> list[LibraryMaterial]:
-    """In order of wavelength, with NaN for what was not measured; of values at one wavelength the mean."""
+    """In order of wavelength, with NaN for what was not measured, also in the middle of a gap where rows were left out;
+    of values at one wavelength the mean."""
     require_nanometres(wavelengths_nm)
+    given = Bands(np.unique(wavelengths_nm))
+    middles, (low, high) = given.edges_nm[1:-1], given.intervals_nm.T
+    gaps = middles[(high[:-1] < middles) & (low[1:] > middles)]
+    wavelengths_nm = np.append(wavelengths_nm, gaps)
+    spectra = np.pad(spectra, ((0, 0), (0, len(gaps))), constant_values=np.nan)
     centers, places = np.unique(wavelengths_nm, return_inverse=True)
     bands, found = Bands(centers), []
     for name, row in zip(names, spectra, strict=True):
