@@ -36,6 +36,10 @@ class SpectrumError(UnmixError):
     """Spectra, wavelengths or endmembers do not fit each other or the request."""
 
 
+class UnmixWarning(UserWarning):
+    """What a user should know of a result; commands show it as a line."""
+
+
 def did_you_mean(word: str, known: Iterable[str], likeness: float = 0.6, form: str = "{}") -> str:
     """A question for a message that names what may have been meant; empty if nothing is near.
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from contextlib import suppress
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 
 from tests.systems import SIGNALS_TO_END, needs_posix
 from unmix_plugin.commands.entry import run_command
-from unmix_plugin.errors import ConfigError, SceneError
+from unmix_plugin.errors import ConfigError, SceneError, UnmixWarning
 
 
 def end_of(command, arguments=()):
@@ -102,6 +103,12 @@ def test_too_little_memory_is_the_users_error_with_what_to_do(capsys, error):
 def test_a_message_moves_no_cursor(capsys):
     assert end_of(raising(SceneError("band \x1b[31mred\r\x9b1A\tof\na.hdr: grün"))) == 2
     assert capsys.readouterr().err == "error: band ?[31mred??1A\tof\na.hdr: grün\n"
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_a_line(capsys):
+    assert end_of(lambda _: warnings.warn("an older one is shown", UnmixWarning, stacklevel=1)) == 0
+    assert capsys.readouterr().err == "warning: an older one is shown\n"
 
 
 def test_a_users_error_exits_2_with_its_message_alone_or_with_debug_its_traceback(capsys):

@@ -1,7 +1,9 @@
 """What a pipeline computes from a model and a data manager, whatever they are."""
 
+import random
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -59,6 +61,13 @@ def test_what_a_step_draws_follows_from_the_seed_and_the_step_alone(pipeline: Pi
         return pipeline.get_train_loss_dict(5)[1]["rgb_loss"].item()
 
     assert loss(5) == loss(5) != loss(6)
+
+    def globally(step: int) -> tuple[float, float]:
+        pipeline.seed_step(step)
+        return np.random.rand(), random.random()  # noqa: NPY002 - a method's own code may draw from them
+
+    assert globally(5) == globally(5)
+    assert not set(globally(5)) & set(globally(6))
 
 
 def test_training_calls_the_callbacks_of_every_step_in_order_with_rising_progress(

@@ -1,11 +1,13 @@
 """Methods are found through entry points, and one broken plugin harms no other."""
 
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from unmix_plugin.engine.registry import METHOD_GROUP, discover_methods, find_method
+from tests.engine.rgb_nerf_plugin import rgb_nerf
+from unmix_plugin.engine.registry import METHOD_GROUP, MethodSpecification, discover_methods, find_method
 from unmix_plugin.errors import ConfigError
 
 
@@ -22,6 +24,11 @@ def test_a_registered_method_is_found_under_its_configs_name_and_another_of_that
     assert list(methods) == ["rgb-nerf"]
     assert methods["rgb-nerf"].description == "Plain RGB radiance field."
     assert "z-again: a method rgb-nerf is registered already" in str(broken[0])
+
+
+def test_settings_have_the_name_of_the_method_by_which_their_runs_are_found_again():
+    made_later = MethodSpecification(lambda: rgb_nerf.config, "A copy.", name="mine")
+    assert made_later.config == replace(rgb_nerf.config, method_name="mine")
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,13 @@ import pytest
 import torch
 
 from tests.engine import rgb_nerf_plugin
-from tests.engine.stopped_runs import finished, quiet_trainer
+from tests.engine.rgb_nerf_plugin import GridField, RgbNerf
+from tests.engine.stopped_runs import finished, newest, quiet_trainer, stop_at
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.registry import find_method
-from unmix_plugin.engine.runs.load_run import load_model, load_pipeline
+from unmix_plugin.engine.runs.checkpoints import save_checkpoint
+from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipeline
+from unmix_plugin.errors import ConfigError
 
 
 @pytest.mark.usefixtures("registered")
@@ -47,6 +50,49 @@ def test_a_finished_run_renders_from_its_folder_alone(short_config: TrainerConfi
     assert torch.equal(actual["rgb"], expected["rgb"])
     assert loaded.scene.summary == {"scene": "ball"}
     assert len(loaded.scene.train_cameras) == 10
+
+
+def test_a_scene_without_evaluation_views_trains_and_opens(short_config: TrainerConfig):
+    data = replace(short_config.pipeline.datamanager, eval_views=())
+    trainer = finished(replace(short_config, pipeline=replace(short_config.pipeline, datamanager=data)))
+    loaded = load_pipeline(trainer.run.path, "cpu")
+    assert len(loaded.scene.eval_cameras) == 0
+    assert loaded.pipeline.get_average_eval_image_metrics_and_images() == ({}, {})
+
+
+def test_a_parameter_that_modules_share_is_loaded_with_its_average(short_config: TrainerConfig, monkeypatch):
+    def share_field(model: RgbNerf) -> None:
+        model.field = model.again = GridField(20)
+
+    monkeypatch.setattr(RgbNerf, "populate_modules", share_field)
+    trainer = finished(replace(short_config, average_decay=0.8))
+    assert trainer.average is not None
+    loaded = dict(load_model(trainer.run.path, "cpu").model.named_parameters())
+    assert torch.equal(loaded["field.grid"], trainer.average.values["field.grid"])
+
+
+def test_parameters_that_no_checkpoint_would_hold_are_refused(short_config: TrainerConfig, monkeypatch):
+    stray = {"fields": [torch.nn.Parameter(torch.zeros(1))]}
+    monkeypatch.setattr(RgbNerf, "get_param_groups", lambda _: stray)
+    with pytest.raises(ConfigError, match="group fields has parameters that no module of the model holds"):
+        quiet_trainer(short_config)
+
+
+def test_a_parameter_that_is_trained_from_a_resume_on_joins_the_average(
+    short_config: TrainerConfig, monkeypatch
+):
+    stopped = stop_at(replace(short_config, average_decay=0.8), 6).run
+    monkeypatch.setattr(RgbNerf, "populate_modules", with_a_gain)
+    checkpoint = newest(stopped)
+    tensors = {**checkpoint.tensors, "model/gain": torch.tensor(2.0)}
+    save_checkpoint(stopped / "checkpoints", 6, tensors, checkpoint.record)
+    resumed = quiet_trainer(load_config(stopped))
+    assert resumed.average is not None
+    assert resumed.average.values["gain"] == 2.0
+
+
+def with_a_gain(model: RgbNerf) -> None:
+    model.field, model.gain = GridField(20), torch.nn.Parameter(torch.ones(()))
 
 
 def test_groups_that_a_model_resets_between_steps_are_forgotten(short_config, monkeypatch):

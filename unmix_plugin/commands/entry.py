@@ -23,7 +23,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
-from unmix_plugin.errors import UnmixError
+from unmix_plugin.errors import UnmixError, UnmixWarning
 
 DONE, INTERNAL_ERROR, USER_ERROR, INTERRUPTED, BROKEN_PIPE = 0, 1, 2, 130, 141
 
@@ -108,8 +108,8 @@ def _as_bytes(error: UnicodeError) -> tuple[str | bytes, int]:
 
 @contextmanager
 def _libraries_in_short() -> Iterator[None]:
-    """Context in which Matplotlib says nothing of a home folder that can't be written, where it helps itself, and of
-    all letters that its font lacks one line.
+    """Context in which our warnings are lines. Matplotlib says nothing of a home folder that can't be written, where it
+    helps itself, and one line of all letters that its font lacks.
     """
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     usual, is_said = warnings.showwarning, False
@@ -117,7 +117,9 @@ def _libraries_in_short() -> Iterator[None]:
     def show(message: Warning | str, *where: Any, **more: Any) -> None:
         nonlocal is_said
         lacking = re.match(r"Glyph (\d+) .*missing from", str(message))
-        if lacking is None:
+        if isinstance(message, UnmixWarning):
+            _say(f"warning: {message}")
+        elif lacking is None:
             usual(message, *where, **more)
         elif not is_said:
             is_said, letter = True, chr(int(lacking[1]))

@@ -175,6 +175,9 @@ def finish(trainer: Trainer, console: Console) -> None:
     record = trainer.train()
     speed = f"{record.train_rays_per_second:,.0f} rays/s"
     say(console, f"trained {counted(record.steps, 'step')} in {record.train_seconds:.1f} s, {speed}")
+    if record.skipped_steps:
+        skipped = f"{counted(record.skipped_steps, 'step')} changed nothing"
+        say(console, f"warning: {skipped}: loss or gradients were not finite, see {trainer.run.log_path}")
     averaged = nullcontext() if trainer.average is None else trainer.average.swapped_in()
     with trainer.control.device.training_turn(), averaged:
         trainer.pipeline.model.write_results(trainer.run.path)

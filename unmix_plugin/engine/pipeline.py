@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from unmix_plugin.engine.configs import PipelineConfig
-from unmix_plugin.engine.machine import step_generator, step_seed
+from unmix_plugin.engine.machine import seed_everything, step_generator, step_seed
 from unmix_plugin.engine.model import DataManager, Model, TrainOutputs
 
 _MODEL_STREAM = 1
@@ -59,8 +59,8 @@ class Pipeline(nn.Module):
     def seed_step(self, step: int) -> None:
         """Make everything that the model draws in training step `step` a function of (seed, step)."""
         self.model.generator = step_generator(self.seed, step, self.model.device, _MODEL_STREAM)
-        # For what takes no generator, such as dropout.
-        torch.manual_seed(step_seed(self.seed, step, _MODEL_STREAM))
+        # For what takes no generator, such as dropout or NumPy.
+        seed_everything(step_seed(self.seed, step, _MODEL_STREAM))
 
     def get_train_loss_dict(self, step: int) -> TrainOutputs:
         """Outputs, losses and metrics of training step `step`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, TypeVar
@@ -37,14 +37,17 @@ class MethodSpecification:
                 `products.product.RunProduct` with defaults; called when the command is. None: nothing of its own.
             name: On the command line, as `config.method_name`; needed where `config` is made later.
         """
-        self._config = config
+        if name is None:
+            config = config() if callable(config) else config
+            name = config.method_name
+        self._config, self.name = config, name
         self.description, self.scene, self.products = description, scene, products
-        self.name = self.config.method_name if name is None else name
 
     @cached_property
     def config(self) -> TrainerConfig:
         """Defaults of everything."""
-        return self._config() if callable(self._config) else self._config
+        config = self._config() if callable(self._config) else self._config
+        return replace(config, method_name=self.name)  # by which runs find their method
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import itertools
 import json
+import math
 import os
 import subprocess
 import sys
@@ -208,6 +209,15 @@ def test_the_newest_two_stay_and_a_damaged_one_does_not_count_among_them(tmp_pat
     (tmp_path / "step-000009.safetensors").write_bytes(b"damaged")
     save_checkpoint(tmp_path, 3, tensors_of(3), {}, keep=2)
     assert checkpoint_steps(tmp_path) == [3, 2]
+
+
+def test_tensors_that_could_not_be_read_are_refused_and_push_out_no_checkpoint(tmp_path: Path):
+    for step in (1, 2):
+        save_checkpoint(tmp_path, step, tensors_of(step), {}, keep=1)
+    for name, value in (("model/mean", math.nan), ("average/a", math.inf)):
+        with pytest.raises(RunError, match=f"{name} has values that are not finite"):
+            save_checkpoint(tmp_path, 3, {name: torch.full((2,), value)}, {}, keep=1)
+    assert newest_complete_checkpoint(tmp_path).step == 2
 
 
 def test_a_checkpoint_of_a_newer_version_is_refused_not_passed_over(tmp_path: Path):

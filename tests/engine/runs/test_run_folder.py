@@ -2,8 +2,8 @@
 
 import json
 import os
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from tests.engine.rgb_nerf_plugin import RgbNerfConfig
+from tests.engine.stopped_runs import quiet_trainer
 from unmix_plugin.engine.configs import TrainerConfig
 from unmix_plugin.engine.runs.atomic_files import RUN_FORMAT, whole_file, write_file, write_run_json
 from unmix_plugin.engine.runs.checkpoints import save_checkpoint
@@ -19,7 +21,7 @@ from unmix_plugin.engine.runs.load_run import load_config, load_model, load_pipe
 from unmix_plugin.engine.runs.run_folder import RunFolder, create_run_folder, newest_run, open_run_folder
 from unmix_plugin.engine.runs.scene_record import differences
 from unmix_plugin.engine.training.trainer import Trainer
-from unmix_plugin.errors import ConfigError, RunError, SceneError
+from unmix_plugin.errors import ConfigError, RunError, SceneError, UnmixError, UnmixWarning
 
 NOON = datetime(2024, 5, 6, 12, 0, 7, tzinfo=timezone.utc)
 
@@ -124,6 +126,57 @@ def test_a_config_that_does_not_fit_its_method_is_refused(trained: RunFolder, na
     rewrite(trained.config_path, lambda run: run["config"]["pipeline"]["model"].update({name: value}))
     with pytest.raises(RunError, match=words):
         load_model(trained.path)
+
+
+def test_a_setting_that_a_config_lacks_is_not_taken_for_the_default(trained: RunFolder):
+    rewrite(trained.config_path, lambda run: run["config"]["pipeline"]["model"].pop("num_samples_per_ray"))
+    with pytest.raises(RunError, match=r"config\.json lacks pipeline\.model\.num_samples_per_ray"):
+        load_model(trained.path)
+
+
+def test_a_run_is_shown_from_an_older_checkpoint_with_a_warning_alone(trained: RunFolder):
+    (trained.checkpoints / "step-000012.safetensors").write_bytes(b"cut")
+    for load in (load_model, load_pipeline):
+        with pytest.warns(
+            UnmixWarning, match=r"as it was after step 8: passed over step-000012: the tensors"
+        ):
+            assert load(trained.path, "cpu").training.steps == 8
+    resumed = quiet_trainer(load_config(trained.path))
+    assert resumed.pipeline.reasons.startswith("warning: passed over a damaged checkpoint: step-000012")
+    assert resumed.pipeline.reasons in resumed.run.log_path.read_text()
+
+
+@dataclass(frozen=True)
+class Unreadable(RgbNerfConfig):
+    widths: Sequence[int] = (64,)
+
+
+@dataclass(frozen=True)
+class ReadAsAnother(RgbNerfConfig):
+    powers: Mapping[int, float] = field(default_factory=lambda: {1: 2.0})
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "words"),
+    [
+        ("summary", {"frames": ["left/1.png"]}, "'left/1.png' can't be the name of a frame"),
+        ("metadata", {"grid_size": 20, "far": 1e20}, r"the number 1e\+20"),
+        ("metadata", {"grid_size": np.int64(20)}, "int64 is not JSON serializable"),
+        ("initial_data", {"raw_density": np.full(1, np.nan)}, r"field\.grid has values that are not finite"),
+        ("model", Unreadable(), r"model\.widths: expected .*Sequence"),
+        ("model", ReadAsAnother(), "are read back as others"),
+    ],
+)
+def test_what_a_run_could_not_be_opened_with_is_refused_before_it_is_trained(
+    short_config: TrainerConfig, monkeypatch, part: str, value: Any, words: str
+):
+    monkeypatch.setattr(
+        f"tests.engine.rgb_nerf_plugin.BallDataManager.{part}", lambda _: value, raising=False
+    )
+    model = value if part == "model" else short_config.pipeline.model
+    with pytest.raises(UnmixError, match=words):
+        Trainer(replace(short_config, pipeline=replace(short_config.pipeline, model=model)))
+    assert not short_config.output_dir.exists()
 
 
 def test_a_run_whose_method_is_gone_is_refused(trained: RunFolder, registered: list):

@@ -246,7 +246,7 @@ class Cameras:
             torch.tensor(values["camera_to_world"], dtype=torch.float32).reshape(count, 3, 4),
             torch.tensor(values["focal_px"], dtype=torch.float32).reshape(count, 2),
             torch.tensor(values["center_px"], dtype=torch.float32).reshape(count, 2),
-            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, -1),
+            torch.tensor(values["distortion"], dtype=torch.float32).reshape(count, -1 if count else 4),
             width,
             height,
             tuple(sizes) or None,

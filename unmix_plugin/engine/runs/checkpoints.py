@@ -57,8 +57,10 @@ def save_checkpoint(
     Returns:
         The path of the record.
     Raises:
-        RunError: the disk is full or refuses; the checkpoints from before are as they were.
+        RunError: a tensor has values that are not finite, or the disk is full or refuses; the checkpoints from before
+            are as they were.
     """
+    require_sound(tensors)
     data = safetensors.torch.save(_separate(tensors))
     tensors_path, record_path = folder / f"{_stem(step)}.safetensors", folder / f"{_stem(step)}.json"
     sha256 = hashlib.sha256(data).hexdigest()
@@ -107,14 +109,20 @@ def _read(record_path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | str:
         if hashlib.sha256(data).hexdigest() != record.get("sha256"):
             return "the tensors do not have the hash of the record"
         tensors = safetensors.torch.load(data)
-        broken = next((name for name, tensor in tensors.items() if not _is_sound(name, tensor)), None)
-        if broken is not None:
-            return f"{broken} has values that are not finite"
+        require_sound(tensors)
         return tensors, record
     except OtherFormatError:
         raise
     except (OSError, RunError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         return str(error)
+
+
+def require_sound(tensors: Mapping[str, Tensor]) -> None:
+    """Refuse what no training goes on from, and no run is shown from. Raises RunError: a tensor has values that are not
+    finite."""
+    broken = next((name for name, tensor in tensors.items() if not _is_sound(name, tensor)), None)
+    if broken is not None:
+        raise RunError(f"{broken} has values that are not finite")
 
 
 def _is_sound(name: str, tensor: Tensor) -> bool:
@@ -235,9 +243,10 @@ def restore_training(
 def restore_model(tensors: Mapping[str, Tensor], model: nn.Module, averaged: bool) -> None:
     """Give the model its values, with `averaged` those of the moving average where there is one. Raises RunError: the
     tensors do not fit the model."""
-    values = {**part(tensors, _MODEL), **(part(tensors, AVERAGE) if averaged else {})}
     try:
-        model.load_state_dict(values)
+        model.load_state_dict(part(tensors, _MODEL))
+        # After all of them: a parameter that modules share has several names, and an average under one.
+        model.load_state_dict(part(tensors, AVERAGE) if averaged else {}, strict=False)
     except RuntimeError as error:
         raise RunError(
             "the checkpoint does not fit the model that config and scene describe: leave out settings that differ from "

@@ -38,6 +38,13 @@ def config_to_json(value: Any) -> Any:
     raise TypeError(f"a config holds a {type(value).__name__}, which JSON has no form for: {value!r}")
 
 
+def require_kept(config: Any) -> None:
+    """Refuse settings that a run could not keep. Raises ConfigError: they are read back as others, or not at all.
+    TypeError: as `config_to_json`."""
+    if config_from_json(config_to_json(config), config) != config:
+        raise ConfigError("the settings are read back as others: keys of mappings must be text, lists lists")
+
+
 def flattened(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested values by their dotted names.
 

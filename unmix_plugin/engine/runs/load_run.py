@@ -1,5 +1,6 @@
 """Bringing a run back from its folder: its config, its model alone, or the pipeline with its data."""
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,11 +10,16 @@ from unmix_plugin.engine.model import Model
 from unmix_plugin.engine.pipeline import Pipeline
 from unmix_plugin.engine.registry import find_method
 from unmix_plugin.engine.runs.atomic_files import read_run_json, write_run_json
-from unmix_plugin.engine.runs.checkpoints import TrainingRecord, newest_complete_checkpoint, restore_model
-from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json
+from unmix_plugin.engine.runs.checkpoints import (
+    Checkpoint,
+    TrainingRecord,
+    newest_complete_checkpoint,
+    restore_model,
+)
+from unmix_plugin.engine.runs.config_json import config_from_json, config_to_json, flattened
 from unmix_plugin.engine.runs.run_folder import RunFolder, open_run_folder
 from unmix_plugin.engine.runs.scene_record import SceneRecord, check_same_scene, read_scene_record
-from unmix_plugin.errors import ConfigError, RunError, UnmixError
+from unmix_plugin.errors import ConfigError, RunError, UnmixError, UnmixWarning, name_some
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,7 @@ def load_model(path: Path, device: str = "auto") -> LoadedModel:
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = newest_complete_checkpoint(run.checkpoints)
+    checkpoint = _newest_checkpoint(run)
     try:
         model = config.pipeline.model.setup(scene_box=scene.scene_box, metadata=scene.metadata)
     except (UnmixError, LookupError, TypeError, ValueError, ArithmeticError) as error:
@@ -72,7 +78,7 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     run, place = open_run_folder(path), resolve_device(device)
     config = load_config(path)
     scene = read_scene_record(run, config.pipeline.datamanager.target)
-    checkpoint = newest_complete_checkpoint(run.checkpoints)
+    checkpoint = _newest_checkpoint(run)
     config = config if data is None else replace(config, data=data)
     pipeline: Pipeline = config.pipeline.setup(data=require_data(config), device=place, seed=config.seed)
     check_same_scene(scene, pipeline.datamanager, run)
@@ -80,12 +86,23 @@ def load_pipeline(path: Path, device: str = "auto", data: Path | None = None) ->
     return LoadedPipeline(run, config, pipeline.eval(), scene, TrainingRecord.from_json(checkpoint.record))
 
 
+def _newest_checkpoint(run: RunFolder) -> Checkpoint:
+    """The newest complete checkpoint, with a warning where it isn't the newest."""
+    found = newest_complete_checkpoint(run.checkpoints)
+    if found.damaged:
+        said = (
+            f"{run.path} is shown as it was after step {found.step}: passed over {'; '.join(found.damaged)}"
+        )
+        warnings.warn(said, UnmixWarning, stacklevel=3)
+    return found
+
+
 def load_config(path: Path) -> TrainerConfig:
     """The settings of the run at `path`, with `load_run` set to it: `Trainer(load_config(path))` resumes.
 
     Raises:
-        RunError: the run is missing, half-written or from another version, its settings do not fit the method, or the
-            method is not installed.
+        RunError: the run is missing, half-written or from another version, its settings lack some or do not fit the
+            method, or the method is not installed.
     """
     run = open_run_folder(path)
     values = read_run_json(run.config_path)
@@ -95,6 +112,11 @@ def load_config(path: Path) -> TrainerConfig:
         config = config_from_json(stored, find_method(str(name)).config)
     except ConfigError as error:
         raise RunError(f"can't use the settings in {run.config_path}: {error}") from error
+    if missing := sorted(flattened(config_to_json(config)).keys() - flattened(stored or {}).keys()):
+        raise RunError(
+            f"{run.config_path} lacks {name_some(missing)}: it is damaged, or of another version of the method; add "
+            "what the run was trained with, or train again"
+        )
     return replace(config, load_run=run.path)
 
 

@@ -5,6 +5,7 @@ Two descriptions of a scene mean the same if they are equal but for numbers, whi
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ import torch
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.engine.model import DataManager
-from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, read_run_json, safe_name
+from unmix_plugin.engine.runs.atomic_files import NOT_PORTABLE, parse_plain_json, read_run_json, safe_name
 from unmix_plugin.engine.runs.config_json import flattened
 from unmix_plugin.engine.runs.run_folder import RunFolder
 from unmix_plugin.errors import ConfigError, RunError, name_some
@@ -38,14 +39,20 @@ class SceneRecord:
 
 
 def scene_record_to_json(datamanager: DataManager) -> dict[str, Any]:
-    """What `scene.json` holds."""
-    return {
+    """What `scene.json` holds. Raises ConfigError: something that it couldn't be read with."""
+    values = {
         "scene_box": datamanager.scene_box.aabb.tolist(),
         "metadata": datamanager.metadata(),
         "train_cameras": datamanager.train_cameras.to_json(),
         "eval_cameras": datamanager.eval_cameras.to_json(),
         "summary": datamanager.summary(),
     }
+    kind = type(datamanager)
+    try:
+        _record_of(parse_plain_json(json.dumps(values, allow_nan=False)), kind)
+    except _MISFITS as error:
+        raise ConfigError(f"no run can keep what {kind.__name__} says of the scene: {error}") from error
+    return values
 
 
 def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> SceneRecord:
@@ -58,18 +65,26 @@ def read_scene_record(run: RunFolder, kind: type[DataManager] = DataManager) -> 
     """
     values = read_run_json(run.scene_path)
     try:
-        metadata, summary = _dictionary(values, "metadata"), _dictionary(values, "summary")
-        record = SceneRecord(
-            SceneBox(torch.tensor(values["scene_box"], dtype=torch.float32).reshape(2, 3)),
-            metadata,
-            Cameras.from_json(values["train_cameras"]),
-            Cameras.from_json(values["eval_cameras"]),
-            summary,
-        )
-        _check_frames(record)
-        kind.check_record(metadata, summary)
-    except (LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError) as error:
+        return _record_of(values, kind)
+    except _MISFITS as error:
         raise RunError(f"{run.scene_path} is damaged: {type(error).__name__}: {error}") from error
+
+
+_MISFITS = (LookupError, TypeError, ValueError, RuntimeError, OverflowError, ConfigError)
+
+
+def _record_of(values: dict[str, Any], kind: type[DataManager]) -> SceneRecord:
+    """The record that is written as these values by a data manager of that kind. Raises one of `_MISFITS`."""
+    metadata, summary = _dictionary(values, "metadata"), _dictionary(values, "summary")
+    record = SceneRecord(
+        SceneBox(torch.tensor(values["scene_box"], dtype=torch.float32).reshape(2, 3)),
+        metadata,
+        Cameras.from_json(values["train_cameras"]),
+        Cameras.from_json(values["eval_cameras"]),
+        summary,
+    )
+    _check_frames(record)
+    kind.check_record(metadata, summary)
     return record
 
 

@@ -145,9 +145,9 @@ class ParameterAverage:
             self._swap()
 
     def restore(self, values: Mapping[str, Tensor], updates: int) -> None:
-        """Go on from these `values`, after so many updates."""
+        """Go on from these `values`, after so many updates; parameters that were not trained until now have none."""
         for name, value in self.values.items():
-            value.copy_(values[name])
+            value.copy_(values.get(name, value))
         self.updates = updates
 
     def _swap(self) -> None:

@@ -64,11 +64,18 @@ class TrainingSteps:
             configs: Settings of the optimiser by parameter group.
             processes: That take these steps together.
         Raises:
-            ConfigError: a group of the model has no optimizer config, or there are more processes than rays.
+            ConfigError: a group of the model has no optimizer config or a parameter that no checkpoint would hold, or
+                there are more processes than rays.
         """
         self.pipeline, self.configs, self.processes = pipeline, configs, processes
         pipeline.model.processes = processes
-        self.optimizer = build_optimizer(pipeline.model.get_param_groups(), configs)
+        groups, known = pipeline.model.get_param_groups(), set(map(id, pipeline.model.parameters()))
+        if stray := [name for name, own in groups.items() if not known.issuperset(map(id, own))]:
+            raise ConfigError(
+                f"the parameter group {', '.join(stray)} has parameters that no module of the model holds, nor would a "
+                "checkpoint: make them attributes, or entries of an nn.ParameterList"
+            )
+        self.optimizer = build_optimizer(groups, configs)
         self.guard = GradientGuard(self.optimizer)
         self.callbacks = [
             *pipeline.datamanager.get_training_callbacks(),

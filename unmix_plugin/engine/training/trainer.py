@@ -19,9 +19,10 @@ from unmix_plugin.engine.runs.checkpoints import (
     collect_tensors,
     newest_complete_checkpoint,
     part,
+    require_sound,
     save_checkpoint,
 )
-from unmix_plugin.engine.runs.config_json import config_to_json
+from unmix_plugin.engine.runs.config_json import require_kept
 from unmix_plugin.engine.runs.load_run import load_config, require_data, write_config
 from unmix_plugin.engine.runs.run_folder import (
     RunFolder,
@@ -68,9 +69,9 @@ class Trainer:
             processes: That train together, of which this is the first; the others call `follow_training`.
         Raises:
             SceneError, ConfigError: scene or settings are wrong; nothing has been written.
-            RunError: the run to resume is unusable, or the folder can't be made.
+            RunError: the run to resume is unusable, the model's values are not finite, or the folder can't be made.
         """
-        config_to_json(config)  # settings that can't be written down are refused before anything is
+        require_kept(config)
         self.console = console or ProgressConsole()
         self.control = control or TrainingControl()
         self.processes = processes
@@ -261,6 +262,7 @@ class Trainer:
         return ParameterAverage(self.pipeline.model, self.config.average_decay, AVERAGE_INTERVAL)
 
     def _new_run(self) -> RunFolder:
+        require_sound(collect_tensors(self.pipeline.model, self.optimizer, None))
         scene = scene_record_to_json(self.pipeline.datamanager)
         data = require_data(self.config)
         run = create_run_folder(self.config.output_dir, data.resolve().name, self.config.method_name)
@@ -285,5 +287,7 @@ class Trainer:
         if self.average is not None and averaged:
             self.average.restore(averaged, record.average_updates)
         write_config(self.run, self.config)
-        for reason in checkpoint.damaged:
-            self._log(f"passed over a damaged checkpoint: {reason}")
+        passed_over = (
+            f"warning: passed over a damaged checkpoint: {reason}" for reason in checkpoint.damaged
+        )
+        self.pipeline.reasons = "\n".join(filter(None, [self.pipeline.reasons, *passed_over]))
