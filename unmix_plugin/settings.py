@@ -61,7 +61,7 @@ def _within(value: float | int | str, low: float | int, high: float | int = math
 class SceneOptions:
     """How to read a scene."""
 
-    value_scale: Annotated[float | None, Common, short("value-scale")] = None
+    value_scale: Annotated[float | None, Common, AtStart, short("value-scale")] = None
     """Cubes are divided by this number (needed for integer cubes, such as 255 or 4095); None takes them as they are."""
     invalid_pixels: Annotated[Literal["refuse", "mask", "clip"], Common, short("invalid-pixels")] = "refuse"
     """What to do with pixels that hold NaN, infinite or negative values: refuse the scene; leave them out (mask); or
@@ -133,7 +133,7 @@ class UnmixFieldConfig:
     """Cells along an edge of the scene box on the coarsest level."""
     finest_resolution: Ours[int | Auto] = "auto"
     """The same on the finest level. Auto follows from `cells_per_pixel`."""
-    cells_per_pixel: float = 1.7
+    cells_per_pixel: Annotated[float, AtStart] = 1.7
     """Cells of the finest level along the edge of a pixel where it meets the middle of the scene box: finer ones would
     fit what the views don't show."""
     log2_rows_per_level: Ours[int | Auto] = "auto"
@@ -165,10 +165,10 @@ class UnmixFieldConfig:
 class RendererConfig:
     """How finely rays are sampled and what is left out."""
 
-    samples_per_pixel: float | Auto = "auto"
+    samples_per_pixel: Annotated[float | Auto, AtStart] = "auto"
     """Samples of a ray along the length of a pixel's edge where it meets the middle of the scene box. Auto is 1.5, but
     1 where neither alpha nor a backdrop is known, or the box is more than 300 pixels long: more rays teach more."""
-    coarse_samples: Ours[int | Auto] = "auto"
+    coarse_samples: Annotated[Ours[int | Auto], AtStart] = "auto"
     """Samples along the longest edge of the scene box at the start of training, if there are more in the end: what is
     coarse must be found first, by many rays of few samples. Auto is 256, but 64 in an unbounded world, where rays go
     on outside the box."""
@@ -223,7 +223,7 @@ class LossConfig:
     abundances: float = 0.1
     """Weight of the mean squared distance of composited abundances to those of the measured spectra, unmixed one by
     one with the first endmembers; 0 as published. It falls to a tenth of that at the end of training."""
-    exposure: Ours[float | Auto] = "auto"
+    exposure: Annotated[Ours[float | Auto], AtStart] = "auto"
     """Factor on spectra, rendered and measured, before they are compared: errors of dark scenes count as much as those
     of bright ones. Auto makes the median opaque pixel as bright as 0.2, but darkens nothing."""
     relative: Ours[float | Auto] = "auto"
@@ -316,7 +316,7 @@ class UnmixModelConfig(ModelConfig):
     samples_per_step: int | Auto = "auto"
     """Samples of rays that a training step looks at; the number of rays adapts to it. Auto is 25,000 on a CPU and
     400,000 on a GPU, which takes no longer for them."""
-    initial_opacity: Ours[float | Auto] = "auto"
+    initial_opacity: Annotated[Ours[float | Auto], AtStart] = "auto"
     """Opacity of one sample's interval in the untrained field. Auto is 0.05 with alpha or before a backdrop, else
     0.01: space between cameras and walls must stay clear."""
     as_published: Ours[bool] = False
@@ -333,12 +333,14 @@ class UnmixModelConfig(ModelConfig):
         count, opacity, ours = self.num_endmembers, self.initial_opacity, not self.as_published
         has_lamp, has_file = self.lamp not in ("auto", ()), self.endmember_file is not None
         is_lamp = len(self.lamp) == _LAMP_NUMBERS and self.lamp[0] in (0, 1)
+        is_lamp = is_lamp and all(any(self.lamp[first : first + 3]) for first in (4, 7))
         rules = {
             "num-endmembers of 1 to 255 or auto": count is None or _within(count, 1, 255),
             "num-specular-spectra of 1 to 256 or auto": _within(self.num_specular_spectra, 1, 256),
             "samples-per-step of 1 to 100 million or auto": _within(self.samples_per_step, 1, 100_000_000),
             "initial-opacity in (0, 1) or auto": opacity == "auto" or 0 < opacity < 1,
-            "a lamp of no or ten numbers, the first 0 or 1, or auto": not has_lamp or is_lamp,
+            "a lamp of no or ten numbers, the first 0 or 1, axis and way not 0, or auto": not has_lamp
+            or is_lamp,
             "light camera where numbers of a lamp are given": not has_lamp or self.light == "camera",
             "light fixed or per-view: the field as published has no shading": ours or self.light != "camera",
             "a scale per-endmember: the method as published has no shared one": ours

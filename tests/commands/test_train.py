@@ -177,15 +177,27 @@ def test_a_finished_run_without_a_larger_limit_says_that_there_is_nothing_to_tra
 
 @pytest.mark.parametrize(
     ("flag", "value"),
-    [("endmember-init", "vca"), ("lamp", "0 0 0 0 0 0 1 0 0 1"), ("endmember-file", "a.csv")],
+    [
+        ("model.endmember-init", "vca"),
+        ("model.lamp", "0 0 0 0 0 0 1 0 0 1"),
+        ("model.endmember-file", "a.csv"),
+        # What the run's parameters mean follows from these.
+        ("datamanager.scene.value-scale", "2"),
+        ("model.field.cells-per-pixel", "1.71"),
+        ("model.renderer.samples-per-pixel", "2"),
+        ("model.renderer.coarse-samples", "9"),
+        ("model.initial-opacity", "0.2"),
+        ("model.losses.exposure", "2"),
+    ],
 )
 def test_what_acts_at_the_start_alone_is_refused_where_a_run_goes_on(run_copy, flag, value):
     before = (run_copy / "config.json").read_bytes()
-    others = {"lamp": ["--light", "camera"], "endmember-file": ["--endmember-init", "file"]}.get(flag, [])
-    words = [f"--pipeline.model.{flag}", *value.split(), *others, "--max-num-iterations", 21]
+    more = {"model.lamp": ["--light", "camera"], "model.endmember-file": ["--endmember-init", "file"]}
+    others = more.get(flag, [])
+    words = [f"--pipeline.{flag}", *value.split(), *others, "--max-num-iterations", 21]
     said = refused(train, "unmix-nerf", "--load-run", run_copy, *words)
-    named = "endmember-init" if flag == "endmember-file" else flag
-    assert f"--pipeline.model.{named} is " in said
+    named = "model.endmember-init" if flag == "model.endmember-file" else flag
+    assert f"--pipeline.{named} is " in said
     assert "it acts when a run is started alone; leave it out, or start a new run" in said
     assert (run_copy / "config.json").read_bytes() == before
 

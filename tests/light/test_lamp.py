@@ -214,3 +214,10 @@ def test_a_lamp_is_refused_in_a_light_that_does_not_move_with_the_camera(light):
     assert UnmixModelConfig(light=light, lamp=()).lamp == ()
     assert UnmixModelConfig(light="camera", lamp=NUMBERS).lamp == NUMBERS
     assert Lamp.of_numbers(NUMBERS) == TURNTABLE
+
+
+def test_an_axis_of_another_length_moves_no_lamp_and_none_at_all_is_refused():
+    assert Lamp.of_numbers((*NUMBERS[:6], 5.0, *NUMBERS[7:])) == TURNTABLE
+    for at in (4, 7):
+        with pytest.raises(ConfigError, match="axis and way not 0"):
+            UnmixModelConfig(light="camera", lamp=(*NUMBERS[:at], 0.0, 0.0, 0.0, *NUMBERS[at + 3 :]))

@@ -8,6 +8,7 @@ Notation: `R` rays.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -43,9 +44,10 @@ class Lamp:
 
     @staticmethod
     def of_numbers(numbers: Sequence[float]) -> Lamp:
-        """The lamp of ten numbers."""
+        """The lamp of ten numbers; the axis may have any length but 0."""
         middle, axis, place = ((numbers[i], numbers[i + 1], numbers[i + 2]) for i in (1, 4, 7))
-        return Lamp(_FRAMES[int(numbers[0])], middle, axis, place)
+        x, y, z = (part / math.hypot(*axis) for part in axis)
+        return Lamp(_FRAMES[int(numbers[0])], middle, (x, y, z), place)
 
 
 class MovingLamp(nn.Module):
