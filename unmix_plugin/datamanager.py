@@ -35,7 +35,12 @@ from unmix_plugin.scenes.geometry.carving import Cells, Masks, carve, mask_warni
 from unmix_plugin.scenes.geometry.lighting import judge_exposure, judge_light
 from unmix_plugin.scenes.geometry.matched_points import find_matched_points
 from unmix_plugin.scenes.geometry.surface_evidence import SurfaceEvidence
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, parallax_warning, training_views
+from unmix_plugin.scenes.geometry.view_agreement import (
+    check_scene_poses,
+    lens_warning,
+    parallax_warning,
+    training_views,
+)
 from unmix_plugin.scenes.pixel_table import PixelRays, PixelTable
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.scenes.scene import check_recorded_scene, scene_identity
@@ -221,6 +226,7 @@ class HyperspectralDataManager(DataManager):
         each other, a backdrop, sensors that share no band or no place with another, and bad bands and values."""
         found = [check_scene_poses(self.scene) or self._carved[1], *self._pixels.notes, *self.scene.warnings]
         found.append(parallax_warning(self._initial_data["knots"], self.scene_box))
+        found.append(lens_warning(self.train_cameras))
         found += noise_warnings(self.scene, self._noise, self._pixels.bad_share)
         if self.scene.has_backdrop:
             found.append(

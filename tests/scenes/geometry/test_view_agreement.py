@@ -1,17 +1,19 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tests.method_factory import CAMERA
 from tests.scenes.scene_factory import look_at, make_scene
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import SceneError
 from unmix_plugin.scenes.demo.scene import make_demo_scene
 from unmix_plugin.scenes.geometry import view_agreement
-from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions
+from unmix_plugin.scenes.geometry.view_agreement import check_scene_poses, compare_conventions, lens_warning
 from unmix_plugin.scenes.geometry.views import Views
 from unmix_plugin.scenes.reading.loader import load_scene
 from unmix_plugin.settings import HyperspectralDataManagerConfig
@@ -125,3 +127,11 @@ def test_a_camera_that_only_turns_is_said_before_a_training(tmp_path):
     turned = [look_at(np.array([0.0, 3.0, 0.5]), np.array([x, 0.0, 0.0])) for x in np.linspace(-0.4, 0.4, 6)]
     folder = make_scene(tmp_path / "scene", alpha=False, poses=turned)
     assert any("all training cameras stand at one place" in said for said in warnings_of(folder.root))
+
+
+@pytest.mark.parametrize(("k1", "said"), [(0.0, None), (-0.5, None), (0.5, None), (-4.0, "1 view folds")])
+def test_pixels_to_which_no_direction_leads_are_said(k1: float, said: str | None):
+    bent = replace(CAMERA, distortion=torch.tensor([[k1, 0.0, 0.0, 0.0]]))
+    found = lens_warning(bent)
+    assert (found is not None) == (said is not None)
+    assert (said or "") in (found or "")

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
 from unmix_plugin.engine.geometry.space import RayBundle, SceneBox
+from unmix_plugin.errors import counted
 from unmix_plugin.scenes.geometry.views import (
     NUM_AGREEING,
     Differences,
@@ -242,6 +243,33 @@ def parallax_warning(positions: Float[np.ndarray, "N 3"], box: SceneBox) -> str 
         "are, so no other place can be rendered from such views. Move it between views; if it was moved, look whether "
         "each 'transform_matrix' is camera to world: read the other way, all cameras around an object stand at one"
     )
+
+
+def lens_warning(cameras: Cameras) -> str | None:
+    """A warning if a lens with distortion reaches less than the picture: no direction leads to the rest of it."""
+    lost = [_unreached(cameras[index]) for index in range(len(cameras)) if not cameras.is_line_camera(index)]
+    if max(lost, default=0.0) <= _MOST_UNREACHED:
+        return None
+    views = counted(sum(share > _MOST_UNREACHED for share in lost), "view")
+    return (
+        f"the distortion of {views} folds the picture over: no direction leads to {max(lost):.1%} of its pixels, and "
+        "their rays are wrong. Calibrate the lens anew, with points near the corners too, or mask them"
+    )
+
+
+_MOST_UNREACHED, _PIXELS_ASKED = 0.002, 2_500
+
+
+def _unreached(camera: Cameras) -> float:
+    """Share of pixels that don't come back when what lies on their rays is projected."""
+    camera = camera.shrunk(_PIXELS_ASKED)
+    if not camera.is_distorted:
+        return 0.0
+    rays = camera.image_rays(0)
+    pixels, depths = camera.project(rays.origins + rays.directions, 0)
+    assert rays.pixel_coords is not None
+    comes_back = (depths > 0) & ((pixels - rays.pixel_coords).norm(dim=1) < 1.0)
+    return 1.0 - float(comes_back.float().mean())
 
 
 @dataclass(frozen=True)
