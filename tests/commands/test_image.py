@@ -56,6 +56,16 @@ def test_spectra_maps_and_shares_are_written_and_said(cube, tmp_path):
     assert (len(left), left & {"angles.csv", "mnf.csv", "mnf.hdr", "mnf.img"}) == (7, set())
 
 
+def test_files_that_only_other_options_write_are_not_taken_away_unasked(cube, tmp_path):
+    write_envi_cube(tmp_path / "field", cube, Bands.of(np.linspace(450, 900, cube.shape[2])), None, "a field")
+    own = tmp_path / "field" / "mnf.hdr"
+    own.parent.mkdir()
+    own.write_text("of another program")
+    said = refused(image, tmp_path / "field.hdr", "--endmembers", 3, "--output-dir", tmp_path)
+    assert f"{own} exists already; give --overwrite" in said
+    assert own.read_text() == "of another program"
+
+
 @pytest.mark.parametrize(
     ("name", "field", "is_said"),
     [

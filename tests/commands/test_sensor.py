@@ -60,7 +60,9 @@ def test_a_render_has_the_sensors_bands(solid, camera, tmp_path):
 
 def test_known_spectra_are_not_compared_with_broad_channels(solid, camera, tmp_path):
     words = ["--run", solid.run, "--device", "cpu", "--output", tmp_path / "out", "--sensor", camera]
-    said = " ".join(done(export, "endmembers", *words).out.split())
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "angles.csv").write_text("of an earlier export without a sensor")
+    said = " ".join(done(export, "endmembers", *words, "--overwrite").out.split())
     assert "without angles.csv: known spectra are compared in the run's own bands" in said
     assert not (tmp_path / "out" / "angles.csv").exists()
     done(export, "endmembers", "--run", solid.run, "--output", tmp_path / "all")

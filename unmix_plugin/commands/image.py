@@ -59,7 +59,8 @@ def image(argv: list[str]) -> None:
 
     folder = options.output_dir / safe_name(options.file.resolve().stem, NOT_PORTABLE, "image")
     paths = unmixed_image_paths(folder, bool(options.library), options.mnf > 0)
-    refuse_to_overwrite(paths, options.overwrite)
+    all_paths = unmixed_image_paths(folder, True, True)
+    refuse_to_overwrite(all_paths, options.overwrite)
     opened = open_spectral_file(options.file, options.for_readers())
     bands, wavelengths = _good_bands(opened)
     stored = opened.read(bands=bands)
@@ -74,7 +75,7 @@ def image(argv: list[str]) -> None:
     fractions = _fractions(cube, mask, options.mnf)
     found = unmix_image(cube, options.endmembers, mask=mask, shares=options.shares, seed=options.seed)
     place = opened.metadata.get("map")
-    for earlier in {*unmixed_image_paths(folder, True, True)} - {*paths}:
+    for earlier in {*all_paths} - {*paths}:
         earlier.unlink(missing_ok=True)  # it would tell of other materials
     names = write_unmixed_image(folder, found, wavelengths, bands + 1, place, library, fractions)
     _say(found, mask, names)

@@ -27,17 +27,18 @@ _LEGEND_ROWS = 16
 
 def export(job: Job, asked: Endmembers) -> list[Path]:
     """Write table, library and plot, and in the run's own bands the angles to all known spectra."""
-    materials, paths = job.materials, _endmember_paths(job.folder)
+    materials, paths, angles_path = job.materials, _endmember_paths(job.folder), job.folder / "angles.csv"
     if materials.sensor is not None:
         if asked.library:
             raise ConfigError(
                 "--library is compared with in the run's own bands; leave out --library or --sensor"
             )
-        job.claim(paths)
+        job.claim([*paths, angles_path])
         job.say("without angles.csv: known spectra are compared in the run's own bands, without --sensor")
         _write_endmembers(job.folder, materials)
+        angles_path.unlink(missing_ok=True)  # of an earlier export, to spectra in other bands
         return paths
-    light, angles_path = job.scene.light_power, job.folder / "angles.csv"
+    light = job.scene.light_power
     known = library_of(asked.library, materials.bands, light)
     job.claim([*paths, angles_path])
     if not materials.is_light_known:
