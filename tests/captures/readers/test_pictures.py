@@ -138,7 +138,7 @@ def test_folders_that_are_no_image_are_refused(tmp_path):
     with pytest.raises(CaptureError, match="3 bands; expected one band a file"):
         open_spectral_file(tmp_path)
     (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(CaptureError, match=r"is a scene already.*train on it with unmix-train"):
+    with pytest.raises(CaptureError, match=r"pictures as views.*with unmix-process nerfstudio"):
         open_spectral_file(tmp_path)
     (tmp_path / "transforms.json").unlink()
     Image.fromarray(RGB[..., 0]).save(tmp_path / "a.png")

@@ -41,7 +41,8 @@ def open_band_folder(folder: Path, open_band: Callable[[Path], SpectralFile]) ->
             found = f"{band.path}: {band.shape[2]} bands; expected one band a file in {folder}"
             if (folder / "transforms.json").is_file():
                 found = (
-                    f"{folder}: is a scene already, as its transforms.json says; train on it with unmix-train"
+                    f"{folder}: its transforms.json names pictures as views, which are no bands of one image; give one "
+                    "of them, or read all with unmix-process nerfstudio"
                 )
             raise CaptureError(found)
         if (model := radiometric_model(band)) is not None:
