@@ -225,6 +225,7 @@ LEFT_OUT: dict[str, Callable[[dict[str, Any]], object]] = {
     "EXT_mesh_gpu_instancing": lambda gltf: gltf["nodes"][0].update(
         extensions={"EXT_mesh_gpu_instancing": {"attributes": {}}}
     ),
+    "skins": lambda gltf: gltf["nodes"][0].update(skin=0),
     "morph targets": lambda gltf: gltf["meshes"][0].update(weights=[1.0]),
     "several parents": lambda gltf: gltf["nodes"].extend([{"children": [0]}, {"children": [0]}]),
     "last row 0, 0, 0, 1": lambda gltf: gltf["nodes"][0].update(
@@ -263,6 +264,15 @@ def test_an_obj_whose_corners_count_from_0_is_refused(tmp_path, face):
     assert len(read_mesh(tmp_path / "mesh.obj").faces) == 1
     (tmp_path / "mesh.obj").write_text(f"{corners}f 1 2 3\n{face}\n")
     with pytest.raises(SceneError, match="names vertex 0"):
+        read_mesh(tmp_path / "mesh.obj")
+
+
+def test_an_obj_that_would_lose_its_first_vertex_to_a_byte_order_mark_is_refused(tmp_path):
+    faces = "v 10 0 0\nv 0 10 0\nv 0 0 10\nv 9 9 9\nf 1 2 3\nf 2 3 4\n"
+    (tmp_path / "mesh.obj").write_text(f"\ufeff# by hand\n{faces}", encoding="utf-8")
+    assert len(read_mesh(tmp_path / "mesh.obj").vertices) == 4
+    (tmp_path / "mesh.obj").write_text(f"\ufeff{faces}", encoding="utf-8")
+    with pytest.raises(SceneError, match="byte order mark"):
         read_mesh(tmp_path / "mesh.obj")
 
 

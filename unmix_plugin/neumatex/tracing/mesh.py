@@ -258,6 +258,7 @@ def _check_gltf(path: Path) -> None:
             "positions or texture coordinates as normalized whole numbers": any(
                 accessors[index].get("normalized") for index in read - {None}
             ),
+            "skins": any("skin" in one for one in nodes),
             "triangle fans": any(one.get("mode") == _FAN for one in primitives),
             "morph targets": any(any(one.get("weights", ())) for one in [*meshes, *nodes]),
             "a node with several parents": len(set(children)) < len(children),
@@ -282,6 +283,10 @@ def _has_corner_normals(path: Path) -> bool:
         if found := _CORNER_0.search(text):
             line = found[0].decode("ascii", "replace").strip()
             raise SceneError(f"{path}: '{line}' names vertex 0; an OBJ counts from 1: export the mesh again")
+        if (
+            text[:4] == b"\xef\xbb\xbfv"
+        ):  # by which trimesh loses the first vertex, and all faces move on by one
+            raise SceneError(f"{path}: begins with a byte order mark; save it as UTF-8 without one")
         return text.find(b"\nvn ") >= 0
 
 
