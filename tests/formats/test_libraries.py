@@ -69,6 +69,10 @@ def test_libraries_of_spectral_python_are_read_exactly_with_their_scale_units_an
         ({"lines": 1, "spectra_names": "{oak}"}, "has 24 bytes; 1 spectra of 3 values need 12"),
         ({"data_type": 2}, "has 24 bytes; 2 spectra of 3 values need 12"),
         ({"lines": "two"}, "'lines' is two; expected a whole number"),
+        (
+            {"lines": "2\nreflectance scale factor: 10000"},
+            "line 'reflectance scale factor: 10000' has no '='",
+        ),
         ({"reflectance_scale_factor": 0}, "'reflectance scale factor' is 0"),
         ({"wavelength": "{0.4, 0.5, 0.7}"}, "look like micrometres"),
         ({"spectra_names": "{oak}"}, "1 'spectra names' for 2 spectra"),

@@ -196,11 +196,23 @@ def _read_csv(path: Path) -> _Table:
     return names, values[:, 0] * factor, values[:, 1:].T, scales
 
 
+_KEYS = ("reflectance scale", "data ignore", "data gain", "data offset", "bbl", "wavelength", "spectra names")
+"""Of a header of spectra, beside those of its layout."""
+
+
+def _header_of_spectra(path: Path) -> dict[str, str]:
+    header = read_header(path)
+    for line in header.get("", "").splitlines():
+        if line.lower().replace("_", " ").startswith(_KEYS):
+            raise ValueError(f"the line {line[:80]!r} has no '='")
+    return header
+
+
 def _read_envi(path: Path) -> _Table:
     """Of the header these keys count beside those of the layout: `wavelength` and `wavelength units`, `spectra names`,
     `reflectance scale factor` (values are divided by it), `data ignore value`, and `bbl`, whose bad bands are gaps."""
     header_path = path if path.suffix.lower() == ".hdr" else path.with_suffix(".hdr")
-    header = read_header(header_path)
+    header = _header_of_spectra(header_path)
     layout = read_layout({**header, "file type": "", "bands": "1", "interleave": "bsq"})
     num_spectra, num_bands, _ = layout.shape
     data_path = data_beside(header_path, layout.num_bytes, ".sli")
