@@ -16,7 +16,7 @@ from unmix_plugin.products.render.job import needs_survey, take_survey
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.features import continuum_removed, derivative_matrix
 from unmix_plugin.trained.model_scene import model_scene
-from unmix_plugin.trained.outputs import OUTPUTS, MaterialView
+from unmix_plugin.trained.outputs import OUTPUTS, MaterialView, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 
 SCENE = make_scene(light=[0.5, 0.7, 1.0, 0.9, 0.6])
@@ -53,6 +53,18 @@ def test_an_output_has_the_shape_and_the_values_that_it_promises(view, name):
     if output.kind in ("map", "shares") and output.value_range is None:  # it gets one from the views
         assert needs_survey([output])
         assert name in take_survey(SCENE, SCENE.views, [output]).scales
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_range_of_colours_follows_the_unit_of_lengths(unit):
+    low, high = usual_range(
+        torch.cat([unit * torch.linspace(1, 2, 101), torch.tensor([torch.nan, torch.inf])])
+    )
+    assert (low / unit, high / unit) == pytest.approx((1.01, 1.99))
+    same = usual_range(torch.full((5,), unit))
+    assert same[1] > same[0]
+    assert usual_range(torch.ones(3), low_at_most=0.0) == (0.0, 1.0)
+    assert usual_range(torch.full((3,), torch.nan)) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize(

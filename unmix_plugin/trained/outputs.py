@@ -5,6 +5,7 @@ Notation: `H x W` pixels, `B` bands, `K` endmembers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -343,6 +344,16 @@ def find_output(name: str, materials: Materials) -> MaterialOutput:
     if not argument:
         raise ConfigError(f"the output {prefix} needs {family.needs}, as in {family.example}")
     return family.make(name, argument, materials)
+
+
+def usual_range(values: Float[Tensor, "*values"], low_at_most: float = math.inf) -> tuple[float, float]:
+    """From the 1st percentile of what is known, or `low_at_most` if that is less, to the 99th; never empty."""
+    known = values[values.isfinite()].float()
+    if len(known) == 0:
+        return 0.0, 1.0
+    low, high = torch.quantile(known, known.new_tensor([0.01, 0.99])).tolist()
+    low = min(low, low_at_most)
+    return low, high if high - low > 1e-6 * max(abs(low), abs(high)) else low + max(1.0, abs(low))
 
 
 def available_outputs(materials: Materials) -> tuple[MaterialOutput, ...]:

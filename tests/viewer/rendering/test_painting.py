@@ -302,11 +302,3 @@ def test_odd_formulas_still_have_a_scale_and_a_short_label(frame, aids):
 def test_what_cannot_be_shown_says_why(frame, aids, layer, index, error, message):
     with pytest.raises(error, match=message):
         painted(frame, aids, layer, index=index)
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
-def test_the_range_of_colours_follows_the_unit_of_lengths(unit):
-    low, high = painting._percentile_range(unit * torch.linspace(1, 2, 101))
-    assert (low / unit, high / unit) == pytest.approx((1.01, 1.99))
-    same = painting._percentile_range(torch.full((5,), unit))
-    assert same[1] > same[0]

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from unmix_plugin.engine.geometry.cameras import Cameras
@@ -45,6 +44,7 @@ from unmix_plugin.products.render.pictures import Palette, scale_of
 from unmix_plugin.spectral.bands import Bands
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.subspace import PcaColours
+from unmix_plugin.trained.outputs import usual_range
 from unmix_plugin.trained.protocol import RenderableScene
 from unmix_plugin.trained.reflectance_maps import Score, is_reflectance_map, parse_reflectance_map
 from unmix_plugin.trained.run_views import RunView
@@ -53,9 +53,6 @@ from unmix_plugin.trained.trained_scene import TrainedScene, one_pixel
 _MOST_VIEWS = 12
 _PIXELS = 32 * 32
 """Of a view looked at."""
-
-_RANGE = (0.01, 0.99)
-"""Quantiles of what is seen that the colours of a map go through."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,8 @@ def take_survey(
     spectra = ["spectral"] if is_mixed and (maps or has_pca) else []
     seen = _seen(scene, views, [*(output.name for output in ranged), *spectra])
     scales = {
-        output.name: scale_of(output, *_bounds(seen[output.name] * _units(output, info))) for output in ranged
+        output.name: scale_of(output, *usual_range(seen[output.name] * _units(output, info)))
+        for output in ranged
     }
     if not is_mixed or not spectra:
         return Survey(scales)
@@ -101,7 +99,7 @@ def take_survey(
     scores = {output.name: parse_reflectance_map(output.name, bands, lit).fit(reflectance) for output in maps}
     for output in maps:
         if output.value_range is None and output.kind == "map":
-            scales[output.name] = scale_of(output, *_bounds(scores[output.name](reflectance)))
+            scales[output.name] = scale_of(output, *usual_range(scores[output.name](reflectance)))
     return Survey(scales, PcaColours.fit(seen["spectral"]) if has_pca else None, scores)
 
 
@@ -132,15 +130,6 @@ def _seen(scene: RenderableScene, views: Sequence[RunView], outputs: Sequence[st
             found[name].append(looked[name][occupied].cpu())
         found["accumulation"].append(looked.opacity[occupied].cpu())
     return {name: torch.cat(parts) for name, parts in found.items()}
-
-
-def _bounds(values: Float[Tensor, "..."]) -> tuple[float, float]:
-    """Between which values nearly all of them lie."""
-    known = values[values.isfinite()].double()
-    if len(known) == 0:
-        return 0.0, 1.0
-    low, high = torch.quantile(known, torch.tensor(_RANGE, dtype=torch.float64)).tolist()
-    return low, max(high, low + 1e-6)
 
 
 _PATH_FPS, _VIEWS_FPS = 24.0, 2.0

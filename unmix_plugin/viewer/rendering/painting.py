@@ -35,7 +35,7 @@ from unmix_plugin.spectral.colour.conversion import (
 )
 from unmix_plugin.spectral.materials import OCCUPIED_ACCUMULATION
 from unmix_plugin.spectral.segmentation import NOTHING_ID
-from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView
+from unmix_plugin.trained.outputs import FAMILIES, OUTPUTS, MaterialView, usual_range
 from unmix_plugin.trained.protocol import RenderableScene, RenderedView
 from unmix_plugin.trained.reflectance_maps import parse_reflectance_map
 from unmix_plugin.trained.trained_scene import TrainedScene
@@ -124,15 +124,6 @@ def legend_html(shown: Legend) -> str:
     )
 
 
-def _percentile_range(values: Float[Tensor, "N"], low_at_most: float = math.inf) -> tuple[float, float]:
-    """From the 1st percentile, or `low_at_most` if that is less, to the 99th; never empty."""
-    if len(values) == 0:
-        return (0.0, 1.0)
-    low, high = torch.quantile(values.float(), values.new_tensor([0.01, 0.99]).float()).tolist()
-    low = min(low, low_at_most)
-    return (low, high if high - low > 1e-6 * max(abs(low), abs(high)) else low + 1.0)
-
-
 _Painter = Callable[[Any, LayerSettings, Any], tuple[_Picture, Legend]]
 """From a rendered view, of the kind of scene that has the layer, and what layers need of the run."""
 
@@ -179,7 +170,7 @@ def _layer_of(output: Output) -> _Layer:
             seen = values[is_known & (opacity > OCCUPIED_ACCUMULATION)]
             # Opacity itself is shown everywhere, also where there is little of it.
             part = is_known.to(opacity) if output.name == "accumulation" else opacity * is_known
-            scale = output.value_range or _percentile_range(seen)
+            scale = output.value_range or usual_range(seen)
             return _paint_scaled(values, part, settings, scale, output.what)
         palette = torch.from_numpy(id_colours()).to(opacity)
         if kind == "labels":
@@ -257,7 +248,7 @@ def _paint_index(frame: MaterialView, settings: LayerSettings, aids: LayerAids) 
     scale = settings.value_range or asked.usual_range
     if scale is None:
         seen = index(materials.reflectance(aids.reference))
-        scale = _percentile_range(seen[seen.isfinite()])
+        scale = usual_range(seen)
     label = asked.what if len(asked.what) <= _LONGEST_LABEL else f"{asked.what[:_LONGEST_LABEL]}..."
     label += "" if materials.is_light_known else "; of radiance: light unknown"
     if bool((frame.opacity > OCCUPIED_ACCUMULATION).any()) and not bool(values.isfinite().any()):
@@ -295,7 +286,7 @@ def _paint_band(frame: MaterialView, settings: LayerSettings, aids: LayerAids) -
     column = torch.eye(len(bands))[:, band : band + 1]
     reference = _unpremultiplied(materials.through(aids.reference, column), aids.reference.accumulation)
     values = _unpremultiplied(materials.through(frame.coefficients, column), frame.coverage)[..., 0]
-    scale = _percentile_range(reference[:, 0], low_at_most=0.0)
+    scale = usual_range(reference[:, 0], low_at_most=0.0)
     label = f"{materials.quantity} at {bands.centers_nm[band]:.0f} nm"
     return _paint_scaled(values, frame.coverage, settings, scale, label)
 
