@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from unmix_plugin.commands import reporting
-from unmix_plugin.commands.reporting import announce_kernel_compilation
+from unmix_plugin.commands.reporting import announce_kernel_compilation, shell_line
 from unmix_plugin.operators.launching import warp
 
 
@@ -22,3 +22,16 @@ def test_compiling_is_said_only_when_a_kernel_is_not_in_the_cache(tmp_path, monk
             (tmp_path / "wp_module_new").mkdir()
             assert is_said.wait(120)
     assert out.getvalue().count("compiling kernels") == compiles
+
+
+@pytest.mark.parametrize(
+    ("is_windows", "folder", "written"),
+    [
+        (False, "my run", "'my run'"),
+        (True, r"C:\my run", r'"C:\my run"'),
+        (True, r"C:\run", r"C:\run"),
+    ],
+)
+def test_printed_commands_are_quoted_as_the_system_takes_them(monkeypatch, is_windows, folder, written):
+    monkeypatch.setattr(reporting, "_IS_WINDOWS", is_windows)
+    assert shell_line("unmix-view", "--run", folder) == f"unmix-view --run {written}"

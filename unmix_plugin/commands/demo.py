@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +28,7 @@ def demo(arguments: list[str]) -> None:
 
     from unmix_plugin.commands.eval import evaluate
     from unmix_plugin.commands.export import export
+    from unmix_plugin.commands.reporting import shell_line
     from unmix_plugin.commands.train import train
     from unmix_plugin.engine.runs.run_folder import newest_run
 
@@ -42,4 +42,4 @@ def demo(arguments: list[str]) -> None:
     export(["page", *words, "--resolution", "160"])
     print(f"\npictures: {run.eval} (true, predicted, error) and {run.exports} (abundance maps)")
     print(f"in 3-D, to open in a browser or to mail: {run.exports / 'page' / 'page.html'}")
-    print(f"look around in it: {shlex.join(['unmix-view', '--run', str(run.path)])}")
+    print(f"look around in it: {shell_line('unmix-view', '--run', run.path)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -55,6 +54,7 @@ def write_demo_scene(arguments: list[str]) -> None:
 
 
 def _write_scene(options: _DemoSceneOptions) -> None:
+    from unmix_plugin.commands.reporting import shell_line
     from unmix_plugin.scenes.demo.scene import (
         DEFAULT_BANDS,
         DEFAULT_SIZE,
@@ -84,7 +84,7 @@ def _write_scene(options: _DemoSceneOptions) -> None:
         ("illuminant.csv", "the lamp's spectrum"),
     ):
         print(f"  {folder / name}  {content}")
-    print(f"train on it: {shlex.join(['unmix-train', 'unmix-nerf', '--data', str(folder)])}")
+    print(f"train on it: {shell_line('unmix-train', 'unmix-nerf', '--data', folder)}")
 
 
 def _write_capture(options: _DemoSceneOptions) -> None:
@@ -99,7 +99,7 @@ def _write_capture(options: _DemoSceneOptions) -> None:
         make_demo_capture,
         marked_place,
     )
-    from unmix_plugin.commands.reporting import CommandConsole, follow
+    from unmix_plugin.commands.reporting import CommandConsole, follow, shell_line
     from unmix_plugin.spectral.colour.conversion import parse_light
 
     folder, started = options.directory, time.perf_counter()
@@ -120,10 +120,10 @@ def _write_capture(options: _DemoSceneOptions) -> None:
         ("truth", "true materials of each pixel and their reflectances, the lamp's spectrum"),
     ):
         print(f"  {folder / name}  {content}")
-    words = ["unmix-process", "cubes", "--data", str(folder), "--output-dir", "SCENE"]
-    words += ["--white", str(folder / "white.hdr"), "--dark", str(folder / "dark.hdr"), "--poses"]
-    marked = ["markers", "--marker-size", str(MARKER_SIZE), "--marker-family", MARKER_FAMILY]
-    print(f"make a scene of it: {shlex.join([*words, *(marked if options.markers else ['estimate'])])}")
+    words = ["unmix-process", "cubes", "--data", folder, "--output-dir", "SCENE"]
+    words += ["--white", folder / "white.hdr", "--dark", folder / "dark.hdr", "--poses"]
+    marked = ["markers", "--marker-size", MARKER_SIZE, "--marker-family", MARKER_FAMILY]
+    print(f"make a scene of it: {shell_line(*words, *(marked if options.markers else ['estimate']))}")
 
 
 def _numbers(options: _DemoSceneOptions, defaults: tuple[int, int, int]) -> tuple[int, ...]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -16,6 +19,15 @@ from unmix_plugin.engine.runs.run_folder import newest_run
 if TYPE_CHECKING:
     from unmix_plugin.engine.model import DataManager
     from unmix_plugin.scenes.scene import Scene
+
+
+_IS_WINDOWS = os.name == "nt"
+
+
+def shell_line(*words: object) -> str:
+    """A command to paste: shells of Windows take double quotes alone."""
+    texts = [str(word) for word in words]
+    return subprocess.list2cmdline(texts) if _IS_WINDOWS else shlex.join(texts)
 
 
 def chosen_run(run: Path | None, output_dir: Path) -> Path:

@@ -5,7 +5,6 @@ Arguments are settings of the method, or of the run to go on with, changed by wh
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -127,6 +126,7 @@ def train(argv: list[str]) -> None:
         return
     config, viewing = parse(argv)
 
+    from unmix_plugin.commands.reporting import shell_line
     from unmix_plugin.engine.processes import start_together
     from unmix_plugin.engine.training.progress import ProgressConsole
     from unmix_plugin.engine.training.steps import follow_training, joined_training
@@ -145,7 +145,7 @@ def train(argv: list[str]) -> None:
             except Interrupted as stop:
                 print(stop, file=sys.stderr)
                 if stop.step is not None:
-                    resume = shlex.join([_PROGRAM, config.method_name, "--load-run", str(stop.run)])
+                    resume = shell_line(_PROGRAM, config.method_name, "--load-run", stop.run)
                     print(f"go on with: {resume}", file=sys.stderr)
                 print(f"run: {stop.run}", flush=True)
                 sys.exit(INTERRUPTED)
