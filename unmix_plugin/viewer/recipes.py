@@ -53,9 +53,8 @@ class RecipeHistory:
         now, (last_subject, changed_at) = self._clock(), self._last_change
         goes_on = subject is not None and subject == last_subject and now - changed_at <= _ONE_EDIT_S
         before = self._recipes[: self._index if goes_on else self._index + 1]
-        if before[-1:] == [
-            recipe
-        ]:  # dragged to where it was: nothing to undo, and the next change is its own
+        # Dragged to where it was, it leaves nothing to undo, and the next change is its own.
+        if before[-1:] == [recipe]:
             del before[-1]
             subject = None
         self._recipes = [*before[-_MOST_UNDONE:], recipe]
