@@ -105,9 +105,10 @@ def test_channels_without_wavelengths_are_bands_without_them(tmp_path):
     check_file(open_spectral_file(tmp_path / "a.exr"), names=["s0", "s1"], nm=None)
     named = open_spectral_file(tmp_path / "a.exr", ReadOptions(dataset="s1"))
     check_file(named, values=channels["s1"][..., None])
-    channels = write_random(tmp_path / "rgb.exr", ["R", "G", "B"])
-    colours = np.stack([channels[name] for name in "RGB"], axis=-1)
-    check_file(open_spectral_file(tmp_path / "rgb.exr"), values=colours)
+    for names in ("RGB", [f"View.Combined.{name}" for name in "RGB"], ["key.red", "key.green", "key.blue"]):
+        channels = write_random(tmp_path / "rgb.exr", list(names))
+        colours = np.stack([channels[name] for name in names], axis=-1)
+        check_file(open_spectral_file(tmp_path / "rgb.exr"), values=colours)
     write_random(tmp_path / "counted.exr", ["1", "2", "3"])
     check_file(open_spectral_file(tmp_path / "counted.exr"), nm=None)
 

@@ -45,7 +45,7 @@ _RANGE = re.compile(rf"{_LAYER}{_NUMBER} ?- ?{_NUMBER} ?nm")
 _PLAIN = re.compile(rf"{_LAYER}{_NUMBER}")
 _METRES_PER_SECOND = 299_792_458.0
 _ALPHA = ("A", "alpha")
-_COLOURS = ("R", "G", "B")
+_COLOURS = (("R", "G", "B"), ("red", "green", "blue"))
 _OF_ALL_FILES = ("pixelAspectRatio", "screenWindowWidth")
 _DAMAGED = "can't be read as OpenEXR, copy the file again"
 LAYERS = ("S0", "T", "")
@@ -207,7 +207,7 @@ def _choose(
     if not spectral:
         own = [channel.name for channel in channels if channel.part == channels[0].part]
         bands = [name for name in own if name.rpartition(".")[2] not in _ALPHA] or own
-        bands.sort(key=lambda name: (_COLOURS.index(name) if name in _COLOURS else -1, natural_order(name)))
+        bands = _in_order(bands)
         found, table = wavelengths_in_names(bands), BandTable(names=tuple(bands))
         if found is not None:
             evidence = f"names of channels, such as {bands[0]!r}: {found[1]}"
@@ -230,6 +230,23 @@ def _choose(
         same = f"{len(repeated)} other parts have the same ones"
         warnings.append(f"wavelengths of the first part are taken; {same} (--dataset)")
     return table, chosen
+
+
+def _in_order(names: Sequence[str]) -> list[str]:
+    """By name, but red, green and blue of each layer in this order, behind all that is no colour.
+
+    >>> _in_order(["Z", "a.B", "a.G", "a.R", "B"])
+    ['B', 'Z', 'a.R', 'a.G', 'a.B']
+    """
+
+    def place(name: str) -> tuple[int, list[tuple[int, str]], int]:
+        layer, dot, last = name.rpartition(".")
+        for colours in _COLOURS:
+            if last in colours and {layer + dot + one for one in colours} <= {*names}:
+                return 1, natural_order(layer), colours.index(last)
+        return 0, natural_order(name), 0
+
+    return sorted(names, key=place)
 
 
 def _spectral_channels(names: Sequence[str]) -> list[_SpectralChannel]:
