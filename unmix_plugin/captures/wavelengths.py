@@ -38,8 +38,8 @@ _LONGEST_NAME = 1000
 """Longer texts are no names, and looking for counters in them takes long."""
 _COUNTER = re.compile(r"(?:bands?|b|ch|channel|frame|img|image|view|page|dsc|#)[ _-]*$", re.I)
 """What precedes a number that counts instead of measuring."""
-_OTHER_UNIT = re.compile(r" ?(?:cm|mm|[muµμ]s|[kmgt]?hz)(?![a-z])", re.I)
-"""What follows a wavenumber, a length, a time or a frequency, which are no wavelengths in nm."""
+_OTHER_UNIT = re.compile(r" ?(?:cm|[muµμ]m|microns?|[muµμ]s|[kmgt]?hz)(?![a-z])", re.I)
+"""What follows a wavenumber, a length, a time or a frequency, which are no wavelengths in nm; 0.45um is read before."""
 _USUAL_NM = (200.0, 3000.0)
 """What a number without a unit must lie in to be taken for nm."""
 PLAUSIBLE_NM = (100.0, 30_000.0)

@@ -108,6 +108,7 @@ SAID: dict[str, dict[str, Any]] = {
     "band names = {1 nm, 2 nm, 3 nm, 4 nm}": {"nm": None},
     "band names = {Band 201, Band 202, Band 203, Band 204}": {"nm": None},
     "band names = {400 cm-1, 500 cm-1, 600 cm-1, 700 cm-1}": {"nm": None},
+    "band names = {grain 350um, grain 450um, grain 550um, grain 650um}": {"nm": None},
     "band names = {400_200ms, 500_300ms, 600 2THz, 700_400 \u00b5s}": {"nm": NM},
     "band names = {a, b, c, d}": {"nm": None, "names": "abcd"},
     "band names = {450 nm, 460 nm, red, 480 nm}": {"nm": None},
