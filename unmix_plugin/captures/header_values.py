@@ -154,7 +154,7 @@ def state_linear(
         where: What entries are, for people.
         pairs: Plain names of gains and of offsets; those of an earlier pair go before others.
     Raises:
-        CaptureError: they are no numbers, impossible, or there is a factor beside gains.
+        CaptureError: they are no numbers, impossible, or there is a factor beside gains or a large offset.
     """
     named, found, has_gains = plain_names(entries), [], False
     for pair in pairs:
@@ -174,10 +174,11 @@ def state_linear(
     factors = _factors(key, entries.get(key, "1"), warnings)
     if set(factors) == {1.0}:
         return found[0] if found else None
-    if has_gains:
+    # An offset above 1 is one of stored numbers, not of reflectances, to which the factor leads.
+    if has_gains or (found and np.abs(found[0].offsets).max() > 1):
         raise CaptureError(
-            f"{path}: has '{key}' {factors[0]:g} and other gains ({found[0].evidence}); take one out of the file, as "
-            "it is unclear which the numbers need"
+            f"{path}: has '{key}' {factors[0]:g} and other gains, or an offset above 1 ({found[0].evidence}); take one "
+            "out of the file, as it is unclear which the numbers need"
         )
     offsets, said = (found[0].offsets.tolist(), f"{found[0].evidence} and") if found else ([], where)
     return linear_values(path, num_bands, [1 / factor for factor in factors], offsets, f"{said} '{key}'")

@@ -211,6 +211,7 @@ def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding
         ({"data gain values": "{1, 2, x, 1}"}, "'data gain values' has 'x'"),
         ({"data gain values": "{1, 0, 2, 1}"}, "gains from 0 to 2; expected finite numbers above 0"),
         ({"data gain values": "2\nreflectance scale factor = 10000"}, "it is unclear which the numbers need"),
+        ({"data offset values": "-1000\nreflectance scale factor = 10000"}, "an offset above 1"),
     ],
 )
 def test_headers_that_cannot_be_followed_are_refused(tmp_path, change, message):
