@@ -100,6 +100,15 @@ def test_too_little_memory_is_the_users_error_with_what_to_do(capsys, error):
     assert "bug" not in shown
 
 
+def test_a_home_folder_that_the_shell_left_to_us_is_meant(monkeypatch):
+    seen = []
+    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.setenv("USERPROFILE", "/home/me")
+    given = ["--data=~/a b", "~/c", "~", "a~/b", "--x=a=~/b", "~b", "index:r1/~"]
+    assert end_of(seen.extend, given) == 0
+    assert seen == ["--data=/home/me/a b", "/home/me/c", "/home/me", *given[3:]]
+
+
 def test_a_message_moves_no_cursor(capsys):
     assert end_of(raising(SceneError("band \x1b[31mred\r\x9b1A\tof\na.hdr: grün"))) == 2
     assert capsys.readouterr().err == "error: band ?[31mred??1A\tof\na.hdr: grün\n"

@@ -226,4 +226,6 @@ def test_several_runs_are_compared_in_one_table(run_copy, tmp_path):
         (["--run", run_copy, other], "either with --run or without it"),
         ([run_copy, tmp_path / "nothing"], "no run folder at"),
     ):
+        shutil.rmtree(run_copy / "eval", ignore_errors=True)
         assert said in refused(evaluate, *words)
+        assert not (run_copy / "eval").exists()  # the first is not evaluated in vain

@@ -246,6 +246,10 @@ def test_a_report_quotes_the_figures_that_eval_found_and_links_to_the_page(solid
     assert '<a href="../50%20%25%20%231/exports/page/page.html">in 3-D</a>' in page
     assert "eval/metrics.json" in page
     assert "12.34" in page
+    (moved / "eval" / "metrics.json").write_text('{"psnr": 12.34, "train_seconds": 1e-9, "definitions": {}}')
+    ended = done(export, *words("report", "--run", moved, *out))
+    assert "metrics.json is of an earlier state of the run, and left out" in ended.out
+    assert "12.34" not in (tmp_path / "out" / "report.html").read_text()
     # On Windows, there is no relative path to another drive.
     monkeypatch.setattr("os.path.relpath", Mock(side_effect=ValueError("path is on mount 'C:'")))
     done(export, *words("report", "--run", moved, *out))

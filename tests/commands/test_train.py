@@ -202,6 +202,19 @@ def test_what_acts_at_the_start_alone_is_refused_where_a_run_goes_on(run_copy, f
     assert (run_copy / "config.json").read_bytes() == before
 
 
+def test_a_run_goes_on_in_its_own_folder_alone(run_copy, tmp_path):
+    words = [
+        "unmix-nerf",
+        "--load-run",
+        run_copy,
+        "--max-num-iterations",
+        21,
+        "--output-dir",
+        tmp_path / "copy-of-it",
+    ]
+    assert "--output-dir is " in refused(train, *words)
+
+
 def test_a_run_of_another_method_is_not_gone_on_with(run_copy):
     with pytest.raises(ConfigError, match="is a run of unmix-nerf, not of neumatex"):
         parse(["neumatex", "--load-run", str(run_copy)])

@@ -60,7 +60,7 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
     Raises:
         SystemExit: always, with the exit code; one that the command raises (the parser's 0 or 2) passes through.
     """
-    argv = list(sys.argv[1:] if arguments is None else arguments)
+    argv = [_at_home(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     is_debug = "--debug" in argv
     interrupts: list[int] = []
     try:
@@ -79,6 +79,11 @@ def run_command(command: Callable[[list[str]], object], arguments: Sequence[str]
         _say(message, is_debug)
         sys.exit(status)
     sys.exit(DONE)
+
+
+def _at_home(word: str) -> str:
+    """A word in which `~` is the home folder where the shell left it alone: in quotes, and behind `--flag=`."""
+    return re.sub(r"^((?:--[\w.-]+=)?)~(?=/|\Z)", lambda found: found[1] + os.path.expanduser("~"), word)  # noqa: PTH111
 
 
 def _ready_streams() -> None:

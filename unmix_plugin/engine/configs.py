@@ -163,7 +163,7 @@ class TrainerConfig:
     """Name under which the method is registered."""
     data: Annotated[Path | None, Common] = None
     """The scene's folder."""
-    output_dir: Annotated[Path, Common] = Path("outputs")
+    output_dir: Annotated[Path, Common, AtStart] = Path("outputs")
     """Folder under which the run's own folder is made."""
     max_num_iterations: Annotated[int | None, Common] = 20_000
     """Training ends after so many steps (None: no such limit)."""

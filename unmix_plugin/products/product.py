@@ -162,7 +162,10 @@ class Job:
         with self.working("looking for the scene"):
             scene = find_scene(self.loaded.record.summary, self.loaded.folder.path, data)
         if scene is None:
-            self.say("the scene folder was not found: nothing measured is shown; give it with --data")
+            place = self.loaded.record.summary.get("root")
+            self.say(
+                f"no scene, or no longer the same, at {place}: nothing measured is shown; name it with --data"
+            )
         return scene
 
     def render(self, view: RunView) -> PredictedView:

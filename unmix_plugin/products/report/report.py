@@ -116,6 +116,9 @@ def _stored_figures(job: Job) -> dict[str, Any] | None:
     words = found.get("definitions", {}) if isinstance(found, dict) else None
     if not isinstance(words, dict) or not all(isinstance(found.get(name), figure) for name in DEFINITIONS):
         raise RunError(f"{path} is not what unmix-eval writes; run it again, or remove the file")
+    if found.get("train_seconds") not in (None, job.loaded.training.train_seconds):
+        job.say(f"{path} is of an earlier state of the run, and left out; run unmix-eval again")
+        return None
     return found
 
 
