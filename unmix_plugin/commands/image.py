@@ -126,7 +126,8 @@ def _fractions(cube: np.ndarray, mask: np.ndarray, count: int) -> NoiseFractions
 
     from unmix_plugin.spectral.features import minimum_noise_fractions
 
-    if not 0 <= count <= (num_bands := cube.shape[2]):
+    num_bands = cube.shape[2]
+    if not 0 <= count <= num_bands:
         raise ConfigError(f"--mnf is {count}; expected 1 to {num_bands}, one a band at most, or 0 for none")
     numbers = torch.from_numpy(np.where(mask[..., None], cube, 0).astype(np.float64))
     return minimum_noise_fractions(numbers, torch.from_numpy(mask), count) if count else None
