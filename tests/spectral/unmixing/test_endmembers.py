@@ -61,6 +61,7 @@ def test_endmembers_lie_in_the_unit_box_and_are_as_bright_as_lit_pixels(method):
     assert float(ratio.max()) < 1.05
 
 
+@pytest.mark.usefixtures("few_searches")
 @pytest.mark.parametrize("method", METHODS)
 def test_dark_and_saturated_pixels_have_no_say(method):
     pixels, _ = shaded_scene(3)
@@ -98,6 +99,7 @@ def test_what_no_endmembers_can_be_found_in_is_refused(method, pixels, count, sa
         initialise_endmembers(pixels, count, method, seeded())
 
 
+@pytest.mark.usefixtures("few_searches")
 @pytest.mark.parametrize("method", METHODS)
 def test_many_pixels_are_thinned_by_the_generator(method, monkeypatch):
     pixels, _ = shaded_scene(3)

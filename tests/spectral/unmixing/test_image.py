@@ -45,6 +45,7 @@ def test_the_misfit_of_an_exact_mixture_is_0():
     assert unmix_image((shade * smooth_endmembers(1)[0].float()).numpy(), 1).misfit.max() < 1e-5
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_an_image_that_spy_loaded_is_unmixed_as_the_array_of_its_numbers(tmp_path):
     cube = image_of(smooth_endmembers(3)).astype(np.float32)
     envi.save_image(str(tmp_path / "a.hdr"), cube)
@@ -65,6 +66,7 @@ def test_confidence_is_high_where_a_pixel_is_pure_and_low_at_a_tie():
     assert np.median(found[1400:]) < 0.6
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_shares_of_area_and_of_light_differ_by_the_brightness_of_materials():
     bright, dark = smooth_endmembers(2)
     share = torch.linspace(0, 1, 1600, dtype=torch.float64)[:, None]
@@ -78,6 +80,7 @@ def test_shares_of_area_and_of_light_differ_by_the_brightness_of_materials():
     assert shone.max() > own.max() + 0.2
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_pixels_outside_of_the_mask_take_no_part():
     cube = image_of(smooth_endmembers(3))
     mask = np.ones((40, 40), bool)
@@ -89,6 +92,7 @@ def test_pixels_outside_of_the_mask_take_no_part():
     np.testing.assert_array_equal(found.abundances[5:], unmix_image(cube, 3, mask=mask).abundances[5:])
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_what_an_array_masks_takes_no_part_though_its_numbers_are_finite():
     stored = np.round(image_of(smooth_endmembers(3)) * 10_000).astype(np.uint16)
     hole = np.zeros((40, 40), bool)

@@ -38,6 +38,7 @@ def test_materials_are_found_among_smooth_mixtures_and_among_edges_whatever_the_
         assert worst_angle(first, second) < 0.02
 
 
+@pytest.mark.usefixtures("few_searches")
 def test_spectra_have_length_one_and_the_best_sets_the_same_order():
     pixels = mixed_pixels(smooth_endmembers(3), 800, seed=0).float()
     found = pooled_search(pixels, 3, seeded())
