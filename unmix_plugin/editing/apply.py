@@ -64,12 +64,7 @@ from unmix_plugin.field import CoefficientField
 from unmix_plugin.figures.plotting import css_colour
 from unmix_plugin.formats.libraries import read_library
 from unmix_plugin.spectral.bands import Bands
-from unmix_plugin.spectral.colour.conversion import (
-    brightness,
-    covered_bands,
-    illuminant_power,
-    rgb_matrix,
-)
+from unmix_plugin.spectral.colour.conversion import brightness, covered_bands, illuminant_power, rgb_matrix
 from unmix_plugin.spectral.library.material_library import (
     DARK_LIGHT,
     MaterialLibrary,

@@ -105,9 +105,7 @@ def appearance_of(state: MaterialState, index: int) -> Appearance | None:
     spectra = others @ state.spectra + specular @ state.mirrored()[0]
     shares = _rows(seen.abundances[..., index] / seen.accumulation, is_its)
     return Appearance(
-        scaled[:, index],
-        spectra @ rgb_matrix(state.bands, torch.float64).numpy(),
-        shares**_PURITY_EXPONENT,
+        scaled[:, index], spectra @ rgb_matrix(state.bands, torch.float64).numpy(), shares**_PURITY_EXPONENT
     )
 
 

@@ -29,12 +29,7 @@ from unmix_plugin.viewer.page import failures_said, number, paragraph
 from unmix_plugin.viewer.recipes import RecipeHistory, numbered
 from unmix_plugin.viewer.rendering.captures import VideoQueue
 from unmix_plugin.viewer.rendering.painting import legend_html
-from unmix_plugin.viewer.rendering.pictures import (
-    DEFAULT_HEIGHT,
-    HEIGHT_BOUNDS,
-    PictureMaker,
-    Shown,
-)
+from unmix_plugin.viewer.rendering.pictures import DEFAULT_HEIGHT, HEIGHT_BOUNDS, PictureMaker, Shown
 from unmix_plugin.viewer.rendering.regions import RunRegions
 from unmix_plugin.viewer.rendering.render_loop import RenderLoop, View
 from unmix_plugin.viewer.rendering.scene import Edit, MeasuredViews, SceneSource, usable_views
