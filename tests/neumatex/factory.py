@@ -28,6 +28,7 @@ CENTRE = np.array([0.3, -0.2, 1.5])
 RADIUS = 0.5
 DISTANCE = 3.0
 LENS_PX = 60.0
+Colour = tuple[float, ...]
 COLOUR = (0.5, 0.3, 0.1)
 WAVELENGTHS = [450.0, 500.0, 550.0, 600.0, 650.0]
 LAMP = np.array([0.4, 0.6, 0.8, 1.0, 0.9])
@@ -75,9 +76,7 @@ def write_light(folder: Path, sky: float) -> Path:
     return write_exr(folder / "environment.exr", dict.fromkeys("RGB", np.full((8, 16), sky, np.float32)), {})
 
 
-def write_views(
-    folder: Path, suffix: str, colour: tuple[float, ...], count: int = NUM_VIEWS, **extra: Any
-) -> None:
+def write_views(folder: Path, suffix: str, colour: Colour, count: int = NUM_VIEWS, **extra: Any) -> None:
     """Pictures of the ball in one colour, with alpha, and their transforms.json."""
     names = [f"images/{index:03d}{suffix}" for index in range(count)]
     for name in names:
@@ -85,7 +84,7 @@ def write_views(
     _write_transforms(folder, [{"file_path": name} for name in names], **extra)
 
 
-def write_picture(path: Path, colour: tuple[float, ...], lit_rows: int = SIZE) -> None:
+def write_picture(path: Path, colour: Colour, lit_rows: int = SIZE) -> None:
     """The ball's silhouette filled with a colour; all but the upper `lit_rows` nearly black."""
     path.parent.mkdir(parents=True, exist_ok=True)
     side = np.arange(SIZE) + 0.5 - SIZE / 2
@@ -121,14 +120,11 @@ def write_cubes(folder: Path, count: int, sky: float, **extra: Any) -> None:
 
 def _write_transforms(folder: Path, frames: list[dict[str, Any]], **extra: Any) -> None:
     """Poses are evenly spread around the ball; keys that are None are left out."""
-    angles = np.linspace(0, 2 * math.pi, len(frames), endpoint=False)
-    posed = [
-        {**frame, "transform_matrix": pose(angle).tolist()}
-        for frame, angle in zip(frames, angles, strict=True)
-    ]
-    content = {"fl_x": LENS_PX, "frames": posed, **extra}
-    content = {key: value for key, value in content.items() if value is not None}
-    (folder / "transforms.json").write_text(json.dumps(content))
+    for index, frame in enumerate(frames):
+        frame["transform_matrix"] = pose(2 * math.pi * index / len(frames)).tolist()
+    content = {"fl_x": LENS_PX, "frames": frames, **extra}
+    known = {key: value for key, value in content.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(known))
 
 
 def pose(angle: float) -> np.ndarray:

@@ -33,33 +33,20 @@ BATCHES = [[], [0], [1], [3, 0, 2], [0, 0, 40, 1, 0], [2] * 600]
 
 @pytest.mark.parametrize("counts", BATCHES)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_weights_and_their_gradient_agree_with_the_twin(counts, dtype, device):
-    optical_depths, _, packed_info = make(counts, dtype)
-    tau, packed_info = optical_depths.to(device).requires_grad_(), packed_info.to(device)
-    actual, expected = volume_weights(tau, packed_info), volume_weights_twin(tau, packed_info)
+@pytest.mark.parametrize("twins", [(volume_weights, volume_weights_twin), (accumulate, accumulate_twin)])
+def test_weights_totals_and_their_gradients_agree_with_the_twins(twins, counts, dtype, device):
+    depths, values, packed_info = (x.to(device) for x in make(counts, dtype))
+    are_weights = twins[0] is volume_weights
+    inputs = [x.requires_grad_() for x in ((depths,) if are_weights else (depths, values))]
+    actual, expected = (function(*inputs, packed_info) for function in twins)
     # In float32 the twin's running sum over all rays loses digits that the kernel, which sums ray by ray, has.
-    rtol, atol = (1e-3, 1e-4) if dtype == torch.float32 else (1e-9, 1e-12)
+    of_weights = {torch.float32: (1e-3, 1e-4), torch.float64: (1e-9, 1e-12)}
+    rtol, atol = of_weights[dtype] if are_weights else (None, None)
     assert_close(actual, expected, rtol=rtol, atol=atol)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
-        device
-    )
-    found, wanted = (torch.autograd.grad(w, tau, cotangent)[0] for w in (actual, expected))
+    drawn = torch.Generator().manual_seed(1)
+    cotangent = torch.randn(expected.shape, generator=drawn, dtype=dtype).to(device)
+    found, wanted = (torch.autograd.grad(one, inputs, cotangent) for one in (actual, expected))
     assert_close(found, wanted, rtol=rtol, atol=atol)
-
-
-@pytest.mark.parametrize("counts", BATCHES)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_totals_and_their_gradients_agree_with_the_twin(counts, dtype, device):
-    weights, values, packed_info = (x.to(device) for x in make(counts, dtype))
-    for tensor in (weights, values):
-        tensor.requires_grad_()
-    actual, expected = (f(weights, values, packed_info) for f in (accumulate, accumulate_twin))
-    assert_close(actual, expected)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
-        device
-    )
-    found = torch.autograd.grad(actual, (weights, values), cotangent)
-    assert_close(found, torch.autograd.grad(expected, (weights, values), cotangent))
 
 
 def test_gradients_are_those_of_finite_differences():
@@ -106,9 +93,8 @@ def test_behind_something_opaque_there_is_exactly_no_light():
     """Numbers between 0 and the smallest of normal exponent are a hundred times slower on a CPU than 0 itself."""
     tau = torch.full((200,), 1.0, requires_grad=True)
     weights = volume_weights(tau, pack([200]))
-    (gradient,) = torch.autograd.grad(
-        weights, tau, torch.randn(200, generator=torch.Generator().manual_seed(0))
-    )
+    cotangent = torch.randn(200, generator=torch.Generator().manual_seed(0))
+    (gradient,) = torch.autograd.grad(weights, tau, cotangent)
     for values in (weights.detach(), gradient):
         assert (values[:40] != 0).all()
         assert (values[60:] == 0).all()

@@ -29,9 +29,8 @@ def test_kernel_and_twin_agree_in_value_and_every_gradient(layout, num_samples, 
         tensor.requires_grad_()
     actual, expected = hash_encode(positions, table, layout), hash_encode_twin(positions, table, layout)
     assert_close(actual, expected)
-    cotangent = torch.randn(expected.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(
-        device
-    )
+    drawn = torch.Generator().manual_seed(1)
+    cotangent = torch.randn(expected.shape, generator=drawn, dtype=dtype).to(device)
     found = torch.autograd.grad(actual, (positions, table), cotangent)
     wanted = torch.autograd.grad(expected, (positions, table), cotangent)
     assert_close(found, wanted, rtol=1e-4, atol=1e-4)

@@ -39,11 +39,9 @@ def test_kernel_and_twin_take_the_same_samples(num_rays, sides, device):
         assert_close(samples.t, lattice[ray, indices], rtol=0, atol=2e-6)
         assert torch.equal(ray, torch.arange(num_rays, device=device).repeat_interleave(count))
         assert torch.equal(samples.packed_info[:, 0], count.cumsum(0) - count)
-        taken.append(
-            torch.zeros_like(lattice, dtype=torch.bool).index_put(
-                (ray, indices), torch.ones_like(ray, dtype=torch.bool)
-            )
-        )
+        is_taken = torch.zeros_like(lattice, dtype=torch.bool)
+        is_taken[ray, indices] = True
+        taken.append(is_taken)
     # A sample within rounding of a cell's face or of the far end may fall to either side.
     scaled = (o[:, None] + lattice[..., None] * d[:, None]) * torch.tensor(sides, device=device)
     is_clear = ((scaled - scaled.round()).abs() > 1e-4).all(-1) & ((lattice - t_far[:, None]).abs() > 1e-5)

@@ -11,15 +11,15 @@ def ball(points: torch.Tensor) -> torch.Tensor:
     return 100.0 * ((points - 0.5).norm(dim=-1) < 0.25)
 
 
-def updated(
-    grid: OccupancyGrid, density_fn, times: int = 1, num_cells=None, seed=0, block=1
-) -> OccupancyGrid:
-    generator = torch.Generator().manual_seed(seed)
+def updated(grid, density_fn, times=1, num_cells=None, seed=0, block=1):
+    threshold, decay, generator = 1.0, 0.5, torch.Generator().manual_seed(seed)
     for _ in range(times):
-        grid.update(
-            density_fn, threshold=1.0, decay=0.5, num_cells=num_cells, generator=generator, block=block
-        )
+        grid.update(density_fn, threshold, decay, num_cells, generator, block)
     return grid
+
+
+def nothing(points):
+    return torch.zeros(len(points))
 
 
 def full(side: int = 8) -> OccupancyGrid:
@@ -52,9 +52,9 @@ def test_what_is_emptied_later_stays_empty_and_all_else_is_as_it_was():
 def test_a_cell_is_forgotten_once_its_density_has_decayed_and_occupied_again_when_it_gains_some():
     grid = updated(full(4), lambda points: torch.full((len(points),), 8.0))
     assert grid.occupied.all()
-    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    updated(grid, nothing, times=2)
     assert grid.occupied.all()
-    updated(grid, lambda points: torch.zeros(len(points)), times=2)
+    updated(grid, nothing, times=2)
     assert not grid.occupied.any()
     updated(grid, ball, times=4)
     assert grid.occupied[1:3, 1:3, 1:3].all()
@@ -97,13 +97,13 @@ def test_cells_in_which_rays_met_nothing_are_empty_without_being_probed():
 
 def test_what_rays_met_counts_once_and_the_largest_in_a_cell():
     grid = OccupancyGrid(torch.ones(2, 2, 2) > 0, records_observed=True)
-    updated(grid, lambda points: torch.zeros(len(points)))
+    updated(grid, nothing)
     points = torch.tensor([[0.1, 0.1, 0.1], [0.2, 0.3, 0.1], [0.9, 0.9, 0.9]])
     grid.record_observed(points, torch.tensor([3.0, 8.0, 0.5]))
-    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    updated(grid, nothing, num_cells=0)
     assert float(grid.peak_densities[0, 0, 0]) == 8.0
     assert float(grid.peak_densities[1, 1, 1]) == 0.5
-    updated(grid, lambda points: torch.zeros(len(points)), num_cells=0)
+    updated(grid, nothing, num_cells=0)
     assert float(grid.peak_densities[0, 0, 0]) == 8.0
 
 
@@ -111,9 +111,9 @@ def test_cells_of_a_block_stay_while_one_of_them_is_dense():
     """Small cells are soon emptied by chance; blocks of them only where nothing was met in any."""
     for block, expected in ((1, 1), (2, 8), (3, 27)):
         grid = OccupancyGrid(torch.ones(5, 5, 5) > 0, records_observed=True)
-        updated(grid, lambda points: torch.zeros(len(points)))
+        updated(grid, nothing)
         grid.record_observed(torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([8.0]))
-        updated(grid, lambda points: torch.zeros(len(points)), num_cells=0, block=block)
+        updated(grid, nothing, num_cells=0, block=block)
         assert int(grid.occupied.sum()) == expected
 
 

@@ -188,6 +188,16 @@ def test_two_clicks_and_a_distance_set_the_scale_that_commands_read(viewer):
 @pytest.mark.slow
 def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
     source = make_source(tmp_path, initial_opacity=0.6)
+
+    def kept():
+        region = read_measures(source.run).regions["middle part"]
+        assert isinstance(region, InView)
+        return region
+
+    def area_of(region):
+        with source.borrowed_materials() as scene:
+            return MeasuredSurface.of(scene).measure(region, "").area
+
     with serving(source) as (viewer, _), opened(viewer) as page:
         options = lambda: page.props("region")["options"]  # noqa: E731
         page.set("keep the region")
@@ -204,14 +214,11 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.set("keep the region")
         page.wait_until(lambda: options() == ["none: choose one", "middle part"])
         page.wait_for_text(" square units</td>")
-        kept = read_measures(source.run).regions["middle part"]
-        assert isinstance(kept, InView)
-        rows, columns = np.nonzero(kept.mask())
-        height, width = kept.mask().shape
-        assert (rows.min() / height, columns.max() / width) == pytest.approx((0.4, 0.6), abs=0.01)
-        with source.borrowed_materials() as scene:
-            found = MeasuredSurface.of(scene).measure(kept, "")
-        assert f"{found.area:.4g} square units" in page.texts
+        mask, area = kept().mask(), area_of(kept())
+        rows, columns = np.nonzero(mask)
+        assert rows.min() / mask.shape[0] == pytest.approx(0.4, abs=0.01)
+        assert columns.max() / mask.shape[1] == pytest.approx(0.6, abs=0.01)
+        assert f"{area:.4g} square units" in page.texts
         page.look_from(0.9)
         page.click(0.5, 0.5)
         page.wait_for_text("Corners: 1")
@@ -221,17 +228,10 @@ def test_a_region_is_drawn_named_kept_as_commands_read_it_and_removed(tmp_path):
         page.click(0.75, 0.7)
         page.wait_for_text("Corners: 2")
         page.set("keep the region")  # once more under its name
-
-        def redrawn() -> InView:
-            region = read_measures(source.run).regions["middle part"]
-            assert isinstance(region, InView)
-            return region
-
-        page.wait_until(lambda: not np.array_equal(redrawn().mask(), kept.mask()))
-        with source.borrowed_materials() as scene:
-            again = MeasuredSurface.of(scene).measure(redrawn(), "")
-        assert again.area != pytest.approx(found.area, rel=0.01)
-        page.wait_for_text(f"{again.area:.4g} square units")
+        page.wait_until(lambda: not np.array_equal(kept().mask(), mask))
+        redrawn = area_of(kept())
+        assert redrawn != pytest.approx(area, rel=0.01)
+        page.wait_for_text(f"{redrawn:.4g} square units")
         page.set("shape", "polygon")
         page.wait_for_text("Tick the box")
         for count, place in enumerate(((0.5, 0.4), (0.6, 0.6), (0.45, 0.6)), 1):

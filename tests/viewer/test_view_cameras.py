@@ -14,13 +14,7 @@ from tests.viewer.view_factory import ring, some_pose
 from unmix_plugin.engine.geometry.space import SceneBox
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.trained.run_views import up_direction
-from unmix_plugin.viewer.view_cameras import (
-    _checked_pose,
-    beside,
-    camera_of,
-    path_poses,
-    pose_of,
-)
+from unmix_plugin.viewer.view_cameras import _checked_pose, beside, camera_of, path_poses, pose_of
 
 components = st.floats(-1, 1, allow_nan=False)
 quaternions = st.tuples(components, components, components, components).filter(lambda q: math.hypot(*q) > 0.1)

@@ -37,11 +37,9 @@ def ring(count: int = 4) -> Cameras:
     return cameras_at(ring_poses(count, distance=4.0), WIDTH, HEIGHT, FOCAL)
 
 
-def make_source(
-    folder: Path, control: TrainingControl | None = None, seed: int = 0, **settings: Any
-) -> SceneSource:
+def make_source(folder: Path, control: TrainingControl | None = None, **settings: Any) -> SceneSource:
     """A model of random blobs as a finished run, or as one under training."""
-    return source_of_model(make_model(seed, **settings), folder, control)
+    return source_of_model(make_model(**settings), folder, control)
 
 
 def source_of_model(model: UnmixModel, folder: Path, control: TrainingControl | None = None) -> SceneSource:

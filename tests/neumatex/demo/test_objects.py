@@ -11,14 +11,8 @@ from torch.testing import assert_close
 
 from tests.neumatex.surfaces import generator
 from tools.procedural_objects import SHAPES, seeded_lights, seeded_mesh, seeded_surface
-from unmix_plugin.neumatex.demo import objects as module
-from unmix_plugin.neumatex.demo.objects import (
-    DEFAULT_SPECTRAL_LIGHTS,
-    demo_object_path,
-    viewpoints,
-    write_object,
-    write_spectral_object,
-)
+from unmix_plugin.neumatex.demo import objects
+from unmix_plugin.neumatex.demo.objects import demo_object_path, viewpoints
 from unmix_plugin.neumatex.demo.surfaces import SpectralSurface, demo_mesh, demo_surface
 from unmix_plugin.neumatex.fit.object_scene import load_object
 from unmix_plugin.neumatex.tracing.path_tracer import TracedObject
@@ -61,7 +55,9 @@ SIZE = 20
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder, said = tmp_path_factory.mktemp("demo") / "object", []
-    write_object(folder, seeded_mesh(3), seeded_surface(3), seeded_lights(3)[:2], SIZE, 9, 3, said.append)
+    objects.write_object(
+        folder, seeded_mesh(3), seeded_surface(3), seeded_lights(3)[:2], SIZE, 9, 3, said.append
+    )
     assert len(said) == 2
     return folder
 
@@ -89,17 +85,16 @@ def test_objects_are_well_exposed_and_whole(folder):
 
 @pytest.mark.parametrize("name", ["demo-object", "demo-spectral-object"])
 def test_a_default_object_is_written_once(tmp_path, monkeypatch, name):
-    for what, number in {"SIZE": 16, "VIEWS": 2, "BANDS": 4}.items():
-        monkeypatch.setattr(module, f"DEFAULT_{what}", number)
-    for what in ("LIGHTS", "SPECTRAL_LIGHTS"):
-        monkeypatch.setattr(module, f"DEFAULT_{what}", getattr(module, f"DEFAULT_{what}")[:1])
+    quick = {"DEFAULT_SIZE": 16, "DEFAULT_VIEWS": 2, "DEFAULT_BANDS": 4, "demo_mesh": lambda: demo_mesh(24)}
+    for what, value in {**quick, "_EVALUATION_SAMPLES": 4, "_SPECTRAL_EVALUATION_SAMPLES": 4}.items():
+        monkeypatch.setattr(objects, what, value)
+    for what in ("DEFAULT_LIGHTS", "DEFAULT_SPECTRAL_LIGHTS"):
+        monkeypatch.setattr(objects, what, getattr(objects, what)[:1])
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     said = []
-    path = demo_object_path(name, said.append)
-    assert demo_object_path(name, said.append) == path
-    assert len(said) == 1
-    bands = load_object(path).bands
-    assert (bands is None) is (name == "demo-object")
+    path, again = (demo_object_path(name, said.append) for _ in range(2))
+    assert (again, len(said)) == (path, 1)
+    assert (load_object(path).bands is None) is (name == "demo-object")
     next((path / "images").iterdir()).unlink()
     assert len(list((demo_object_path(name, said.append) / "images").iterdir())) == 2
 
@@ -109,8 +104,7 @@ def test_cameras_look_at_the_object_from_all_sides():
     places = cameras.camera_to_world[:, :, 3]
     assert_close(places.norm(dim=-1), torch.full((24,), 4.2))
     assert places.mean(dim=0)[:2].norm() < 0.6
-    assert places[:, 2].min() < -2
-    assert places[:, 2].max() > 3
+    assert places[:, 2].min() < -2 < 3 < places[:, 2].max()
     for index in range(24):
         pixels, depths = cameras.project(torch.zeros(1, 3), index)
         assert_close(pixels, torch.full((1, 2), 32.0), atol=1e-3, rtol=0)
@@ -120,8 +114,8 @@ def test_cameras_look_at_the_object_from_all_sides():
 
 @pytest.fixture(scope="module")
 def spectral_folder(tmp_path_factory):
-    folder, lights = tmp_path_factory.mktemp("demo") / "object", DEFAULT_SPECTRAL_LIGHTS[:2]
-    write_spectral_object(folder, seeded_mesh(3), lights, SIZE, 9, 6, 3)
+    folder, lights = tmp_path_factory.mktemp("demo") / "object", objects.DEFAULT_SPECTRAL_LIGHTS[:2]
+    objects.write_spectral_object(folder, seeded_mesh(3), lights, SIZE, 9, 6, 3)
     return folder
 
 
@@ -159,8 +153,7 @@ def test_truth_fits_the_surface_and_every_material_covers_a_part(spectral_folder
     like_any_other = load_scene(spectral_folder)
     assert like_any_other.material_names == truth.names
     assert (len(like_any_other.frames), len(like_any_other.eval_indices)) == (9, 2)
-    assert like_any_other.has_alpha
-    assert like_any_other.has_abundances
+    assert (like_any_other.has_alpha, like_any_other.has_abundances) == (True, True)
     np.testing.assert_allclose(shares.sum(axis=-1)[scene.pictures.read(0).opacity > 0.5], 1, atol=2e-3)
     assert scene.truth(1) == {}
     vertices = seeded_mesh(3).vertices

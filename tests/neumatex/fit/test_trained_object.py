@@ -1,8 +1,11 @@
 """Laws of the scene of a mesh with materials: what it shows, under which light, and that nothing changes it."""
 
+from functools import reduce
+
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch.testing import assert_close
 
 from tests.neumatex.surfaces import CAMERAS, FRAME, PBR, TURN, make_object, uneven_light
@@ -39,19 +42,16 @@ def test_it_offers_what_commands_and_viewer_ask_of_scenes(scene):
 
 def test_what_is_shown_of_the_material_is_that_of_the_surface_that_is_seen(scene):
     middle = scene.probe(CAMERA, 12, 9)
-    position = torch.as_tensor(middle.position).float()
+    position, values = torch.as_tensor(middle.position).float(), middle.values
     assert float(position.norm()) == pytest.approx(0.6, abs=0.02)
     truth = PBR.parameters(position[None])[0].numpy()
-    np.testing.assert_allclose(middle.values["base_colour"], truth[:3], atol=1e-5)
-    np.testing.assert_allclose(middle.values["roughness"][0], truth[3], atol=1e-5)
-    np.testing.assert_allclose(middle.values["uncertainty"][0], np.exp(-2), atol=1e-6)
-    camera = CAMERAS[0].camera_to_world[0, :, 3].numpy()
-    assert middle.values["depth"][0] == pytest.approx(
-        np.linalg.norm(FRAME.to_world(camera[None].astype(float)) - middle.world_position), rel=0.02
-    )
-    np.testing.assert_allclose(FRAME.to_model(middle.world_position[None])[0], middle.position, atol=1e-9)
-    normal = middle.values["normals"] @ TURN.T  # back in model space
-    np.testing.assert_allclose(normal, middle.position / 0.6, atol=0.05)
+    assert_allclose(values["base_colour"], truth[:3], atol=1e-5)
+    assert_allclose(values["roughness"][0], truth[3], atol=1e-5)
+    assert_allclose(values["uncertainty"][0], np.exp(-2), atol=1e-6)
+    camera = FRAME.to_world(CAMERAS[0].camera_to_world[0, :, 3].double().numpy())
+    assert_allclose(values["depth"][0], np.linalg.norm(camera - middle.world_position), rtol=0.02)
+    assert_allclose(FRAME.to_model(middle.world_position[None])[0], middle.position, atol=1e-9)
+    assert_allclose(values["normals"] @ TURN.T, middle.position / 0.6, atol=0.05)  # back in model space
 
 
 def test_light_adds_up_and_materials_do_not_change_with_it(scene):
@@ -87,27 +87,23 @@ def test_light_can_be_exchanged_for_the_first_again_or_the_same_from_a_file(scen
 
 
 def test_estimates_are_independent_and_their_mean_comes_near_the_finished_view(scene):
-    finished = make_object(bounces=1).look(CAMERA, 1)["linear_rgb"]
-    mean = first = scene.estimate(CAMERA, 1, 0)
-    for number in range(1, 12):
-        mean = mean.averaged(scene.estimate(CAMERA, 1, number))
-    assert mean.num_estimates == 12
-    assert mean.num_wanted == scene.num_estimates == 4
-    truth = scene.estimate(CAMERA, 1, 99)
-    for number in range(100, 140):
-        truth = truth.averaged(scene.estimate(CAMERA, 1, number))
+    def mean_of(numbers):
+        views = (scene.estimate(CAMERA, 1, number) for number in numbers)
+        return reduce(lambda mean, view: mean.averaged(view), views)
 
-    def error(view):
-        return float((view - truth["linear_rgb"]).square().mean().sqrt())
+    def error(colours):
+        return float((colours - truth).square().mean().sqrt())
 
-    assert error(mean["linear_rgb"]) < 0.6 * error(first["linear_rgb"])
-    assert error(finished) < error(first["linear_rgb"])
+    mean, truth = mean_of(range(12)), mean_of(range(99, 140))["linear_rgb"]
+    assert (mean.num_estimates, mean.num_wanted, scene.num_estimates) == (12, 4, 4)
+    first = error(scene.estimate(CAMERA, 1, 0)["linear_rgb"])
+    assert error(mean["linear_rgb"]) < 0.6 * first
+    assert error(make_object(bounces=1).look(CAMERA, 1)["linear_rgb"]) < first
 
 
 def test_each_strip_of_a_picture_has_noise_of_its_own(scene, monkeypatch):
     """Strips as far above the middle as others are below it, too."""
-    seeds = []
-    light_of_rays = TracedObject.light_of_rays
+    seeds, light_of_rays = [], TracedObject.light_of_rays
 
     def noted(traced, hits, samples, bounces, generator):
         seeds.append(generator.initial_seed())

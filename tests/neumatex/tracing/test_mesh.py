@@ -56,28 +56,28 @@ def test_formats_agree_and_an_open_mesh_is_noted(tmp_path, suffix, first):
     assert_close(mesh.corners(), corners, atol=1e-6, rtol=0)
 
 
+def obj_of(path, solid, suffix_of, *more):
+    """A file of a solid whose corners are named once, each with a suffix by the number of its face."""
+    lines = [f"v {x} {y} {z}" for x, y, z in solid.vertices] + ["vt 0 0", "vt 1 0", *more]
+    for index, face in enumerate(solid.faces):
+        lines.append("f " + " ".join(f"{corner + 1}{suffix_of(index)}" for corner in face))
+    path.write_text("\n".join(lines) + "\n")
+    return read_mesh(path)
+
+
 @pytest.mark.parametrize("texture", ["", "1"])
 def test_corners_of_an_obj_have_their_own_normals(tmp_path, texture):
-    """A box whose corners are named once, and have a normal for each face."""
     box = trimesh.creation.box()
-    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0 0"]
-    lines += [f"vn {x} {y} {z}" for x, y, z in box.face_normals]
-    for index, face in enumerate(box.faces, start=1):
-        lines.append("f " + " ".join(f"{corner + 1}/{texture}/{index}" for corner in face))
-    (tmp_path / "box.obj").write_text("\n".join(lines) + "\n")
-    mesh = read_mesh(tmp_path / "box.obj")
+    normals = [f"vn {x} {y} {z}" for x, y, z in box.face_normals]
+    mesh = obj_of(tmp_path / "box.obj", box, lambda index: f"/{texture}/{index + 1}", *normals)
     expected = torch.from_numpy(np.array(box.face_normals)).float()[:, None].expand(12, 3, 3)
     assert_close(mesh.normals[mesh.faces.long()], expected)
     assert_close(mesh.corners(), torch.from_numpy(np.array(box.triangles)))
 
 
 def test_without_normals_an_obj_is_smooth_at_seams_of_texture(tmp_path):
-    box = trimesh.creation.icosphere(subdivisions=2)
-    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices] + ["vt 0 0", "vt 1 0"]
-    for index, face in enumerate(box.faces):
-        lines.append("f " + " ".join(f"{corner + 1}/{index % 2 + 1}" for corner in face))
-    (tmp_path / "ball.obj").write_text("\n".join(lines) + "\n")
-    mesh = read_mesh(tmp_path / "ball.obj")
+    solid = trimesh.creation.icosphere(subdivisions=2)
+    mesh = obj_of(tmp_path / "ball.obj", solid, lambda index: f"/{index % 2 + 1}")
     assert_close(mesh.normals, unit(mesh.vertices).float(), atol=0.03, rtol=0)
 
 
@@ -115,15 +115,14 @@ end_header
 
 
 def test_scene_graph_is_applied_and_parts_are_joined(tmp_path):
-    scene = trimesh.Scene()
-    box = trimesh.creation.box()
+    scene, box = trimesh.Scene(), trimesh.creation.box()
     scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((3, 0, 0)))
     scene.add_geometry(box, transform=trimesh.transformations.scale_matrix(2.0))
     scene.export(tmp_path / "mesh.glb")
     mesh = read_mesh(tmp_path / "mesh.glb")
     assert len(mesh.faces) == 24
-    assert_close(mesh.vertices.max(dim=0).values, torch.tensor([3.5, 1.0, 1.0]).double())
-    assert_close(mesh.vertices.min(dim=0).values, torch.tensor([-1.0, -1.0, -1.0]).double())
+    extents = torch.stack(mesh.vertices.aminmax(dim=0))
+    assert_close(extents, torch.tensor([[-1.0, -1.0, -1.0], [3.5, 1.0, 1.0]]).double())
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.2, 0.1, 0.97), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)])
@@ -279,9 +278,8 @@ def test_an_obj_that_would_lose_its_first_vertex_to_a_byte_order_mark_is_refused
 def test_model_space_is_centred_with_half_edge_one():
     vertices = torch.tensor([[1.0, 2, 3], [5, 2, 3], [1, 4, 3], [1, 2, 4]])
     mesh = mesh_of(vertices, torch.tensor([[0, 1, 2], [0, 1, 3]]))
-    moved = mesh.transformed(*mesh.to_model_space())
-    assert_close(moved.vertices.min(dim=0).values, torch.tensor([-1.0, -0.5, -0.25]))
-    assert_close(moved.vertices.max(dim=0).values, torch.tensor([1.0, 0.5, 0.25]))
+    extents = torch.stack(mesh.transformed(*mesh.to_model_space()).vertices.aminmax(dim=0))
+    assert_close(extents, torch.tensor([[-1.0, -0.5, -0.25], [1.0, 0.5, 0.25]]))
 
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]

@@ -60,16 +60,10 @@ def test_the_record_belongs_to_the_shipped_file():
     assert not any(parameter.requires_grad for parameter in [*decoder.parameters(), *encoder.parameters()])
 
 
-def test_what_is_written_is_read_back(tmp_path: Path):
-    decoder = Decoder()
-    write_weights(tmp_path / "w.safetensors", decoder, Encoder(), {})
-    found, _ = _read_weights(tmp_path / "w.safetensors")
-    latents = torch.rand(5, 6)
-    assert_close(found.numbers(latents), decoder.numbers(latents))
-
-
-def test_other_weights_are_refused_with_the_reason(tmp_path: Path):
-    path = tmp_path / "w.safetensors"
+def test_what_is_written_is_read_back_and_other_weights_are_refused_with_the_reason(tmp_path: Path):
+    path, decoder, latents = tmp_path / "w.safetensors", Decoder(), torch.rand(5, 6)
+    write_weights(path, decoder, Encoder(), {})
+    assert_close(_read_weights(path)[0].numbers(latents), decoder.numbers(latents))
     for write, said in (
         (lambda: write_weights(path, Decoder(width=7), Encoder(), {}), r"size mismatch for decoder\.hidden"),
         (lambda: path.write_bytes(safetensors.torch.save({"other": torch.zeros(2)})), "Missing key"),

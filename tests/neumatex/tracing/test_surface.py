@@ -63,9 +63,7 @@ def test_parameters_are_in_the_unit_interval_and_log_variances_in_theirs():
         triplane.planes.mul_(1e3)
     positions = points(300).float()
     parameters, log_variance = triplane.parameters_at(positions), triplane.log_variance(positions)
-    assert parameters.shape == log_variance.shape == (300, 5)
-    assert triplane.readers.num_parameters == 5
-    assert 0 <= parameters.min() < 0.1
-    assert 0.9 < parameters.max() <= 1
-    assert LOG_VARIANCE_RANGE[0] <= log_variance.min()
-    assert log_variance.max() <= LOG_VARIANCE_RANGE[1]
+    assert parameters.shape == log_variance.shape == (300, triplane.readers.num_parameters) == (300, 5)
+    assert 0 <= parameters.min() < 0.1 < 0.9 < parameters.max() <= 1
+    low, high = LOG_VARIANCE_RANGE
+    assert low <= log_variance.min() <= log_variance.max() <= high
