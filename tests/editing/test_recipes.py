@@ -210,9 +210,9 @@ def test_a_recipe_of_the_greatest_size_is_read_in_time_and_aliases_do_not_multip
     """An alias costs as much as what it repeats: the limits on both bound the product."""
     many = ", ".join(["7"] * 255)
     text = f"edits:\n- remove: &all [{many}]\n" + 999 * "- remove: *all\n"
-    started = time.perf_counter()
+    started = time.process_time()
     recipe = recipe_from_yaml(text)
-    assert time.perf_counter() - started < 20  # as measured: 2
+    assert time.process_time() - started < 20  # seconds of computing; as measured: 2
     assert len(recipe.operations) == 1000
     assert recipe.operations[-1] == Remove((7,) * 255)
     assert "not YAML" in (fault := fault_of("edits: &a [*a]")) or "an edit is one of" in fault

@@ -150,9 +150,7 @@ def test_pages_of_other_sites_are_told_by_their_origin_and_host(origin, host, is
         (f"http://{MINE}:7007", {"host": f"{MINE}:7007"}, "0.0.0.0", False, True),
     ],
 )
-def test_with_the_token_a_page_may_come_through_a_proxy_and_without_it_under_a_name_of_the_viewers(
-    origin, host, listens_at, has_token, is_own
-):
+def test_with_the_token_a_page_may_come_through_a_proxy(origin, host, listens_at, has_token, is_own):
     assert _is_own_page({"origin": origin, **host}, listens_at, has_token) is is_own
 
 

@@ -359,9 +359,7 @@ def test_a_recipe_that_does_not_fit_or_lies_outside_its_folder_is_refused_and_ch
     ("first_nm", "title", "said"),
     [(600.0, "edited", "was not measured at 1 of 5 bands"), (850.0, "not done", "ColorChecker/red")],
 )
-def test_a_known_material_is_held_where_it_was_not_measured_and_refused_where_it_never_was(
-    tmp_path, first_nm, title, said
-):
+def test_a_known_material_is_held_or_refused_beyond_its_bands(tmp_path, first_nm, title, said):
     source = source_of_bands(tmp_path, *(first_nm + 50.0 * index for index in range(5)))
     with serving(source) as (viewer, _), opened(viewer) as page:
         page.set("known material", "ColorChecker/red")

@@ -30,6 +30,7 @@ from unmix_plugin.viewer.recipes import change_of, with_change, with_swap, with_
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.1, 0.9)
 CLAY = Rename(0, "clay")
+SCENE = lit_scene()
 
 
 def test_a_change_takes_the_place_of_those_of_which_it_leaves_nothing():
@@ -73,7 +74,7 @@ panel_changes = st.one_of(
 @settings(deadline=None, max_examples=30)
 @given(st.lists(panel_changes, max_size=8))
 def test_whatever_is_changed_fits_the_run_and_the_last_change_does_what_it_does_alone(changes):
-    scene, recipe = lit_scene(), Recipe()
+    scene, recipe = SCENE, Recipe()
     for make in changes:
         change = make()
         before = edit_scene(scene, recipe).materials.endmembers

@@ -380,9 +380,7 @@ def _store_integers(folder):
     _change_arrays(folder / "cubes", lambda cube: np.rint(cube * 10000).astype(np.uint16))
 
 
-def test_integers_of_cubes_and_of_arrays_of_colours_are_divided_by_the_value_scale(
-    made_spectral, spectral_folder, made, tmp_path
-):
+def test_integers_are_divided_by_the_value_scale(made_spectral, spectral_folder, made, tmp_path):
     _store_integers(spectral_folder)
     _change(spectral_folder, value_scale=10000.0)
     expected, found = (load_object(one).pictures.read(1).numbers for one in (made_spectral, spectral_folder))

@@ -126,6 +126,6 @@ def test_a_folder_that_holds_other_weights_is_refused_and_they_are_named(folder,
 
 
 def test_without_the_extra_the_message_names_it(monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, WanTransformer3DModel.__module__, None)
+    monkeypatch.setitem(sys.modules, AutoencoderKLWan.__module__, None)
     with pytest.raises(ConfigError, match='-m pip install "diffusers>=0'):
         read_wan_prior(tmp_path, num_parameters=9)

@@ -32,9 +32,8 @@ def test_pixels_are_drawn_by_their_weights_and_evenly_within(weights):
     axis = (torch.arange(600, dtype=torch.float64) + 0.5) / 600
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
     row, column, down, across = _PictureInversion(given.double()).draw(grid)
-    drawn = torch.zeros_like(given, dtype=torch.float64).index_put_(
-        (row, column), torch.ones_like(down), True
-    )
+    drawn = torch.zeros_like(given, dtype=torch.float64)
+    drawn.index_put_((row, column), torch.ones_like(down), accumulate=True)
     assert_close(drawn / len(grid), given.double() / given.double().sum(), atol=3e-3, rtol=0)
     assert bool((drawn[given == 0] == 0).all())
     for place in (down, across):

@@ -221,9 +221,7 @@ FOLLOWED = "list(follow(Console(), 'rendering', [1, 2])); print('other'); print(
     ],
     ids=["a video", "progress as the command prints it", "a failure"],
 )
-def test_a_video_or_the_reason_why_there_is_none_is_told_and_progress(
-    tmp_path, run_instead, code, name, reason, parts
-):
+def test_a_video_or_why_there_is_none_is_told_and_progress(tmp_path, run_instead, code, name, reason, parts):
     imports = (
         "import sys; from rich.console import Console; from unmix_plugin.commands.reporting import follow\n"
     )

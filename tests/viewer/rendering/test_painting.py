@@ -253,9 +253,7 @@ FORMULA = "(r650-r450)/(r650+r450)"
 
 
 @pytest.mark.parametrize("light", [None, [0.2, 0.4, 0.6, 0.8, 1.0]])
-def test_an_index_is_the_output_of_renders_over_the_background_where_that_is_undefined(
-    frame, aids, light, monkeypatch
-):
+def test_an_index_is_the_output_of_renders_over_the_background(frame, aids, light, monkeypatch):
     monkeypatch.setattr(painting, "_CHUNK", 100)  # fewer than there are pixels
     lit = replace(frame.materials, light=None if light is None else torch.tensor(light))
     shown = replace(frame, scene=replace(frame.scene, materials=lit))

@@ -250,6 +250,7 @@ def training(tmp_path):
 def test_while_training_runs_pictures_follow_it(training, monkeypatch):
     monkeypatch.setattr("unmix_plugin.viewer.rendering.pictures.REFRESH_S", 0.05)
     control, model, _, loop, screen = training
+    control.device.guest_share = 0.8
     with control.running():
         loop.change(screen.view, pose=some_pose())
         until = time.monotonic() + 120

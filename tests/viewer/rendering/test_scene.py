@@ -70,9 +70,7 @@ def test_pictures_are_looked_at_only_for_edits_that_depend_on_them(trained):
         assert asked == expected
 
 
-def test_what_cameras_see_is_sampled_once_while_colours_change_and_again_where_parts_go(
-    trained, source, monkeypatch
-):
+def test_what_cameras_see_is_sampled_again_only_where_parts_go(trained, source, monkeypatch):
     sampled = []
     monkeypatch.setattr(aids_module, "sample_seen", lambda scene: sampled.append(1) or sample_seen(scene))
     aids = SceneAids(replace(source, take=lambda: trained), has_materials=True)
@@ -207,9 +205,7 @@ GAIN = torch.linspace(0.5, 2.0, 6)
 @pytest.mark.parametrize(
     ("shift_px", "light", "gain"), [(2.0, None, None), (0.0, LIGHT, None), (0.0, None, GAIN)]
 )
-def test_what_was_measured_is_compared_from_where_as_lit_and_as_exposed_as_the_scene(
-    views, scene, ball_of, shift_px, light, gain
-):
+def test_what_was_measured_is_seen_lit_and_exposed_alike(views, scene, ball_of, shift_px, light, gain):
     def shift(camera):
         return replace(camera, center_px=camera.center_px + shift_px)
 
@@ -243,9 +239,7 @@ def test_a_click_takes_one_device_turn_and_is_measured_in_it(views, scene, ball_
     assert taken.measured == pytest.approx(scene.cube(index)[camera.height // 2, camera.width // 2])
 
 
-def test_an_error_is_shown_though_the_scene_was_read_while_the_reference_was_rendered(
-    views, scene, ball_of, source, monkeypatch
-):
+def test_an_error_is_shown_though_the_scene_was_read_late(views, scene, ball_of, source, monkeypatch):
     camera, render = scene.cameras[scene.train_indices[1]], aids_module.render_reference
     aids = SceneAids(replace(source, take=lambda: ball_of(camera).scene), has_materials=True)
 
