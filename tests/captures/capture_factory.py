@@ -18,6 +18,9 @@ HEIGHT, WIDTH, BANDS = 24, 32, 9
 WAVELENGTHS_NM = np.linspace(450.0, 850.0, BANDS)
 
 
+Tell = Callable[[str], None]
+
+
 @dataclass(frozen=True)
 class MadeCapture:
     """A folder and what its cubes show."""
@@ -31,11 +34,9 @@ class MadeCapture:
     """(W, B)"""
 
 
-def make_capture(
-    root: Path, views: int = 4, kind: str = "envi", noise: float = 0.0, seed: int = 0
-) -> MadeCapture:
+def make_capture(root: Path, views: int = 4, kind: str = "envi", noise: float = 0.0) -> MadeCapture:
     """A line camera's cubes (counts in 12 bits) with dark and white frames and poses on a ring."""
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     root.mkdir(parents=True)
     dark = 100.0 + 10.0 * generator.random((WIDTH, BANDS))
     white = 3000.0 * (0.5 + 0.5 * generator.random((WIDTH, 1))) * np.linspace(1.0, 0.6, BANDS)
@@ -52,9 +53,7 @@ def make_capture(
     return MadeCapture(root, reflectance, np.rint(white + dark) - np.rint(dark), np.rint(dark))
 
 
-def write_cube(
-    root: Path, name: str, counts: np.ndarray, kind: str = "envi", header: dict[str, Any] | None = None
-) -> Path:
+def write_cube(root: Path, name: str, counts: np.ndarray, kind: str = "envi", header: Any = None) -> Path:
     """One image as NAME.hdr and NAME.raw (bil), or as NAME.npy."""
     if kind == "npy":
         np.save(root / f"{name}.npy", counts)
@@ -82,14 +81,7 @@ def write_poses(path: Path, names: list[str], width: int = WIDTH, height: int = 
     path.write_text(json.dumps(content), encoding="utf-8")
 
 
-def process(
-    capture: Path,
-    output: Path,
-    layout: str = "cubes",
-    tell: Callable[[str], None] = lambda _: None,
-    /,
-    **options: Any,
-) -> list[str]:
+def process(capture: Path, output: Path, layout: str = "cubes", tell: Tell = lambda _: None, /, **options):
     """Make the scene of a capture, of the layout `cubes` with all of each image unless a mask is asked for; gives what
     looks wrong."""
     given = {"poses": "transforms.json", "mask": "none"} if layout == "cubes" else {}

@@ -66,12 +66,10 @@ def test_a_band_has_its_centre_and_width_or_none_is_made_up(tags, centre, width)
 def test_numbers_of_10_bits_of_a_sequoia_are_as_bright_as_those_of_16():
     """Whose black level is 2046 in both."""
     numbers = np.random.default_rng(1).integers(40, 1000, (*SIZE, 1)).astype(np.uint16)
-    short = file_of(numbers, metadata={"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": 10}})
-    whole = file_of(numbers * 64, metadata={"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": 16}})
-    expected = model_of(whole).apply(whole.read().astype(np.float32), slice(0, SIZE[0]))
-    found = model_of(short).apply(short.read().astype(np.float32), slice(0, SIZE[0]))
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-    assert expected.mean() > 0
+    said = [{"xmp": SEQUOIA, "exif": EXIF | {"BitsPerSample": bits}} for bits in (10, 16)]
+    short, whole = (radiance_of(file_of(numbers * 64**i, metadata=own)) for i, own in enumerate(said))
+    np.testing.assert_allclose(short, whole, rtol=1e-5)
+    assert whole.mean() > 0
 
 
 def test_exif_rationals_become_numbers(tmp_path):
@@ -123,22 +121,29 @@ def make(tmp_path, pixels, tags, exif=EXIF, **options) -> SpectralFile:
     return open_spectral_file(write_band_file(tmp_path / "band.tif", pixels, tags, exif, **options))
 
 
+def radiance_of(file: SpectralFile, rows: slice = slice(None)) -> np.ndarray:
+    return model_of(file).apply(file.read(rows).astype(np.float64), rows)
+
+
 def model_of(file: SpectralFile) -> _RadiometricModel:
     return present(radiometric_model(file))
 
 
+def micasense(vignetting: float, p: int, y: int) -> float:
+    row = 1 + 1.2e-07 * y / 0.0008 - 1.4e-06 * y
+    return 0.00014 / (4.0 * 0.0008) * (p - 4801.5) / 65536 / vignetting / row
+
+
 def micasense_by_hand(p: int, x: int, y: int) -> float:
     r = math.sqrt((x - 25.5) ** 2 + (y - 14.25) ** 2)
-    v = 1 - 3e-05 * r + 1e-05 * r**2 - 3e-07 * r**3 + 1e-09 * r**4 - 1e-11 * r**5 + 7e-14 * r**6
-    row = 1 + 1.2e-07 * y / 0.0008 - 1.4e-06 * y
-    return 0.00014 / (4.0 * 0.0008) * (p - 4801.5) / 65536 / v / row
+    return micasense(
+        1 - 3e-05 * r + 1e-05 * r**2 - 3e-07 * r**3 + 1e-09 * r**4 - 1e-11 * r**5 + 7e-14 * r**6, p, y
+    )
 
 
 def micasense_2d_by_hand(p: int, x: int, y: int) -> float:
     u, w = x / 50, y / 30
-    v = 0.6 + 0.7 * u - 0.2 * w - 0.4 * u**2 * w
-    row = 1 + 1.2e-07 * y / 0.0008 - 1.4e-06 * y
-    return 0.00014 / (4.0 * 0.0008) * (p - 4801.5) / 65536 / v / row
+    return micasense(0.6 + 0.7 * u - 0.2 * w - 0.4 * u**2 * w, p, y)
 
 
 def sequoia_by_hand(p: int, x: int, y: int) -> float:
@@ -171,29 +176,23 @@ def test_radiance_is_that_of_a_calculation_by_hand(
     tmp_path, pixels, tags, options, by_hand, unit, irradiance
 ):
     file = make(tmp_path, pixels, tags, **options)
-    model = model_of(file)
-    radiance = model.apply(file.read().astype(np.float64), slice(None))
+    radiance, rows, model = radiance_of(file), slice(7, 19), model_of(file)
     expected = [[by_hand(int(pixels[y, x]), x, y) for x in range(SIZE[1])] for y in range(SIZE[0])]
     np.testing.assert_allclose(radiance[..., 0], expected, rtol=1e-5)
-    rows = slice(7, 19)
-    np.testing.assert_array_equal(model.apply(file.read(rows).astype(np.float64), rows), radiance[rows])
+    np.testing.assert_array_equal(radiance_of(file, rows), radiance[rows])
     assert (model.unit, model.irradiance) == (unit, irradiance and pytest.approx(irradiance))
     assert model.maker in model.description
 
 
 def test_what_is_below_the_black_level_stays_below_0(tmp_path):
-    file = make(tmp_path, np.full(SIZE, 4700), MICASENSE, black_level=[4800] * 4)
-    assert (model_of(file).apply(file.read().astype(np.float64), slice(None)) < 0.0).all()
+    assert (radiance_of(make(tmp_path, np.full(SIZE, 4700), MICASENSE, **LEVELS)) < 0.0).all()
 
 
 def test_the_faulty_exposure_of_old_firmware_is_mended(tmp_path, pixels):
     file = make(tmp_path, pixels, MICASENSE, EXIF | {"ExposureTime": 1.0 / 6329.0})
-    plain = model_of(file)
+    plain = radiance_of(file, slice(1))
     file.metadata["exif"]["Model"] = "RedEdge"
-    mended = model_of(file)
-    values = pixels[:1, :, None].astype(np.float64)
-    ratio = mended.apply(values, slice(1)) / plain.apply(values, slice(1))
-    np.testing.assert_allclose(ratio, (1.0 / 6329.0) / 0.000274, rtol=1e-4)
+    np.testing.assert_allclose(radiance_of(file, slice(1)) / plain, (1.0 / 6329.0) / 0.000274, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,20 @@
 """The scale of a scene by two points a known distance apart: what lenses, worlds and found poses make of it."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.captures.capture_factory import HEIGHT, WIDTH, make_capture, process
-from tests.commands.running import run
+from tests.captures.poses.pose_factory import by_hand
 from unmix_plugin.captures import process as process_module
 from unmix_plugin.captures.poses.reading import read_poses
-from unmix_plugin.commands.process import process as command
 from unmix_plugin.errors import ConfigError
 from unmix_plugin.scenes.reading.loader import load_scene
+
+pytestmark = pytest.mark.usefixtures("no_contact_sheet")
 
 MM = 0.001
 ENDS = np.array([[-0.8, 0.4, 0.2], [0.8, -0.5, -0.4]])
@@ -25,38 +27,25 @@ LENSES = {
 }
 
 
-def seen_at(pose: np.ndarray, lens: dict, point: np.ndarray) -> tuple[float, float]:
+def seen_at(pose: np.ndarray, lens: dict, point: np.ndarray) -> str:
     """Column and row by the formulas of OpenCV's manual, 0 being the centre of the first pixel."""
     x, y, z = np.diag([1, -1, -1]) @ pose[:3, :3].T @ (point - pose[:3, 3])
-    x, y = x / z, y / z
-    k1, k2, p1, p2 = (lens.get(key, 0.0) for key in ("k1", "k2", "p1", "p2"))
-    r = np.hypot(x, y)
-    if lens.get("camera_model") == "OPENCV_FISHEYE":
-        angle = np.arctan(r)
-        factor = angle * (1 + k1 * angle**2 + k2 * angle**4) / r
-        x, y = factor * x, factor * y
-    else:
-        factor = 1 + k1 * r**2 + k2 * r**4
-        x, y = (
-            factor * x + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-            factor * y + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
-        )
-    return FOCAL * x + WIDTH / 2 - 0.5, FOCAL * y + HEIGHT / 2 - 0.5
+    radial = [lens.get(key, 0.0) for key in ("k1", "k2")]
+    tangential = (lens.get("p1", 0.0), lens.get("p2", 0.0))
+    is_fisheye = lens.get("camera_model") == "OPENCV_FISHEYE"
+    center, ideal = (WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5), np.array([[x / z, y / z]])
+    ((column, row),) = by_hand(ideal, (FOCAL, FOCAL), center, radial, tangential, is_fisheye=is_fisheye)
+    return f"{column:.2f},{row:.2f}"
 
 
 def capture_with(folder, lens: dict, **keys):
     """A capture with the lens in its poses; and what to give as --known-distance, without the metres."""
     root = make_capture(folder).root
-    path = root / "transforms.json"
-    content = {**json.loads(path.read_text()), "fl_x": FOCAL, **lens, **keys}
-    path.write_text(json.dumps(content))
+    content = {**json.loads((root / "transforms.json").read_text()), "fl_x": FOCAL, **lens, **keys}
+    (root / "transforms.json").write_text(json.dumps(content))
     poses = [np.array(frame["transform_matrix"]) for frame in content["frames"]]
-    words = []
-    for point, views in zip(ENDS, ((0, 1), (1, 2)), strict=True):
-        for view in views:
-            column, row = seen_at(poses[view], lens, point)
-            words.append(f"view_{view:02d}:{column:.2f},{row:.2f}")
-    return root, words
+    ends = [(ENDS[0], 0), (ENDS[0], 1), (ENDS[1], 1), (ENDS[1], 2)]
+    return root, [f"view_{view:02d}:{seen_at(poses[view], lens, point)}" for point, view in ends]
 
 
 def true_metres(unit: float = MM) -> float:
@@ -79,18 +68,12 @@ def test_found_poses_become_metres_in_the_upright_world(tmp_path, monkeypatch):
     cameras = {name.split("/")[-1].removesuffix(".png"): camera for name, camera in given.cameras.items()}
     found = replace(given, cameras=cameras, up=None, has_world=False)
     monkeypatch.setattr(process_module, "poses_of_written_views", lambda *_: found)
-    process(
-        root,
-        tmp_path / "scene",
-        poses="estimate",
-        crop=(2, 2, 20, 28),
-        known_distance=(*words, true_metres(1.0)),
-    )
+    asked = {"known_distance": (*words, true_metres(1.0)), "crop": (2, 2, 20, 28)}
+    process(root, tmp_path / "scene", poses="estimate", **asked)
     scene = load_scene(tmp_path / "scene")
     assert scene.metres_per_unit == 1.0
     world = scene.normalisation.to_world(scene.cameras.camera_to_world[:, :, 3].double().numpy())
-    side = np.linalg.norm(world[1] - world[0])
-    assert side == pytest.approx(3.0 * np.sqrt(2.0), rel=0.003)
+    assert np.linalg.norm(world[1] - world[0]) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.003)
     np.testing.assert_allclose(world[:, 2], world[0, 2], atol=1e-4)
 
 
@@ -110,6 +93,7 @@ def test_found_poses_become_metres_in_the_upright_world(tmp_path, monkeypatch):
         ({"beside": True}, "nearly parallel (0.00 degrees between them); expected 2 or more"),
         ({"unposed": True}, "view_00 has no pose; choose another view"),
         ({"metres": True}, "transforms.json gives metres already; leave it out"),
+        ({"markers": True}, "--known-distance and --marker-size both give the scale"),
     ],
 )
 def test_what_can_not_be_is_refused(tmp_path, changes, said):
@@ -129,15 +113,7 @@ def test_what_can_not_be_is_refused(tmp_path, changes, said):
     elif "unposed" in changes:
         del content["frames"][0]
     (root / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(ConfigError) as refused:
-        process(root, tmp_path / "scene", known_distance=tuple(asked))
-    assert said in str(refused.value)
+    markers = {"poses": "markers", "marker_size": 0.05} if "markers" in changes else {}
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        process(root, tmp_path / "scene", known_distance=tuple(asked), **markers)
     assert not (tmp_path / "scene").exists()
-
-
-def test_the_scale_is_given_once(tmp_path):
-    root, words = capture_with(tmp_path / "capture", LENSES["pinhole"])
-    asked = ["cubes", "--data", root, "--output-dir", tmp_path / "scene", "--known-distance", *words, "1"]
-    ended = run(command, *asked, "--poses", "markers", "--marker-size", "0.05")
-    assert ended.status == 2
-    assert "--known-distance and --marker-size both give the scale" in ended.err

@@ -52,19 +52,21 @@ def test_large_holes_and_parts_stay():
     assert (specks, holes) == (0, 0)
 
 
-@pytest.mark.parametrize("pixels", [np.zeros((4, 5, 3), np.uint8), np.full((4, 5), 300, np.uint16)])
+@pytest.mark.parametrize("pixels", [np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 300, np.uint16)])
 def test_pictures_that_hold_no_labels_are_refused(tmp_path, pixels):
-    np.save(tmp_path / "cube.npy", np.ones((4, 5, 3), np.float32))
     Image.fromarray(pixels).save(tmp_path / "labels.png")
-    cube = open_spectral_file(tmp_path / "cube.npy")
-    view = CaptureView("a", cube, labels=tmp_path / "labels.png")
     with pytest.raises(CaptureError, match="expected labels of 0 to 255 in one channel"):
-        read_labels(view, Raster(0, 0, 4, 5, 1))
+        read_labels(CaptureView("a", CUBE, labels=tmp_path / "labels.png"), WHOLE)
 
 
 CUBE = file_of(np.zeros((6, 8, 2), np.uint16))
 WHOLE = Raster(0, 0, 6, 8, 1)
-LEFT = np.arange(8)[None, :].repeat(6, axis=0) < 4
+LEFT = np.tile(np.arange(8) < 4, (6, 1))
+
+
+def recipe_of(raster: Raster, bands: int) -> ViewRecipe:
+    matrix = np.eye(bands, 3, dtype=np.float32)
+    return ViewRecipe(Calibration(raster, np.arange(bands)), 1.0, matrix, use_opacity=True)
 
 
 @pytest.mark.parametrize("white", [1, 255])
@@ -82,8 +84,8 @@ def test_colours_of_a_png_are_multiplied_by_its_opacity_before_they_are_averaged
     pixels[2, 2], pixels[2, 4], pixels[2, 6] = (255, 255, 255, 128), 255, (200, 100, 50, 0)
     Image.fromarray(pixels).save(tmp_path / "a.png")
     raster = Raster.of(6, 8, None, binning)
-    recipe = ViewRecipe(Calibration(raster, np.arange(3)), 1.0, np.eye(3, dtype=np.float32), use_opacity=True)
-    write_view(CaptureView("a", open_spectral_file(tmp_path / "a.png")), recipe, tmp_path / "scene")
+    view = CaptureView("a", open_spectral_file(tmp_path / "a.png"))
+    write_view(view, recipe_of(raster, 3), tmp_path / "scene")
     linear = decode_srgb(pixels[..., :3] / 255) * (pixels[..., 3:] / 255)
     expected = linear.reshape(raster.height, binning, raster.width, binning, 3).mean(axis=(1, 3))
     written = np.load(tmp_path / "scene/cubes/a.npy") / 65535
@@ -121,11 +123,8 @@ def test_pixels_without_a_measurement_are_no_share_of_the_matter(tmp_path, first
     values[:, 4] = np.nan
     mask = np.tile(np.arange(5) >= first, (4, 1)).astype(np.uint8)
     Image.fromarray(mask).save(tmp_path / "mask.png")
-    recipe = ViewRecipe(
-        Calibration(Raster(0, 0, 4, 5, 1), np.arange(2)), 1.0, np.ones((2, 3), np.float32), use_opacity=True
-    )
     view = CaptureView("a", file_of(values), mask=tmp_path / "mask.png")
-    record = write_view(view, recipe, tmp_path / "scene")
+    record = write_view(view, recipe_of(Raster(0, 0, 4, 5, 1), 2), tmp_path / "scene")
     assert (record.missing_pixels, record.matter_share) == (4, share)
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
-import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from PIL import Image
 
 from tests.captures.capture_factory import (
+    BANDS,
     HEIGHT,
     WAVELENGTHS_NM,
     WIDTH,
@@ -30,6 +31,8 @@ from unmix_plugin.captures.writing.view_files import FULL_SCALE, write_view
 from unmix_plugin.errors import CaptureError, ConfigError, RunError
 from unmix_plugin.scenes.reading.loader import load_scene
 
+pytestmark = pytest.mark.usefixtures("no_contact_sheet")
+
 
 @pytest.fixture
 def capture(tmp_path: Path):
@@ -41,10 +44,19 @@ def references_of(capture, suffix: str = "hdr") -> dict[str, Path]:
     return {name: capture.root / f"{name}.{suffix}" for name in ("white", "dark")}
 
 
+def counts_of(path: Path) -> np.ndarray:
+    """Of a cube that the factory wrote, (H, W, B)."""
+    return np.fromfile(path, "<u2").reshape(-1, BANDS, WIDTH).transpose(0, 2, 1)
+
+
 def made(tmp_path: Path, capture, **options):
     """The scene of a capture, and what looks wrong."""
     findings = process(capture.root, tmp_path / "scene", **options)
     return load_scene(tmp_path / "scene"), findings
+
+
+def scale_of(scene: Path) -> float:
+    return record_of(scene)["decisions"]["scale"]["calibrated"]
 
 
 def record_of(scene: Path):
@@ -55,15 +67,13 @@ def record_of(scene: Path):
 def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
     capture = make_capture(tmp_path / "capture", kind=kind)
     stated = {} if kind == "envi" else {"wavelengths": ",".join(map(str, WAVELENGTHS_NM))}
-    references = references_of(capture, "hdr" if kind == "envi" else "npy")
-    process(capture.root, tmp_path / "scene", **references, **stated)
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture, **references_of(capture, "hdr" if kind == "envi" else "npy"), **stated)
     np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM)
     assert [frame.name for frame in scene.frames] == sorted(capture.reflectance)
     for index, frame in enumerate(scene.frames):
         np.testing.assert_allclose(scene.cube(index), capture.reflectance[frame.name], atol=1.0 / 1000)
     record = record_of(tmp_path / "scene")
-    assert record["decisions"]["scale"]["calibrated"] == 1.0
+    assert scale_of(tmp_path / "scene") == 1.0
     assert {Path(file["path"]).stem for file in record["references"]} == {"white", "dark"}
     for source in (source for view in record["views"] for source in view["sources"]):
         data = Path(source["path"]).read_bytes()
@@ -71,15 +81,12 @@ def test_counts_become_reflectances_of_a_scene_that_loads(tmp_path: Path, kind):
 
 
 @pytest.mark.parametrize("suffix", ["hdr", "raw"])
-def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_named(
-    tmp_path: Path, capture, suffix
-):
+def test_a_reference_of_any_name_is_no_view_by_whichever_of_its_files_it_is_named(tmp_path, capture, suffix):
     for path in capture.root.glob("white.*"):
         path.rename(path.with_stem("spectralon"))
     told: list[str] = []
-    process(
-        capture.root, tmp_path / "scene", "cubes", told.append, white=capture.root / f"spectralon.{suffix}"
-    )
+    white = capture.root / f"spectralon.{suffix}"
+    process(capture.root, tmp_path / "scene", "cubes", told.append, white=white)
     assert told[0] == f"{capture.root}: 4 views of the layout cubes"
 
 
@@ -93,43 +100,40 @@ def test_crop_and_binning_move_the_lens_with_the_pixels(tmp_path: Path, capture)
     np.testing.assert_allclose(scene.cameras.focal_px[0], 1.5 * WIDTH / 2)
     np.testing.assert_allclose(scene.cameras.center_px[0], [(WIDTH / 2 - 6) / 2, (HEIGHT / 2 - 4) / 2])
     np.testing.assert_allclose(scene.wavelengths_nm, WAVELENGTHS_NM.reshape(3, 3).mean(axis=1))
-    counts = np.fromfile(capture.root / "view_00.raw", "<u2").reshape(HEIGHT, len(WAVELENGTHS_NM), WIDTH)
-    scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
-    assert scene.cube(0)[0, 0, 0] == pytest.approx(counts[4:6, :3, 6:8].mean() / scale, abs=1e-4)
+    square = counts_of(capture.root / "view_00.raw")[4:6, 6:8, :3]
+    assert scene.cube(0)[0, 0, 0] == pytest.approx(square.mean() / scale_of(tmp_path / "scene"), abs=1e-4)
 
 
 def test_saturated_pixels_are_written_as_one_and_missing_ones_are_masked(tmp_path: Path):
     capture = make_capture(tmp_path / "capture", views=2)
-    counts = np.full((HEIGHT, WIDTH, len(WAVELENGTHS_NM)), 900, np.uint16)
+    counts = np.full((HEIGHT, WIDTH, BANDS), 900, np.uint16)
     counts[:, ::3] += np.arange(HEIGHT, dtype=np.uint16)[:, None, None]
     counts[8:12, 8:12, 4] = 4095
     counts[20:22, :, :] = 7
-    for name in ("view_00", "view_01"):
+    for name in capture.reflectance:
         write_cube(capture.root, name, counts, header={"data ignore value": 7})
     scene, _ = made(tmp_path, capture)
     assert (scene.cube(0)[8:12, 8:12, 4] == 1.0).all()
     assert scene.cube(0)[8:12, 8:12, 3].max() < 1.0
     np.testing.assert_array_equal(scene.valid_mask(0), (counts != 7).all(axis=-1))
-    record = record_of(tmp_path / "scene")
-    assert record["totals"]["saturated_pixels"] == 2 * 16
-    assert record["totals"]["missing_pixels"] == 2 * 2 * WIDTH
-    assert record["stored"]["value_scale"] == FULL_SCALE
+    totals = record_of(tmp_path / "scene")["totals"]
+    assert (totals["saturated_pixels"], totals["missing_pixels"]) == (2 * 16, 2 * 2 * WIDTH)
+    assert record_of(tmp_path / "scene")["stored"]["value_scale"] == FULL_SCALE
 
 
-def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_differ(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture", views=2)
-    counts = np.fromfile(capture.root / "view_01.raw", "<u2").reshape(HEIGHT, -1, WIDTH).transpose(0, 2, 1)
-    marks = "{" + ", ".join("0" if band == 3 else "1" for band in range(counts.shape[2])) + "}"
-    write_cube(capture.root, "view_01", counts.astype(">u2"), header={"byte order": 1, "bbl": marks})
+def test_a_band_that_one_view_marks_as_bad_is_left_out_and_byte_orders_may_differ(tmp_path: Path, capture):
+    counts = counts_of(capture.root / "view_01.raw")
+    marks = {"byte order": 1, "bbl": "{1, 1, 1, 0, 1, 1, 1, 1, 1}"}
+    write_cube(capture.root, "view_01", counts.astype(">u2"), header=marks)
     scene, _ = made(tmp_path, capture, scale=4095.0)
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 3))
     np.testing.assert_allclose(scene.cube(1), np.delete(counts, 3, axis=2) / 4095, atol=1e-4)
 
 
 def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: Path, capture):
-    white = np.fromfile(capture.root / "white.raw", "<u2").reshape(-1, len(WAVELENGTHS_NM), WIDTH)
-    white[:, 2] = 4095  # which no view reaches
-    white.tofile(capture.root / "white.raw")
+    white = counts_of(capture.root / "white.raw").copy()
+    white[..., 2] = 4095  # which no view reaches
+    write_cube(capture.root, "white", white)
     scene, findings = made(tmp_path, capture, **references_of(capture))
     assert findings[0].startswith("white.hdr: the white is saturated in 550 nm: these bands are left out")
     np.testing.assert_array_equal(scene.wavelengths_nm, np.delete(WAVELENGTHS_NM, 2))
@@ -138,61 +142,52 @@ def test_bands_in_which_the_white_is_saturated_are_left_out_and_said(tmp_path: P
 
 
 @pytest.mark.parametrize("has_file", [False, True])
-def test_dark_lines_of_a_file_are_its_dark_frame_where_it_has_no_other(
-    tmp_path: Path, capture, has_file: bool
-):
+def test_dark_lines_of_a_file_are_its_dark_frame_where_it_has_no_other(tmp_path, capture, has_file: bool):
     """Specim's line cameras close the shutter for the last lines; poses and masks may be made for all of them."""
 
     def write(name, light, level, shut):
-        counts = np.concatenate([light + level, np.broadcast_to(shut, (6, *light.shape[1:]))])
-        write_cube(
-            capture.root, name, counts.round().astype(np.uint16), header={"autodarkstartline": len(light)}
-        )
+        lines = [light + level, np.broadcast_to(500 if has_file else shut, (6, *light.shape[1:]))]
+        counts = np.concatenate(lines).round().astype(np.uint16)
+        write_cube(capture.root, name, counts, header={"autodarkstartline": len(light)})
 
     for index, (name, reflectance) in enumerate(capture.reflectance.items()):
         level = capture.dark if has_file else capture.dark + 40 * index  # which drifts from view to view
-        write(name, reflectance * capture.white, level, 500 if has_file else level)
+        write(name, reflectance * capture.white, level, level)
         Image.new("RGBA", (WIDTH, HEIGHT + 6 * has_file), (9, 9, 9, 255)).save(capture.root / f"{name}.png")
     level = capture.dark if has_file else 200
-    write("white", np.tile(capture.white, (12, 1, 1)), level, 500 if has_file else level)
+    write("white", np.tile(capture.white, (12, 1, 1)), level, level)
     write_poses(capture.root / "transforms.json", list(capture.reflectance), height=HEIGHT + 6)
-    references = references_of(capture)
-    if not has_file:
-        references.pop("dark")
-    process(capture.root, tmp_path / "scene", mask="files", **references)
-    for name, reflectance in capture.reflectance.items():
-        stored = np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535
-        np.testing.assert_allclose(stored, reflectance, atol=1e-3)
-    frame = json.loads((tmp_path / "scene" / "transforms.json").read_text())
-    lens = {**frame, **frame["frames"][0]}
-    assert (lens["w"], lens["h"], lens["cy"]) == (WIDTH, HEIGHT, (HEIGHT + 6) / 2)
+    references = references_of(capture) if has_file else {"white": capture.root / "white.hdr"}
+    scene, _ = made(tmp_path, capture, mask="files", **references)
+    for index, reflectance in enumerate(capture.reflectance.values()):
+        np.testing.assert_allclose(scene.cube(index), reflectance, atol=1e-3)
+    assert (scene.cameras.width, scene.cameras.height) == (WIDTH, HEIGHT)
+    assert scene.cameras.center_px[0, 1] == (HEIGHT + 6) / 2
 
 
 def test_reflectances_that_are_divided_are_said_to_be(tmp_path: Path, capture):
     stated = references_of(capture) | {"white_reflectance": "0.02"}
     findings = process(capture.root, tmp_path / "scene", **stated)
-    scale = record_of(tmp_path / "scene")["decisions"]["scale"]["calibrated"]
+    scale = scale_of(tmp_path / "scene")
     assert scale != 1
     assert findings[0].startswith(f"values (reflectance) were divided by {scale:g}, as ")
-    said = [process(capture.root, tmp_path / "kept", **stated, scale=1.0)]
+    said = process(capture.root, tmp_path / "kept", **stated, scale=1.0)
     for name, values in capture.reflectance.items():  # numbers whose meaning nobody stated
         write_cube(capture.root, name, (900 * values).astype(np.float32))
-    said.append(process(capture.root, tmp_path / "unstated"))
-    assert not any("divided by" in finding for findings in said for finding in findings)
-    assert record_of(tmp_path / "unstated")["decisions"]["scale"]["calibrated"] > 1
+    said += process(capture.root, tmp_path / "unstated")
+    assert not any("divided by" in finding for finding in said)
+    assert scale_of(tmp_path / "unstated") > 1
 
 
-def test_views_come_in_the_order_of_their_numbers_and_those_without_a_pose_are_left_out(tmp_path: Path):
+def test_views_come_in_the_order_of_their_numbers_and_those_without_a_pose_are_left_out(tmp_path, capture):
     """Ranges of --angles, and neighbours among many views, go by it."""
-    capture = make_capture(tmp_path / "capture", views=4)
     names = ["turn_9", "turn_10", "turn_11", "turn_12"]
     for old, new in zip(capture.reflectance, names, strict=True):
         for suffix in ("hdr", "raw"):
             (capture.root / f"{old}.{suffix}").rename(capture.root / f"{new}.{suffix}")
     assert [view.name for view in find_cubes(capture.root, ReadOptions()).views] == names
     write_poses(capture.root / "transforms.json", names[:3])
-    process(capture.root, tmp_path / "scene")
-    assert [frame.name for frame in load_scene(tmp_path / "scene").frames] == names[:3]
+    assert [frame.name for frame in made(tmp_path, capture)[0].frames] == names[:3]
 
 
 def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(tmp_path: Path, capture):
@@ -211,14 +206,7 @@ def test_the_lamp_is_read_off_the_white_and_reflectances_are_seen_in_flat_light(
 @pytest.mark.parametrize(
     ("name", "top", "dtype", "header", "unit", "is_known"),
     [
-        (
-            "leaf_{}",
-            1e4,
-            np.uint16,
-            {"reflectance scale factor": 10000},
-            "reflectance, as header field",
-            True,
-        ),
+        ("leaf_{}", 1e4, np.uint16, {"reflectance scale factor": 10000}, "reflectance, as header", True),
         ("REFLECTANCE_{}", 1, np.float32, {}, "reflectance, as the name REFLECTANCE_0 says", True),
         ("REFLECTANCE_{}", 100, np.float32, {}, "reflectance, as the name", False),  # per cent
         ("REFLECTANCE_{}", 4000, np.uint16, {}, "relative radiance", False),  # raw
@@ -249,7 +237,6 @@ def test_what_was_done_is_written_for_people(tmp_path: Path, capture):
     assert "bands left out: 500 nm, 550 nm, 600 nm (named in --drop-bands)" in report
     assert findings[0] == "only 4 views: expect holes and fog; 15 or more all around serve better"
     assert findings[0] in report
-    assert (tmp_path / "scene" / "contact-sheet.png").read_bytes().startswith(b"\x89PNG")
     record = record_of(tmp_path / "scene")
     assert record["what_looks_wrong"] == findings
     dropped = record["decisions"]["sensors"]["all views"]["dropped_bands"]
@@ -286,17 +273,10 @@ def writer(interrupted, monkeypatch: pytest.MonkeyPatch) -> _Writer:  # noqa: AR
 
 
 def test_two_processes_do_not_write_one_scene(interrupted, writer, tmp_path: Path):
-    lock = tmp_path / "scene.unfinished" / "process.lock"
-    code = "import sys; from pathlib import Path; from unmix_plugin.engine.runs.run_folder import RunLock\n"
-    code += "lock = RunLock(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
-    words = [sys.executable, "-c", code, str(lock)]
-    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        assert other.stdout.readline() == b"held\n"
+    with FileLock(tmp_path / "scene.unfinished" / "process.lock"):
         with pytest.raises(RunError, match="another unmix-process writes to"):
             process(interrupted.root, tmp_path / "scene")
         assert writer.written == []
-        other.communicate()
     process(interrupted.root, tmp_path / "scene")
     assert not (tmp_path / "scene" / "process.lock").exists()
 
@@ -351,22 +331,19 @@ def test_numbers_that_are_mended_in_a_table_start_again(tmp_path: Path, monkeypa
         named = {"white_reflectance": str(panel), "wavelengths": str(wavelengths)}
         options |= references_of(capture, "npy") | named
 
-    def write(is_mended: bool) -> None:
-        wrong = {changed} if not is_mended else set()
-        listed.write_text(json.dumps(content | {"value_scale": 6000 if "scale" in wrong else 8000}))
-        panel.write_text(f"wavelength,panel\n400,{0.5 if 'panel' in wrong else 0.99}\n900,0.99")
-        centres = WAVELENGTHS_NM[:: -1 if "wavelengths" in wrong else 1]
+    def start(wrong: str, stop_at: int | None = None) -> list[str]:
+        """What is written with numbers of which one is wrong."""
+        listed.write_text(json.dumps(content | {"value_scale": 6000 if wrong == "scale" else 8000}))
+        panel.write_text(f"wavelength,panel\n400,{0.5 if wrong == 'panel' else 0.99}\n900,0.99")
+        centres = WAVELENGTHS_NM[:: -1 if wrong == "wavelengths" else 1]
         wavelengths.write_text("\n".join(["wavelength", *map(str, centres)]))
+        writer = _Writer(stop_at)
+        monkeypatch.setattr(process_module, "write_view", writer)
+        with suppress(KeyboardInterrupt):
+            process(capture.root, tmp_path / "scene", layout, **options)
+        return writer.written
 
-    write(is_mended=False)
-    monkeypatch.setattr(process_module, "write_view", _Writer(stop_at=2))
-    with pytest.raises(KeyboardInterrupt):
-        process(capture.root, tmp_path / "scene", layout, **options)
-    write(is_mended=True)
-    writer = _Writer()
-    monkeypatch.setattr(process_module, "write_view", writer)
-    process(capture.root, tmp_path / "scene", layout, **options)
-    assert len(writer.written) == 4
+    assert (len(start(changed, stop_at=2)), len(start(""))) == (2, 4)
     hashed = {Path(file["path"]) for file in record_of(tmp_path / "scene")["references"]}
     assert {panel, wavelengths} <= hashed or changed == "scale"
 
@@ -380,9 +357,7 @@ def test_a_scene_is_replaced_only_if_asked(tmp_path: Path, capture):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["capture", "scene"]
 
 
-def test_a_scene_may_be_written_to_the_working_directory_but_not_to_the_root_of_the_disk(
-    tmp_path: Path, capture, monkeypatch
-):
+def test_a_scene_may_be_written_to_the_working_directory_but_not_to_the_root(tmp_path, capture, monkeypatch):
     (tmp_path / "scene").mkdir()
     monkeypatch.chdir(tmp_path / "scene")
     process(capture.root, Path())
@@ -445,17 +420,14 @@ def test_alpha_that_some_views_lack_is_not_dropped_in_silence(tmp_path: Path):
     assert "alpha channel" not in notes_of(tmp_path / "capture", tmp_path / "asked", mask="none")
 
 
-def test_wavelengths_from_short_to_long_are_questioned(tmp_path: Path):
-    write_views(tmp_path / "capture")
+def test_wavelengths_from_short_to_long_are_questioned_and_turned_pictures_read_as_stored(tmp_path: Path):
+    """With a note, and their poses name the orientation."""
+    write_views(tmp_path / "capture", turned=("view_01", "view_02"))
     told = notes_of(tmp_path / "capture", tmp_path / "scene", "465,550,610")
     assert "465 nm is taken for red, 550 nm for green, 610 nm for blue" in told
     assert "give --wavelengths 610,550,465" in told
-    assert "taken for red" not in notes_of(tmp_path / "capture", tmp_path / "usual")
-
-
-def test_turned_pictures_are_read_as_stored_with_a_note_and_their_poses_name_the_orientation(tmp_path: Path):
-    write_views(tmp_path / "capture", turned=("view_01", "view_02"))
-    told = notes_of(tmp_path / "capture", tmp_path / "scene")
+    told = notes_of(tmp_path / "capture", tmp_path / "usual")
+    assert "taken for red" not in told
     assert "EXIF's orientation of 2 of 4 pictures is ignored" in told
     write_poses(tmp_path / "capture" / "transforms.json", NAMES[1:3], width=HEIGHT, height=WIDTH)
     with pytest.raises(CaptureError, match="or store them turned as EXIF's orientation says"):
@@ -465,11 +437,9 @@ def test_turned_pictures_are_read_as_stored_with_a_note_and_their_poses_name_the
 @pytest.mark.parametrize("mask", ["black", "auto"])
 def test_a_backdrop_is_cut_out_also_where_nobody_named_it(tmp_path: Path, mask):
     capture = make_capture(tmp_path / "capture", noise=4.0)
-    process(capture.root, tmp_path / "scene", mask=mask, **references_of(capture))
-    scene = load_scene(tmp_path / "scene")
+    scene, _ = made(tmp_path, capture, mask=mask, **references_of(capture))
     for index, frame in enumerate(scene.frames):
-        alpha = present(scene.alpha(index))
-        np.testing.assert_array_equal(alpha > 0.5, BRIGHT_SQUARE)
+        np.testing.assert_array_equal(present(scene.alpha(index)) > 0.5, BRIGHT_SQUARE)
         assert scene.cube(index)[~BRIGHT_SQUARE].max() == 0.0
         expected = capture.reflectance[frame.name][BRIGHT_SQUARE]
         np.testing.assert_allclose(scene.cube(index)[BRIGHT_SQUARE], expected, atol=0.02)
@@ -481,13 +451,11 @@ def test_a_backdrop_is_cut_out_also_where_nobody_named_it(tmp_path: Path, mask):
         assert decisions["sensors"]["all views"]["background"]["kind"] == "found"
 
 
-def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path):
-    capture = make_capture(tmp_path / "capture", noise=4.0)
+def test_without_a_backdrop_all_of_each_image_is_the_scene(tmp_path: Path, capture):
     generator = np.random.default_rng(0)
     for name in capture.reflectance:
         counts = generator.integers(200, 3000, (HEIGHT, WIDTH, 1)) * np.linspace(0.5, 1.0, 9)
         write_cube(capture.root, name, counts.astype(np.uint16))
-    process(capture.root, tmp_path / "scene", mask="auto")
-    assert not load_scene(tmp_path / "scene").has_alpha
+    assert not made(tmp_path, capture, mask="auto")[0].has_alpha
     report = " ".join((tmp_path / "scene" / "report.txt").read_text().split())
     assert "no mask of matter: all of each image belongs to the scene" in report

@@ -30,7 +30,7 @@ from unmix_plugin.formats.files import (
 PORTS = {f"{port}{digit}" for port in ("com", "lpt") for digit in "123456789"}
 DEVICES = {"con", "prn", "aux", "nul"} | PORTS
 NASTY = ["con", "NUL", "aux.txt", "com1", ".", " ", ":", "\\", "/", "\0", "a", "\u00e9", "e\u0301", "-"]
-NAMES = st.one_of(st.text(max_size=400), st.lists(st.sampled_from(NASTY), max_size=6).map("".join))
+NAMES = st.one_of(st.text(max_size=150), st.lists(st.sampled_from(NASTY), max_size=6).map("".join))
 
 
 @pytest.mark.parametrize(

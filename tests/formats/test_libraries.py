@@ -42,15 +42,13 @@ def written_by_spectral(folder, **changed):
     return path, values
 
 
-@pytest.mark.parametrize("suffix", [".hdr", ".sli"])
-def test_libraries_of_spectral_python_are_read_exactly_with_their_scale_units_and_byte_order(
-    tmp_path, suffix
-):
+def test_libraries_of_spectral_python_are_read_exactly_with_their_scale_units_and_byte_order(tmp_path):
     path, values = written_by_spectral(tmp_path)
-    found = read_library(path.with_suffix(suffix))
-    assert [one.name for one in found] == ["oak", "fir tree"]
-    np.testing.assert_array_equal(found[0].bands.centers_nm, [400.5, 500, 700])
-    np.testing.assert_array_equal([one.reflectance for one in found], values.astype(np.float64))
+    for suffix in (".hdr", ".sli"):
+        found = read_library(path.with_suffix(suffix))
+        assert [one.name for one in found] == ["oak", "fir tree"]
+        np.testing.assert_array_equal(found[0].bands.centers_nm, [400.5, 500, 700])
+        np.testing.assert_array_equal([one.reflectance for one in found], values.astype(np.float64))
     changed = {"wavelength": "{ 0.4, 0.5,\n 0.7 }", "wavelength_units": "Micrometers", "byte_order": 1}
     path, values = written_by_spectral(tmp_path, **changed, reflectance_scale_factor=100)
     path.with_suffix(".sli").write_bytes((100 * values).astype(">f4").tobytes())
@@ -98,10 +96,8 @@ def test_missing_parts_of_an_envi_library_are_named(tmp_path):
 
 
 def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what_is_missing(tmp_path):
-    text = (
-        "Wavelength (um),clay (%),ash\n0.7,40,-1.23e34\n0.5,20,0.1\n0.6,30,-999\n0.4,-0.1,0.3\n0.8,nan,0.2\n"
-    )
-    path = written(tmp_path, "mine.csv", text)
+    rows = "0.7,40,-1.23e34\n0.5,20,0.1\n0.6,30,-999\n0.4,-0.1,0.3\n0.8,nan,0.2\n"
+    path = written(tmp_path, "mine.csv", f"Wavelength (um),clay (%),ash\n{rows}")
     (clay, ash) = read_library(path)
     assert (clay.name, clay.source, ash.origin) == ("clay", "mine.csv", (path, "ash"))
     np.testing.assert_allclose(clay.bands.centers_nm, [400, 500, 600, 700])
@@ -109,22 +105,21 @@ def test_a_table_may_be_in_micrometres_percent_and_any_order_with_marks_for_what
     np.testing.assert_allclose(ash.reflectance, [0.3, 0.1, NAN, NAN, 0.2])
 
 
-@pytest.mark.parametrize(
-    "head", ["leaf %", "leaf%", "leaf_%", "leaf (%)", "leaf [Percent]", "leaf (per cent) "]
-)
-def test_percent_are_divided_where_the_head_says_so(tmp_path, head):
-    table = written(tmp_path, "leaf.csv", f"wavelength,{head},clay 20 %\n400,5,0.5\n500,30,0.6\n")
-    (leaf, clay) = read_library(table)
-    assert (leaf.name, clay.name) == ("leaf", "clay 20 %")
-    np.testing.assert_allclose([leaf.reflectance, clay.reflectance], [[0.05, 0.3], [0.5, 0.6]])
-    [text] = read_library(written(tmp_path, "leaf.txt", f"Wavelength\t{head}\n400\t5\n500\t30\n"))
-    np.testing.assert_allclose(text.reflectance, [0.05, 0.3])
+def test_percent_are_divided_where_the_head_says_so(tmp_path):
+    for head in ("leaf %", "leaf%", "leaf_%", "leaf (%)", "leaf [Percent]", "leaf (per cent) "):
+        table = written(tmp_path, "leaf.csv", f"wavelength,{head},clay 20 %\n400,5,0.5\n500,30,0.6\n")
+        (leaf, clay) = read_library(table)
+        assert (leaf.name, clay.name) == ("leaf", "clay 20 %")
+        np.testing.assert_allclose([leaf.reflectance, clay.reflectance], [[0.05, 0.3], [0.5, 0.6]])
+        [text] = read_library(written(tmp_path, "leaf.txt", f"Wavelength\t{head}\n400\t5\n500\t30\n"))
+        np.testing.assert_allclose(text.reflectance, [0.05, 0.3])
 
 
 @pytest.mark.parametrize("marker", ["-999", "-9999", "-1.23e34"])
 def test_marks_for_what_is_missing_count_as_they_are_stored(tmp_path, marker):
-    text = f"wavelength,leaf (%)\n400,5\n500,{marker}\n600,30\n"
-    [leaf] = read_library(written(tmp_path, "leaf.csv", text))
+    [leaf] = read_library(
+        written(tmp_path, "leaf.csv", f"wavelength,leaf (%)\n400,5\n500,{marker}\n600,30\n")
+    )
     np.testing.assert_allclose(leaf.reflectance, [0.05, NAN, 0.3])
     [maple] = read_library(written(tmp_path, "maple.txt", ECOSTRESS.replace("12.5", marker)))
     np.testing.assert_allclose(maple.reflectance, [0.05, 0.08, NAN, 0.44])

@@ -16,7 +16,7 @@ from unmix_plugin.captures.calibration.references import _open_reference as open
 from unmix_plugin.captures.calibration.references import _panel_reference as panel_reference
 from unmix_plugin.captures.calibration.references import find_missing, own_dark_mean
 from unmix_plugin.captures.poses.lens import Lens
-from unmix_plugin.captures.spectral_file import Linear
+from unmix_plugin.captures.spectral_file import Linear, SpectralFile
 from unmix_plugin.errors import CaptureError, ConfigError
 
 LINES, SAMPLES, NUM = 40, 24, 3
@@ -25,32 +25,39 @@ ALL = slice(None)
 ALL_BANDS = np.arange(NUM)
 
 
-def _noisy(level: np.ndarray, seed: int = 0) -> np.ndarray:
-    noise = 5.0 * np.random.default_rng(seed).standard_normal((LINES, SAMPLES, NUM))
+def reference(stored: np.ndarray, kind: str = "white reference", cube: SpectralFile | None = None, **facts):
+    """Of a file with these numbers, for a cube that is like it."""
+    file = file_of(stored, **facts)
+    return open_reference(file, kind, cube or file_of(stored))
+
+
+def noisy(level: np.ndarray) -> np.ndarray:
+    noise = 5.0 * np.random.default_rng(0).standard_normal((LINES, SAMPLES, NUM))
     return np.rint(level + noise).astype(np.uint16)
 
 
 def test_lines_that_differ_by_noise_alone_are_averaged_and_images_used_pixel_by_pixel():
-    counts = _noisy(1000.0 + 20.0 * np.arange(SAMPLES)[None, :, None] + np.zeros((LINES, 1, NUM)))
-    found = open_reference(file_of(counts), "white reference", EMPTY)
+    counts = noisy(1000.0 + 20.0 * np.arange(SAMPLES)[None, :, None])
+    found = reference(counts)
     assert not found.is_per_pixel
     np.testing.assert_allclose(found.rows(slice(3, 5), ALL, ALL_BANDS), counts.mean(axis=0)[None], rtol=1e-6)
-    counts = _noisy(np.linspace(1000.0, 2000.0, LINES)[:, None, None] + np.zeros((1, SAMPLES, NUM)))
-    found = open_reference(file_of(counts), "white reference", EMPTY)
+    counts = noisy(np.linspace(1000.0, 2000.0, LINES)[:, None, None])
+    found = reference(counts)
     assert found.is_per_pixel
     np.testing.assert_array_equal(found.rows(slice(3, 5), slice(2, 6), ALL_BANDS), counts[3:5, 2:6])
     wide = np.random.default_rng(0).random((5, SAMPLES + 7, NUM)).astype(np.float32)
-    found = open_reference(file_of(wide), "white reference", EMPTY)
+    found = reference(wide, cube=EMPTY)
     np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS), wide.mean(axis=(0, 1))[None, None], rtol=1e-5)
     assert f"it is {SAMPLES + 7} columns wide and the cubes {SAMPLES}" in found.how
 
 
 def test_a_line_of_another_binning_is_interpolated_along_the_line():
-    fine = np.arange(2 * SAMPLES, dtype=np.float32)[None, :, None] + np.zeros((1, 1, NUM), np.float32)
-    found = open_reference(file_of(fine), "dark frame", EMPTY)
-    np.testing.assert_allclose(found.rows(ALL, ALL, ALL_BANDS)[0, :, 0], 2.0 * np.arange(SAMPLES) + 0.5)
-    coarse = np.arange(SAMPLES // 2, dtype=np.float32)[None, :, None] + np.zeros((1, 1, NUM), np.float32)
-    line = open_reference(file_of(coarse), "dark frame", EMPTY).rows(ALL, ALL, ALL_BANDS)[0, :, 0]
+    def line_of(samples: int) -> np.ndarray:
+        ramp = np.tile(np.arange(samples, dtype=np.float32)[None, :, None], NUM)
+        return reference(ramp, "dark frame", EMPTY).rows(ALL, ALL, ALL_BANDS)[0, :, 0]
+
+    np.testing.assert_allclose(line_of(2 * SAMPLES), 2.0 * np.arange(SAMPLES) + 0.5)
+    line = line_of(SAMPLES // 2)
     np.testing.assert_allclose(line[1:-1], 0.5 * (np.arange(SAMPLES) - 0.5)[1:-1])
     assert (line[0], line[-1]) == (0.0, SAMPLES // 2 - 1)
 
@@ -86,9 +93,8 @@ def test_columns_in_which_the_white_is_not_above_the_dark_are_missing():
     counts, file = _cube()
     light = np.full((1, WIDTH, BANDS), 3000, np.uint16)
     light[0, 3, 2] = 40
-    white = open_reference(file_of(light), "white reference", file)
-    dark = open_reference(file_of(np.full((1, WIDTH, BANDS), 50, np.uint16)), "dark frame", file)
-    white = replace(white, dark=dark, reflectance=np.ones(BANDS))
+    dark = reference(np.full_like(light, 50), "dark frame", file)
+    white = replace(reference(light, cube=file), dark=dark, reflectance=np.ones(BANDS))
     found = Calibration(WHOLE, EVERY, dark=dark, white=white).rows(file, 0, HEIGHT)
     np.testing.assert_array_equal(found.missing, np.arange(WIDTH)[None, :] == 3 + np.zeros((HEIGHT, 1)))
     assert (found.values[:, 3] == 0).all()
@@ -106,14 +112,13 @@ def test_a_white_of_one_value_leaves_no_trace_of_the_dark_of_columns_or_pixels(i
     truth = generator.choice([0.25, 0.5], (LINES, SAMPLES, 1)) + np.zeros(NUM)
     truth[2:8, 3:9] = 1.0
     cube = file_of((8000 * truth + dark_levels).astype(np.uint16))
-    stored = np.broadcast_to(dark_levels, (LINES, SAMPLES, NUM)).astype(np.uint16)
-    dark = open_reference(file_of(stored), "dark frame", cube)
+    dark = reference(np.broadcast_to(dark_levels, truth.shape).astype(np.uint16), "dark frame", cube)
     assert dark.is_per_pixel == is_image
     if is_in_view:
         white = panel_reference(cube, (2, 3, 6, 6), "a view")
     else:  # wider than the cubes, of which the mean dark is all that is known
         level = 8000.0 + dark_levels.mean(axis=(0, 1)) + np.zeros((3, SAMPLES + 7, 1))
-        white = open_reference(file_of(level.astype(np.float32)), "white reference", cube)
+        white = reference(level.astype(np.float32), cube=cube)
     white = replace(white, dark=dark, reflectance=np.ones(NUM))
     np.testing.assert_allclose(white.signal, 8000, rtol=1e-6)
     calibration = Calibration(Raster.of(LINES, SAMPLES, None, 1), ALL_BANDS, dark=dark, white=white)
@@ -150,37 +155,36 @@ def test_pixels_of_a_reference_without_a_measurement_are_left_out_of_it(is_image
         light[LINES // 2 :] = 1000
     truth = light.astype(np.float64)
     light[:4, 5] = 65535
-    white = open_reference(file_of(light, no_data=(65535.0,)), "white reference", file_of(light))
+    white = reference(light, no_data=(65535.0,))
     assert white.is_per_pixel == is_image
     assert is_image or (white.mean == 3000).all()
     counts = np.random.default_rng(0).integers(100, 4000, light.shape).astype(np.uint16)
-    raster, every = Raster.of(LINES, SAMPLES, None, 1), np.arange(NUM)
     known = replace(white, reflectance=np.ones(NUM))
-    found = Calibration(raster, every, white=known).rows(file_of(counts), 0, LINES)
+    raster = Raster.of(LINES, SAMPLES, None, 1)
+    found = Calibration(raster, ALL_BANDS, white=known).rows(file_of(counts), 0, LINES)
     measured = ~found.missing
     assert measured[4:].all()
     assert (~measured[:4, 5]).all() == is_image
     np.testing.assert_allclose(found.values[measured], (counts / truth)[measured], rtol=1e-5)
     light[:, 5] = 65535
     with pytest.raises(CaptureError, match="has columns without a measurement"):
-        open_reference(file_of(light, no_data=(65535.0,)), "white reference", file_of(light))
+        reference(light, no_data=(65535.0,))
 
 
 def test_a_dark_frame_of_zeros_is_measured_where_zero_means_no_data_too():
     counts = np.random.default_rng(0).integers(0, 2, (LINES, SAMPLES, NUM)).astype(np.uint16)
     counts[:, :3] = 0
-    dark = open_reference(file_of(counts, no_data=(0.0,)), "dark frame", file_of(counts))
+    dark = reference(counts, "dark frame", no_data=(0.0,))
     np.testing.assert_allclose(dark.mean[0], counts.mean(axis=0), rtol=1e-6)
     with pytest.raises(CaptureError, match="has columns without a measurement"):
-        open_reference(file_of(counts, no_data=(0.0,)), "white reference", file_of(counts))
+        reference(counts, no_data=(0.0,))
 
 
 def test_what_a_reference_lacks_is_told_by_all_of_its_bands():
-    lines, columns = np.indices((LINES, SAMPLES))
+    lines, columns = np.indices((LINES // 2, SAMPLES))
     light = np.full((LINES, SAMPLES, 5), 1000, np.uint16)
-    light[: LINES // 2, :, :4] = (2000 * ((lines + columns) % 2))[: LINES // 2, :, None]
-    white = open_reference(file_of(light, no_data=(0.0,)), "white reference", file_of(light))
-    assert not white.is_per_pixel
+    light[: LINES // 2, :, :4] = (2000 * ((lines + columns) % 2))[..., None]
+    assert not reference(light, no_data=(0.0,)).is_per_pixel
 
 
 @pytest.mark.parametrize("no_data", [(), (65535.0,)])
@@ -205,9 +209,7 @@ def test_a_panel_is_the_mean_of_what_was_measured_in_its_rectangle(no_data: tupl
         ("leaf", np.uint16, {"metadata": {"header": {"reflectance scale factor": "1"}}}, False),
     ],
 )
-def test_dark_lines_of_raw_numbers_are_a_dark_frame_whatever_their_file_is_called(
-    name, dtype, facts, has_dark
-):
+def test_dark_lines_of_raw_numbers_are_a_dark_frame_whatever_they_are_called(name, dtype, facts, has_dark):
     counts = np.full((6, 4, 2), 300, dtype)
     counts[4:] = 90
     file = replace(file_of(counts, **facts), path=Path(f"{name}.hdr"), shape=(4, 4, 2), dark_lines=2)

@@ -30,7 +30,7 @@ SPECTRA = GENERATOR.random((3, 12)) * 0.6 + 0.2
 MIXTURES = (GENERATOR.dirichlet(np.ones(3), 3000) @ SPECTRA).astype(np.float32)
 
 
-def test_noise_is_found_beside_what_bands_share():
+def test_noise_is_found_beside_what_bands_share_and_not_told_from_too_few_pixels_or_bands():
     level = np.full(12, 0.01)
     level[7] = 0.3
     noisy = MIXTURES + level * np.random.default_rng(5).standard_normal(MIXTURES.shape)
@@ -38,9 +38,6 @@ def test_noise_is_found_beside_what_bands_share():
     found = _noise_shares(noisy.astype(np.float32))
     assert found[7] == pytest.approx(expected[7], rel=0.05)
     np.testing.assert_allclose(np.delete(found, 7), np.delete(expected, 7), rtol=0.5)
-
-
-def test_noise_is_not_told_from_too_few_pixels_or_bands():
     assert np.isnan(_noise_shares(MIXTURES[:20])).all()
     assert np.isnan(_noise_shares(MIXTURES[:, :3])).all()
 
@@ -62,16 +59,15 @@ def test_dead_saturated_and_noisy_bands_are_left_out_with_the_reason():
     np.testing.assert_array_equal(found.kept, [1, 3, 4, 5, 6, 8, 10, 11])
 
 
-def test_a_white_background_that_saturates_every_band_drops_none():
+def test_what_is_wrong_with_every_band_drops_none():
+    """A white background that saturates them, or nothing that they have in common."""
+    choice, notes = _BandChoice(WAVELENGTHS_NM, {}), []
     saturated = np.zeros(MIXTURES.shape, bool)
     saturated[:2000] = True
-    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), (MIXTURES, saturated), 0.5, []).dropped == {}
-
-
-def test_bands_that_have_nothing_in_common_are_not_all_noise():
+    assert _drop_found(choice, (MIXTURES, saturated), 0.5, notes).dropped == {}
+    assert notes == []
     independent = GENERATOR.random((3000, 12)).astype(np.float32)
-    sample, notes = (independent, np.zeros(independent.shape, bool)), []
-    assert _drop_found(_BandChoice(WAVELENGTHS_NM, {}), sample, 0.3, notes).dropped == {}
+    assert _drop_found(choice, (independent, np.zeros_like(saturated)), 0.3, notes).dropped == {}
     assert notes == ["12 of 12 bands have noise above 30% of their signal; all are kept"]
 
 
@@ -99,9 +95,8 @@ def test_bands_are_sorted_and_binned_by_wavelength_and_used_once():
     ],
 )
 def test_no_bin_spans_a_gap(wavelengths_nm, dropped, expected):
-    choice = _BandChoice(
-        np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named")
-    ).without_incomplete_bins(2)
+    named = _BandChoice(np.array(wavelengths_nm, float), dict.fromkeys(dropped, "named"))
+    choice = named.without_incomplete_bins(2)
     np.testing.assert_allclose(choice.centers_nm(2), expected)
     assert set(choice.dropped.values()) <= {"named", "too few up to a gap or the end for --bin-bands 2"}
 
@@ -122,15 +117,18 @@ def test_the_end_of_the_detector_is_a_plateau(top: int, facts, part, value: int,
     assert _find_saturation([file_of(counts, **facts)], np.arange(6))[0] == expected
 
 
+def white_of(counts: np.ndarray, **facts):
+    return open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts))
+
+
 def test_missing_pixels_of_a_white_do_not_count_as_saturated():
     counts = GENERATOR.integers(2900, 3100, (16, 8, 3)).astype(np.uint16)
     counts[1:4, :, 2] = 4095
     counts[::8] = 65535
-    white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
-    np.testing.assert_array_equal(_clipped_bands(white, 65535.0), [False, False, True])
+    found = _clipped_bands(white_of(counts, no_data=(65535.0,)), 65535.0)
+    np.testing.assert_array_equal(found, [False, False, True])
     counts[sampled_rows(16)] = 65535  # nothing is left to look at
-    white = open_reference(file_of(counts, no_data=(65535.0,)), "white reference", file_of(counts))
-    assert not _clipped_bands(white, 65535.0).any()
+    assert not _clipped_bands(white_of(counts, no_data=(65535.0,)), 65535.0).any()
 
 
 BLOWN = np.array([False, True, False])
@@ -153,12 +151,19 @@ def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, satu
     counts = np.rint(noisy.clip(0, top)).astype(dtype)
     view = np.full((60, 50, 3), top // 3, dtype)
     view[7:47, 9:29] = counts
-    whites = [
-        open_reference(file_of(counts, **facts), "white reference", file_of(counts, **facts)),
-        panel_reference(file_of(view, **facts), (7, 9, 40, 20), "a view"),
-    ]
-    for white in whites:
+    panel = panel_reference(file_of(view, **facts), (7, 9, 40, 20), "a view")
+    for white in (white_of(counts, **facts), panel):
         np.testing.assert_array_equal(_clipped_bands(white, saturation), BLOWN)
+
+
+def together(cubes: dict[str, np.ndarray], facts: dict[str, dict]):
+    """The sensors of files that one camera wrote, as they are brought to one exposure."""
+    bands = np.array([500.0, 600.0, 700.0])
+    files = {name: file_of(cube, bands, metadata=facts[name]) for name, cube in cubes.items()}
+    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
+    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
+    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
+    return with_one_exposure(sensors, files).values()
 
 
 @pytest.mark.parametrize(
@@ -172,32 +177,17 @@ def test_a_blown_out_white_is_told_by_its_stored_numbers(facts, top, dtype, satu
 def test_sensors_of_one_camera_have_one_exposure_or_it_is_said_why_not(dtype, scale, facts, said):
     """Views of two sizes, the second taken at twice the time."""
     light = GENERATOR.random((12, 10, 3)) + 0.2
-    files = {
-        name: file_of(
-            (scale * ratio * light).astype(dtype),
-            np.array([500.0, 600.0, 700.0]),
-            metadata=facts | {"exposure_s": 0.01 * ratio},
-        )
-        for name, ratio in (("10x12", 1), ("12x10", 2))
-    }
-    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
-    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
-    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
-    upright, across = with_one_exposure(sensors, files).values()
+    cubes = {name: (scale * ratio * light).astype(dtype) for name, ratio in (("10x12", 1), ("12x10", 2))}
+    times = {"10x12": facts | {"exposure_s": 0.01}, "12x10": facts | {"exposure_s": 0.02}}
+    upright, across = together(cubes, times)
     assert said in " ".join([*upright.notes, *upright.warnings])
     assert np.allclose(across.sample, upright.sample, rtol=1e-2) == (dtype == np.uint16)
 
 
 def test_what_is_wrong_with_exposures_of_one_sensor_is_said_once():
     """One with times that can't be those of its bands, beside one without any."""
-    cube, bands = np.full((12, 10, 3), 1000, np.uint16), np.array([500.0, 600.0, 700.0])
-    files = {
-        name: file_of(cube + np.arange(10, dtype=np.uint16)[:, None], bands, metadata=facts)
-        for name, facts in (("a", {"exposure_s": [0.01, 0.02]}), ("b", {"exposure_s": [0.01, 0.04]}))
-    }
-    options = ProcessOptions("cubes", data=Path(), output_dir=Path())
-    each = {name: [CaptureView(name, file, name)] for name, file in files.items()}
-    sensors = {name: prepare_sensor(own, options, (None, None), own) for name, own in each.items()}
-    for sensor in with_one_exposure(sensors, files).values():
+    cube = np.full((12, 10, 3), 1000, np.uint16) + np.arange(10, dtype=np.uint16)[:, None]
+    times = {"a": {"exposure_s": [0.01, 0.02]}, "b": {"exposure_s": [0.01, 0.04]}}
+    for sensor in together({"a": cube, "b": cube}, times):
         (warning,) = sensor.warnings
         assert "2 exposure times or gains for 3 bands" in warning

@@ -45,12 +45,8 @@ NIR_BENDS = (-0.1, 0.05, 0.0, 0.001, -0.002)
 LENSES = (
     LensOfRig("GRE", "Green", 550, 40, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (5.2e5, 2100.0, 300.0), 0.004, 3.0),
     LensOfRig("RED", "Red", 660, 40, (1.5, -2.0, 0.7), (0.03, 0.0, 0.0), (4.1e5, 2000.0, 100.0), 0.006, 3.1),
-    LensOfRig(
-        "REG", "RedEdge", 735, 10, (-1, 0.5, -1.2), (0.0, 0.02, 0.0), (3.3e5, 1900.0, 200.0), 0.008, 2.9
-    ),
-    LensOfRig(
-        "NIR", "NIR", 790, 40, (0.4, 1.1, 2), (0.03, 0.02, 0), (4.8e5, 2050, 400), 0.005, 3.0, NIR_BENDS
-    ),
+    LensOfRig("REG", "RedEdge", 735, 10, (-1, 0.5, -1.2), (0.0, 0.02, 0.0), (3.3e5, 1900, 200), 0.008, 2.9),
+    LensOfRig("NIR", "NIR", 790, 40, (0.4, 1.1, 2), (0.03, 0.02, 0), (4.8e5, 2050, 400), 0.005, 3, NIR_BENDS),
 )
 
 
@@ -130,17 +126,16 @@ def tags(index: int, lens: LensOfRig) -> dict[str, str | list[str]]:
     }
 
 
+def file_name(index: int, lens: LensOfRig) -> str:
+    return f"IMG_170101_1010{index:02d}_{index:04d}_{lens.ending}.TIF"
+
+
 def write_flight(root: Path, releases: int = 10) -> None:
     """Files of all lenses; EXIF says that they are turned, which must be ignored."""
     for index in range(releases):
         for lens in LENSES:
-            write_band_file(
-                root / f"IMG_170101_1010{index:02d}_{index:04d}_{lens.ending}.TIF",
-                stored(image(index, lens), lens),
-                tags(index, lens),
-                EXIF | {"ExposureTime": lens.exposure_s},
-                orientation=3,
-            )
+            exif, counts = EXIF | {"ExposureTime": lens.exposure_s}, stored(image(index, lens), lens)
+            write_band_file(root / file_name(index, lens), counts, tags(index, lens), exif, orientation=3)
 
 
 PANEL_LIGHT = {"GRE": 0.5, "RED": 0.4, "REG": 0.7, "NIR": 0.62}
@@ -159,10 +154,7 @@ def write_panel(root: Path) -> str:
 def write_poses(path: Path, lenses: tuple[LensOfRig, ...] = LENSES[:1], releases: int = 10) -> None:
     """True poses of some lenses, with their lens, as nerfstudio writes them."""
     frames = [
-        {
-            "file_path": f"images/IMG_170101_1010{index:02d}_{index:04d}_{lens.ending}.TIF",
-            "transform_matrix": lens_pose(index, lens).tolist(),
-        }
+        {"file_path": f"images/{file_name(index, lens)}", "transform_matrix": lens_pose(index, lens).tolist()}
         for index in range(releases)
         for lens in lenses
     ]

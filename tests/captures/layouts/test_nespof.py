@@ -1,3 +1,5 @@
+"""The rendered and the real scenes of NeSpoF."""
+
 import json
 import shutil
 
@@ -34,47 +36,38 @@ def scene(tmp_path_factory):
     return find_nespof(root, PLAIN)
 
 
-def test_views_have_the_first_stokes_component_of_all_wavelengths_and_opacity(scene, tmp_path):
-    assert [view.name for view in scene.views] == ["r_0", "r_1", "r_2", "r_3", "r_4"]
-    assert [view.split for view in scene.views] == ["eval", "train", "train", "train", "train"]
+def test_views_have_the_first_stokes_component_of_all_wavelengths_opacity_poses_and_lens(scene, tmp_path):
+    splits = {view.name: view.split for view in scene.views}
+    assert splits == {"r_0": "eval", "r_1": "train", "r_2": "train", "r_3": "train", "r_4": "train"}
     assert any("5 frames of transforms_test.json listed before" in note for note in scene.notes)
     for index, view in enumerate(scene.views):
         expected = np.stack([intensity(index, wavelength) for wavelength in (450, 460, 470)], axis=-1)
         check_file(view.cube, values=expected, nm=[450, 460, 470])
         np.testing.assert_allclose(view.alpha.read()[..., 0], np.linspace(0, 1, 35).reshape(5, 7), atol=1e-6)
+        camera = scene.poses.cameras[view.name]
+        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
+        assert (camera.lens.width, camera.lens.height) == (7, 5)
+        assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
     rows_and_bands_of(scene.views[2].cube, scene.views[2].cube.read())
     write_nespof(tmp_path)
     given = ReadOptions(wavelengths_nm=np.array([500.0, 510.0, 520.0]))
     check_file(find_nespof(tmp_path, given).views[0].cube, nm=[500, 510, 520])
 
 
-def test_poses_and_field_of_view_belong_to_the_views(scene):
-    for index in range(5):
-        camera = scene.poses.cameras[f"r_{index}"]
-        np.testing.assert_allclose(camera.camera_to_world, pose(index)[:3], atol=1e-6)
-        assert (camera.lens.width, camera.lens.height) == (7, 5)
-        assert camera.lens.focal_px[0] == pytest.approx(0.5 * 7 / np.tan(0.4))
-
-
-def test_labels_lie_in_seg_and_a_scene_without_alpha_has_no_opacity(tmp_path):
-    write_nespof(tmp_path, alpha=False)
+def test_labels_lie_in_seg_and_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
+    write_nespof(tmp_path, wavelengths=(450,), alpha=False)
     (tmp_path / "seg" / "train").mkdir(parents=True)
     Image.fromarray(np.zeros((5, 7), np.uint8)).save(tmp_path / "seg" / "train" / "r_3.png")
-    views = find_nespof(tmp_path, PLAIN).views
-    assert [view.name for view in views if view.labels is not None] == ["r_3"]
-    assert {view.alpha for view in views} == {None}
-
-
-def test_views_of_one_name_in_two_splits_keep_their_folder(tmp_path):
-    write_nespof(tmp_path, wavelengths=(450,))
-    for name, split in (("transforms_train.json", "train"), ("transforms_val.json", "val")):
-        content = json.loads((tmp_path / name).read_text())
-        frame = {**content["frames"][0], "file_path": f"./{split}/same"}
-        (tmp_path / name).write_text(json.dumps({**content, "frames": [*content["frames"], frame]}))
+    for split in ("train", "val"):
+        path = tmp_path / f"transforms_{split}.json"
+        content = json.loads(path.read_text())
+        content["frames"].append({**content["frames"][0], "file_path": f"./{split}/same"})
+        path.write_text(json.dumps(content))
         write_exr(tmp_path / "450" / split / "same.exr", stokes(intensity(9, 450)))
-    names = [view.name for view in find_nespof(tmp_path, PLAIN).views]
-    assert "train_same" in names
-    assert "val_same" in names
+    views = {view.name: view for view in find_nespof(tmp_path, PLAIN).views}
+    assert {"train_same", "val_same"} < views.keys()
+    assert [name for name, view in views.items() if view.labels is not None] == ["train_r_3"]
+    assert {view.alpha for view in views.values()} == {None}
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float16])
@@ -86,12 +79,13 @@ def test_raw_files_of_mitsuba_have_the_intensity_in_the_fifth_channel(tmp_path, 
 
 
 def test_channels_are_known_by_name_wherever_they_stand_and_others_are_refused(tmp_path):
-    write_exr(tmp_path / "a.exr", {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
-    assert (_open_intensity(tmp_path / "a.exr").read() == 2.0).all()
-    assert (present(_open_opacity(tmp_path / "a.exr")).read() == 0.5).all()
-    write_exr(tmp_path / "a.exr", {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
+    path = tmp_path / "a.exr"
+    write_exr(path, {"A": np.full((3, 4), 0.5), **stokes(np.full((3, 4), 2.0))})
+    assert (_open_intensity(path).read() == 2.0).all()
+    assert (present(_open_opacity(path)).read() == 0.5).all()
+    write_exr(path, {"R": np.zeros((3, 4)), "G": np.zeros((3, 4))})
     with pytest.raises(CaptureError, match="has the channels G, R; expected s0 to s3"):
-        _open_intensity(tmp_path / "a.exr")
+        _open_intensity(path)
 
 
 def _outside(root):
@@ -117,22 +111,19 @@ def test_a_spoilt_scene_is_refused(tmp_path, spoil, message):
         find_nespof(tmp_path / "scene", PLAIN)
 
 
-def test_real_captures_have_one_folder_a_view(tmp_path):
-    write_real(tmp_path, poses=False)
+def test_real_captures_have_one_folder_a_view_and_poses_in_the_order_of_names(tmp_path):
+    write_real(tmp_path, views=("v10", "v2", "v1"), poses=False)
     capture = find_nespof_real(tmp_path, PLAIN)
-    assert [view.name for view in capture.views] == ["v10", "v2"]
+    assert [view.name for view in capture.views] == ["v1", "v10", "v2"]
     expected = np.stack([intensity(1, 450), intensity(1, 460)], axis=-1)
-    np.testing.assert_array_equal(capture.views[1].cube.read(), expected)
+    np.testing.assert_array_equal(capture.views[2].cube.read(), expected)
     assert capture.poses is None
     assert any("poses_bounds.npy is not there" in note for note in capture.notes)
-
-
-def test_poses_go_with_views_in_the_order_of_names(tmp_path):
     write_real(tmp_path, views=("v10", "v2", "v1"))
     poses = present(find_nespof_real(tmp_path, PLAIN).poses)
-    for index, name in enumerate(("v1", "v10", "v2")):
-        np.testing.assert_allclose(poses.cameras[name].camera_to_world, pose(index)[:3], atol=1e-12)
-        lens = present(poses.cameras[name].lens)
+    for index, view in enumerate(capture.views):
+        np.testing.assert_allclose(poses.cameras[view.name].camera_to_world, pose(index)[:3], atol=1e-12)
+        lens = present(poses.cameras[view.name].lens)
         assert (lens.height, lens.width, lens.focal_px) == (5, 7, (9.0, 9.0))
 
 

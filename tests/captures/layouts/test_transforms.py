@@ -33,12 +33,20 @@ from unmix_plugin.captures.spectral_file import ReadOptions
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.scenes.reading.loader import load_scene
 
+pytestmark = pytest.mark.usefixtures("no_contact_sheet")
+
 
 def edit(root, change):
     path = root / "transforms.json"
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))
+
+
+def scene_of(tmp_path, **options):
+    """What `tmp_path / "data"` becomes, of the layout unmix-nerf."""
+    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none", **options)
+    return load_scene(tmp_path / "scene")
 
 
 @pytest.mark.parametrize("written", ["eval", "val"])
@@ -81,8 +89,7 @@ def test_frames_of_some_lists_are_split_as_scenes_are(tmp_path, lists, expected)
     listed = {f"{k}_filenames": [f"train/frame_0000{i}.png" for i in v] for k, v in lists.items()}
     write_unmix(tmp_path / "data", "train", "train", **listed)
     assert [view.split for view in find_unmix_nerf(tmp_path / "data", PLAIN).views] == expected
-    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none", scale=1.0)
-    scene = load_scene(tmp_path / "scene")
+    scene = scene_of(tmp_path, scale=1.0)
     for indices, split in ((scene.train_indices, "train"), (scene.eval_indices, "eval")):
         assert list(indices) == [index for index, one in enumerate(expected) if one == split]
 
@@ -103,22 +110,17 @@ def test_lists_that_name_no_frame_are_refused(tmp_path, key, listed, message):
             find(tmp_path, PLAIN)
 
 
-def as_integers(root):
-    """Numbers of 16 bits of which 1000 stands for 1, and widths."""
-    for path in root.rglob("*.npy"):
-        np.save(path, np.rint(1000 * np.load(path)).astype(np.uint16))
-    edit(root, lambda content: content.update(value_scale=1000, fwhm=[5, 6, 7, 8]))
-
-
 def test_a_scene_folder_is_read_with_its_scale_and_widths_and_says_what_it_leaves_out(tmp_path):
-    write_unmix(tmp_path / "data", written="val", materials=["leaf"])
-    as_integers(tmp_path / "data")
+    """Numbers of 16 bits of which 1000 stands for 1."""
+    write_unmix(tmp_path / "data", written="val", materials=["leaf"], value_scale=1000, fwhm=[5, 6, 7, 8])
+    for path in (tmp_path / "data").rglob("*.npy"):
+        np.save(path, np.rint(1000 * np.load(path)).astype(np.uint16))
     capture = find_unmix_nerf(tmp_path / "data", PLAIN)
     assert any("not taken over from transforms.json: materials;" in note for note in capture.notes)
     for index, view in enumerate(capture.views):
         check_file(view.cube, scale=1000, fwhm=[5, 6, 7, 8])
         np.testing.assert_allclose(view.cube.read() / 1000, cube(index), atol=5.01e-4)
-    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none")
+    scene_of(tmp_path)
     process(tmp_path / "scene", tmp_path / "again", "unmix-nerf", mask="none")
     for folder in ("scene", "again"):
         scene = load_scene(tmp_path / folder)
@@ -146,8 +148,7 @@ def test_frames_of_a_scene_folder_have_bands_sensor_and_shot_of_their_own(tmp_pa
     assert [view.sensor for view in capture.views] == ["bands 1", "bands 1", "bands 2", "wide", "wide"]
     assert [view.release for view in capture.views] == ["", "", "", "shot 1", "shot 1"]
     assert any("'fwhm' has 0 or null for 1 of 4 bands" in text for text in capture.warnings)
-    process(tmp_path / "data", tmp_path / "scene", "unmix-nerf", mask="none", scale=1.0)
-    scene = load_scene(tmp_path / "scene")
+    scene = scene_of(tmp_path, scale=1.0)
     for index, bands in enumerate(order):
         shown = sorted(bands or [0, 1, 2, 3])
         np.testing.assert_allclose(scene.cube(index), cube(index)[..., shown], atol=1e-4)
@@ -208,18 +209,18 @@ def with_content(text):
     return lambda root: (root / "transforms.json").write_text(text)
 
 
+OUTSIDE = ("../outside.npy", "/etc/passwd", "link.npy")
+NO_LIST = ("{", '{"frames": 3}', '{"frames": [3]}', "", '{"no": "frames"}')
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (lambda root: [path.unlink() for path in root.glob("train/*.npy")], r"lacks 3 files .*nerfstudio"),
         (with_path(None), r"frames\[0\] has no 'hyperspectral_file_path'"),
-        *(
-            (with_path(text), r"frames\[0\].*leaves the folder")
-            for text in ("../outside.npy", "/etc/passwd", "link.npy")
-        ),
+        *((with_path(text), r"frames\[0\].*leaves the folder") for text in OUTSIDE),
         (with_path("train/frame 00001.npy"), "would both be the view 'frame_00001'"),
-        *((with_content(text), "transforms.json") for text in ("{", '{"frames": 3}', '{"frames": [3]}', "")),
-        (with_content('{"no": "frames"}'), "transforms.json"),
+        *((with_content(text), "transforms.json") for text in NO_LIST),
     ],
 )
 def test_a_spoilt_list_of_frames_is_refused(tmp_path, spoil, message):
@@ -248,11 +249,8 @@ def test_a_mask_that_is_not_there_is_refused_and_missing_labels_are_said(tmp_pat
     (tmp_path / "eval" / "frame_00003_seg.png").unlink()
     notes = find_unmix_nerf(tmp_path, PLAIN).notes
     assert any("2 views without the labels that transforms.json names" in note for note in notes)
-    path = tmp_path / "transforms.json"
-    content = json.loads(path.read_text())
     for named, said in (("masks/1.png", r"lacks 1 file of its views: masks/1\.png"), (5, "'mask_path' is 5")):
-        content["frames"][1]["mask_path"] = named
-        path.write_text(json.dumps(content))
+        edit(tmp_path, lambda content, named=named: content["frames"][1].update(mask_path=named))
         with pytest.raises(CaptureError, match=said):
             find_unmix_nerf(tmp_path, PLAIN)
 
@@ -304,32 +302,28 @@ def linear_picture(root):
     return np.where(pixels <= 0.04045, pixels / 12.92, ((pixels + 0.055) / 1.055) ** 2.4)
 
 
-def halves_of(view, wavelengths):
-    return np.stack([intensity(view, nm) / 2 for nm in wavelengths], axis=-1)
+def halves_of(*wavelengths):
+    return np.stack([intensity(2, nm) / 2 for nm in wavelengths], axis=-1)
 
 
+write_val = partial(write_unmix, written="val")
+write_three = partial(write_real, views=("a", "b", "c"))
 OPACITY = np.linspace(0, 1, 35).reshape(5, 7)
+SEEN = (OPACITY > 0)[..., None]
 NM = [450, 500, 550, 600]
 SCENES = {
-    "nerfstudio": (partial(write_unmix, written="val"), {"wavelengths": "610,550,465"}, [465, 550, 610]),
-    "hs-nerf": (write_hs, {"wavelengths": "450,500,550,600"}, NM),
-    "unmix-nerf": (write_unmix, {"mask": "none"}, NM),
-    "nespof": (write_nespof, {"scale": 2.0}, [450, 460, 470]),
-    "nespof-real": (partial(write_real, views=("a", "b", "c")), {"scale": 2.0}, [450, 460]),
-}
-VALUES = {
-    "nerfstudio": linear_picture,
-    "hs-nerf": lambda _: cube(2),
-    "unmix-nerf": lambda _: cube(2),
-    "nespof": lambda _: (OPACITY > 0)[..., None] * halves_of(2, (450, 460, 470)),
-    "nespof-real": lambda _: halves_of(2, (450, 460)),
+    "nerfstudio": (write_val, {"wavelengths": "610,550,465"}, [465, 550, 610], linear_picture),
+    "hs-nerf": (write_hs, {"wavelengths": "450,500,550,600"}, NM, lambda _: cube(2)),
+    "unmix-nerf": (write_unmix, {"mask": "none"}, NM, lambda _: cube(2)),
+    "nespof": (write_nespof, {"scale": 2.0}, [450, 460, 470], lambda _: SEEN * halves_of(450, 460, 470)),
+    "nespof-real": (write_three, {"scale": 2.0}, [450, 460], lambda _: halves_of(450, 460)),
 }
 
 
 @pytest.mark.parametrize("layout", SCENES)
 def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout):
     """Or asks for the wavelengths that it lacks."""
-    write, options, nm = SCENES[layout]
+    write, options, nm, values = SCENES[layout]
     write(tmp_path / "data")
     if "wavelengths" in options:
         with pytest.raises(CaptureError, match="--wavelengths"):
@@ -337,7 +331,7 @@ def test_each_layout_becomes_a_scene_with_its_values_and_splits(tmp_path, layout
     process(tmp_path / "data", tmp_path / "scene", layout, **{"scale": 1.0, **options})
     scene = load_scene(tmp_path / "scene")
     atol = 1.01 / 255 if layout == "hs-nerf" else 1e-4
-    np.testing.assert_allclose(scene.cube(2), VALUES[layout](tmp_path / "data"), atol=atol)
+    np.testing.assert_allclose(scene.cube(2), values(tmp_path / "data"), atol=atol)
     assert scene.wavelengths_nm.tolist() == nm
     evaluated = [scene.frames[index].name for index in scene.eval_indices]
     if layout == "unmix-nerf":

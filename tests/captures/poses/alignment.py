@@ -17,6 +17,8 @@ from unmix_plugin.captures.poses.pose_set import PosedCamera, PoseSet
 from unmix_plugin.engine.geometry.camera_paths import focus_point
 from unmix_plugin.scenes.placement import Placement
 
+Poses = Float64[np.ndarray, "N 3 4"]
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -85,26 +87,22 @@ def align_poses(estimated: PoseSet, truth: PoseSet, names: dict[str, str] | None
     return Alignment(best, tuple(shared.values()), errors_px, np.degrees(turns), places)
 
 
-def _stacked(cameras: list[PosedCamera]) -> Float64[np.ndarray, "N 3 4"]:
+def _stacked(cameras: list[PosedCamera]) -> Poses:
     return np.stack([camera.camera_to_world for camera in cameras])
 
 
-def _first_guess(
-    mine: Float64[np.ndarray, "N 3 4"], theirs: Float64[np.ndarray, "N 3 4"]
-) -> tuple[Placement, float]:
+def _first_guess(mine: Poses, theirs: Poses) -> tuple[Placement, float]:
     """By the mean turn, middle and extent of the cameras; and the extent of the true ones."""
     middles = [poses[:, :, 3].mean(axis=0) for poses in (mine, theirs)]
-    extents = [
-        float(np.linalg.norm(poses[:, :, 3] - middle, axis=1).mean()) or 1.0
-        for poses, middle in zip((mine, theirs), middles, strict=True)
-    ]
+    away = [poses[:, :, 3] - middle for poses, middle in zip((mine, theirs), middles, strict=True)]
+    extents = [float(np.linalg.norm(steps, axis=1).mean()) or 1.0 for steps in away]
     scale = extents[1] / extents[0]
     turns = Rotation.from_matrix(theirs[:, :, :3] @ mine[:, :, :3].transpose(0, 2, 1))
     rotation = turns.mean().as_matrix()
     return Placement(rotation, middles[1] / scale - rotation @ middles[0], scale), extents[1]
 
 
-def _around(poses: Float64[np.ndarray, "N 3 4"], reach: float) -> Float64[np.ndarray, "P 3"]:
+def _around(poses: Poses, reach: float) -> Float64[np.ndarray, "P 3"]:
     """A cross around where the cameras look."""
     middle = focus_point(poses)
     if middle is None:
@@ -112,9 +110,8 @@ def _around(poses: Float64[np.ndarray, "N 3 4"], reach: float) -> Float64[np.nda
     return middle + 0.1 * reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
 
 
-SIMILARITY = Placement(
-    Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix(), np.array([1.0, 2.0, -3.0]), 2.5
-)
+TURN = Rotation.from_euler("xyz", [0.3, -1.0, 2.0]).as_matrix()
+SIMILARITY = Placement(TURN, np.array([1.0, 2.0, -3.0]), 2.5)
 
 
 def elsewhere(poses: PoseSet) -> PoseSet:

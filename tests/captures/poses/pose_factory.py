@@ -32,10 +32,8 @@ def transforms(poses: dict[str, np.ndarray], **top: Any) -> dict[str, Any]:
     """Content of a transforms.json."""
     (fl_x, fl_y), (cx, cy), (k1, k2, p1, p2) = LENS.focal_px, LENS.center_px, LENS.distortion
     lens = {"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "k1": k1, "k2": k2, "p1": p1, "p2": p2}
-    below = [0, 0, 0, 1]
-    frames = [
-        {"file_path": name, "transform_matrix": [*pose.tolist(), below]} for name, pose in poses.items()
-    ]
+    whole = {name: [*pose.tolist(), [0, 0, 0, 1]] for name, pose in poses.items()}
+    frames = [{"file_path": name, "transform_matrix": pose} for name, pose in whole.items()]
     return {"w": LENS.width, "h": LENS.height, **lens, **top, "frames": frames}
 
 
@@ -65,9 +63,7 @@ def pixels_in_file(found: PoseSet, ideal: np.ndarray) -> np.ndarray:
     return lens.resampled_from(ideal) if lens.resampled_from else lens.pixels_of(ideal)
 
 
-def by_hand(
-    ideal: np.ndarray, focal, center, radial=(), tangential=(0.0, 0.0), growth=(), skew=0.0, is_fisheye=False
-) -> np.ndarray:
+def by_hand(ideal, focal, center, radial=(), tangential=(0, 0), growth=(), skew=0.0, is_fisheye=False):
     """Where OpenCV's and Metashape's manuals say that ideal points are seen; p1, p2 in OpenCV's order."""
     x, y = ideal.T
     if is_fisheye:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.captures.file_factory import present
 from tests.captures.poses.pose_factory import (
     FLIP,
     IDEAL,
@@ -23,6 +24,7 @@ from tests.captures.poses.pose_factory import (
     write_json,
 )
 from unmix_plugin.captures.poses.lens import Lens
+from unmix_plugin.captures.poses.pose_set import PosedCamera
 from unmix_plugin.captures.poses.reading import read_poses
 from unmix_plugin.errors import CaptureError
 from unmix_plugin.formats.meshes import write_ply
@@ -45,13 +47,6 @@ def test_poses_and_lens_are_those_of_the_file(tmp_path, encoding):
     bare = read(tmp_path, transforms(ring())["frames"])
     assert_same_poses(bare, ring())
     assert all(camera.lens is None for camera in bare.cameras.values())
-
-
-def test_scaled_rotations_are_made_rigid_and_the_factor_is_said(tmp_path):
-    scaled = {name: pose * [[0.25, 0.25, 0.25, 1.0]] for name, pose in ring().items()}
-    found = read(tmp_path, transforms(scaled))
-    assert_same_poses(found, ring())
-    assert "the rotations of 6 of 6 cameras were scaled by 0.25; made rigid, positions kept" in found.notes
 
 
 def test_blenders_split_files_are_read_together_with_an_angle_and_the_size_of_the_pictures(tmp_path):
@@ -92,42 +87,28 @@ def test_what_was_applied_is_undone_for_cameras_and_points(tmp_path):
     turn = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     shift, scale = np.array([1.0, -2.0, 3.0]), 0.5
     way = Placement(turn, shift, scale)
-    applied = {
-        name: np.column_stack([turn @ pose[:, :3], way.to_scene(pose[:, 3])]) for name, pose in ring().items()
-    }
+    applied = {name: PosedCamera(pose, None).moved(way).camera_to_world for name, pose in ring().items()}
     points = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]])
     moved = way.to_scene(points)
     red = np.array([255, 0], np.uint8)
     columns = {axis: moved[:, index] for index, axis in enumerate("xyz")}
     write_ply(tmp_path / "sparse.ply", {**columns, "red": red, "green": red, "blue": red})
-    content = transforms(
-        applied,
-        applied_transform=np.column_stack([turn, shift]).tolist(),
-        applied_scale=scale,
-        ply_file_path="sparse.ply",
-        metres_per_unit=0.001,
-    )
-    found = read(tmp_path, content)
+    stated = {"applied_transform": np.column_stack([turn, shift]).tolist(), "applied_scale": scale}
+    stated |= {"ply_file_path": "sparse.ply", "metres_per_unit": 0.001}
+    found = read(tmp_path, transforms(applied, **stated))
     assert_same_poses(found, ring())
     assert found.metres_per_unit == 0.001
-    assert found.points is not None
-    np.testing.assert_allclose(found.points, points, atol=1e-12)
-    assert found.colours is not None
-    np.testing.assert_array_equal(found.colours[:, 0], red)
-    assert found.up is not None
-    np.testing.assert_allclose(found.up, [0, 0, -1])
+    np.testing.assert_allclose(present(found.points), points, atol=1e-12)
+    np.testing.assert_array_equal(present(found.colours)[:, 0], red)
+    np.testing.assert_allclose(present(found.up), [0, 0, -1])
 
 
-@pytest.mark.parametrize(
-    "hints", [{}, {"scale": 0.5, "from_na": False}, {"applied_transform": np.eye(4).tolist(), "scale": 1}]
-)
-def test_the_offset_of_instant_ngp_moves_no_pose(tmp_path, hints):
-    found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
-    assert_same_poses(found, ring())
-    assert not found.offset.any()
-
-
-def test_cameras_of_neus2_have_the_axes_of_opencv(tmp_path):
+def test_the_offset_of_instant_ngp_moves_no_pose_and_cameras_of_neus2_have_the_axes_of_opencv(tmp_path):
+    applied = np.eye(4).tolist()
+    for hints in ({}, {"scale": 0.5, "from_na": False}, {"applied_transform": applied, "scale": 1}):
+        found = read(tmp_path, transforms(ring(), offset=[0.5, 0.5, 0.5], **hints))
+        assert_same_poses(found, ring())
+        assert not found.offset.any()
     flipped = {name: np.column_stack([pose[:, :3] @ FLIP, pose[:, 3]]) for name, pose in ring().items()}
     content = transforms(flipped, from_na=True, scale=0.5, offset=[0.5, 0.5, 0.5])
     found = read(tmp_path, content)
@@ -210,18 +191,20 @@ def test_large_coordinates_are_split_into_an_offset_and_the_rest(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("factor", "message"),
-    [
-        (0.0, "all zeros"),
-        ([[-1.0, 1.0, 1.0, 1.0]], "mirror image"),
-        ([[1.0, 2.0, 1.0, 1.0]], "sheared"),
-    ],
+    ("factor", "message"), [(0, "all zeros"), ([[-1, 1, 1, 1]], "mirror image"), ([[1, 2, 1, 1]], "sheared")]
 )
-def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, message):
+def test_matrices_that_are_no_poses_are_refused_by_name_and_scaled_ones_made_rigid(tmp_path, factor, message):
+    scaled = {name: pose * [[0.25, 0.25, 0.25, 1.0]] for name, pose in ring().items()}
+    found = read(tmp_path, transforms(scaled))
+    assert_same_poses(found, ring())
+    assert "the rotations of 6 of 6 cameras were scaled by 0.25; made rigid, positions kept" in found.notes
     poses = ring()
     poses["images/view_3.png"] = factor * poses["images/view_3.png"]
     with pytest.raises(CaptureError, match=rf"1 of 6 .*images/view_3.png: .*{message}"):
         read(tmp_path, transforms(poses))
+
+
+NO_NUMBERS = [{"file_path": f"{i}.png", "transform_matrix": [math.nan] * 12} for i in range(2)]
 
 
 @pytest.mark.parametrize(
@@ -231,10 +214,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"frames": [1]}, r"frames\[0\] is 1"),
         ({"frames": [{"file_path": "a.png"}]}, "'transform_matrix' is absent"),
         ({"frames": [{"transform_matrix": [0] * 11}]}, r"frames\[0\]: .* list of 11; .*4 numbers"),
-        (
-            {"frames": [{"file_path": f"{i}.png", "transform_matrix": [math.nan] * 12} for i in range(2)]},
-            r"2 of 2 camera matrices .*: 0\.png, 1\.png: .* not finite",
-        ),
+        ({"frames": NO_NUMBERS}, r"2 of 2 camera matrices .*: 0\.png, 1\.png: .* not finite"),
         ({"fl_x": "long"}, "'fl_x' is \"long\""),
         ({"fl_x": -5}, "'fl_x' is -5"),
         ({"w": 0.5}, "'w' is 0.5; expected a whole number"),
@@ -243,7 +223,7 @@ def test_matrices_that_are_no_poses_are_refused_by_name(tmp_path, factor, messag
         ({"ftheta_p0": "steep"}, "'ftheta_p0' to 'ftheta_p5' are .*expected 6 numbers"),
         (
             {"camera_model": "FISHEYE624", "distortion_params": [0] * 6},
-            "FISHEYE624 are a list of 6; expected 12 numbers",
+            "are a list of 6; expected 12 numbers",
         ),
         ({"applied_transform": np.diag([2, 1, 1, 1])[:3].tolist()}, "'applied_transform'.*a rotation"),
         ({"applied_scale": 0}, "'applied_scale' is 0"),

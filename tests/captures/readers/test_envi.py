@@ -9,14 +9,7 @@ import pytest
 import spectral.io.envi as spy
 import tifffile
 
-from tests.captures.file_factory import (
-    AXES,
-    check_file,
-    header_text,
-    present,
-    rows_and_bands_of,
-    write_envi,
-)
+from tests.captures.file_factory import AXES, check_file, header_text, present, rows_and_bands_of, write_envi
 from unmix_plugin.captures.layouts.cubes import find_cubes
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.captures.spectral_file import ReadOptions
@@ -46,13 +39,13 @@ def test_files_of_spy_are_read(tmp_path):
     cube = np.random.default_rng(1).random((6, 3, 5)).astype(np.float32)
     entries = {
         "wavelength": [0.45, 0.5, 0.55, 0.6, 0.7],
-        "wavelength units": "Micrometers",
         "fwhm": [0.01] * 5,
+        "wavelength units": "Micrometers",
     }
     spy.save_image(str(tmp_path / "cube.hdr"), cube, metadata=entries, interleave="bil")
     file = open_spectral_file(tmp_path / "cube.img")
     check_file(file, values=cube, nm=[450, 500, 550, 600, 700], fwhm=10, evidence="'wavelength', Micrometers")
-    assert file.files == (tmp_path / "cube.hdr", tmp_path / "cube.img")
+    check_file(file, files=(tmp_path / "cube.hdr", tmp_path / "cube.img"))
 
 
 def test_a_header_as_headwall_and_plantcv_write_it(tmp_path):
@@ -82,10 +75,10 @@ data ignore value = 65535
     (tmp_path / "cube").write_bytes(CUBE.astype("<u2").transpose(AXES["bil"]).tobytes())
     file = open_spectral_file(tmp_path / "cube")
     check_file(file, values=CUBE, nm=[400.5, 410, 420, 430], bad=[1], scale=10000, no_data=(65535,))
-    assert file.path == tmp_path / "cube.hdr"
-    assert file.warnings == ("the header has no byte order; taken as little-endian",)
+    check_file(file, path=tmp_path / "cube.hdr", warnings=(NO_BYTE_ORDER,))
 
 
+NO_BYTE_ORDER = "the header has no byte order; taken as little-endian"
 UNIT = "wavelength units = "
 NO_UNIT = {"nm": NM, "evidence": "no unit: 400 to 700 taken as nm"}
 RANGES = {"nm": NM, "fwhm": [20, 20, 40, 100], "evidence": "ranges with the unit um"}
@@ -117,6 +110,9 @@ SAID: dict[str, dict[str, Any]] = {
     "reflectance scale factor = {1, 2, 3, 4}": {"linear": None, "warning": "is 1, 2, 3, 4 and is left out"},
     "data ignore value = unset": {"warning": "'data ignore value' is unset, no number: not used"},
     "sensor type = a\nsensor type = b\nwavelength = {400, 500, 600, 700}": {"nm": NM},
+    "; by hand\n\nscale factor: 10000": {
+        "warning": "1 line of the header not read for want of '=': 'scale f"
+    },
 }
 LEFT_OUT = {
     "wavelength = {400, 500, 600}": "are left out: 3 for 4 bands",
@@ -129,13 +125,15 @@ LEFT_OUT = {
     f"{UNIT}Micrometers\nwavelength = {{400, 500, 600, 700}}": "can't be in Micrometers",
     f"{UNIT}nm\nwavelength = {{.4, .5, .6, .7}}": "can't be in nm",
 }
+FINE = f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = "
+IN_UM = f"{UNIT}Micrometers\nwavelength = {{.5, .51, .52, .53}}\nfwhm = "
 WIDTHS = {
-    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.0055, .0055, .0055, .0055}}": "taken as micrometres",
-    f"{UNIT}Micrometers\nwavelength = {{.5, .51, .52, .53}}\nfwhm = {{5.5, 5.5, 5.5, 5.5}}": "5.5 to 5.5 taken as nm",
+    FINE + "{.0055, .0055, .0055, .0055}": "taken as micrometres",
+    IN_UM + "{5.5, 5.5, 5.5, 5.5}": "5.5 to 5.5 taken as nm",
 }
 NO_WIDTHS = {
-    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{900, 5.5, 5.5, 5.5}}": "would be 5.5 to 900 nm",
-    f"{UNIT}nm\nwavelength = {{500, 510, 520, 530}}\nfwhm = {{.00005, 5.5, 5.5, 5.5}}": "would be 5e-05 to 5.5 nm",
+    FINE + "{900, 5.5, 5.5, 5.5}": "FWHM are left out: they would be 5.5 to 900 nm",
+    FINE + "{.00005, 5.5, 5.5, 5.5}": "FWHM are left out: they would be 5e-05 to 5.5 nm",
 }
 
 
@@ -145,10 +143,7 @@ NO_WIDTHS = {
         *SAID.items(),
         *((text, {"nm": None, "warning": said}) for text, said in LEFT_OUT.items()),
         *((text, {"fwhm": 5.5, "warning": said}) for text, said in WIDTHS.items()),
-        *(
-            (text, {"fwhm": None, "warning": f"FWHM are left out: they {said}"})
-            for text, said in NO_WIDTHS.items()
-        ),
+        *((text, {"fwhm": None, "warning": said}) for text, said in NO_WIDTHS.items()),
     ],
 )
 def test_what_a_header_says_of_bands_is_used_or_left_out_with_a_reason(tmp_path, entries, expected):
@@ -205,36 +200,23 @@ def test_headers_in_the_encodings_and_lists_of_other_programs(tmp_path, encoding
         ({"wavelength": "{1, 2"}, "the list of 'wavelength' is never closed"),
         (
             {"wavelength": "{1, 2, 3, 4}\nwavelength = {2, 3, 4, 5}"},
-            r"cube\.hdr: 'wavelength' is there twice, with different values",
+            r"cube\.hdr: 'wavelength' is there twice",
         ),
         ({"data gain values": "{1, 2}"}, "'data gain values' gives 2 gains for 4 bands"),
         ({"data gain values": "{1, 2, x, 1}"}, "'data gain values' has 'x'"),
         ({"data gain values": "{1, 0, 2, 1}"}, "gains from 0 to 2; expected finite numbers above 0"),
         ({"data gain values": "2\nreflectance scale factor = 10000"}, "it is unclear which the numbers need"),
         ({"data offset values": "-1000\nreflectance scale factor = 10000"}, "an offset above 1"),
+        ("BYTEORDER I\nNROWS 540\n", "header of an ESRI"),
+        (bytes(range(256)).decode("latin-1"), "no ENVI header: its first line is not 'ENVI'.* Convert the"),
     ],
 )
 def test_headers_that_cannot_be_followed_are_refused(tmp_path, change, message):
     header = write_envi(tmp_path / "cube.hdr", CUBE.astype("<i2"), "bil")
-    header.write_text(header_text(CUBE.astype("<i2"), "bil", change))
+    text = change if isinstance(change, str) else header_text(CUBE.astype("<i2"), "bil", change)
+    header.write_text(text, encoding="latin-1", newline="")
     with pytest.raises(CaptureError, match=message):
         open_spectral_file(header)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("BYTEORDER I\nNROWS 540\n", "header of an ESRI"),
-        (
-            bytes(range(256)).decode("latin-1"),
-            "no ENVI header: its first line is not 'ENVI'.* Convert the file",
-        ),
-    ],
-)
-def test_headers_of_other_programs_are_refused(tmp_path, text, message):
-    (tmp_path / "cube.hdr").write_text(text, encoding="latin-1", newline="")
-    with pytest.raises(CaptureError, match=message):
-        open_spectral_file(tmp_path / "cube.hdr")
 
 
 @pytest.mark.parametrize(
@@ -244,11 +226,7 @@ def test_headers_of_other_programs_are_refused(tmp_path, text, message):
         ("cube.hdr", {"cube.bil": STORED, "cube.bsq": bytes(len(STORED))}, "cube.bil"),
         ("cube.hdr", {"cube": STORED, "cube.bil": bytes(2 * len(STORED))}, "cube"),
         ("cube.raw.hdr", {"cube.raw": STORED}, "cube.raw"),
-        (
-            "cube.hdr",
-            {"cube.img": bytes(len(STORED)), "cube.bsq": STORED},
-            "cube.img and cube.bsq could each be what it describes",
-        ),
+        ("cube.hdr", {"cube.img": STORED, "cube.bsq": STORED}, "cube.img and cube.bsq could each be what it"),
         ("cube.hdr", {"other.raw": STORED}, "no file of numbers beside this header; expected cube or"),
         ("cube.hdr", {"cube": b"\x1f\x8b\x08" + bytes(50)}, "cube: compressed with gzip; unpack it"),
     ],
@@ -294,17 +272,13 @@ def test_the_header_beside_a_tiff_describes_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ("data type = ", "data type = 6;", "'data type' is 6"),
-        ("data type = ", "kind = ", "'data type' is missing"),
-    ],
+    ("new", "said"), [("data type = 6;", "'data type' is 6"), ("kind = ", "'data type' is missing")]
 )
-def test_a_faulty_header_of_numbers_is_refused_and_not_read_as_that_of_a_quick_look(tmp_path, old, new, said):
+def test_a_faulty_header_of_numbers_is_refused_and_not_read_as_that_of_a_quick_look(tmp_path, new, said):
     header = write_envi(tmp_path / "x.hdr", CUBE, "bil")
     (tmp_path / "x").rename(tmp_path / "x.img")
     tifffile.imwrite(tmp_path / "x.tif", CUBE[..., 0])
-    header.write_text(header.read_text().replace(old, new))
+    header.write_text(header.read_text().replace("data type = ", new))
     with pytest.raises(CaptureError, match=said):
         open_spectral_file(header)
     assert open_spectral_file(tmp_path / "x.tif").shape == (*CUBE.shape[:2], 1)
@@ -322,24 +296,12 @@ def test_a_header_beside_numbers_of_its_own_describes_no_other_file(tmp_path, ot
         find_cubes(tmp_path, ReadOptions())
 
 
-@pytest.mark.parametrize(
-    ("gain", "factor"), [("0.0", 1.0), ("6.0206", 2.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)]
-)
+@pytest.mark.parametrize(("gain", "factor"), [("0.0", 1.0), ("12.0412", 4.0), ("6.0206 dB", 2.0)])
 def test_gains_of_resonon_are_decibels_and_that_is_said(tmp_path, gain, factor):
     """Told by the names beside them, and of no other camera."""
-    cube = np.ones((4, 5, 3), np.uint16)
-    file = open_spectral_file(
-        write_envi(tmp_path / "a.hdr", cube, "bil", f"shutter = 20.0\ngain = {gain}\nframerate = 40.0\n")
-    )
+    more = f"shutter = 20.0\ngain = {gain}\nframerate = 40.0\n"
+    file = open_spectral_file(write_envi(tmp_path / "a.hdr", CUBE, "bil", more))
     check_file(file, exposure_s=0.02, gain=pytest.approx(factor, rel=1e-4), warnings=())
-    evidence = file.metadata["gain_evidence"]
-    assert evidence == "header field 'gain', taken as decibels, as Resonon writes"
-    other = open_spectral_file(write_envi(tmp_path / "b.hdr", cube, "bil", "shutter = 20.0\ngain = 6\n"))
+    check_file(file, gain_evidence="header field 'gain', taken as decibels, as Resonon writes")
+    other = open_spectral_file(write_envi(tmp_path / "b.hdr", CUBE, "bil", "shutter = 20.0\ngain = 6\n"))
     check_file(other, gain=6.0)
-
-
-def test_lines_of_a_header_without_an_equals_sign_are_said(tmp_path):
-    header = write_envi(tmp_path / "cube.hdr", CUBE.astype("<u2"), "bil")
-    header.write_text(header.read_text() + "; by hand\n\nreflectance scale factor: 10000\n")
-    said = open_spectral_file(header).warnings
-    assert said[-1] == "1 line of the header not read for want of '=': 'reflectance scale factor: 10000'"

@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from tests.captures.file_factory import (
-    check_file,
-    gdal_items,
-    gdal_tag,
-    header_text,
-    present,
-    write_envi,
-)
+from tests.captures.file_factory import check_file, gdal_items, gdal_tag, header_text, present, write_envi
+from tests.captures.poses.pose_factory import llff_table, ring, transforms, write_json
 from tests.fuzz.capture_samples import SAMPLES
 from unmix_plugin.captures.calibration.references import finished_by, stated_reflectance
 from unmix_plugin.captures.readers.opening import inspect_file, open_spectral_file
@@ -37,9 +31,8 @@ def test_a_package_that_is_not_installed_is_named_with_its_extra(tmp_path, monke
     with h5py.File(tmp_path / "h5py", "w") as file:
         file["cube"] = CUBE
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(
-        CaptureError, match=rf'the package {package} .*-m pip install "h5py>=.*" "imagecodecs>='
-    ):
+    said = rf'the package {package} .*-m pip install "h5py>=.*" "imagecodecs>='
+    with pytest.raises(CaptureError, match=said):
         open_spectral_file(tmp_path / package)
 
 
@@ -91,13 +84,11 @@ def tiff_of(path, shape, _):
     tifffile.memmap(path, shape=shape, dtype=np.uint16, **options)
 
 
-@pytest.mark.parametrize(
-    ("name", "write", "interleave"),
-    [
-        *(("cube.hdr", envi_of, interleave) for interleave in ("bsq", "bil", "bip")),
-        *(("cube.h5", hdf5_of, None), ("cube.npy", npy_of, None), ("cube.tif", tiff_of, None)),
-    ],
-)
+LARGE = [("cube.h5", hdf5_of, None), ("cube.npy", npy_of, None), ("cube.tif", tiff_of, None)]
+LARGE += [("cube.hdr", envi_of, interleave) for interleave in ("bsq", "bil", "bip")]
+
+
+@pytest.mark.parametrize(("name", "write", "interleave"), LARGE)
 def test_a_file_larger_than_memory_opens_at_once_and_gives_its_rows(tmp_path, name, write, interleave):
     shape = (20_000, 10_000, 60) if name == "cube.tif" else (10**5, 10**4, 500)
     write(tmp_path / name, shape, interleave)
@@ -114,12 +105,8 @@ def listed(numbers):
 
 
 def roles(**lists):
-    return gdal_tag(
-        *(
-            gdal_items(name, numbers, f' role="{name}"' * (name in ("scale", "offset")))
-            for name, numbers in lists.items()
-        )
-    )
+    named = {name: f' role="{name}"' if name in ("scale", "offset") else "" for name in lists}
+    return gdal_tag(*(gdal_items(name, numbers, named[name]) for name, numbers in lists.items()))
 
 
 def xml(tag, bands, attribute=""):
@@ -139,10 +126,6 @@ def pam(*bands):
 def enmap(nm, **columns):
     bands = [{name: column[i] for name, column in columns.items()} for i in range(len(nm))]
     return xml("bandID", [{"wavelengthCenterOfBand": nm[i]} | own for i, own in enumerate(bands)], "number")
-
-
-def calibrated_envi(folder, more):
-    return write_envi(folder / "a.hdr", CUBE, "bil", more)
 
 
 def write_tiff(folder, tags=(), name="a.tif", **beside):
@@ -166,20 +149,17 @@ def by_band(gains, offsets, prefix=""):
 
 AUX = pam(*({"Offset": OFFSETS[band], "Scale": GAINS[band]} for band in range(3)))
 OWN = roles(scale=GAINS, offset=OFFSETS)
+OF_ENVI = by_band(GAINS, OFFSETS)
+OF_REFLECTANCE = by_band(GAINS, OFFSETS, "reflectance ") + "data gain values = {7, 7, 7}"
+BESIDE = header_text(CUBE, "bip", {}) + "file type = TIFF\n"
 CALIBRATED = {
-    "ENVI": lambda folder: calibrated_envi(folder, by_band(GAINS, OFFSETS)),
-    "ENVI, reflectance": lambda folder: calibrated_envi(
-        folder, by_band(GAINS, OFFSETS, "reflectance ") + "data gain values = {7, 7, 7}"
-    ),
+    "ENVI": lambda folder: write_envi(folder / "a.hdr", CUBE, "bil", OF_ENVI),
+    "ENVI, reflectance": lambda folder: write_envi(folder / "a.hdr", CUBE, "bil", OF_REFLECTANCE),
     "roles of GDAL": lambda folder: write_tiff(folder, OWN),
-    "names in GDAL's metadata": lambda folder: write_tiff(
-        folder, roles(scale_factor=GAINS, add_offset=OFFSETS)
-    ),
+    "GDAL's metadata": lambda folder: write_tiff(folder, roles(scale_factor=GAINS, add_offset=OFFSETS)),
     "GDAL's file beside it": lambda folder: write_tiff(folder, aux=AUX),
     "its own before unusable ones beside it": lambda folder: write_tiff(folder, OWN, aux=pam({"Scale": 0})),
-    "a header beside a TIFF": lambda folder: write_tiff(
-        folder, hdr=header_text(CUBE, "bip", {}) + "file type = TIFF\n" + by_band(GAINS, OFFSETS)
-    ),
+    "a header beside a TIFF": lambda folder: write_tiff(folder, hdr=BESIDE + OF_ENVI),
     "HDF5, by band": lambda folder: calibrated_hdf5(folder, {"scale_factor": GAINS, "add_offset": OFFSETS}),
 }
 
@@ -216,47 +196,30 @@ def test_gains_beside_a_file_that_cannot_be_used_are_refused(tmp_path):
 
 
 THREE, FIVE = (450, 550, 1650), np.array([450, 550, 650, 1650, 2250])
+SCALED = {"GainOfBand": GAINS, "OffsetOfBand": OFFSETS}
+AS_SCALED = CUBE * GAINS + OFFSETS
+UNLIKE = "a-METADATA.XML describes {} bands, the image has 3: wavelengths and gains in it"
 DESIS = [
-    {
-        "bandNumber": number,
-        "wavelengthCenterOfBand": 400 + 100 * number,
-        "wavelengthWidthOfBand": 3,
-        "gainOfBand": GAINS[number - 1],
-        "offsetOfBand": OFFSETS[number - 1],
-    }
+    {"bandNumber": number, "wavelengthCenterOfBand": 400 + 100 * number, "wavelengthWidthOfBand": 3}
+    | {"gainOfBand": GAINS[number - 1], "offsetOfBand": OFFSETS[number - 1]}
     for number in (2, 3, 1)
 ]
 DESCRIBED = [
-    (
-        "",
-        enmap(THREE, FWHMOfBand=[7, 7, 7], GainOfBand=GAINS, OffsetOfBand=OFFSETS),
-        {"nm": THREE, "fwhm": 7, "calibrated": CUBE * GAINS + OFFSETS},
-    ),
-    *(
-        ("", enmap(THREE, FWHMOfBand=[width, 7, 7]), {"nm": THREE, "fwhm": None})  # a width that no band has
+    ("", enmap(THREE, FWHMOfBand=[7, 7, 7], **SCALED), {"nm": THREE, "fwhm": 7, "calibrated": AS_SCALED}),
+    *(  # a width that no band has
+        ("", enmap(THREE, FWHMOfBand=[width, 7, 7]), {"nm": THREE, "fwhm": None})
         for width in ("0", "-7", "inf")
     ),
     ("", enmap((0, 450, 550)), {"nm": (450, 450, 550), "bad": [0]}),  # a dead band
-    ("", xml("band", DESIS), {"nm": [500, 600, 700], "fwhm": 3, "calibrated": CUBE * GAINS + OFFSETS}),
+    ("", xml("band", DESIS), {"nm": [500, 600, 700], "fwhm": 3, "calibrated": AS_SCALED}),
     *(  # L1B: the first bands are those of the VNIR image, the last those of the SWIR image
-        (
-            detector,
-            enmap(FIVE, GainOfBand=range(1, 6)),
-            {"nm": FIVE[part], "calibrated": CUBE * np.arange(1, 6)[part], "warnings": ()},
-        )
-        for detector, part in (("_VNIR", slice(0, 3)), ("_SWIR", slice(2, 5)))
+        (detector, enmap(FIVE, GainOfBand=gains), {"nm": nm, "calibrated": CUBE * own, "warnings": ()})
+        for gains in [np.arange(1, 6)]
+        for detector, nm, own in (("_VNIR", FIVE[:3], gains[:3]), ("_SWIR", FIVE[2:], gains[2:]))
     ),
     *(
-        (
-            "",
-            enmap(nm),
-            {
-                "nm": None,
-                "linear": None,
-                "warning": f"a-METADATA.XML describes {len(nm)} bands, the image has 3: wavelengths and gains in it",
-            },
-        )
-        for nm in ((), FIVE[:2], FIVE[:4])
+        ("", enmap(FIVE[:count]), {"nm": None, "linear": None, "warning": UNLIKE.format(count)})
+        for count in (0, 2, 4)
     ),
 ]
 
@@ -286,8 +249,7 @@ def test_the_level_of_enmap_and_desis_says_what_gains_make_of_numbers(tmp_path, 
     image = write_tiff(tmp_path, name=f"{product}-SPECTRAL_IMAGE.TIF")
     (tmp_path / f"{product}-METADATA.XML").write_text(text)
     if product.startswith("DESIS"):  # has a header, too, with gains that are radiances elsewhere
-        said = header_text(CUBE, "bip", {}) + "file type = TIFF\n" + by_band([1e-4] * 3, [0] * 3)
-        image.with_suffix(".hdr").write_text(said)
+        image.with_suffix(".hdr").write_text(BESIDE + by_band([1e-4] * 3, [0] * 3))
     file = open_spectral_file(image)
     assert (stated_reflectance(file) is not None) == (quantity == "reflectance")
     assert (finished_by(file) is not None) == (quantity is not None)
@@ -309,28 +271,18 @@ def header(tmp_path):
 
 @pytest.fixture
 def poses(tmp_path):
-    placed = [np.eye(4) + np.eye(4, k=3) * distance for distance in range(3)]
-    frames = [{"file_path": f"{i}.png", "transform_matrix": pose.tolist()} for i, pose in enumerate(placed)]
-    (tmp_path / "transforms.json").write_text(
-        json.dumps({"camera_angle_x": 0.7, "w": 6, "h": 4, "frames": frames})
-    )
-    return tmp_path / "transforms.json"
+    placed = {f"{i}.png": np.eye(4)[:3] + np.eye(3, 4, k=3) * i for i in range(3)}
+    return write_json(tmp_path / "transforms.json", transforms(placed))
 
 
 def test_facts_of_an_image_are_those_of_its_header_and_damaged_numbers_are_found_out(header, tmp_path):
     facts = inspect_file(header)
     assert set(facts) == FACTS
-    expected = {
-        "file": str(header),
-        "reader": "envi",
-        "shape": [4, 6, 3],
-        "dtype": "uint16",
-        "interleave": "bil",
-    }
+    expected = {"file": str(header), "reader": "envi", "shape": [4, 6, 3], "dtype": "uint16"}
     expected |= {"wavelengths_nm": [450, 550, 650.5], "wavelength_evidence": "header field 'wavelength', nm"}
     expected |= {"fwhm_nm": [5, 5, 6], "bad_bands": [1], "scale": None, "no_data": "nan", "poses": None}
     assert {key: facts[key] for key in expected} == expected
-    assert facts["metadata"]["header"]["sensor type"] == "X"
+    assert (facts["interleave"], facts["metadata"]["header"]["sensor type"]) == ("bil", "X")
     np.savez_compressed(tmp_path / "a.npz", cube=CUBE)
     data = bytearray((tmp_path / "a.npz").read_bytes())
     data[len(data) // 2] ^= 255
@@ -343,11 +295,7 @@ def test_facts_of_poses(poses, tmp_path):
     facts = inspect_file(poses)
     assert set(facts) == FACTS
     assert (facts["poses"], facts["shape"]) == (3, None)
-    rows = np.zeros((5, 17))
-    for distance, row in enumerate(rows):
-        row[:15] = np.hstack([np.eye(3), [[distance], [0], [0]], [[480], [640], [500]]]).reshape(-1)
-        row[15:] = 1, 9
-    np.save(tmp_path / "poses_bounds.npy", rows)
+    np.save(tmp_path / "poses_bounds.npy", llff_table(ring(5).values()))
     assert inspect_file(tmp_path / "poses_bounds.npy")["poses"] == 5
 
 

@@ -6,13 +6,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from tests.captures.file_factory import (
-    check_file,
-    header_text,
-    present,
-    rows_and_bands_of,
-    write_band_file,
-)
+from tests.captures.file_factory import check_file, header_text, present, rows_and_bands_of, write_band_file
+from tests.captures.test_camera_tags import EXIF, MICASENSE
 from unmix_plugin.captures.calibration.references import find_missing, finished_by
 from unmix_plugin.captures.readers.opening import open_spectral_file
 from unmix_plugin.errors import CaptureError
@@ -30,19 +25,24 @@ def test_colours_are_three_bands_of_unknown_wavelength(tmp_path, name):
     check_file(file, names=("red", "green", "blue"), nm=None, encoding="sRGB")
 
 
-def test_numbers_of_sixteen_bits_keep_them(tmp_path):
-    (tmp_path / "rgb.png").write_bytes(imagecodecs.png_encode(DEEP))
-    (tmp_path / "grey.png").write_bytes(imagecodecs.png_encode(DEEP[..., 0].copy()))
-    said = "red, green and blue are taken as light, as stored"
-    check_file(open_spectral_file(tmp_path / "rgb.png"), values=DEEP, warning=said)
-    check_file(open_spectral_file(tmp_path / "grey.png"), values=DEEP[..., :1])
-    (tmp_path / "opaque.png").write_bytes(imagecodecs.png_encode(DEEP[..., :2].copy()))
-    check_file(open_spectral_file(tmp_path / "opaque.png"), values=DEEP[..., :1], note="opacity")
+LIGHT = "red, green and blue are taken as light, as stored"
 
 
-def test_opacity_palettes_and_bits(tmp_path):
-    Image.fromarray(np.dstack([RGB, RGB[..., :1]])).save(tmp_path / "rgba.png")
-    check_file(open_spectral_file(tmp_path / "rgba.png"), values=RGB, note="opacity")
+@pytest.mark.parametrize(
+    ("pixels", "expected"),
+    [
+        (DEEP, {"values": DEEP, "warning": LIGHT}),
+        (DEEP[..., 0], {"values": DEEP[..., :1]}),
+        (DEEP[..., :2], {"values": DEEP[..., :1], "note": "opacity"}),
+        (np.dstack([RGB, RGB[..., :1]]), {"values": RGB, "note": "opacity"}),
+    ],
+)
+def test_numbers_keep_their_bits_and_opacity_is_no_band(tmp_path, pixels, expected):
+    (tmp_path / "a.png").write_bytes(imagecodecs.png_encode(pixels.copy()))
+    check_file(open_spectral_file(tmp_path / "a.png"), **expected)
+
+
+def test_palettes_and_bits(tmp_path):
     palette = Image.fromarray(RGB).quantize(256)
     palette.save(tmp_path / "palette.png")
     check_file(open_spectral_file(tmp_path / "palette.png"), values=palette.convert("RGB"))
@@ -86,15 +86,13 @@ def test_counted_files_keep_their_order_and_have_no_wavelengths(tmp_path):
 
 def test_a_band_in_a_folder_has_what_files_beside_it_say(tmp_path):
     """In GDAL's XML: gains, and no-data numbers, which may be light in another band."""
-    for nm, scale in ((500, 1e-4), (600, 2e-4)):
-        path, plane = tmp_path / f"{nm}nm.tif", np.full((3, 4), 5000, np.uint16)
-        plane[0] = nm
-        tifffile.imwrite(path, plane, photometric="minisblack", metadata=None)
+    planes = np.full((2, 3, 4), 5000, np.uint16)
+    planes[0, 0], planes[1] = 500, (500, 600, 5000, 5000)
+    for plane, nm, scale in zip(planes, (500, 600), (1e-4, 2e-4), strict=True):
+        tifffile.imwrite(tmp_path / f"{nm}nm.tif", plane, photometric="minisblack", metadata=None)
         own = f"<NoDataValue>{nm}</NoDataValue><Offset>-0.1</Offset><Scale>{scale}</Scale>"
         text = f'<PAMDataset><PAMRasterBand band="1">{own}</PAMRasterBand></PAMDataset>'
-        (tmp_path / f"{path.name}.aux.xml").write_text(text)
-    plane[:] = (500, 600, 5000, 5000)
-    tifffile.imwrite(tmp_path / "600nm.tif", plane, photometric="minisblack", metadata=None)
+        (tmp_path / f"{nm}nm.tif.aux.xml").write_text(text)
     file = open_spectral_file(tmp_path)
     np.testing.assert_allclose(present(file.linear).gains, [1e-4, 2e-4])
     np.testing.assert_allclose(present(file.linear).offsets, [-0.1, -0.1])
@@ -119,14 +117,8 @@ def test_a_band_in_a_folder_has_what_its_header_says(tmp_path):
 
 
 def test_a_folder_of_the_lenses_of_a_rig_is_refused_with_the_layout_that_reads_it(tmp_path):
-    xmp = {
-        "MicaSense:RadiometricCalibration": ["0.0001", "1e-7", "1e-6"],
-        "Camera:VignettingCenter": ["4", "4"],
-        "Camera:VignettingPolynomial": ["0"] * 6,
-    }
-    exif = {"ExposureTime": 0.01, "ISOSpeed": 100}
     for lens in (1, 2):
-        write_band_file(tmp_path / f"IMG_0000_{lens}.tif", np.full((4, 5), 9), xmp, exif)
+        write_band_file(tmp_path / f"IMG_0000_{lens}.tif", np.full((4, 5), 9), MICASENSE, EXIF)
     with pytest.raises(CaptureError, match=r"IMG_0000_1.tif: of one lens of a MicaSense.*unmix-process rig"):
         open_spectral_file(tmp_path)
 

@@ -41,23 +41,19 @@ STORAGE = {
 }
 
 
-def written(folder: Path, image: np.ndarray, **options: Any) -> SpectralFile:
+def written(folder: Path, image: np.ndarray, name: str = "a.tif", **options: Any) -> SpectralFile:
     """An image as tifffile writes it, opened; bands beside each other in each pixel unless options say otherwise."""
-    given: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "contig"} | options
-    tifffile.imwrite(folder / "a.tif", image, **given)
-    return open_spectral_file(folder / "a.tif")
-
-
-def write(path: Path, arrangement: str, storage: str) -> Path:
-    image, options = ARRANGEMENTS[arrangement]
-    tifffile.imwrite(path, image, photometric="minisblack", **options, **STORAGE[storage])
-    return path
+    given: dict[str, Any] = {"photometric": "minisblack"}
+    given |= {} if "metadata" in options or image.ndim == 2 else {"planarconfig": "contig"}
+    tifffile.imwrite(folder / name, image, **given | options)
+    return open_spectral_file(folder / name)
 
 
 @pytest.mark.parametrize("storage", STORAGE)
 @pytest.mark.parametrize("arrangement", ARRANGEMENTS)
 def test_rows_and_bands_are_those_of_the_image(tmp_path, arrangement, storage):
-    file = open_spectral_file(write(tmp_path / "cube.tif", arrangement, storage))
+    image, options = ARRANGEMENTS[arrangement]
+    file = written(tmp_path, image, **options, **STORAGE[storage])
     check_file(file, reader="tiff", interleave="bip" if arrangement == "chunky" else "bsq")
     rows_and_bands_of(file, CUBE)
     np.testing.assert_array_equal(file.read(slice(13, 41), np.array([4, 0])), CUBE[13:41][..., [4, 0]])
@@ -72,24 +68,21 @@ def test_a_picture_written_by_pillow_has_one_band_or_three(tmp_path):
 
 
 def test_stacks_of_imagej_with_one_entry_for_all_pages(tmp_path):
-    rows_and_bands_of(written(tmp_path, PLANES, imagej=True), CUBE)
+    rows_and_bands_of(written(tmp_path, PLANES, imagej=True, metadata={}), CUBE)
     tifffile.imwrite(tmp_path / "b.tif", PLANES, truncate=True)
     check_file(open_spectral_file(tmp_path / "b.tif"), values=CUBE)
 
 
 def test_rows_as_pages_are_recognised_by_the_number_of_wavelengths_or_said(tmp_path):
-    tifffile.imwrite(tmp_path / "a.tif", CUBE, photometric="minisblack", metadata={"wavelengths": NM})
-    with tifffile.TiffFile(tmp_path / "a.tif") as file:
-        assert len(file.pages) == 70
-    file = open_spectral_file(tmp_path / "a.tif")
+    file = written(tmp_path, CUBE, metadata={"wavelengths": NM})
+    with tifffile.TiffFile(tmp_path / "a.tif") as opened:
+        assert len(opened.pages) == 70
     rows_and_bands_of(file, CUBE)
     check_file(file, nm=NM)
-    tifffile.imwrite(tmp_path / "b.tif", CUBE, photometric="minisblack", compression="zlib")
-    check_file(open_spectral_file(tmp_path / "b.tif"), warning="axis 2 is the shortest")
-    file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="yxb"))
-    rows_and_bands_of(file, CUBE)
-    file = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="xyb"))
-    check_file(file, values=CUBE.transpose(1, 0, 2))
+    check_file(written(tmp_path, CUBE, "b.tif", metadata=None), warning="axis 2 is the shortest")
+    rows_and_bands_of(open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="yxb")), CUBE)
+    turned = open_spectral_file(tmp_path / "b.tif", ReadOptions(axes="xyb"))
+    check_file(turned, values=CUBE.transpose(1, 0, 2))
 
 
 def gdal(*entries: str, **options: Any) -> dict[str, Any]:
@@ -107,41 +100,34 @@ def described(text: str) -> dict[str, Any]:
 
 
 NM, WIDE_NM, UM = [*range(400, 460, 10)], [*range(400, 1000, 100)], [0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
-PACKET = xmp_packet(
-    {"Camera:BandName": "Red edge", "Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}
-)
+RED_EDGE = {"Camera:BandName": "Red edge", "Camera:CentralWavelength": "717", "Camera:WavelengthFWHM": "10"}
+PACKET = xmp_packet(RED_EDGE)
 XMP = {"image": PLANES[0], "extratags": [(700, "B", len(PACKET), PACKET, True)], "metadata": None}
 EXIF = [(33434, "2I", 1, (1, 4), True), (34855, "H", 1, 200, True), (33437, "2I", 1, (28, 10), True)]
-EXIF_OF_GDAL = [
-    whole("EXIF_ExposureTime", "(0.25)"),
-    whole("EXIF_ISOSpeedRatings", 200),
-    whole("EXIF_FNumber", "(2.8) "),
-]
+EXIF_OF_GDAL = [whole("EXIF_ISOSpeedRatings", 200), whole("EXIF_FNumber", "(2.8) ")]
+EXIF_OF_GDAL += [whole("EXIF_ExposureTime", "(0.25)")]
 EXPOSED = {"exposure_s": 0.25, "gain": 2.0, "f_number": 2.8}
 TIMES = [0.01, 0.02, 0.03, 0.04, 0.05, 0.06]
 COLOURS, OPAQUE = CUBE[..., :3].astype(np.uint8), CUBE[..., :4].copy()
+AS_RGB = {"image": COLOURS, "photometric": "rgb"}
 WIDTHS, GOOD = [5, 5, 5, 5, 5, 6], [1, 1, 0, 1, 1, 1]
 PLACES = [(33550, "d", 3, (2.0, 2.0, 0.0)), (33922, "d", 6, (0.0, 0.0, 0.0, 5e5, 4.5e6, 0.0))]
-SCALE, OFFSET = (
-    gdal_items("SCALE", [1e-4] * 6, ' role="scale"'),
-    gdal_items("OFFSET", [0] * 6, ' role="offset"'),
-)
+SCALE = gdal_items("SCALE", [1e-4] * 6, ' role="scale"')
+OFFSET = gdal_items("OFFSET", [0] * 6, ' role="offset"')
+TRIPLED = gdal_items("SCALE", [3] * 6, ' role="scale"')
+IN_UM = gdal_items("wavelength_units", ["Micrometers"] * 6)
+LISTED = "400, 410, 420, 430, 440, 450"
 NO_DATA = (42113, "s", 0, "65535", True)
 NAMED = gdal_items("DESCRIPTION", [f"B{nm % 7} ({nm} nm)" for nm in NM], ' role="description"')
 GAIN, TINT, TIME = whole("gain", 4), whole("tint", 10), whole("exposure_ms", 10)
 SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
     (gdal(gdal_items("wavelength", NM)), {"nm": NM, "notes": ()}),
-    (
-        gdal(gdal_items("wavelength", UM), gdal_items("wavelength_units", ["Micrometers"] * 6)),
-        {"nm": WIDE_NM},
-    ),
+    (gdal(gdal_items("wavelength", UM), IN_UM), {"nm": WIDE_NM}),
     (gdal(gdal_items("CENTRAL_WAVELENGTH_UM", UM, ' domain="IMAGERY"')), {"nm": WIDE_NM}),
     (gdal(NAMED), {"nm": NM}),
     (gdal(*(whole(f"Band_{i}", f"{nm} Nanometers") for i, nm in enumerate(NM, start=1))), {"nm": NM}),
-    (
-        gdal(whole("wavelength", NM), whole("fwhm", WIDTHS), whole("bbl", GOOD)),
-        {"nm": NM, "fwhm": WIDTHS, "bad": [2]},
-    ),
+    (gdal(whole("wavelength", NM), whole("fwhm", WIDTHS)), {"nm": NM, "fwhm": WIDTHS}),
+    (gdal(whole("wavelength", NM), whole("bbl", GOOD)), {"nm": NM, "bad": [2]}),
     ({"extratags": [*gdal_tag(OFFSET, SCALE), NO_DATA]}, {"scale": 10000.0, "no_data": (65535,)}),
     *(
         (described(text), {"nm": NM, "evidence": "image description"})
@@ -149,40 +135,28 @@ SAID: list[tuple[dict[str, Any], dict[str, Any]]] = [
             json.dumps({"wavelengths_nm": NM}),
             json.dumps({"wavelengths_nm": NM, "bands": [{"name": "red"}]}),
             json.dumps({"sensor": {"wavelengths": NM}, "bands": [{"name": "red"}]}),
-            json.dumps({"note": "wavelengths (nm): 400, 410, 420, 430, 440, 450"}),
+            json.dumps({"note": f"wavelengths (nm): {LISTED}"}),
             json.dumps({"Wavelength": [0.4, 0.41, 0.42, 0.43, 0.44, 0.45], "wavelength_units": "um"}),
-            "camera: x\nwavelengths (nm): 400, 410, 420, 430, 440, 450\nshutter: 3",
-            "wavelength = {400, 410, 420, 430, 440, 450}",
+            f"camera: x\nwavelengths (nm): {LISTED}\nshutter: 3",
+            f"wavelength = {{{LISTED}}}",
         )
     ),
     (XMP, {"nm": [717], "fwhm": [10], "names": ["Red edge"]}),
     ({"extratags": [(274, "H", 1, 6, True)]}, {"orientation": 6, "values": CUBE}),  # which is not followed
     ({"extratags": [(274, "H", 1, 1, True)]}, {"orientation": None, "geo_reference": None}),
     ({"extratags": PLACES}, {"geo_reference": "GeoTIFF"}),
-    (
-        {"image": OPAQUE, "photometric": "rgb", "extrasamples": ["unassalpha"]},
-        {"values": OPAQUE, "warning": "marked as opacity"},
-    ),
-    (
-        {"image": COLOURS, "photometric": "rgb"},
-        {"warning": "red, green and blue are taken as light, as stored"},
-    ),
-    (gdal(gdal_items("wavelength", NM[:3]), image=COLOURS, photometric="rgb"), {"warnings": ()}),
+    (AS_RGB | {"image": OPAQUE, "extrasamples": ["unassalpha"]}, {"values": OPAQUE, "warning": "as opacity"}),
+    (AS_RGB, {"values": COLOURS, "warning": "red, green and blue are taken as light, as stored"}),
+    (gdal(gdal_items("wavelength", NM[:3]), **AS_RGB), {"warnings": ()}),
     ({"image": CUBE.astype("i2"), "extratags": EXIF}, EXPOSED),
     (gdal(*EXIF_OF_GDAL), EXPOSED),
     (gdal(gdal_items("EXIF_ExposureTime", TIMES)), {"exposure_s": TIMES, "gain": None}),
     (gdal(GAIN, TIME), {"linear": None, "exposure_s": 0.01, "gain": 4.0}),
     (gdal(GAIN, whole("offset", 2)), {"calibrated": CUBE * 4.0 + 2}),
-    (
-        gdal(SCALE.replace("</Item>", "", 1)),
-        {"linear": None, "warning": "GDAL's metadata in the file is damaged"},
-    ),
+    (gdal(SCALE.replace("</Item>", "", 1)), {"linear": None, "warning": "GDAL's metadata in the file is d"}),
     # A gain that is applied is not of the camera, too.
     (gdal(gdal_items("gain", [4] * 6), TIME), {"calibrated": CUBE * 4.0, "exposure_s": 0.01, "gain": None}),
-    (
-        gdal(GAIN, gdal_items("SCALE", [3] * 6, ' role="scale"'), TINT),
-        {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0},
-    ),
+    (gdal(GAIN, TRIPLED, TINT), {"calibrated": CUBE * 3.0, "exposure_s": 0.01, "gain": 4.0}),
 ]
 
 
@@ -205,13 +179,10 @@ def test_wavelengths_of_ome_and_of_pages_by_their_descriptions_labels_and_names(
     metadata = {"axes": "CYX", "Channel": channels}
     tifffile.imwrite(tmp_path / "a.ome.tif", PLANES, photometric="minisblack", metadata=metadata)
     tifffile.imwrite(tmp_path / "b.tif", PLANES, imagej=True, metadata={"axes": "CYX", "Labels": labels})
-    for name, page in (
-        ("c.tif", lambda label: {"extratags": [(285, "s", 0, f"filter {label}", True)]}),
-        ("d.tif", lambda label: {"description": f"filter {label}"}),
-    ):
-        with tifffile.TiffWriter(tmp_path / name) as file:
-            for plane, label in zip(PLANES, labels, strict=True):
-                file.write(plane, metadata=None, **page(label))
+    with tifffile.TiffWriter(tmp_path / "c.tif") as named, tifffile.TiffWriter(tmp_path / "d.tif") as told:
+        for plane, label in zip(PLANES, labels, strict=True):
+            named.write(plane, metadata=None, extratags=[(285, "s", 0, f"filter {label}", True)])
+            told.write(plane, metadata=None, description=f"filter {label}")
     for path in sorted(tmp_path.iterdir()):
         check_file(open_spectral_file(path), nm=NM, values=CUBE)
 
@@ -228,8 +199,7 @@ def test_previews_and_pages_of_other_sizes_are_left_out(tmp_path, below):
 
 
 def test_the_first_rows_of_a_compressed_file_are_read_without_the_rest(tmp_path):
-    path = write(tmp_path / "cube.tif", "chunky", "deflated strips")
-    file = open_spectral_file(path)
+    file, path = written(tmp_path, CUBE, **STORAGE["deflated strips"]), tmp_path / "a.tif"
     data = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as opened:
         page = opened.pages[0]
@@ -286,10 +256,7 @@ def test_pixels_of_0_in_a_mask_of_the_file_are_missing(tmp_path, dtype, options)
         file.write(stored, subfiletype=1, photometric="minisblack", metadata=None, **options)
         file.write(stored[::2, ::2], subfiletype=1, photometric="minisblack", metadata=None)
     with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as file:
-        for page, kind in (
-            (file.pages[1], 4),
-            (file.pages[2], 5),
-        ):  # tifffile itself writes masks of one bit alone
+        for page, kind in zip(file.pages[1:], (4, 5), strict=True):  # tifffile writes masks of one bit alone
             present(page.tags.get(254)).overwrite(kind)
             present(page.tags.get(262)).overwrite(4)
     opened = open_spectral_file(tmp_path / "a.tif")
@@ -309,9 +276,8 @@ def test_pixels_of_0_in_a_mask_beside_the_file_are_missing(tmp_path, bands):
     np.testing.assert_array_equal(find_missing(file.read(), file), (mask == 0).any(axis=-1))
     rows, wanted = slice(5, 30), np.array([4, 2])
     expected = mask[rows][..., wanted if bands > 1 else slice(None)] == 0
-    np.testing.assert_array_equal(
-        find_missing(file.read(rows, wanted), file, rows, wanted), expected.any(axis=-1)
-    )
+    found = find_missing(file.read(rows, wanted), file, rows, wanted)
+    np.testing.assert_array_equal(found, expected.any(axis=-1))
     tifffile.imwrite(tmp_path / "a.tif.msk", mask[1:, :, 0], photometric="minisblack")
     check_file(written(tmp_path, CUBE), warning="the mask a.tif.msk has 69 x 50", missing_part=None)
 
@@ -333,22 +299,16 @@ def test_a_plain_page_that_is_left_out_in_the_file_is_missing(tmp_path):
 
 
 BYTES = CUBE[..., 0].astype(np.uint8)
+PALETTE = {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)}
+MOSAIC = {"photometric": "cfa", "extratags": [(33421, "H", 2, (2, 2)), (33422, "B", 4, b"\0\1\1\2")]}
 
 
 @pytest.mark.parametrize(
     ("image", "options", "message"),
     [
         (BYTES, {"photometric": "miniswhite"}, "whose numbers grow with darkness"),
-        (
-            BYTES,
-            {"photometric": "palette", "colormap": np.zeros((3, 256), np.uint16)},
-            "places in a table of colours",
-        ),
-        (
-            BYTES,
-            {"photometric": "cfa", "extratags": [(33421, "H", 2, (2, 2)), (33422, "B", 4, b"\0\1\1\2")]},
-            "CFA",
-        ),
+        (BYTES, PALETTE, "places in a table of colours"),
+        (BYTES, MOSAIC, "CFA"),
         (COLOURS, {"photometric": "cielab"}, "colour space of the eye"),
         (np.stack([COLOURS] * 2), {"photometric": "rgb"}, "2 pages of 3 numbers a pixel; expected one page"),
         (CUBE.astype(np.complex64), {}, "the image holds complex64; expected real numbers"),
@@ -356,4 +316,4 @@ BYTES = CUBE[..., 0].astype(np.uint8)
 )
 def test_pages_whose_numbers_are_no_light_are_refused(tmp_path, image, options, message):
     with pytest.raises(CaptureError, match=message):
-        written(tmp_path, image, **({"planarconfig": None} if image.ndim == 2 else {}), **options)
+        written(tmp_path, image, **options)
